@@ -1,0 +1,47 @@
+"""Bayesian estimation of deformation and elastic parameters in non-rigid registration."""
+
+import importlib
+import os
+import sys
+from typing import Any
+
+# Float64 without paying for the import of JAX here: it reads the variable when it is first imported.
+os.environ.setdefault("JAX_ENABLE_X64", "true")
+if "jax" in sys.modules:
+    sys.modules["jax"].config.update("jax_enable_x64", True)
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Image": "image",
+    "TetMesh": "mesh",
+    "Equilibrium": "types",
+    "strain_energy": "fem.elasticity",
+    "solve_interior": "fem.equilibrium",
+    "ModelConfig": "model.options",
+    "build_posterior": "model.posterior",
+    "Posterior": "model.posterior",
+    "sample": "inference.run",
+    "load_image": "io.volumes",
+    "save_image": "io.volumes",
+    "build_mesh": "io.meshing",
+    "load_mesh": "io.meshing",
+    "save_mesh": "io.meshing",
+    "load_config": "config",
+    "run": "pipeline",
+    "load_result": "pipeline",
+}
+
+__all__ = ["__version__", *sorted(_HOME)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'bayesreg' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"bayesreg.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

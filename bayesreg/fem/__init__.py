@@ -1,0 +1,1 @@
+"""Linear elastic finite elements: pure JAX, arrays in and out."""

@@ -1,0 +1,215 @@
+"""Images in world RAS millimetres, and their differentiable interpolation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import product
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from bayesreg.types import AnyArray
+
+Interpolation = Literal["linear", "cubic"]
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A 3D image on a regular grid in world space.
+
+    Parameters
+    ----------
+    voxels : (X, Y, Z) array
+        Finite values; any real or integer type.
+    affine : (4, 4) array
+        Voxel index to world RAS, mm. Any orientation, anisotropic or left-handed, but invertible.
+
+    Raises
+    ------
+    ValueError
+        If the voxels are not 3D, are empty or not finite, or the affine is not an invertible 4 × 4 affine.
+    """
+
+    voxels: AnyArray
+    affine: AnyArray
+
+    def __post_init__(self) -> None:
+        voxels, affine = np.asarray(self.voxels), np.asarray(self.affine, float)
+        if voxels.ndim != 3 or voxels.size == 0:
+            raise ValueError(f"an image is a non-empty 3D array (X, Y, Z); got shape {voxels.shape}")
+        if affine.shape != (4, 4) or not np.isfinite(affine).all() or not np.allclose(affine[3], (0, 0, 0, 1)):
+            raise ValueError(f"an affine is a finite 4 × 4 matrix with last row 0 0 0 1; got {affine.tolist()}")
+        if np.linalg.cond(affine[:3, :3]) > 1e8:
+            raise ValueError(f"the affine is singular (no inverse from world to voxel): {affine.tolist()}")
+        if not np.isfinite(voxels).all():
+            count = int(np.count_nonzero(~np.isfinite(voxels)))
+            raise ValueError(f"{count} voxels are NaN or infinite; replace them before the registration")
+        object.__setattr__(self, "voxels", voxels)
+        object.__setattr__(self, "affine", affine)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of voxels along each axis."""
+        return self.voxels.shape
+
+    @cached_property
+    def to_voxel(self) -> Float[np.ndarray, "4 4"]:
+        """World RAS mm to voxel index."""
+        return np.linalg.inv(self.affine)
+
+    @cached_property
+    def voxel_sizes(self) -> Float[np.ndarray, "3"]:
+        """Edge lengths of a voxel, mm."""
+        return np.linalg.norm(self.affine[:3, :3], axis=0)
+
+    @property
+    def voxel_volume(self) -> float:
+        """Volume of a voxel, mm³."""
+        return float(abs(np.linalg.det(self.affine[:3, :3])))
+
+    def with_voxels(self, voxels: AnyArray) -> Image:
+        """Another image on the same grid."""
+        if np.shape(voxels) != self.shape:
+            raise ValueError(f"expected voxels of shape {self.shape}, got {np.shape(voxels)}")
+        return Image(voxels, self.affine)
+
+    def world_to_voxel(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3"]:
+        """Continuous voxel indices of world points (mm)."""
+        return points @ self.to_voxel[:3, :3].T + self.to_voxel[:3, 3]
+
+    def voxel_to_world(self, indices: AnyArray) -> Float[AnyArray, "*batch 3"]:
+        """World points (mm) of (continuous) voxel indices."""
+        return indices @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    def grid_points(self) -> Float[np.ndarray, "X Y Z 3"]:
+        """World position of every voxel centre, mm."""
+        indices = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in self.shape), indexing="ij"), axis=-1)
+        return self.voxel_to_world(indices)
+
+    def contains(self, points: Float[AnyArray, "*batch 3"]) -> Bool[AnyArray, "*batch"]:
+        """Which world points (mm) lie on the grid (its voxels' extent included)."""
+        indices = self.world_to_voxel(points)
+        return ((indices >= -0.5) & (indices <= np.array(self.shape) - 0.5)).all(axis=-1)
+
+    def interpolator(self, method: Interpolation = "linear") -> Interpolator:
+        """The image as a differentiable function of world position; see `Interpolator`."""
+        voxels = np.asarray(self.voxels, float)
+        if method == "cubic":
+            # Samples to B-spline coefficients, mirrored at the faces; the padding holds the outer taps.
+            coefficients = ndimage.spline_filter(voxels, order=3, mode="mirror", output=float)
+            coefficients = _mirror(coefficients, before=1, after=2)
+        elif method == "linear":
+            coefficients = np.pad(voxels, [(0, 1)] * 3, mode="edge")
+        else:
+            raise ValueError(f"interpolation is 'linear' or 'cubic', got {method!r}")
+        return Interpolator(jnp.asarray(coefficients), jnp.asarray(self.to_voxel), self.shape, method)
+
+    def interpolate(
+        self, points: Float[AnyArray, "*batch 3"], method: Interpolation = "linear"
+    ) -> Float[AnyArray, "*batch"]:
+        """Values at world points (mm); nearest value outside the grid. Differentiable in `points`."""
+        return self.interpolator(method)(jnp.asarray(points, float))
+
+
+def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:
+    """Pad every axis by reflection about its end samples; axes of length one are repeated."""
+    for axis, length in enumerate(array.shape):
+        width = [(0, 0)] * array.ndim
+        width[axis] = (before, after)
+        array = np.pad(array, width, mode="reflect" if length > 1 else "edge")
+    return array
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["coefficients", "to_voxel"],
+    meta_fields=["shape", "method"],
+)
+@dataclass(frozen=True)
+class Interpolator:
+    """An image as a function of world position, for use inside jitted code (it is a pytree).
+
+    Trilinear (continuous, its gradient jumps between voxels) or cubic B-spline (twice continuously
+    differentiable; `scipy.ndimage.map_coordinates` with order 3 and mode "mirror"). Outside the grid the
+    image continues with its nearest value.
+
+    Attributes
+    ----------
+    coefficients : padded (X, Y, Z) array
+        Voxels, or B-spline coefficients.
+    to_voxel : (4, 4) array
+        World RAS mm to voxel index.
+    shape : tuple of int
+        Shape of the image before padding.
+    method : {"linear", "cubic"}
+    """
+
+    coefficients: AnyArray
+    to_voxel: AnyArray
+    shape: tuple[int, int, int]
+    method: Interpolation
+
+    def __call__(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch"]:
+        """Values at world points, mm."""
+        last = jnp.asarray([n - 1.0 for n in self.shape])
+        indices = jnp.clip(points @ self.to_voxel[:3, :3].T + self.to_voxel[:3, 3], 0.0, last)
+        corner = jax.lax.stop_gradient(jnp.floor(indices))
+        weights = (_linear_weights if self.method == "linear" else _cubic_weights)(indices - corner)
+        strides = np.cumprod((1, *self.coefficients.shape[:0:-1]))[::-1]
+        first = (corner.astype(int) * strides).sum(axis=-1)
+        flat = self.coefficients.reshape(-1)
+        value = jnp.zeros(points.shape[:-1])
+        for tap in product(range(len(weights)), repeat=3):
+            weight = weights[tap[0]][..., 0] * weights[tap[1]][..., 1] * weights[tap[2]][..., 2]
+            value = value + weight * flat[first + int(np.dot(tap, strides))]
+        return value
+
+
+def _linear_weights(t: AnyArray) -> tuple[AnyArray, ...]:
+    return 1 - t, t
+
+
+def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:
+    """Uniform cubic B-spline at distances t + 1, t, 1 − t, 2 − t from its centre, 0 ≤ t ≤ 1."""
+    s = 1 - t
+    return s**3 / 6, 2 / 3 - t**2 * (2 - t) / 2, 2 / 3 - s**2 * (2 - s) / 2, t**3 / 6
+
+
+class IntensityScale(NamedTuple):
+    """The affine map of intensities that sends `low` to 0 and `high` to 1."""
+
+    low: float
+    high: float
+
+    def __call__(self, image: Image) -> Image:
+        """The image with rescaled intensities; values outside [low, high] leave [0, 1] and are kept."""
+        return image.with_voxels((np.asarray(image.voxels, float) - self.low) / (self.high - self.low))
+
+
+def robust_scale(image: Image, mask: Bool[np.ndarray, "X Y Z"] | None = None) -> IntensityScale:
+    """Scale of the 0.5 % to 99.5 % quantiles of the intensities inside a mask.
+
+    Parameters
+    ----------
+    image : Image
+    mask : (X, Y, Z) bool array, optional
+        Where to look; the default is everywhere.
+
+    Raises
+    ------
+    ValueError
+        If the mask is empty or the intensities inside it are constant.
+    """
+    values = np.asarray(image.voxels, float)
+    values = values.ravel() if mask is None else values[mask]
+    if values.size == 0:
+        raise ValueError("the mask for the intensity scale is empty")
+    low, high = np.quantile(values, (0.005, 0.995))
+    if not high > low:
+        raise ValueError(f"the image has no contrast inside the mask: its 0.5 % and 99.5 % quantiles are both {low}")
+    return IntensityScale(float(low), float(high))

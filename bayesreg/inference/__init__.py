@@ -1,0 +1,1 @@
+"""Sampling a posterior, and judging the draws."""

@@ -1,0 +1,1 @@
+"""Files and native libraries: volumes, meshes, data sets, run folders."""

@@ -1,0 +1,118 @@
+"""Tetrahedral meshes with one tissue per tetrahedron."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayesreg.types import AnyArray
+
+# The faces of a positively oriented tetrahedron, their normals pointing outwards.
+FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
+
+
+@dataclass(frozen=True, eq=False)
+class TetMesh:
+    """A tetrahedral mesh in world space. Make one with `from_arrays`, which validates.
+
+    Attributes
+    ----------
+    points : (n, 3) float array
+        Node positions, world RAS mm.
+    cells : (m, 4) int array
+        Node indices of each tetrahedron, positively oriented.
+    tissue : (m,) int array
+        Index into `names` of each tetrahedron's tissue.
+    names : tuple of str
+        Tissue names.
+    """
+
+    points: Float[np.ndarray, "nodes 3"]
+    cells: Int[np.ndarray, "cells 4"]
+    tissue: Int[np.ndarray, "cells"]
+    names: tuple[str, ...]
+
+    @classmethod
+    def from_arrays(
+        cls, points: AnyArray, cells: AnyArray, tissue: AnyArray, names: Sequence[str] = ("csf", "gm", "wm")
+    ) -> TetMesh:
+        """Validate arrays and make a mesh of them.
+
+        Raises
+        ------
+        ValueError
+            If shapes or indices are off, a coordinate is not finite, a tetrahedron has no positive volume,
+            or a node belongs to no tetrahedron. The topology is not looked at.
+        """
+        points, cells, tissue = np.array(points, float), np.array(cells), np.array(tissue)
+        _require_shapes(points, cells, tissue)
+        cells, tissue = cells.astype(np.int64), tissue.astype(np.int64)
+        if not np.isfinite(points).all():
+            raise ValueError(f"node {np.argwhere(~np.isfinite(points))[0, 0]} has a coordinate that is not finite")
+        if cells.min() < 0 or cells.max() >= len(points):
+            raise ValueError(f"cells name nodes {cells.min()} to {cells.max()}, but there are {len(points)} points")
+        if tissue.min() < 0 or tissue.max() >= len(names):
+            raise ValueError(f"tissue holds {tissue.min()} to {tissue.max()}, but names has {len(names)} entries")
+        mesh = cls(points, cells, tissue, tuple(names))
+        bad = np.flatnonzero(~(mesh.volumes > 0))
+        if len(bad):
+            raise ValueError(f"{len(bad)} tetrahedra have no positive volume, the first is cell {bad[0]}")
+        unused = np.setdiff1d(np.arange(len(points)), cells)
+        if len(unused):
+            raise ValueError(f"{len(unused)} nodes belong to no tetrahedron, the first is node {unused[0]}")
+        return mesh
+
+    @cached_property
+    def volumes(self) -> Float[np.ndarray, "cells"]:
+        """Signed volume of every tetrahedron, mm³."""
+        return signed_volumes(self.points, self.cells)
+
+    @cached_property
+    def boundary_faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Triangles that belong to exactly one tetrahedron, normals outwards."""
+        faces = self.cells[:, FACES].reshape(-1, 3)
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return faces[first[count == 1]]
+
+    @cached_property
+    def boundary(self) -> Int[np.ndarray, "boundary"]:
+        """Sorted indices of the nodes on the boundary."""
+        return np.unique(self.boundary_faces)
+
+    @cached_property
+    def interior(self) -> Int[np.ndarray, "interior"]:
+        """Sorted indices of the nodes that are not on the boundary."""
+        return np.setdiff1d(np.arange(len(self.points)), self.boundary)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the mesh's content: the same for the same mesh on any machine."""
+        arrays = (self.points.astype("<f8"), self.cells.astype("<i8"), self.tissue.astype("<i8"))
+        content = b"".join(np.ascontiguousarray(a).tobytes() for a in arrays) + "\0".join(self.names).encode()
+        return hashlib.sha256(content).hexdigest()
+
+    def moved(self, u: Float[AnyArray, "nodes 3"]) -> TetMesh:
+        """The mesh with every node displaced by u (mm); raises ValueError if a tetrahedron inverts."""
+        return TetMesh.from_arrays(self.points + np.asarray(u), self.cells, self.tissue, self.names)
+
+
+def signed_volumes(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> np.ndarray:
+    """Volume of every tetrahedron, mm³; negative where it is inverted."""
+    corner = points[cells]
+    return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+
+
+def _require_shapes(points: np.ndarray, cells: np.ndarray, tissue: np.ndarray) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {points.shape}")
+    if cells.ndim != 2 or cells.shape[1] != 4 or len(cells) == 0:
+        raise ValueError(f"cells must have shape (m, 4) with m > 0, got {cells.shape}")
+    if tissue.shape != (len(cells),):
+        raise ValueError(f"tissue must have shape ({len(cells)},), one entry per cell, got {tissue.shape}")
+    if not np.issubdtype(cells.dtype, np.integer) or not np.issubdtype(tissue.dtype, np.integer):
+        raise ValueError(f"cells and tissue must be integers, got {cells.dtype} and {tissue.dtype}")

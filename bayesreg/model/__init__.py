@@ -1,0 +1,1 @@
+"""The Bayesian model: similarity, elastic prior, parameter priors, skull constraint."""

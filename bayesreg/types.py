@@ -1,0 +1,37 @@
+"""Array aliases and the small containers that two floors share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+AnyArray = jax.Array | np.ndarray
+
+Scalar = Float[AnyArray, ""]
+Points = Float[AnyArray, "nodes 3"]
+Cells = Int[AnyArray, "cells 4"]
+Tissue = Int[AnyArray, "cells"]
+
+
+class Equilibrium(NamedTuple):
+    """Displacement of every node, and how well the elastic solve converged.
+
+    Attributes
+    ----------
+    u : (n, 3) array
+        Displacement of every node, mm.
+    residual : scalar
+        Relative residual ‖f − K_II u_I‖ / ‖f‖ of the interior solve.
+    iterations : scalar integer
+        Conjugate-gradient iterations.
+    converged : scalar bool
+        Whether everything is finite and the residual is below the tolerance.
+    """
+
+    u: Float[AnyArray, "nodes 3"]
+    residual: Scalar
+    iterations: Int[AnyArray, ""]
+    converged: Bool[AnyArray, ""]
