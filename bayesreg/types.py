@@ -35,3 +35,11 @@ class Equilibrium(NamedTuple):
     residual: Scalar
     iterations: Int[AnyArray, ""]
     converged: Bool[AnyArray, ""]
+
+
+class InputError(ValueError):
+    """Something that a user gave is wrong; the message says what, where, and what to do.
+
+    The command line shows the message alone and ends with status 2. Any other exception is a bug, and
+    shows its traceback.
+    """

@@ -1,0 +1,145 @@
+"""Isotropic linear elasticity: strain energy and stiffness, affine in the Lamé parameters.
+
+K(λ, μ) = Σ_t λ_t A_t + μ_t B_t, with one pair of matrices for each tissue (or each cell).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+
+from bayesreg.fem.elements import Elements, displacement_gradient, elements_of
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray, Scalar
+
+
+def lame_by_cell(values: Float[AnyArray, "entries"], mesh: TetMesh) -> Float[AnyArray, "cells"]:
+    """Spread a Lamé parameter over the cells.
+
+    Parameters
+    ----------
+    values : (1,), (T,) or (m,) array
+        Uniform, by tissue in the order of `mesh.names`, or by cell.
+
+    Raises
+    ------
+    ValueError
+        If the number of entries is none of these.
+    """
+    return jnp.asarray(values)[lame_entries(mesh, np.shape(values))]
+
+
+def lame_entries(mesh: TetMesh, shape: tuple[int, ...]) -> np.ndarray:
+    """Index of each cell's entry in a uniform (1,), by-tissue (T,) or by-cell (m,) parameter vector."""
+    if shape == (len(mesh.names),):
+        return mesh.tissue
+    if shape == (len(mesh.cells),):
+        return np.arange(len(mesh.cells))
+    if shape == (1,):
+        return np.zeros(len(mesh.cells), int)
+    raise ValueError(
+        f"a Lamé parameter has shape ({len(mesh.names)},) by tissue {mesh.names}, ({len(mesh.cells)},) by cell "
+        f"or (1,) uniform; got {shape}"
+    )
+
+
+def element_strain_energy(
+    elements: Elements,
+    lam: Float[AnyArray, "cells"],
+    mu: Float[AnyArray, "cells"],
+    u: Float[AnyArray, "nodes 3"],
+) -> Float[AnyArray, "cells"]:
+    """∫ μ/4 Σ_jk (∂_j u_k + ∂_k u_j)² + λ/2 (div u)² over each cell: eq. (2), which equals eq. (3)."""
+    gradient = displacement_gradient(elements, u)
+    twice_strain = gradient + jnp.swapaxes(gradient, 0, 1)
+    divergence = gradient[0, 0] + gradient[1, 1] + gradient[2, 2]
+    shear = (twice_strain**2).sum(axis=(0, 1))
+    return elements.volumes * (mu / 4 * shear + lam / 2 * divergence**2)
+
+
+def total_strain_energy(elements: Elements, lam: AnyArray, mu: AnyArray, u: AnyArray) -> Scalar:
+    """E_r of eq. (3), with λ and μ given by cell."""
+    return element_strain_energy(elements, lam, mu, u).sum()
+
+
+def internal_force(
+    elements: Elements,
+    lam: Float[AnyArray, "cells"],
+    mu: Float[AnyArray, "cells"],
+    u: Float[AnyArray, "nodes 3"],
+) -> Float[AnyArray, "nodes 3"]:
+    """K(λ, μ) u of eq. (7): Σ_e V_e σ ∇N_a with Hooke's law σ = μ (∇u + ∇uᵀ) + λ (div u) I."""
+    gradient = displacement_gradient(elements, u)
+    divergence = gradient[0, 0] + gradient[1, 1] + gradient[2, 2]
+    identity = jnp.eye(3)[:, :, None]
+    stress = elements.volumes * (mu * (gradient + jnp.swapaxes(gradient, 0, 1)) + lam * divergence * identity)
+    force = [
+        jnp.stack([sum(elements.gradients[a, j] * stress[k, j] for j in range(3)) for a in range(4)]) for k in range(3)
+    ]
+    return jnp.zeros_like(u).at[elements.cells].add(jnp.stack(force, axis=-1))
+
+
+def stiffness_diagonal(elements: Elements, lam: AnyArray, mu: AnyArray, nodes: int) -> Float[AnyArray, "nodes 3"]:
+    """diag K(λ, μ), one entry for each node and axis."""
+    squares = elements.gradients**2
+    entries = elements.volumes * ((lam + mu) * squares + mu * squares.sum(axis=1, keepdims=True))
+    return jnp.zeros((nodes, 3)).at[elements.cells].add(jnp.moveaxis(entries, 1, -1))
+
+
+def strain_energy(
+    mesh: TetMesh, lam: Float[AnyArray, "entries"], mu: Float[AnyArray, "entries"], u: Float[AnyArray, "nodes 3"]
+) -> Scalar:
+    """Linear elastic strain energy E_r = ½ ∫ εᵀ C ε dx (eq. 3).
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    lam, mu : (T,), (m,) or (1,) array
+        Lamé parameters by tissue, by cell or uniform.
+    u : (n, 3) array
+        Displacement of every node, mm.
+
+    Returns
+    -------
+    scalar
+        In (unit of λ, μ) · mm³. Differentiable in `lam`, `mu` and `u`.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit the mesh.
+    """
+    if np.shape(u) != mesh.points.shape:
+        raise ValueError(f"u must have shape {mesh.points.shape}, got {np.shape(u)}")
+    return total_strain_energy(elements_of(mesh), lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u))
+
+
+def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_matrix:
+    """Global stiffness matrix K of eq. (7), assembled on the host.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    lam, mu : (T,), (m,) or (1,) array
+        Lamé parameters by tissue, by cell or uniform.
+
+    Returns
+    -------
+    (3n, 3n) sparse matrix
+        Row 3 · node + axis. Symmetric; its null space holds the six rigid motions.
+    """
+    gradients = np.moveaxis(np.asarray(elements_of(mesh).gradients), -1, 0)
+    lam_volume, mu_volume = (
+        np.asarray(values)[lame_entries(mesh, np.shape(values))] * mesh.volumes for values in (lam, mu)
+    )
+    # V BᵀCB of eq. (6), block (a, b): λ g_a g_bᵀ + μ (g_b g_aᵀ + (g_a · g_b) I).
+    outer = np.einsum("mai,mbj->maibj", gradients, gradients)
+    inner = np.einsum("mak,mbk,ij->maibj", gradients, gradients, np.eye(3))
+    shear = np.einsum("majbi->maibj", outer) + inner
+    blocks = lam_volume[:, None, None, None, None] * outer + mu_volume[:, None, None, None, None] * shear
+    degrees = (3 * mesh.cells[:, :, None] + np.arange(3)).reshape(-1, 12)
+    rows, columns = np.repeat(degrees, 12, axis=1), np.tile(degrees, (1, 12))
+    size = 3 * len(mesh.points)
+    return scipy.sparse.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size))

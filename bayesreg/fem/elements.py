@@ -1,0 +1,126 @@
+"""Linear (P1) tetrahedra: shape gradients, displacement gradients and quadrature.
+
+Everything over cells keeps the cell as its *last* axis, and the sums over the four nodes and three axes
+are written out: XLA then fuses them into one pass over the cells, where an `einsum` over 3 × 4 blocks
+runs several times slower on the CPU.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray
+
+
+class Elements(NamedTuple):
+    """The geometry that linear elements need (a pytree).
+
+    Attributes
+    ----------
+    cells : (4, m) int array
+        Node indices.
+    gradients : (4, 3, m) array
+        ∂N_a/∂x_i of each node's shape function, 1/mm.
+    volumes : (m,) array
+        mm³.
+    """
+
+    cells: Int[AnyArray, "4 cells"]
+    gradients: Float[AnyArray, "4 3 cells"]
+    volumes: Float[AnyArray, "cells"]
+
+
+def elements_of(mesh: TetMesh) -> Elements:
+    """Shape gradients and volumes of a mesh."""
+    corners = mesh.points[mesh.cells]
+    # Rows of the inverse Jacobian are the gradients of N_1, N_2, N_3; the four of them sum to zero.
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    last_three = np.linalg.inv(edges)
+    gradients = np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
+    return Elements(jnp.asarray(mesh.cells.T), jnp.asarray(np.moveaxis(gradients, 0, -1)), jnp.asarray(mesh.volumes))
+
+
+def displacement_gradient(elements: Elements, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "3 3 cells"]:
+    """∂u_k/∂x_j of every cell, first axis k, second axis j."""
+    nodal = [[u[:, k][elements.cells[a]] for k in range(3)] for a in range(4)]
+    return jnp.stack(
+        [jnp.stack([sum(elements.gradients[a, j] * nodal[a][k] for a in range(4)) for j in range(3)]) for k in range(3)]
+    )
+
+
+class Quadrature(NamedTuple):
+    """Points inside the cells at which an integral over Ω is summed (a pytree).
+
+    Attributes
+    ----------
+    cells : (q,) int array
+        The cell of each point.
+    barycentric : (q, 4) array
+        Its barycentric coordinates there.
+    weights : (q,) array
+        mm³; they sum to the volume of Ω.
+    """
+
+    cells: Int[AnyArray, "points"]
+    barycentric: Float[AnyArray, "points 4"]
+    weights: Float[AnyArray, "points"]
+
+    def positions(self, mesh: TetMesh) -> Float[np.ndarray, "points 3"]:
+        """World position of every point, mm."""
+        corners = mesh.points[mesh.cells[np.asarray(self.cells)]]
+        return np.einsum("qa,qai->qi", np.asarray(self.barycentric), corners)
+
+
+# Four-point Gauss rule, exact for quadratics (the paper's; Zienkiewicz and Taylor).
+_NEAR, _FAR = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
+_GAUSS4 = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
+
+GAUSS_SUBDIVISIONS = {"gauss4": 0, "gauss32": 1, "gauss256": 2}
+
+
+def gauss_quadrature(mesh: TetMesh, rule: str = "gauss4") -> Quadrature:
+    """The four-point Gauss rule on every cell, or on the 8 or 64 equal parts of every cell.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    rule : {"gauss4", "gauss32", "gauss256"}
+        Number of points per cell. All weights are positive and equal within a cell: the noise model
+        behind the Boltzmann similarity gives a point of weight w_q the variance T_s / (2 w_q), which the
+        negative weights of Gauss rules of higher order would not allow.
+    """
+    barycentric = _subdivided(GAUSS_SUBDIVISIONS[rule])
+    count, per_cell = len(mesh.cells), len(barycentric)
+    return Quadrature(
+        jnp.asarray(np.repeat(np.arange(count), per_cell)),
+        jnp.asarray(np.tile(barycentric, (count, 1))),
+        jnp.asarray(np.repeat(mesh.volumes / per_cell, per_cell)),
+    )
+
+
+def _subdivided(levels: int) -> Float[np.ndarray, "points 4"]:
+    """Four-point rule on the children of the reference tetrahedron, in barycentric coordinates."""
+    children = [np.eye(4)]
+    for _ in range(levels):
+        children = [child for parent in children for child in _children(parent)]
+    return np.concatenate([_GAUSS4 @ child for child in children])
+
+
+def _children(corners: Float[np.ndarray, "4 4"]) -> list[np.ndarray]:
+    """The eight equal parts of a tetrahedron: one at each corner, four in the octahedron between them."""
+    mid = {frozenset(pair): corners[list(pair)].mean(axis=0) for pair in combinations(range(4), 2)}
+
+    def middle(a: int, b: int) -> np.ndarray:
+        return mid[frozenset((a, b))]
+
+    at_corners = [np.stack([corners[a], *(middle(a, b) for b in range(4) if b != a)]) for a in range(4)]
+    diagonal = [middle(0, 1), middle(2, 3)]
+    ring = [middle(0, 2), middle(0, 3), middle(1, 3), middle(1, 2)]
+    in_octahedron = [np.stack([*diagonal, ring[i], ring[(i + 1) % 4]]) for i in range(4)]
+    return at_corners + in_octahedron

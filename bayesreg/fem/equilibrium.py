@@ -1,0 +1,177 @@
+"""The elastic equilibrium of the free nodes: K_II u_I = −K_IB u_B by preconditioned conjugate gradients."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bayesreg.fem.elasticity import internal_force, lame_by_cell, stiffness, stiffness_diagonal
+from bayesreg.fem.elements import Elements, elements_of
+from bayesreg.fem.preconditioners import Preconditioner, reference_inverse
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray, Equilibrium, Scalar
+
+TOLERANCE = 1e-8
+MAX_ITERATIONS = 2000
+
+
+class ElasticSystem(NamedTuple):
+    """What the equilibrium of the free nodes needs (a pytree).
+
+    Attributes
+    ----------
+    elements : Elements
+    prescribed, free : (b,), (f,) int arrays
+        A partition of the nodes.
+    preconditioner : (3f, 3f) array or None
+        See `bayesreg.fem.preconditioners`.
+    """
+
+    elements: Elements
+    prescribed: Int[AnyArray, "prescribed"]
+    free: Int[AnyArray, "free"]
+    preconditioner: Preconditioner
+
+
+class SolverInfo(NamedTuple):
+    """Relative residual, iterations, and whether the one is below the tolerance."""
+
+    residual: Scalar
+    iterations: Int[AnyArray, ""]
+    converged: Bool[AnyArray, ""]
+
+
+def elastic_system(
+    mesh: TetMesh,
+    prescribed: Int[AnyArray, "prescribed"],
+    lam_reference: Float[AnyArray, "entries"],
+    mu_reference: Float[AnyArray, "entries"],
+) -> ElasticSystem:
+    """Prepare the solves on a mesh whose `prescribed` nodes have given displacements.
+
+    Raises
+    ------
+    ValueError
+        If the prescribed nodes do not hold the mesh in place.
+    """
+    free = np.setdiff1d(np.arange(len(mesh.points)), np.asarray(prescribed))
+    degrees = (3 * free[:, None] + np.arange(3)).ravel()
+    reference = stiffness(mesh, lam_reference, mu_reference)[degrees][:, degrees]
+    preconditioner = reference_inverse(reference) if len(free) else None
+    return ElasticSystem(elements_of(mesh), jnp.asarray(prescribed), jnp.asarray(free), preconditioner)
+
+
+def equilibrium(
+    system: ElasticSystem,
+    lam: Float[AnyArray, "cells"],
+    mu: Float[AnyArray, "cells"],
+    u_prescribed: Float[AnyArray, "prescribed 3"],
+    tolerance: float = TOLERANCE,
+) -> Equilibrium:
+    """Displacement of every node, λ and μ given by cell; differentiable in λ, μ and u (implicitly).
+
+    The residual is measured in the norm of the inverse diagonal of K, so that it also speaks for tissues
+    a million times softer than their neighbours.
+    """
+    elements, prescribed, free, inverse = system
+    nodes = len(prescribed) + len(free)
+    u_given = jnp.zeros((nodes, 3)).at[prescribed].set(u_prescribed)
+    if len(free) == 0:
+        fine = jnp.isfinite(u_given).all()
+        return Equilibrium(u_given, jnp.zeros(()), jnp.zeros((), int), fine)
+
+    def apply(u_free: AnyArray) -> AnyArray:
+        u = jnp.zeros((nodes, 3)).at[free].set(u_free)
+        return internal_force(elements, lam, mu, u)[free]
+
+    inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(elements, lam, mu, nodes)[free])
+
+    def precondition(r: AnyArray) -> AnyArray:
+        return inverse_diagonal * r if inverse is None else (inverse @ r.reshape(-1)).reshape(r.shape)
+
+    solve = partial(
+        _conjugate_gradients, precondition=precondition, inverse_diagonal=inverse_diagonal, tolerance=tolerance
+    )
+    load = -internal_force(elements, lam, mu, u_given)[free]
+    u_free, info = jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
+    u = u_given.at[free].set(u_free)
+    # A node whose cells have no free node never enters the solve, but must be finite all the same.
+    return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
+
+
+def _conjugate_gradients(apply, load, *, precondition, inverse_diagonal, tolerance):  # type: ignore[no-untyped-def]
+    """Preconditioned conjugate gradients; NaN anywhere ends the iteration unconverged."""
+
+    def norm(r: AnyArray) -> Scalar:
+        return jnp.sqrt((inverse_diagonal * r**2).sum())
+
+    target = tolerance * norm(load)
+
+    def unfinished(state):  # type: ignore[no-untyped-def]
+        _, residual, _, _, iteration = state
+        size = norm(residual)
+        return (size > target) & jnp.isfinite(size) & (iteration < MAX_ITERATIONS)
+
+    def iterate(state):  # type: ignore[no-untyped-def]
+        x, residual, direction, rho, iteration = state
+        image = apply(direction)
+        step = rho / (direction * image).sum()
+        x, residual = x + step * direction, residual - step * image
+        z = precondition(residual)
+        rho, previous = (residual * z).sum(), rho
+        return x, residual, z + (rho / previous) * direction, rho, iteration + 1
+
+    z = precondition(load)
+    start = jnp.zeros_like(load), load, z, (load * z).sum(), jnp.zeros((), int)
+    x, residual, _, _, iterations = jax.lax.while_loop(unfinished, iterate, start)
+    relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
+    return x, SolverInfo(relative, iterations, relative <= tolerance)
+
+
+def solve_interior(
+    mesh: TetMesh,
+    lam: Float[AnyArray, "entries"],
+    mu: Float[AnyArray, "entries"],
+    u_boundary: Float[AnyArray, "boundary 3"],
+    tolerance: float = TOLERANCE,
+) -> Equilibrium:
+    """Elastic equilibrium of the interior nodes for given boundary displacements (eq. 7).
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    lam, mu : (T,), (m,) or (1,) array
+        Lamé parameters by tissue, by cell or uniform; positive.
+    u_boundary : (b, 3) array
+        Displacements in the order of `mesh.boundary`, mm.
+    tolerance : float
+        On the relative residual.
+
+    Returns
+    -------
+    Equilibrium
+        Numbers never raise: NaN in gives ``converged=False``.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit the mesh.
+    """
+    if np.shape(u_boundary) != (len(mesh.boundary), 3):
+        raise ValueError(f"u_boundary must have shape ({len(mesh.boundary)}, 3), got {np.shape(u_boundary)}")
+    reference = _reference(lam, mesh), _reference(mu, mesh)
+    system = elastic_system(mesh, mesh.boundary, *reference)
+    return equilibrium(system, lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u_boundary), tolerance)
+
+
+def _reference(values: Float[AnyArray, "entries"], mesh: TetMesh) -> Float[np.ndarray, "entries"]:
+    """The parameters themselves as the preconditioner's reference, where they are known and physical."""
+    shape = np.shape(values)
+    if isinstance(values, jax.core.Tracer) or not np.all(np.isfinite(values) & (np.asarray(values) > 0)):
+        return np.ones(shape)
+    return np.asarray(values, float)
