@@ -1,0 +1,269 @@
+"""The posterior of boundary displacements and Lamé parameters: from the program to log densities."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpyro.infer.util import log_density
+
+from bayesreg.mesh import TetMesh
+from bayesreg.model.options import ModelConfig
+from bayesreg.model.priors import RangeTransform
+from bayesreg.model.problem import registration_data
+from bayesreg.model.program import LameParameter, RegistrationData, registration
+from bayesreg.image import Image
+from bayesreg.types import AnyArray, Scalar
+
+Values = Mapping[str, AnyArray]
+
+LAME = ("lam", "mu")
+
+
+class Evaluation(NamedTuple):
+    """The log density at one place, and what was found on the way.
+
+    Attributes
+    ----------
+    logdensity : scalar
+        log p(u, λ, μ | m) up to a constant; −∞ outside the support and where the solve failed.
+    u : (n, 3) array
+        Displacement of every node, mm.
+    similarity_energy, strain_energy : scalars
+        E_s and E_r.
+    solver_iterations : scalar integer
+    solver_failed, outside_support : scalar bools
+        Whether the elastic solve failed, and whether a sampled node lies in Ω_SK.
+    """
+
+    logdensity: Scalar
+    u: Float[AnyArray, "nodes 3"]
+    similarity_energy: Scalar
+    strain_energy: Scalar
+    solver_iterations: Int[AnyArray, ""]
+    solver_failed: Bool[AnyArray, ""]
+    outside_support: Bool[AnyArray, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """p(u_B, λ, μ | m) of eq. (9), unnormalised. Make one with `build_posterior`.
+
+    Three sets of coordinates name the same state:
+
+    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries}``, known entries included;
+    - *estimands*: the same with the sampled entries of λ and μ only;
+    - *position*: estimands mapped to the real line (log, or logit where a prior is bounded).
+
+    Attributes
+    ----------
+    data : RegistrationData
+        All arrays; an argument of every jitted function, so that none is baked into compiled code.
+    mesh : TetMesh
+    options : ModelConfig
+    sampled : (b,) int array
+        The nodes whose displacements are sampled, sorted.
+    """
+
+    data: RegistrationData
+    mesh: TetMesh
+    options: ModelConfig
+    sampled: Int[np.ndarray, "sampled"]
+
+    @cached_property
+    def free(self) -> dict[str, Int[np.ndarray, "free"]]:
+        """Indices of the sampled entries of λ and of μ."""
+        return {name: np.flatnonzero(np.asarray(getattr(self.data, name).is_free)) for name in LAME}
+
+    @cached_property
+    def entry_names(self) -> tuple[str, ...]:
+        """What the entries of λ and μ stand for: tissue names, "all", or element numbers."""
+        return {
+            "tissue": self.mesh.names,
+            "uniform": ("all",),
+            "element": tuple(f"element {i}" for i in range(len(self.mesh.cells))),
+        }[self.options.elasticity]
+
+    def logdensity_constrained(self, values: Values) -> Scalar:
+        """log p(u, λ, μ | m) of section 3.1 up to a constant; differentiable.
+
+        Parameters
+        ----------
+        values : mapping
+            "u_boundary" (b, 3) in mm, "lam" and "mu" with all their entries.
+
+        Raises
+        ------
+        ValueError
+            If a name or a shape is wrong.
+        """
+        return self.evaluate(values).logdensity
+
+    def evaluate(self, values: Values) -> Evaluation:
+        """`logdensity_constrained` with the energies, the full displacement and the state of the solve."""
+        self._require_shapes(values)
+        return _evaluate(self.data, dict(values), self.options.similarity)
+
+    def evaluate_estimands(self, data: RegistrationData, estimands: Values) -> Evaluation:
+        """`evaluate` as a pure function of the data, for samplers of the constrained space."""
+        return _evaluate(data, _complete(data, estimands, self.free), self.options.similarity)
+
+    def logdensity(self, position: Values) -> Scalar:
+        """Log density of the unconstrained position, the Jacobian of `constrain` included."""
+        return self.logdensity_of(self.data, position)
+
+    def logdensity_of(self, data: RegistrationData, position: Values) -> Scalar:
+        """`logdensity` as a pure function of the data, for samplers."""
+        estimands, log_jacobian = _to_estimands(data, position, self.free)
+        return self.evaluate_estimands(data, estimands).logdensity + log_jacobian
+
+    def constrain(self, position: Values) -> dict[str, AnyArray]:
+        """Values (known entries included) of an unconstrained position."""
+        estimands, _ = _to_estimands(self.data, position, self.free)
+        return _complete(self.data, estimands, self.free)
+
+    def unconstrain(self, values: Values) -> dict[str, AnyArray]:
+        """Unconstrained position of values; the inverse of `constrain`."""
+        self._require_shapes(values)
+        position = {"u_boundary": jnp.asarray(values["u_boundary"], float)}
+        for name, free in self.free.items():
+            if len(free):
+                position[name] = _transform(getattr(self.data, name), free).inv(jnp.asarray(values[name])[free])
+        return position
+
+    def estimands(self, values: Values) -> dict[str, AnyArray]:
+        """The sampled entries of values."""
+        self._require_shapes(values)
+        free = {name: jnp.asarray(values[name], float)[free] for name, free in self.free.items() if len(free)}
+        return {"u_boundary": jnp.asarray(values["u_boundary"], float), **free}
+
+    def complete(self, estimands: Values) -> dict[str, AnyArray]:
+        """Values with the known entries put back."""
+        return _complete(self.data, estimands, self.free)
+
+    def reference(self) -> dict[str, AnyArray]:
+        """Values at rest: no displacement, λ and μ at their known or reference values."""
+        return {
+            "u_boundary": jnp.zeros((len(self.sampled), 3)),
+            "lam": jnp.asarray(self.data.lam.reference),
+            "mu": jnp.asarray(self.data.mu.reference),
+        }
+
+    def initial(self, key: AnyArray) -> dict[str, AnyArray]:
+        """A random position near `reference`: displacements of 0.01 mm, parameters within about 10 %."""
+        position = self.unconstrain(self.reference())
+        keys = jax.random.split(key, len(position))
+        scales = {"u_boundary": 0.01, "lam": 0.1, "mu": 0.1}
+        return {
+            name: value + scales[name] * jax.random.normal(subkey, value.shape)
+            for (name, value), subkey in zip(position.items(), keys, strict=True)
+        }
+
+    def energies(self, values: Values) -> dict[str, Scalar]:
+        """Every term of the log density by name, and the energies behind them.
+
+        Returns
+        -------
+        dict
+            "similarity_energy" (E_s), "strain_energy" (E_r), and the terms that sum to the log density:
+            "log_similarity", "log_elastic", "log_rigid", "log_prior_lam", "log_prior_mu", "log_support",
+            "log_solved".
+        """
+        self._require_shapes(values)
+        return _terms(self.data, dict(values), self.options.similarity)
+
+    def _require_shapes(self, values: Values) -> None:
+        expected = {"u_boundary": (len(self.sampled), 3), **{n: getattr(self.data, n).low.shape for n in LAME}}
+        for name, shape in expected.items():
+            if name not in values:
+                raise ValueError(f"values lack {name!r}; expected {', '.join(expected)}")
+            if np.shape(values[name]) != shape:
+                raise ValueError(f"values[{name!r}] must have shape {shape}, got {np.shape(values[name])}")
+
+
+def build_posterior(
+    fixed: Image,
+    moving: Image,
+    mesh: TetMesh,
+    model: ModelConfig | None = None,
+    skull: Image | None = None,
+    reference: Mapping[str, AnyArray] | None = None,
+) -> Posterior:
+    """The posterior of a registration problem.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+        f and m; their intensities are taken as they are.
+    mesh : TetMesh
+        In the space of `fixed`.
+    model : ModelConfig, optional
+        The default is the paper's model with three tissues.
+    skull : Image, optional
+        Nonzero = forbidden; off its grid is forbidden too. None: no constraint.
+    reference : mapping, optional
+        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start; the nearer
+        to the posterior the faster. Default: λ = 10, μ = 1, and 0.01 for a tissue named "csf".
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    ValueError
+        If the mesh does not overlap an image, lies partly in the skull, an option names a tissue or node that
+        does not exist, or the sampled and held nodes do not hold the mesh.
+    """
+    model = model or ModelConfig()
+    data, sampled = registration_data(fixed, moving, mesh, model, skull, reference)
+    return Posterior(data, mesh, model, sampled)
+
+
+def _complete(data: RegistrationData, estimands: Values, free: Mapping[str, np.ndarray]) -> dict[str, AnyArray]:
+    values = {"u_boundary": estimands["u_boundary"]}
+    for name in LAME:
+        known = jnp.asarray(getattr(data, name).reference)
+        values[name] = known.at[free[name]].set(estimands[name]) if len(free[name]) else known
+    return values
+
+
+def _transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
+    return RangeTransform(jnp.asarray(parameter.low)[free], jnp.asarray(parameter.high)[free])
+
+
+def _to_estimands(
+    data: RegistrationData, position: Values, free: Mapping[str, np.ndarray]
+) -> tuple[dict[str, AnyArray], Scalar]:
+    estimands, log_jacobian = {"u_boundary": position["u_boundary"]}, jnp.zeros(())
+    for name in LAME:
+        if len(free[name]):
+            transform = _transform(getattr(data, name), free[name])
+            estimands[name] = transform(position[name])
+            log_jacobian += transform.log_abs_det_jacobian(position[name], estimands[name]).sum()
+    return estimands, log_jacobian
+
+
+@partial(jax.jit, static_argnames="similarity")
+def _evaluate(data: RegistrationData, values: dict[str, AnyArray], similarity: str) -> Evaluation:
+    total, trace = log_density(registration, (data, similarity), {}, values)
+    found = {name: trace[name]["value"] for name in Evaluation._fields if name != "logdensity"}
+    # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
+    return Evaluation(logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), **found)
+
+
+@partial(jax.jit, static_argnames="similarity")
+def _terms(data: RegistrationData, values: dict[str, AnyArray], similarity: str) -> dict[str, Scalar]:
+    _, trace = log_density(registration, (data, similarity), {}, values)
+    terms = {name: trace[name]["value"] for name in ("similarity_energy", "strain_energy")}
+    for name in ("log_similarity", "log_elastic", "log_rigid", "log_support", "log_solved"):
+        terms[name] = trace[name]["fn"].log_prob(trace[name]["value"])
+    for name in LAME:
+        terms[f"log_prior_{name}"] = getattr(data, name).prior().log_prob(values[name])
+    return terms

@@ -1,0 +1,129 @@
+"""Priors of the Lamé parameters: Beta distributions scaled to [r1, r2] (section 3.1 of the paper)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jax.scipy.special import betaln, xlog1py, xlogy
+from jaxtyping import Float
+from numpyro.distributions import constraints
+from numpyro.distributions.transforms import Transform, biject_to
+
+from bayesreg.types import AnyArray
+
+
+class _Range(constraints.Constraint):
+    """low ≤ x ≤ high, entry by entry; high may be infinite."""
+
+    def __init__(self, low: AnyArray, high: AnyArray) -> None:
+        self.low, self.high = low, high
+
+    def __call__(self, x: AnyArray) -> AnyArray:
+        return (x >= self.low) & (x <= self.high)
+
+    def feasible_like(self, prototype: AnyArray) -> AnyArray:
+        return jnp.broadcast_to(RangeTransform(self.low, self.high)(jnp.zeros(())), jnp.shape(prototype))
+
+    def tree_flatten(self):  # type: ignore[no-untyped-def]
+        return (self.low, self.high), (("low", "high"), {})
+
+
+class RangeTransform(Transform):
+    """The real line to [low, high]: low + e^z where high is infinite, low + (high − low) sigmoid(z) elsewhere.
+
+    Parameters
+    ----------
+    low, high : arrays
+        Bounds, entry by entry.
+    """
+
+    def __init__(self, low: AnyArray, high: AnyArray) -> None:
+        self.low, self.high = low, high
+
+    @property
+    def domain(self):  # type: ignore[no-untyped-def]
+        """The real line."""
+        return constraints.real
+
+    @property
+    def codomain(self):  # type: ignore[no-untyped-def]
+        """The interval."""
+        return _Range(self.low, self.high)
+
+    @property
+    def _width(self) -> AnyArray:
+        # One where unbounded: the branch not taken must stay finite for its gradient.
+        return jnp.where(jnp.isinf(self.high), 1.0, self.high - self.low)
+
+    def __call__(self, z: AnyArray) -> AnyArray:
+        """Constrained values."""
+        bounded = self._width / (1 + jnp.exp(-z))
+        return self.low + jnp.where(jnp.isinf(self.high), jnp.exp(z), bounded)
+
+    def _inverse(self, x: AnyArray) -> AnyArray:
+        offset = x - self.low
+        fraction = jnp.where(jnp.isinf(self.high), 0.5, offset / self._width)
+        return jnp.where(jnp.isinf(self.high), jnp.log(offset), jnp.log(fraction) - jnp.log1p(-fraction))
+
+    def log_abs_det_jacobian(self, x: AnyArray, y: AnyArray, intermediates: None = None) -> AnyArray:
+        """log |dy/dx|, entry by entry."""
+        bounded = jnp.log(self._width) - jnp.logaddexp(0.0, x) - jnp.logaddexp(0.0, -x)
+        return jnp.where(jnp.isinf(self.high), x, bounded)
+
+    def tree_flatten(self):  # type: ignore[no-untyped-def]
+        """Bounds are data."""
+        return (self.low, self.high), (("low", "high"), {})
+
+
+@biject_to.register(_Range)
+def _biject_to_range(constraint: _Range) -> RangeTransform:
+    return RangeTransform(constraint.low, constraint.high)
+
+
+class ScaledBeta(dist.Distribution):
+    """Beta(α, β) scaled to [low, high]; where high = ∞ and α = β = 1, the flat improper density 1 on [low, ∞).
+
+    Parameters
+    ----------
+    alpha, beta, low, high : arrays of one common shape
+        Shape parameters A, B and the range [r1, r2], in the unit of the parameter.
+
+    Raises
+    ------
+    NotImplementedError
+        By `sample`, where the prior is improper.
+    """
+
+    arg_constraints = {  # noqa: RUF012 (NumPyro's convention)
+        "alpha": constraints.positive,
+        "beta": constraints.positive,
+        "low": constraints.real,
+        "high": constraints.real,
+    }
+    reparametrized_params = ("alpha", "beta", "low", "high")
+
+    def __init__(self, alpha: AnyArray, beta: AnyArray, low: AnyArray, high: AnyArray) -> None:
+        self.alpha, self.beta, self.low, self.high = alpha, beta, low, high
+        super().__init__(batch_shape=jnp.shape(alpha), validate_args=False)
+
+    @constraints.dependent_property(is_discrete=False, event_dim=0)
+    def support(self) -> _Range:
+        """[low, high]."""
+        return _Range(self.low, self.high)
+
+    def log_prob(self, value: Float[AnyArray, "*entries"]) -> Float[AnyArray, "*entries"]:
+        """log p(value), entry by entry; −∞ outside the range."""
+        inside = self.support(value)
+        improper = jnp.isinf(self.high)
+        width = jnp.where(improper, 1.0, self.high - self.low)
+        fraction = jnp.where(inside & ~improper, (value - self.low) / width, 0.5)
+        beta = xlogy(self.alpha - 1, fraction) + xlog1py(self.beta - 1, -fraction)
+        density = jnp.where(improper, 0.0, beta - betaln(self.alpha, self.beta) - jnp.log(width))
+        return jnp.where(inside, density, -jnp.inf)
+
+    def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> AnyArray:
+        """Draw from a proper prior."""
+        if np.any(np.isinf(self.high)):
+            raise NotImplementedError("a flat prior on [low, inf) cannot be sampled; give a finite high")
+        return self.low + (self.high - self.low) * dist.Beta(self.alpha, self.beta).sample(key, sample_shape)

@@ -1,0 +1,202 @@
+"""From images, a mesh and options to the arrays of a registration problem, with every input checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature
+from bayesreg.fem.equilibrium import elastic_system
+from bayesreg.fem.location import locate
+from bayesreg.image import Image
+from bayesreg.mesh import TetMesh
+from bayesreg.model.constraint import signed_distance
+from bayesreg.model.options import Lame, ModelConfig, PriorConfig
+from bayesreg.model.program import LameParameter, RegistrationData
+from bayesreg.types import AnyArray
+
+
+def registration_data(
+    fixed: Image,
+    moving: Image,
+    mesh: TetMesh,
+    model: ModelConfig,
+    skull: Image | None,
+    reference: Mapping[str, AnyArray] | None,
+) -> tuple[RegistrationData, Int[np.ndarray, "sampled"]]:
+    """All arrays of the problem, and the sampled nodes; see `bayesreg.build_posterior`."""
+    require_overlap(mesh, fixed, "fixed image")
+    require_overlap(mesh, moving, "moving image")
+    sampled, held = sampled_nodes(mesh, model)
+    prescribed = np.union1d(sampled, list(held)).astype(int)
+    lam, mu = (lame_parameter(name, mesh, model, reference) for name in ("lam", "mu"))
+    entry = cell_entries(mesh, model)
+    quadrature = quadrature_of(mesh, fixed, model)
+    positions = quadrature.positions(mesh)
+    displacement = np.zeros((len(prescribed), 3))
+    displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
+    distance = None if skull is None else signed_distance(skull).interpolator("linear")
+    data = RegistrationData(
+        system=elastic_system(mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry]),
+        cell_entry=jnp.asarray(entry),
+        lam=lam,
+        mu=mu,
+        moving=moving.interpolator(model.interpolation),
+        skull_distance=distance,
+        quadrature=quadrature,
+        positions=jnp.asarray(positions),
+        fixed_values=fixed.interpolate(positions, model.interpolation),
+        points_sampled=jnp.asarray(mesh.points[sampled]),
+        slots=jnp.asarray(np.searchsorted(prescribed, sampled)),
+        held=jnp.asarray(displacement),
+        rigid_modes=jnp.asarray(rigid_modes(mesh.points[sampled])),
+        rigid_sd=jnp.asarray(np.inf if model.rigid_sd is None else model.rigid_sd),
+        t_similarity=jnp.asarray(model.t_similarity),
+        t_elastic=jnp.asarray(model.t_elastic),
+    )
+    return data, sampled
+
+
+def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
+    """Raise ValueError if less than half of the mesh's nodes lie on the image's grid."""
+    inside = image.contains(mesh.points)
+    if inside.mean() < 0.5:
+        corners = image.voxel_to_world(np.array([(0, 0, 0), np.array(image.shape) - 1]))
+        raise ValueError(
+            f"the {name} and the mesh do not overlap: {inside.sum()} of {len(inside)} nodes lie on its grid. It runs "
+            f"from {corners[0].round(1).tolist()} to {corners[1].round(1).tolist()} mm (world RAS), the mesh from "
+            f"{mesh.points.min(0).round(1).tolist()} to {mesh.points.max(0).round(1).tolist()} mm; "
+            "check the affines, or align the images first"
+        )
+
+
+def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[int, tuple[float, float, float]]]:
+    """Sorted sampled nodes (held ones left out), and the held nodes with their displacements.
+
+    Raises
+    ------
+    ValueError
+        If a node does not exist, or sampled and held nodes together are fewer than three or on one line.
+    """
+    count = len(mesh.points)
+    if model.sampled == "boundary":
+        wanted = mesh.boundary
+    elif model.sampled == "all":
+        wanted = np.arange(count)
+    else:
+        wanted = np.unique(np.asarray(model.sampled, int))
+    held = dict(sorted(model.held.items()))
+    for name, nodes in (("sampled", wanted), ("held", np.array(list(held), int))):
+        if len(nodes) and nodes.max() >= count:
+            raise ValueError(f"model.{name} names node {nodes.max()}, but the mesh has {count} nodes (0 to {count - 1})")
+    sampled = np.setdiff1d(wanted, list(held)).astype(int)
+    prescribed = mesh.points[np.union1d(sampled, list(held)).astype(int)]
+    if len(sampled) == 0:
+        raise ValueError("no node is sampled: model.sampled names none that is not held")
+    spread = np.linalg.svd(prescribed - prescribed.mean(axis=0), compute_uv=False)
+    if len(prescribed) < 3 or spread[1] < 1e-6 * spread[0]:
+        raise ValueError(
+            f"{len(prescribed)} sampled and held nodes do not hold the mesh in place: "
+            "give at least three that are not on one line (model.sampled, model.held)"
+        )
+    return sampled, held
+
+
+def cell_entries(mesh: TetMesh, model: ModelConfig) -> Int[np.ndarray, "cells"]:
+    """Index of each cell's entry in λ and μ."""
+    return {
+        "tissue": mesh.tissue,
+        "uniform": np.zeros(len(mesh.cells), int),
+        "element": np.arange(len(mesh.cells)),
+    }[model.elasticity]
+
+
+def lame_parameter(
+    name: Lame, mesh: TetMesh, model: ModelConfig, reference: Mapping[str, AnyArray] | None
+) -> LameParameter:
+    """Prior, known entries and reference values of λ or μ.
+
+    Raises
+    ------
+    ValueError
+        If the options name a tissue that the mesh does not have, two tissues that share one entry are given
+        different values, or the reference has the wrong shape or sign.
+    """
+    entries = cell_entries(mesh, model).max() + 1 if model.elasticity != "tissue" else len(mesh.names)
+    prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
+    fixed = _default_fixed(mesh, model) if model.fixed is None else model.fixed
+    known = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
+    start = _default_reference(name, mesh, model, entries) if reference is None else np.asarray(reference[name], float)
+    if start.shape != (entries,) or not (np.isfinite(start) & (start > 0)).all():
+        raise ValueError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
+    values = np.array([s if k is None else float(k) for s, k in zip(start, known, strict=True)])
+    return LameParameter(
+        alpha=jnp.array([float(p.alpha) for p in prior]),
+        beta=jnp.array([float(p.beta) for p in prior]),
+        low=jnp.array([float(p.low) for p in prior]),
+        high=jnp.array([float(p.high) for p in prior]),
+        is_free=jnp.array([k is None for k in known]),
+        reference=jnp.asarray(values),
+    )
+
+
+def _default_fixed(mesh: TetMesh, model: ModelConfig) -> dict[str, object]:
+    if model.elasticity == "uniform":
+        return {"mu": 1.0}
+    return {"mu": {"gm" if "gm" in mesh.names else mesh.names[0]: 1.0}}
+
+
+def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: int) -> Float[np.ndarray, "entries"]:
+    """λ = 10, μ = 1 (the literature's λ/μ is about 24); fluid-like 0.01 in CSF."""
+    solid = 10.0 if name == "lam" else 1.0
+    by_tissue = np.array([0.01 if tissue == "csf" else solid for tissue in mesh.names])
+    return {"tissue": by_tissue, "uniform": np.full(1, solid), "element": by_tissue[mesh.tissue]}[model.elasticity]
+
+
+def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: ModelConfig, entries: int) -> list:
+    """One option per entry of λ or μ, from one for all or a mapping by tissue."""
+    if not isinstance(given, Mapping):
+        return [default if given is None else given] * entries
+    unknown = set(given) - set(mesh.names)
+    if unknown:
+        raise ValueError(f"model.{where} names {sorted(unknown)}, but the mesh's tissues are {list(mesh.names)}")
+    if model.elasticity == "tissue":
+        return [given.get(tissue, default) for tissue in mesh.names]
+    if model.elasticity == "element":
+        return [given.get(mesh.names[tissue], default) for tissue in mesh.tissue]
+    if len(set(given.values())) > 1:
+        raise ValueError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
+    return [next(iter(given.values()), default)]
+
+
+def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature:
+    """The rule that the options name.
+
+    Raises
+    ------
+    ValueError
+        If the rule is "voxels" and no voxel centre lies inside the mesh.
+    """
+    if model.quadrature in GAUSS_SUBDIVISIONS:
+        return gauss_quadrature(mesh, model.quadrature)
+    centres = fixed.grid_points().reshape(-1, 3)
+    near = centres[((centres >= mesh.points.min(axis=0)) & (centres <= mesh.points.max(axis=0))).all(axis=1)]
+    cells, barycentric = locate(mesh.points, mesh.cells, near)
+    inside = cells >= 0
+    if not inside.any():
+        raise ValueError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
+    weights = np.full(inside.sum(), fixed.voxel_volume)
+    return Quadrature(jnp.asarray(cells[inside]), jnp.asarray(barycentric[inside]), jnp.asarray(weights))
+
+
+def rigid_modes(points: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "rows 6"]:
+    """Orthonormal basis of the translations and infinitesimal rotations of some points about their centroid."""
+    centred = points - points.mean(axis=0)
+    translations = np.tile(np.eye(3), (len(points), 1))
+    rotations = np.stack([np.cross(axis, centred).ravel() for axis in np.eye(3)], axis=1)
+    basis, triangle = np.linalg.qr(np.concatenate([translations, rotations], axis=1))
+    independent = np.abs(np.diag(triangle)) > 1e-9 * np.abs(triangle).max()
+    return basis * independent

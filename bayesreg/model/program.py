@@ -1,0 +1,151 @@
+"""The generative model of section 3.1 as a NumPyro program."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+from jaxtyping import Bool, Float, Int
+from numpyro.distributions import constraints
+
+from bayesreg.fem.elasticity import total_strain_energy
+from bayesreg.fem.elements import Quadrature
+from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
+from bayesreg.image import Interpolator
+from bayesreg.model.constraint import is_allowed
+from bayesreg.model.priors import ScaledBeta
+from bayesreg.model.similarity import SIMILARITIES
+from bayesreg.model.warp import displacement_at
+from bayesreg.types import AnyArray, Scalar
+
+# The implicit solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
+SOLVER_TOLERANCE = 1e-10
+
+
+class LameParameter(NamedTuple):
+    """Prior and known entries of λ or of μ (a pytree).
+
+    Attributes
+    ----------
+    alpha, beta, low, high : (entries,) arrays
+        Of the scaled Beta prior of each entry.
+    is_free : (entries,) bool array
+        False where the parameter is known.
+    reference : (entries,) array
+        The known value, or the one at which the interior solve is preconditioned and chains may start.
+    """
+
+    alpha: Float[AnyArray, "entries"]
+    beta: Float[AnyArray, "entries"]
+    low: Float[AnyArray, "entries"]
+    high: Float[AnyArray, "entries"]
+    is_free: Bool[AnyArray, "entries"]
+    reference: Float[AnyArray, "entries"]
+
+    def prior(self) -> dist.Distribution:
+        """p(λ) or p(μ), with known entries left out of the density."""
+        return ScaledBeta(self.alpha, self.beta, self.low, self.high).mask(self.is_free).to_event(1)
+
+
+class RegistrationData(NamedTuple):
+    """All arrays of one registration problem (a pytree, an argument of every jitted function).
+
+    Attributes
+    ----------
+    system : ElasticSystem
+    cell_entry : (m,) int array
+        Index of each cell's entry in λ and μ.
+    lam, mu : LameParameter
+    moving : Interpolator
+    skull_distance : Interpolator or None
+        Signed distance to Ω_SK, mm.
+    quadrature : Quadrature
+    positions : (q, 3) array
+        World positions x_q of the quadrature points, mm.
+    fixed_values : (q,) array
+        f(x_q).
+    points_sampled : (b, 3) array
+        Positions of the sampled nodes, mm.
+    slots : (b,) int array
+        Where the sampled nodes stand among `system.prescribed`.
+    held : (prescribed, 3) array
+        Known displacements, zero in the rows of sampled nodes, mm.
+    rigid_modes : (3b, 6) array
+        Orthonormal basis of the sampled nodes' infinitesimal rigid motions.
+    rigid_sd, t_similarity, t_elastic : scalars
+        `rigid_sd` is infinite for the flat prior.
+    """
+
+    system: ElasticSystem
+    cell_entry: Int[AnyArray, "cells"]
+    lam: LameParameter
+    mu: LameParameter
+    moving: Interpolator
+    skull_distance: Interpolator | None
+    quadrature: Quadrature
+    positions: Float[AnyArray, "points 3"]
+    fixed_values: Float[AnyArray, "points"]
+    points_sampled: Float[AnyArray, "boundary 3"]
+    slots: Int[AnyArray, "boundary"]
+    held: Float[AnyArray, "prescribed 3"]
+    rigid_modes: Float[AnyArray, "rows 6"]
+    rigid_sd: Scalar
+    t_similarity: Scalar
+    t_elastic: Scalar
+
+
+def registration(data: RegistrationData, similarity: str = "ssd") -> None:
+    """p(m, u, λ, μ) of eq. (8): the program whose log joint density is the posterior's up to a constant.
+
+    The displacements have a flat base measure, on which the Boltzmann elastic prior (12), the rigid prior
+    and the Boltzmann likelihood (11) are factors. The skull belongs to the likelihood: a configuration with
+    a sampled node in Ω_SK cannot have produced the image. So does an elastic solve that failed.
+    """
+    flat = dist.ImproperUniform(constraints.real_matrix, (), event_shape=data.points_sampled.shape)
+    u_boundary = numpyro.sample("u_boundary", flat)
+    lam = numpyro.sample("lam", data.lam.prior())
+    mu = numpyro.sample("mu", data.mu.prior())
+
+    # Outside the priors' support K may be indefinite; the density is −∞ there whatever the solve says.
+    lam_cells = _physical(lam, data.lam)[data.cell_entry]
+    mu_cells = _physical(mu, data.mu)[data.cell_entry]
+    state = equilibrium(data.system, lam_cells, mu_cells, data.held.at[data.slots].set(u_boundary), SOLVER_TOLERANCE)
+
+    elements, quadrature = data.system.elements, data.quadrature
+    moved = data.positions + displacement_at(elements, quadrature, state.u)
+    similarity_energy = SIMILARITIES[similarity](data.fixed_values, data.moving(moved), quadrature.weights)
+    strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)
+    inside = _in_support(data, u_boundary)
+
+    numpyro.factor("log_similarity", -similarity_energy / data.t_similarity)
+    numpyro.factor("log_elastic", -strain_energy / data.t_elastic)
+    numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
+    numpyro.factor("log_support", jnp.where(inside, 0.0, -jnp.inf))
+    numpyro.factor("log_solved", jnp.where(state.converged, 0.0, -jnp.inf))
+
+    numpyro.deterministic("u", state.u)
+    numpyro.deterministic("similarity_energy", similarity_energy)
+    numpyro.deterministic("strain_energy", strain_energy)
+    numpyro.deterministic("solver_iterations", state.iterations)
+    numpyro.deterministic("solver_failed", ~state.converged)
+    numpyro.deterministic("outside_support", ~inside)
+
+
+def _physical(values: AnyArray, parameter: LameParameter) -> AnyArray:
+    """The parameters, or their reference where any entry is not positive and finite."""
+    return jnp.where(((values > 0) & jnp.isfinite(values)).all(), values, parameter.reference)
+
+
+def _in_support(data: RegistrationData, u_boundary: Float[AnyArray, "boundary 3"]) -> Bool[AnyArray, ""]:
+    if data.skull_distance is None:
+        return jnp.array(True)
+    return is_allowed(data.skull_distance, data.points_sampled + u_boundary).all()
+
+
+def _log_rigid_prior(data: RegistrationData, u_boundary: Float[AnyArray, "boundary 3"]) -> Scalar:
+    """Gaussian on the root-mean-square displacement of each rigid mode over the sampled nodes."""
+    coefficients = data.rigid_modes.T @ u_boundary.reshape(-1)
+    mean_square = coefficients**2 / len(data.points_sampled)
+    return -0.5 * (mean_square / data.rigid_sd**2).sum()

@@ -1,0 +1,29 @@
+"""Image similarity energies E_s at quadrature points; the likelihood is exp(−E_s / T_s), eq. (11)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from jaxtyping import Float
+
+from bayesreg.types import AnyArray, Scalar
+
+Similarity = Callable[[AnyArray, AnyArray, AnyArray], Scalar]
+
+
+def sum_of_squared_differences(
+    fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+) -> Scalar:
+    """∫ (f − m(x + u))² dx, eq. (1).
+
+    Parameters
+    ----------
+    fixed, moving : (q,) array
+        f(x_q) and m(x_q + u(x_q)).
+    weights : (q,) array
+        Quadrature weights, mm³.
+    """
+    return (weights * (fixed - moving) ** 2).sum()
+
+
+SIMILARITIES: dict[str, Similarity] = {"ssd": sum_of_squared_differences}
