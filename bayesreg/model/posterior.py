@@ -39,7 +39,8 @@ class Evaluation(NamedTuple):
         E_s and E_r.
     solver_iterations : scalar integer
     solver_failed, outside_support : scalar bools
-        Whether the elastic solve failed, and whether a sampled node lies in Ω_SK.
+        Whether the elastic solve failed; whether a sampled node lies in Ω_SK or a parameter outside the
+        range of its prior.
     """
 
     logdensity: Scalar
@@ -154,6 +155,11 @@ class Posterior:
             "lam": jnp.asarray(self.data.lam.reference),
             "mu": jnp.asarray(self.data.mu.reference),
         }
+
+    def constant_data(self) -> dict[str, AnyArray]:
+        """Points (mm), cells, tissue of every cell and the sampled nodes."""
+        mesh = self.mesh
+        return {"points": mesh.points, "cells": mesh.cells, "tissue_of_cell": mesh.tissue, "boundary": self.sampled}
 
     def initial(self, key: AnyArray) -> dict[str, AnyArray]:
         """A random position near `reference`: displacements of 0.01 mm, parameters within about 10 %."""

@@ -117,7 +117,7 @@ def registration(data: RegistrationData, similarity: str = "ssd") -> None:
     moved = data.positions + displacement_at(elements, quadrature, state.u)
     similarity_energy = SIMILARITIES[similarity](data.fixed_values, data.moving(moved), quadrature.weights)
     strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)
-    inside = _in_support(data, u_boundary)
+    inside = _clear_of_skull(data, u_boundary) & _in_range(lam, data.lam) & _in_range(mu, data.mu)
 
     numpyro.factor("log_similarity", -similarity_energy / data.t_similarity)
     numpyro.factor("log_elastic", -strain_energy / data.t_elastic)
@@ -138,7 +138,11 @@ def _physical(values: AnyArray, parameter: LameParameter) -> AnyArray:
     return jnp.where(((values > 0) & jnp.isfinite(values)).all(), values, parameter.reference)
 
 
-def _in_support(data: RegistrationData, u_boundary: Float[AnyArray, "boundary 3"]) -> Bool[AnyArray, ""]:
+def _in_range(values: AnyArray, parameter: LameParameter) -> Bool[AnyArray, ""]:
+    return (~parameter.is_free | ((values >= parameter.low) & (values <= parameter.high))).all()
+
+
+def _clear_of_skull(data: RegistrationData, u_boundary: Float[AnyArray, "boundary 3"]) -> Bool[AnyArray, ""]:
     if data.skull_distance is None:
         return jnp.array(True)
     return is_allowed(data.skull_distance, data.points_sampled + u_boundary).all()

@@ -1,0 +1,132 @@
+"""Draws to ArviZ and back; R̂, effective sample sizes and Monte Carlo errors of every estimand.
+
+The one module that knows which ArviZ it has: 0.23 (InferenceData) and 1.x (xarray.DataTree) differ in
+how draws are handed over, and read each other's NetCDF files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import arviz as az
+import numpy as np
+import xarray as xr
+
+from bayesreg.inference.target import Target
+
+_OLD = int(az.__version__.split(".")[0]) < 1
+
+STATISTICS = (
+    "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
+    "outside_support", "diverging",
+)  # fmt: skip
+_DIMS = {
+    "u_boundary": ["node", "axis"],
+    "lam": ["tissue"],
+    "mu": ["tissue"],
+    "ratio": ["tissue"],
+    "points": ["point", "axis"],
+    "cells": ["cell", "corner"],
+    "tissue_of_cell": ["cell"],
+    "boundary": ["node"],
+}
+
+
+def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> Any:
+    """Blocks of draws as ArviZ data.
+
+    Parameters
+    ----------
+    target : Target
+        For the known entries of λ and μ and the names of all of them.
+    blocks : list of mappings
+        Arrays (chain, draw, …) of the estimands and of `STATISTICS`.
+
+    Returns
+    -------
+    arviz.InferenceData or xarray.DataTree
+        posterior: u_boundary (chain, draw, node, axis) in mm, lam, mu and ratio = λ/μ (chain, draw, tissue),
+        known entries included; sample_stats; constant_data.
+    """
+    draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in blocks[0]}
+    estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
+    values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values["ratio"] = values["lam"] / values["mu"]
+    groups = {
+        "posterior": values,
+        "sample_stats": {name: draws[name] for name in STATISTICS},
+        "constant_data": {name: np.asarray(value) for name, value in target.constant_data().items()},
+    }
+    coords = {"node": np.asarray(target.sampled), "axis": list("xyz"), "tissue": list(target.entry_names)}
+    return az.from_dict(**groups, coords=coords, dims=_DIMS) if _OLD else az.from_dict(groups, coords=coords, dims=_DIMS)
+
+
+def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """λ and μ with their known entries, on the host: there may be many draws."""
+    reference = target.reference()
+    found = {}
+    for name in ("lam", "mu"):
+        known = np.asarray(reference[name])
+        full = np.tile(known, (*estimands["u_boundary"].shape[:2], 1))
+        if name in estimands:
+            full[..., np.asarray(target.free[name])] = estimands[name]
+        found[name] = full
+    return found
+
+
+class Convergence(NamedTuple):
+    """Diagnostics of every estimand, as datasets shaped like the posterior; NaN where an entry is known.
+
+    Attributes
+    ----------
+    rhat : xarray.Dataset
+        Rank-normalised split R̂ (Vehtari et al. 2021).
+    ess_bulk, ess_tail : xarray.Dataset
+        Effective sample sizes.
+    """
+
+    rhat: xr.Dataset
+    ess_bulk: xr.Dataset
+    ess_tail: xr.Dataset
+
+
+def convergence(idata: Any) -> Convergence:
+    """R̂ and effective sample sizes of every displacement, λ and μ; of few draws (below 4) all NaN."""
+    posterior = dataset(idata, "posterior")[["u_boundary", "lam", "mu"]]
+    if posterior.sizes["draw"] < 4:
+        nothing = xr.full_like(posterior.isel(chain=0, draw=0, drop=True), np.nan)
+        return Convergence(nothing, nothing, nothing)
+    constant = posterior.min(("chain", "draw")) == posterior.max(("chain", "draw"))
+    found = (az.rhat(posterior), az.ess(posterior, method="bulk"), az.ess(posterior, method="tail"))
+    return Convergence(*(_plain(result).where(~constant) for result in found))
+
+
+def _plain(result: Any) -> xr.Dataset:
+    return result if isinstance(result, xr.Dataset) else result.to_dataset()
+
+
+def dataset(idata: Any, group: str) -> xr.Dataset:
+    """One group of the draws as an xarray Dataset, whichever ArviZ made them."""
+    found = idata[group]
+    return found if isinstance(found, xr.Dataset) else found.to_dataset()
+
+
+def save_posterior(idata: Any, path: str | Path) -> None:
+    """Write draws as NetCDF, displacements in single precision and compressed."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    groups = idata.groups() if _OLD else [name.strip("/") for name in idata.groups if name != "/"]
+    for index, group in enumerate(groups):
+        data = dataset(idata, group)
+        compact = {"dtype": "float32", "zlib": True, "complevel": 1}
+        encoding = {"u_boundary": compact} if "u_boundary" in data else {}
+        data.to_netcdf(partial, mode="w" if index == 0 else "a", group=group, engine="netcdf4", encoding=encoding)
+    partial.replace(path)
+
+
+def open_posterior(path: str | Path) -> Any:
+    """Read draws written by `save_posterior`."""
+    return az.from_netcdf(str(path))
+

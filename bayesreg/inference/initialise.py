@@ -1,0 +1,85 @@
+"""Start values: overdispersed chains between identity and a given displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.inference.target import Target
+from bayesreg.types import AnyArray
+
+
+class Start(NamedTuple):
+    """Where chains begin.
+
+    Attributes
+    ----------
+    field : (b, 3) array, optional
+        Displacement of the sampled nodes, mm, at the far end; None is no displacement.
+    fraction : (float, float)
+        Chains start at fractions of the field spread evenly over this range: 0 identity, 1 the field.
+    lam, mu : mapping of entry name to float, optional
+        Centre of the start parameters, where it is not the posterior's reference.
+    spread : float
+        Standard deviation of the log of the start parameters between chains.
+    """
+
+    field: Float[AnyArray, "boundary 3"] | None = None
+    fraction: tuple[float, float] = (0.0, 1.0)
+    lam: Mapping[str, float] | None = None
+    mu: Mapping[str, float] | None = None
+    spread: float = 0.1
+
+
+def starting_points(target: Target, start: Start, chains: int, key: AnyArray) -> dict[str, AnyArray]:
+    """Estimands of every chain (leading axis).
+
+    Raises
+    ------
+    ValueError
+        If the field has the wrong shape, or a chain would start where the density is zero.
+    """
+    at_rest = target.reference()
+    field = np.zeros(at_rest["u_boundary"].shape) if start.field is None else np.asarray(start.field, float)
+    if field.shape != at_rest["u_boundary"].shape:
+        raise ValueError(f"the start field must have shape {at_rest['u_boundary'].shape}, got {field.shape}")
+    fractions = np.linspace(*start.fraction, chains) if chains > 1 else np.array([np.mean(start.fraction)])
+    for name in ("lam", "mu"):
+        at_rest[name] = _with_entries(at_rest[name], getattr(start, name), target, name)
+    centre = target.estimands(at_rest)
+    points = {"u_boundary": jnp.asarray(fractions[:, None, None] * field)}
+    for name, subkey in zip(("lam", "mu"), jax.random.split(key), strict=True):
+        if name in centre:
+            noise = jax.random.normal(subkey, (chains, *centre[name].shape))
+            points[name] = centre[name] * jnp.exp(start.spread * noise)
+    _require_density(target, points, fractions)
+    return points
+
+
+def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: Target, name: str) -> AnyArray:
+    values = jnp.asarray(values)
+    for entry, value in (given or {}).items():
+        if entry not in target.entry_names:
+            raise ValueError(f"start.{name} names {entry!r}; the entries are {', '.join(target.entry_names[:8])}")
+        index = target.entry_names.index(entry)
+        if index in target.free[name]:
+            values = values.at[index].set(value)
+    return values
+
+
+def _require_density(target: Target, points: dict[str, AnyArray], fractions: np.ndarray) -> None:
+    evaluate = jax.jit(jax.vmap(target.evaluate_estimands, in_axes=(None, 0)))
+    found = evaluate(target.data, points)
+    for chain in np.flatnonzero(~np.isfinite(found.logdensity)):
+        why = "a node lies in the skull or a parameter outside its prior's range"
+        if not found.outside_support[chain]:
+            why = "the elastic solve failed" if found.solver_failed[chain] else "it is not a number"
+        raise ValueError(
+            f"chain {chain} cannot start at {fractions[chain]:.2f} of the start field: its density is zero because "
+            f"{why}; give another start field or fraction, or other start parameters"
+        )

@@ -1,0 +1,69 @@
+"""Running means and variances (Welford), and the scale reduction that follows from them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayesreg.types import AnyArray
+
+
+class Moments(NamedTuple):
+    """Count, mean and sum of squared deviations of a pytree; its size does not grow with the draws."""
+
+    count: AnyArray
+    mean: Any
+    squares: Any
+
+
+def zero_moments(like: Any) -> Moments:
+    """Moments of no draw."""
+    zeros = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), like)
+    return Moments(jnp.zeros(()), zeros, zeros)
+
+
+def updated(moments: Moments, draw: Any) -> Moments:
+    """Moments with one draw more."""
+    count = moments.count + 1
+    mean = jax.tree.map(lambda m, x: m + (x - m) / count, moments.mean, draw)
+    squares = jax.tree.map(
+        lambda s, x, old, new: s + (x - old) * (x - new), moments.squares, draw, moments.mean, mean
+    )
+    return Moments(count, mean, squares)
+
+
+def pooled(moments: Moments) -> tuple[Any, Any]:
+    """Mean and standard deviation over all draws of all chains (leading axis), each chain of equal length."""
+    count = np.asarray(moments.count)[0]
+
+    def total(mean: AnyArray, squares: AnyArray) -> np.ndarray:
+        mean, squares = np.asarray(mean), np.asarray(squares)
+        between = count * ((mean - mean.mean(axis=0)) ** 2).sum(axis=0)
+        return np.sqrt((squares.sum(axis=0) + between) / max(count * len(mean) - 1, 1))
+
+    return jax.tree.map(lambda m: np.asarray(m).mean(axis=0), moments.mean), jax.tree.map(
+        total, moments.mean, moments.squares
+    )
+
+
+def scale_reduction(moments: Moments) -> Any:
+    """R̂ = √(var⁺ / W) of Gelman et al. (the paper's reference 12), chains not split, for every entry.
+
+    NaN where there are fewer than two chains or two draws; infinite where chains stand still at different
+    places; one where all stand still at the same.
+    """
+    count = float(np.asarray(moments.count)[0])
+
+    def ratio(mean: AnyArray, squares: AnyArray) -> np.ndarray:
+        mean, squares = np.asarray(mean), np.asarray(squares)
+        if len(mean) < 2 or count < 2:
+            return np.full(mean.shape[1:], np.nan)
+        within = squares.mean(axis=0) / (count - 1)
+        pooled_variance = (count - 1) / count * within + mean.var(axis=0, ddof=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(pooled_variance == 0, 1.0, np.sqrt(pooled_variance / within))
+
+    return jax.tree.map(ratio, moments.mean, moments.squares)

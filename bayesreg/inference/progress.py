@@ -1,0 +1,81 @@
+"""A progress bar that shows what matters while chains run."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, Self
+
+import numpy as np
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as RichProgress
+
+
+class Progress(Protocol):
+    """Told of every block."""
+
+    def __enter__(self) -> Self:
+        """Begin."""
+
+    def __exit__(self, *exception: object) -> None:
+        """End, also after an error."""
+
+    def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
+        """Show how far the chains are."""
+
+
+class NoProgress:
+    """Shows nothing."""
+
+    def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
+        pass
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        return None
+
+    def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
+        """Nothing."""
+
+
+class SamplingProgress(NoProgress):
+    """Draws, acceptance, steps per second, greatest running R̂ and time left, on one line."""
+
+    def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
+        self._draws, self._max_seconds, self._threshold = draws, max_seconds, threshold
+        self._first: tuple[float, float] | None = None
+        self._bar = RichProgress(
+            TextColumn("sampling"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
+            TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
+        )  # fmt: skip
+        self._task = self._bar.add_task("sampling", total=draws, figures="compiling", left="")
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
+        """Acceptance inside the support and overall, steps per second of a chain, greatest R̂, time left."""
+        draws, seconds, tally = int(checkpoint.draws), float(checkpoint.seconds), checkpoint.tally
+        if draws == 0:
+            return
+        steps = float(np.sum(tally.steps))
+        inside = max(steps - float(np.sum(tally.outside_support)), 1.0)
+        accepted = float(np.sum(tally.acceptance))
+        worst = max((np.max(value, initial=0.0) for value in rhat["estimands"].values()), default=np.nan)
+        target = "" if self._threshold is None else f"/{self._threshold:g}"
+        # The first block holds the compilation: rates are taken from its end.
+        self._first = self._first or (draws, seconds)
+        figures = f"accepted {accepted / steps:.0%} (in support {accepted / inside:.0%})  R̂ {worst:.2f}{target}"
+        left = ""
+        if draws > self._first[0]:
+            rate = (draws - self._first[0]) / max(seconds - self._first[1], 1e-9)
+            figures += f"  {rate * steps / draws / len(tally.steps):.0f} steps/s"
+            remaining = (self._draws - draws) / rate
+            if self._max_seconds is not None:
+                remaining = min(remaining, self._max_seconds - seconds)
+            left = f"{max(remaining, 0) / 60:.1f} min left"
+        self._bar.update(self._task, completed=draws, figures=figures, left=left)

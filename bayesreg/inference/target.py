@@ -1,0 +1,60 @@
+"""What the samplers know of a posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from bayesreg.types import AnyArray
+
+Estimands = Mapping[str, AnyArray]
+
+
+class Evaluation(Protocol):
+    """The log density at one place, and what was found on the way."""
+
+    logdensity: AnyArray
+    u: AnyArray
+    similarity_energy: AnyArray
+    strain_energy: AnyArray
+    solver_iterations: AnyArray
+    solver_failed: AnyArray
+    outside_support: AnyArray
+
+
+class Target(Protocol):
+    """A posterior as the samplers see it; `bayesreg.Posterior` is one.
+
+    `data` is a pytree and an argument of every density, so that no array is baked into compiled code.
+    """
+
+    @property
+    def data(self) -> Any:
+        """All arrays of the problem."""
+
+    @property
+    def sampled(self) -> AnyArray:
+        """Node numbers of the rows of "u_boundary"."""
+
+    @property
+    def free(self) -> Mapping[str, AnyArray]:
+        """Indices of the sampled entries of "lam" and "mu"."""
+
+    @property
+    def entry_names(self) -> tuple[str, ...]:
+        """Names of all entries of "lam" and "mu"."""
+
+    def evaluate_estimands(self, data: Any, estimands: Estimands) -> Any:
+        """An `Evaluation` in the constrained space."""
+
+    def complete(self, estimands: Estimands) -> dict[str, AnyArray]:
+        """Estimands with the known entries of "lam" and "mu" put back."""
+
+    def estimands(self, values: Estimands) -> dict[str, AnyArray]:
+        """The sampled entries of values."""
+
+    def reference(self) -> dict[str, AnyArray]:
+        """Values at rest."""
+
+    def constant_data(self) -> dict[str, AnyArray]:
+        """What a reader of the draws needs to know of the mesh."""
