@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 Interpolation = Literal["linear", "cubic"]
 
@@ -41,14 +42,14 @@ class Image:
     def __post_init__(self) -> None:
         voxels, affine = np.asarray(self.voxels), np.asarray(self.affine, float)
         if voxels.ndim != 3 or voxels.size == 0:
-            raise ValueError(f"an image is a non-empty 3D array (X, Y, Z); got shape {voxels.shape}")
+            raise InputError(f"an image is a non-empty 3D array (X, Y, Z); got shape {voxels.shape}")
         if affine.shape != (4, 4) or not np.isfinite(affine).all() or not np.allclose(affine[3], (0, 0, 0, 1)):
-            raise ValueError(f"an affine is a finite 4 × 4 matrix with last row 0 0 0 1; got {affine.tolist()}")
+            raise InputError(f"an affine is a finite 4 × 4 matrix with last row 0 0 0 1; got {affine.tolist()}")
         if np.linalg.cond(affine[:3, :3]) > 1e8:
-            raise ValueError(f"the affine is singular (no inverse from world to voxel): {affine.tolist()}")
+            raise InputError(f"the affine is singular (no inverse from world to voxel): {affine.tolist()}")
         if not np.isfinite(voxels).all():
             count = int(np.count_nonzero(~np.isfinite(voxels)))
-            raise ValueError(f"{count} voxels are NaN or infinite; replace them before the registration")
+            raise InputError(f"{count} voxels are NaN or infinite; replace them before the registration")
         object.__setattr__(self, "voxels", voxels)
         object.__setattr__(self, "affine", affine)
 
@@ -72,10 +73,16 @@ class Image:
         """Volume of a voxel, mm³."""
         return float(abs(np.linalg.det(self.affine[:3, :3])))
 
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of voxels (as float64) and affine."""
+        arrays = (np.asarray(self.voxels, "<f8"), np.asarray(self.affine, "<f8"))
+        return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
     def with_voxels(self, voxels: AnyArray) -> Image:
         """Another image on the same grid."""
         if np.shape(voxels) != self.shape:
-            raise ValueError(f"expected voxels of shape {self.shape}, got {np.shape(voxels)}")
+            raise InputError(f"expected voxels of shape {self.shape}, got {np.shape(voxels)}")
         return Image(voxels, self.affine)
 
     def world_to_voxel(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3"]:
@@ -106,7 +113,7 @@ class Image:
         elif method == "linear":
             coefficients = np.pad(voxels, [(0, 1)] * 3, mode="edge")
         else:
-            raise ValueError(f"interpolation is 'linear' or 'cubic', got {method!r}")
+            raise InputError(f"interpolation is 'linear' or 'cubic', got {method!r}")
         return Interpolator(jnp.asarray(coefficients), jnp.asarray(self.to_voxel), self.shape, method)
 
     def interpolate(
@@ -208,8 +215,8 @@ def robust_scale(image: Image, mask: Bool[np.ndarray, "X Y Z"] | None = None) ->
     values = np.asarray(image.voxels, float)
     values = values.ravel() if mask is None else values[mask]
     if values.size == 0:
-        raise ValueError("the mask for the intensity scale is empty")
+        raise InputError("the mask for the intensity scale is empty")
     low, high = np.quantile(values, (0.005, 0.995))
     if not high > low:
-        raise ValueError(f"the image has no contrast inside the mask: its 0.5 % and 99.5 % quantiles are both {low}")
+        raise InputError(f"the image has no contrast inside the mask: its 0.5 % and 99.5 % quantiles are both {low}")
     return IntensityScale(float(low), float(high))

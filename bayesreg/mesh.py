@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 # The faces of a positively oriented tetrahedron, their normals pointing outwards.
 FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
@@ -53,18 +53,18 @@ class TetMesh:
         _require_shapes(points, cells, tissue)
         cells, tissue = cells.astype(np.int64), tissue.astype(np.int64)
         if not np.isfinite(points).all():
-            raise ValueError(f"node {np.argwhere(~np.isfinite(points))[0, 0]} has a coordinate that is not finite")
+            raise InputError(f"node {np.argwhere(~np.isfinite(points))[0, 0]} has a coordinate that is not finite")
         if cells.min() < 0 or cells.max() >= len(points):
-            raise ValueError(f"cells name nodes {cells.min()} to {cells.max()}, but there are {len(points)} points")
+            raise InputError(f"cells name nodes {cells.min()} to {cells.max()}, but there are {len(points)} points")
         if tissue.min() < 0 or tissue.max() >= len(names):
-            raise ValueError(f"tissue holds {tissue.min()} to {tissue.max()}, but names has {len(names)} entries")
+            raise InputError(f"tissue holds {tissue.min()} to {tissue.max()}, but names has {len(names)} entries")
         mesh = cls(points, cells, tissue, tuple(names))
         bad = np.flatnonzero(~(mesh.volumes > 0))
         if len(bad):
-            raise ValueError(f"{len(bad)} tetrahedra have no positive volume, the first is cell {bad[0]}")
+            raise InputError(f"{len(bad)} tetrahedra have no positive volume, the first is cell {bad[0]}")
         unused = np.setdiff1d(np.arange(len(points)), cells)
         if len(unused):
-            raise ValueError(f"{len(unused)} nodes belong to no tetrahedron, the first is node {unused[0]}")
+            raise InputError(f"{len(unused)} nodes belong to no tetrahedron, the first is node {unused[0]}")
         return mesh
 
     @cached_property
@@ -109,10 +109,10 @@ def signed_volumes(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, 
 
 def _require_shapes(points: np.ndarray, cells: np.ndarray, tissue: np.ndarray) -> None:
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points must have shape (n, 3), got {points.shape}")
+        raise InputError(f"points must have shape (n, 3), got {points.shape}")
     if cells.ndim != 2 or cells.shape[1] != 4 or len(cells) == 0:
-        raise ValueError(f"cells must have shape (m, 4) with m > 0, got {cells.shape}")
+        raise InputError(f"cells must have shape (m, 4) with m > 0, got {cells.shape}")
     if tissue.shape != (len(cells),):
-        raise ValueError(f"tissue must have shape ({len(cells)},), one entry per cell, got {tissue.shape}")
+        raise InputError(f"tissue must have shape ({len(cells)},), one entry per cell, got {tissue.shape}")
     if not np.issubdtype(cells.dtype, np.integer) or not np.issubdtype(tissue.dtype, np.integer):
-        raise ValueError(f"cells and tissue must be integers, got {cells.dtype} and {tissue.dtype}")
+        raise InputError(f"cells and tissue must be integers, got {cells.dtype} and {tissue.dtype}")

@@ -10,9 +10,9 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from bayesreg.fem.elements import Elements, displacement_gradient, elements_of
+from bayesreg.fem.elements import Elements, displacement_gradient, elements_of, shape_gradients
 from bayesreg.mesh import TetMesh
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.types import AnyArray, InputError, Scalar
 
 
 def lame_by_cell(values: Float[AnyArray, "entries"], mesh: TetMesh) -> Float[AnyArray, "cells"]:
@@ -39,7 +39,7 @@ def lame_entries(mesh: TetMesh, shape: tuple[int, ...]) -> np.ndarray:
         return np.arange(len(mesh.cells))
     if shape == (1,):
         return np.zeros(len(mesh.cells), int)
-    raise ValueError(
+    raise InputError(
         f"a Lamé parameter has shape ({len(mesh.names)},) by tissue {mesh.names}, ({len(mesh.cells)},) by cell "
         f"or (1,) uniform; got {shape}"
     )
@@ -112,7 +112,7 @@ def strain_energy(
         If a shape does not fit the mesh.
     """
     if np.shape(u) != mesh.points.shape:
-        raise ValueError(f"u must have shape {mesh.points.shape}, got {np.shape(u)}")
+        raise InputError(f"u must have shape {mesh.points.shape}, got {np.shape(u)}")
     return total_strain_energy(elements_of(mesh), lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u))
 
 
@@ -130,7 +130,7 @@ def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_ma
     (3n, 3n) sparse matrix
         Row 3 · node + axis. Symmetric; its null space holds the six rigid motions.
     """
-    gradients = np.moveaxis(np.asarray(elements_of(mesh).gradients), -1, 0)
+    gradients = shape_gradients(mesh)
     lam_volume, mu_volume = (
         np.asarray(values)[lame_entries(mesh, np.shape(values))] * mesh.volumes for values in (lam, mu)
     )

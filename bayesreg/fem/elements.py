@@ -38,12 +38,17 @@ class Elements(NamedTuple):
 
 def elements_of(mesh: TetMesh) -> Elements:
     """Shape gradients and volumes of a mesh."""
+    gradients = np.moveaxis(shape_gradients(mesh), 0, -1)
+    return Elements(jnp.asarray(mesh.cells.T), jnp.asarray(gradients), jnp.asarray(mesh.volumes))
+
+
+def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
+    """∂N_a/∂x_i of every cell, on the host, 1/mm."""
     corners = mesh.points[mesh.cells]
     # Rows of the inverse Jacobian are the gradients of N_1, N_2, N_3; the four of them sum to zero.
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     last_three = np.linalg.inv(edges)
-    gradients = np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
-    return Elements(jnp.asarray(mesh.cells.T), jnp.asarray(np.moveaxis(gradients, 0, -1)), jnp.asarray(mesh.volumes))
+    return np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
 
 
 def displacement_gradient(elements: Elements, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "3 3 cells"]:

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 
 from bayesreg.fem.elasticity import internal_force, lame_by_cell, stiffness, stiffness_diagonal
 from bayesreg.fem.elements import Elements, elements_of
-from bayesreg.fem.preconditioners import Preconditioner, reference_inverse
+from bayesreg.fem.preconditioners import ReferenceInverse, reference_inverse
 from bayesreg.mesh import TetMesh
-from bayesreg.types import AnyArray, Equilibrium, Scalar
+from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
 
 TOLERANCE = 1e-8
 MAX_ITERATIONS = 2000
@@ -28,14 +28,14 @@ class ElasticSystem(NamedTuple):
     elements : Elements
     prescribed, free : (b,), (f,) int arrays
         A partition of the nodes.
-    preconditioner : (3f, 3f) array or None
+    preconditioner : ReferenceInverse or None
         See `bayesreg.fem.preconditioners`.
     """
 
     elements: Elements
     prescribed: Int[AnyArray, "prescribed"]
     free: Int[AnyArray, "free"]
-    preconditioner: Preconditioner
+    preconditioner: ReferenceInverse | None
 
 
 class SolverInfo(NamedTuple):
@@ -78,7 +78,7 @@ def equilibrium(
     The residual is measured in the norm of the inverse diagonal of K, so that it also speaks for tissues
     a million times softer than their neighbours.
     """
-    elements, prescribed, free, inverse = system
+    elements, prescribed, free, reference = system
     nodes = len(prescribed) + len(free)
     u_given = jnp.zeros((nodes, 3)).at[prescribed].set(u_prescribed)
     if len(free) == 0:
@@ -92,7 +92,7 @@ def equilibrium(
     inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(elements, lam, mu, nodes)[free])
 
     def precondition(r: AnyArray) -> AnyArray:
-        return inverse_diagonal * r if inverse is None else (inverse @ r.reshape(-1)).reshape(r.shape)
+        return inverse_diagonal * r if reference is None else reference(r)
 
     solve = partial(
         _conjugate_gradients, precondition=precondition, inverse_diagonal=inverse_diagonal, tolerance=tolerance
@@ -163,15 +163,16 @@ def solve_interior(
         If a shape does not fit the mesh.
     """
     if np.shape(u_boundary) != (len(mesh.boundary), 3):
-        raise ValueError(f"u_boundary must have shape ({len(mesh.boundary)}, 3), got {np.shape(u_boundary)}")
-    reference = _reference(lam, mesh), _reference(mu, mesh)
-    system = elastic_system(mesh, mesh.boundary, *reference)
+        raise InputError(f"u_boundary must have shape ({len(mesh.boundary)}, 3), got {np.shape(u_boundary)}")
+    system = elastic_system(mesh, mesh.boundary, *_reference(lam, mu))
     return equilibrium(system, lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u_boundary), tolerance)
 
 
-def _reference(values: Float[AnyArray, "entries"], mesh: TetMesh) -> Float[np.ndarray, "entries"]:
-    """The parameters themselves as the preconditioner's reference, where they are known and physical."""
-    shape = np.shape(values)
-    if isinstance(values, jax.core.Tracer) or not np.all(np.isfinite(values) & (np.asarray(values) > 0)):
-        return np.ones(shape)
-    return np.asarray(values, float)
+def _reference(
+    lam: Float[AnyArray, "entries"], mu: Float[AnyArray, "entries"]
+) -> tuple[Float[np.ndarray, "entries"], Float[np.ndarray, "entries"]]:
+    """The parameters themselves to precondition with, where they are known and a factor of K would exist."""
+    known = not any(isinstance(values, jax.core.Tracer) for values in (lam, mu))
+    if known and all(np.all((np.asarray(v) > 1e-12) & (np.asarray(v) < 1e12)) for v in (lam, mu)):
+        return np.asarray(lam, float), np.asarray(mu, float)
+    return np.ones(np.shape(lam)), np.ones(np.shape(mu))

@@ -60,7 +60,9 @@ def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> An
         "constant_data": {name: np.asarray(value) for name, value in target.constant_data().items()},
     }
     coords = {"node": np.asarray(target.sampled), "axis": list("xyz"), "tissue": list(target.entry_names)}
-    return az.from_dict(**groups, coords=coords, dims=_DIMS) if _OLD else az.from_dict(groups, coords=coords, dims=_DIMS)
+    return (
+        az.from_dict(**groups, coords=coords, dims=_DIMS) if _OLD else az.from_dict(groups, coords=coords, dims=_DIMS)
+    )
 
 
 def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -129,4 +131,3 @@ def save_posterior(idata: Any, path: str | Path) -> None:
 def open_posterior(path: str | Path) -> Any:
     """Read draws written by `save_posterior`."""
     return az.from_netcdf(str(path))
-

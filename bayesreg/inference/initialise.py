@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.inference.target import Target
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 
 class Start(NamedTuple):
@@ -47,7 +47,7 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
     at_rest = target.reference()
     field = np.zeros(at_rest["u_boundary"].shape) if start.field is None else np.asarray(start.field, float)
     if field.shape != at_rest["u_boundary"].shape:
-        raise ValueError(f"the start field must have shape {at_rest['u_boundary'].shape}, got {field.shape}")
+        raise InputError(f"the start field must have shape {at_rest['u_boundary'].shape}, got {field.shape}")
     fractions = np.linspace(*start.fraction, chains) if chains > 1 else np.array([np.mean(start.fraction)])
     for name in ("lam", "mu"):
         at_rest[name] = _with_entries(at_rest[name], getattr(start, name), target, name)
@@ -65,7 +65,7 @@ def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: T
     values = jnp.asarray(values)
     for entry, value in (given or {}).items():
         if entry not in target.entry_names:
-            raise ValueError(f"start.{name} names {entry!r}; the entries are {', '.join(target.entry_names[:8])}")
+            raise InputError(f"start.{name} names {entry!r}; the entries are {', '.join(target.entry_names[:8])}")
         index = target.entry_names.index(entry)
         if index in target.free[name]:
             values = values.at[index].set(value)
@@ -79,7 +79,7 @@ def _require_density(target: Target, points: dict[str, AnyArray], fractions: np.
         why = "a node lies in the skull or a parameter outside its prior's range"
         if not found.outside_support[chain]:
             why = "the elastic solve failed" if found.solver_failed[chain] else "it is not a number"
-        raise ValueError(
+        raise InputError(
             f"chain {chain} cannot start at {fractions[chain]:.2f} of the start field: its density is zero because "
             f"{why}; give another start field or fraction, or other start parameters"
         )

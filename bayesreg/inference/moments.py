@@ -29,9 +29,7 @@ def updated(moments: Moments, draw: Any) -> Moments:
     """Moments with one draw more."""
     count = moments.count + 1
     mean = jax.tree.map(lambda m, x: m + (x - m) / count, moments.mean, draw)
-    squares = jax.tree.map(
-        lambda s, x, old, new: s + (x - old) * (x - new), moments.squares, draw, moments.mean, mean
-    )
+    squares = jax.tree.map(lambda s, x, old, new: s + (x - old) * (x - new), moments.squares, draw, moments.mean, mean)
     return Moments(count, mean, squares)
 
 

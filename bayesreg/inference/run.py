@@ -17,7 +17,7 @@ from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
 from bayesreg.inference.samplers import SAMPLERS, Info, Sampler, State
 from bayesreg.inference.target import Target
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 
 class StopRule(NamedTuple):
@@ -163,10 +163,10 @@ def sample(
         If an option is out of range or a chain cannot start.
     """
     if sampler not in SAMPLERS:
-        raise ValueError(f"unknown sampler {sampler!r}; there are {', '.join(SAMPLERS)}")
+        raise InputError(f"unknown sampler {sampler!r}; there are {', '.join(SAMPLERS)}")
     for name, value in {"chains": chains, "draws": draws, "thin": thin, "block": block}.items():
         if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+            raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
     kernel = SAMPLERS[sampler](posterior, **settings)
     began = time.perf_counter()
@@ -179,11 +179,37 @@ def sample(
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(kernel, posterior, chain_keys, thin, block, draws, checkpoint, began)
-        for found, checkpoint in _until(stop, advance, checkpoint, bar):
+        for found, reached in _until(stop, advance, checkpoint, bar):
             blocks.append(found)
+            checkpoint = reached
             if on_block is not None:
                 on_block(len(blocks) - 1, found, checkpoint)
     return _samples(posterior, kernel, blocks, checkpoint, stop, draws)
+
+
+def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
+    """A checkpoint as named arrays, for a file."""
+    return {f"leaf_{i:03d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(checkpoint))}
+
+
+def checkpoint_from_arrays(
+    arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: float
+) -> Checkpoint:
+    """The inverse of `checkpoint_to_arrays`, for the same posterior, sampler and number of chains.
+
+    Raises
+    ------
+    InputError
+        If the arrays belong to another problem.
+    """
+    kernel = SAMPLERS[sampler](posterior, **settings)
+    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.estimands(posterior.reference()))
+    expected = jax.eval_shape(lambda p: _first(kernel, posterior, p), points)
+    leaves = [arrays[name] for name in sorted(arrays)]
+    wanted, structure = jax.tree.flatten(expected)
+    if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
+        raise InputError("the stored state belongs to another problem: other nodes, parameters or number of chains")
+    return jax.tree.unflatten(structure, leaves)
 
 
 def _first(kernel: Sampler, posterior: Target, points: Any) -> Checkpoint:
@@ -223,7 +249,15 @@ def _advance(
 
 @partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=(6, 7))
 def _run_block(  # type: ignore[no-untyped-def]
-    step, length: int, thin: int, data: Any, chain_keys: AnyArray, first: int, state: State, moments: Moments, tally: Tally
+    step,
+    length: int,
+    thin: int,
+    data: Any,
+    chain_keys: AnyArray,
+    first: int,
+    state: State,
+    moments: Moments,
+    tally: Tally,
 ):
     def chain(key: AnyArray, state: State, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
         def one_draw(carry, draw):  # type: ignore[no-untyped-def]

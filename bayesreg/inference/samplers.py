@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from bayesreg.inference.target import Estimands, Target
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 
 class State(NamedTuple):
@@ -69,7 +69,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
     sigma = {"u_boundary": sigma_u, "lam": sigma_lam, "mu": sigma_mu}
     for name, value in sigma.items():
         if not value > 0:
-            raise ValueError(f"the step of {name} must be positive, got {value}")
+            raise InputError(f"the step of {name} must be positive, got {value}")
 
     def init(data: Any, estimands: Estimands) -> State:
         evaluation = target.evaluate_estimands(data, estimands)
@@ -85,9 +85,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
         evaluation = target.evaluate_estimands(data, proposal)
         kernel = blackjax.additive_step_random_walk(lambda _: evaluation.logdensity, lambda *_: move)
         kernel_state, kernel_info = kernel.step(key_accept, state.kernel)
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(kernel_info.is_accepted, new, old), evaluation, state.evaluation
-        )
+        kept = jax.tree.map(lambda new, old: jnp.where(kernel_info.is_accepted, new, old), evaluation, state.evaluation)
         info = Info(
             acceptance_rate=kernel_info.acceptance_rate,
             outside_support=evaluation.outside_support,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from bayesreg.types import AnyArray
 
 Estimands = Mapping[str, AnyArray]
 
 
+@runtime_checkable
 class Evaluation(Protocol):
     """The log density at one place, and what was found on the way."""
 
@@ -22,6 +23,7 @@ class Evaluation(Protocol):
     outside_support: AnyArray
 
 
+@runtime_checkable
 class Target(Protocol):
     """A posterior as the samplers see it; `bayesreg.Posterior` is one.
 

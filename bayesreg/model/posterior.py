@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpyro.infer.util import log_density
 
+from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
 from bayesreg.model.program import LameParameter, RegistrationData, registration
-from bayesreg.image import Image
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.model.warp import displacement_at
+from bayesreg.types import AnyArray, InputError, Scalar
 
 Values = Mapping[str, AnyArray]
 
@@ -156,6 +157,15 @@ class Posterior:
             "mu": jnp.asarray(self.data.mu.reference),
         }
 
+    def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+        """f(x_q) − m(x_q + u(x_q)) at the quadrature points."""
+        return _residuals(self.data, jnp.asarray(u))
+
+    @property
+    def implied_noise_sd(self) -> float:
+        """√(T_s / 2w): the noise that the temperature stands for at a point of average weight w."""
+        return float(np.sqrt(self.options.t_similarity / (2 * np.mean(self.data.quadrature.weights))))
+
     def constant_data(self) -> dict[str, AnyArray]:
         """Points (mm), cells, tissue of every cell and the sampled nodes."""
         mesh = self.mesh
@@ -188,9 +198,9 @@ class Posterior:
         expected = {"u_boundary": (len(self.sampled), 3), **{n: getattr(self.data, n).low.shape for n in LAME}}
         for name, shape in expected.items():
             if name not in values:
-                raise ValueError(f"values lack {name!r}; expected {', '.join(expected)}")
+                raise InputError(f"values lack {name!r}; expected {', '.join(expected)}")
             if np.shape(values[name]) != shape:
-                raise ValueError(f"values[{name!r}] must have shape {shape}, got {np.shape(values[name])}")
+                raise InputError(f"values[{name!r}] must have shape {shape}, got {np.shape(values[name])}")
 
 
 def build_posterior(
@@ -273,3 +283,9 @@ def _terms(data: RegistrationData, values: dict[str, AnyArray], similarity: str)
     for name in LAME:
         terms[f"log_prior_{name}"] = getattr(data, name).prior().log_prob(values[name])
     return terms
+
+
+@jax.jit
+def _residuals(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+    displacement = displacement_at(data.system.elements, data.quadrature, u)
+    return data.fixed_values - data.moving(data.positions + displacement)

@@ -8,15 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayesreg.distance import signed_distance
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import locate
-from bayesreg.image import Image
+from bayesreg.image import Image, Interpolator
 from bayesreg.mesh import TetMesh
-from bayesreg.model.constraint import signed_distance
+from bayesreg.model.constraint import is_allowed
 from bayesreg.model.options import Lame, ModelConfig, PriorConfig
 from bayesreg.model.program import LameParameter, RegistrationData
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 
 def registration_data(
@@ -38,7 +39,7 @@ def registration_data(
     positions = quadrature.positions(mesh)
     displacement = np.zeros((len(prescribed), 3))
     displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
-    distance = None if skull is None else signed_distance(skull).interpolator("linear")
+    distance = None if skull is None else skull_distance(skull, mesh, sampled)
     data = RegistrationData(
         system=elastic_system(mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry]),
         cell_entry=jnp.asarray(entry),
@@ -65,12 +66,32 @@ def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
     inside = image.contains(mesh.points)
     if inside.mean() < 0.5:
         corners = image.voxel_to_world(np.array([(0, 0, 0), np.array(image.shape) - 1]))
-        raise ValueError(
+        raise InputError(
             f"the {name} and the mesh do not overlap: {inside.sum()} of {len(inside)} nodes lie on its grid. It runs "
             f"from {corners[0].round(1).tolist()} to {corners[1].round(1).tolist()} mm (world RAS), the mesh from "
             f"{mesh.points.min(0).round(1).tolist()} to {mesh.points.max(0).round(1).tolist()} mm; "
             "check the affines, or align the images first"
         )
+
+
+def skull_distance(skull: Image, mesh: TetMesh, sampled: Int[np.ndarray, "sampled"]) -> Interpolator:
+    """Signed distance to the skull, for jitted code.
+
+    Raises
+    ------
+    ValueError
+        If a sampled node lies in the skull before it has moved.
+    """
+    distance = signed_distance(skull).interpolator("linear")
+    inside = np.flatnonzero(~np.asarray(is_allowed(distance, jnp.asarray(mesh.points[sampled]))))
+    if len(inside):
+        node = sampled[inside[0]]
+        raise InputError(
+            f"{len(inside)} of {len(sampled)} sampled nodes lie in the skull before they have moved, the first is node "
+            f"{node} at {mesh.points[node].round(1).tolist()} mm; check that nonzero means forbidden in the skull "
+            "image, and that mesh and skull share one space"
+        )
+    return distance
 
 
 def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[int, tuple[float, float, float]]]:
@@ -91,14 +112,16 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
     held = dict(sorted(model.held.items()))
     for name, nodes in (("sampled", wanted), ("held", np.array(list(held), int))):
         if len(nodes) and nodes.max() >= count:
-            raise ValueError(f"model.{name} names node {nodes.max()}, but the mesh has {count} nodes (0 to {count - 1})")
+            raise InputError(
+                f"model.{name} names node {nodes.max()}, but the mesh has {count} nodes (0 to {count - 1})"
+            )
     sampled = np.setdiff1d(wanted, list(held)).astype(int)
     prescribed = mesh.points[np.union1d(sampled, list(held)).astype(int)]
     if len(sampled) == 0:
-        raise ValueError("no node is sampled: model.sampled names none that is not held")
+        raise InputError("no node is sampled: model.sampled names none that is not held")
     spread = np.linalg.svd(prescribed - prescribed.mean(axis=0), compute_uv=False)
     if len(prescribed) < 3 or spread[1] < 1e-6 * spread[0]:
-        raise ValueError(
+        raise InputError(
             f"{len(prescribed)} sampled and held nodes do not hold the mesh in place: "
             "give at least three that are not on one line (model.sampled, model.held)"
         )
@@ -125,13 +148,13 @@ def lame_parameter(
         If the options name a tissue that the mesh does not have, two tissues that share one entry are given
         different values, or the reference has the wrong shape or sign.
     """
-    entries = cell_entries(mesh, model).max() + 1 if model.elasticity != "tissue" else len(mesh.names)
+    entries = int(cell_entries(mesh, model).max()) + 1 if model.elasticity != "tissue" else len(mesh.names)
     prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
     fixed = _default_fixed(mesh, model) if model.fixed is None else model.fixed
     known = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
     start = _default_reference(name, mesh, model, entries) if reference is None else np.asarray(reference[name], float)
     if start.shape != (entries,) or not (np.isfinite(start) & (start > 0)).all():
-        raise ValueError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
+        raise InputError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
     values = np.array([s if k is None else float(k) for s, k in zip(start, known, strict=True)])
     return LameParameter(
         alpha=jnp.array([float(p.alpha) for p in prior]),
@@ -162,13 +185,13 @@ def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: 
         return [default if given is None else given] * entries
     unknown = set(given) - set(mesh.names)
     if unknown:
-        raise ValueError(f"model.{where} names {sorted(unknown)}, but the mesh's tissues are {list(mesh.names)}")
+        raise InputError(f"model.{where} names {sorted(unknown)}, but the mesh's tissues are {list(mesh.names)}")
     if model.elasticity == "tissue":
         return [given.get(tissue, default) for tissue in mesh.names]
     if model.elasticity == "element":
         return [given.get(mesh.names[tissue], default) for tissue in mesh.tissue]
     if len(set(given.values())) > 1:
-        raise ValueError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
+        raise InputError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
     return [next(iter(given.values()), default)]
 
 
@@ -187,7 +210,7 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
     cells, barycentric = locate(mesh.points, mesh.cells, near)
     inside = cells >= 0
     if not inside.any():
-        raise ValueError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
+        raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
     weights = np.full(inside.sum(), fixed.voxel_volume)
     return Quadrature(jnp.asarray(cells[inside]), jnp.asarray(barycentric[inside]), jnp.asarray(weights))
 

@@ -108,16 +108,17 @@ def registration(data: RegistrationData, similarity: str = "ssd") -> None:
     lam = numpyro.sample("lam", data.lam.prior())
     mu = numpyro.sample("mu", data.mu.prior())
 
-    # Outside the priors' support K may be indefinite; the density is −∞ there whatever the solve says.
-    lam_cells = _physical(lam, data.lam)[data.cell_entry]
-    mu_cells = _physical(mu, data.mu)[data.cell_entry]
+    # Where K may be indefinite the density is −∞; the solve is given the reference, to end soon.
+    physical = _physical(lam, mu)
+    lam_cells = jnp.where(physical, lam, data.lam.reference)[data.cell_entry]
+    mu_cells = jnp.where(physical, mu, data.mu.reference)[data.cell_entry]
     state = equilibrium(data.system, lam_cells, mu_cells, data.held.at[data.slots].set(u_boundary), SOLVER_TOLERANCE)
 
     elements, quadrature = data.system.elements, data.quadrature
     moved = data.positions + displacement_at(elements, quadrature, state.u)
     similarity_energy = SIMILARITIES[similarity](data.fixed_values, data.moving(moved), quadrature.weights)
     strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)
-    inside = _clear_of_skull(data, u_boundary) & _in_range(lam, data.lam) & _in_range(mu, data.mu)
+    inside = physical & _clear_of_skull(data, u_boundary) & _in_range(lam, data.lam) & _in_range(mu, data.mu)
 
     numpyro.factor("log_similarity", -similarity_energy / data.t_similarity)
     numpyro.factor("log_elastic", -strain_energy / data.t_elastic)
@@ -133,9 +134,9 @@ def registration(data: RegistrationData, similarity: str = "ssd") -> None:
     numpyro.deterministic("outside_support", ~inside)
 
 
-def _physical(values: AnyArray, parameter: LameParameter) -> AnyArray:
-    """The parameters, or their reference where any entry is not positive and finite."""
-    return jnp.where(((values > 0) & jnp.isfinite(values)).all(), values, parameter.reference)
+def _physical(lam: AnyArray, mu: AnyArray) -> Bool[AnyArray, ""]:
+    """Whether K is positive definite up to rigid motions: λ ≥ 0 and μ > 0, all of them finite."""
+    return ((lam >= 0) & jnp.isfinite(lam)).all() & ((mu > 0) & jnp.isfinite(mu)).all()
 
 
 def _in_range(values: AnyArray, parameter: LameParameter) -> Bool[AnyArray, ""]:
