@@ -161,8 +161,8 @@ def nearest_on_surface(
 
     Notes
     -----
-    The point is exact for the triangles that own one of the four nearest sample points of the surface (6 to
-    45 on each triangle); a nearer triangle can be missed only by less than the distance between samples.
+    The point is exact for the triangles that own one of the four nearest sample points of the surface (3 to
+    36 on each triangle); a nearer triangle can be missed only by less than the distance between samples.
     """
     corners = points[triangles]
     lattice = _lattice(int(np.clip(np.sqrt(120_000 / len(triangles)), 2, 8)))
@@ -182,7 +182,10 @@ def nearest_on_surface(
 
 
 def _lattice(order: int) -> Float[np.ndarray, "samples 3"]:
-    return np.array([(i, j, order - i - j) for i in range(order + 1) for j in range(order + 1 - i)]) / order
+    """Centres of the upright parts of a triangle whose sides are cut in `order`; none lies on an edge."""
+    return np.array([(i, j, order - 1 - i - j) for i in range(order) for j in range(order - i)]) / order + 1 / (
+        3 * order
+    )
 
 
 def closest_in_triangles(

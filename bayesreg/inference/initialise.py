@@ -22,7 +22,8 @@ class Start(NamedTuple):
     field : (b, 3) array, optional
         Displacement of the sampled nodes, mm, at the far end; None is no displacement.
     fraction : (float, float)
-        Chains start at fractions of the field spread evenly over this range: 0 identity, 1 the field.
+        Chains start at fractions of the field spread evenly over this range: 0 identity, 1 the field. A node
+        that this would put into the skull starts at the nearest fraction that does not.
     lam, mu : mapping of entry name to float, optional
         Centre of the start parameters, where it is not the posterior's reference.
     spread : float
@@ -52,13 +53,29 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
     for name in ("lam", "mu"):
         at_rest[name] = _with_entries(at_rest[name], getattr(start, name), target, name)
     centre = target.estimands(at_rest)
-    points = {"u_boundary": jnp.asarray(fractions[:, None, None] * field)}
+    points = {"u_boundary": jnp.stack([_admissible(target, field, fraction) for fraction in fractions])}
     for name, subkey in zip(("lam", "mu"), jax.random.split(key), strict=True):
         if name in centre:
             noise = jax.random.normal(subkey, (chains, *centre[name].shape))
             points[name] = centre[name] * jnp.exp(start.spread * noise)
     _require_density(target, points, fractions)
     return points
+
+
+def _admissible(target: Target, field: np.ndarray, fraction: float) -> AnyArray:
+    """A fraction of the field; a node that it would put into the skull takes the nearest fraction that does not.
+
+    Both ends of a node's path may be allowed and its middle not: a skull is not convex. At zero the node is at
+    rest, where it is allowed.
+    """
+    chosen = np.full(len(field), fraction)
+    candidates = np.linspace(0, 1, 201)
+    for candidate in candidates[np.argsort(np.abs(candidates - fraction), kind="stable")]:
+        forbidden = ~np.asarray(target.allowed(chosen[:, None] * field))
+        if not forbidden.any():
+            break
+        chosen[forbidden] = candidate
+    return jnp.asarray(chosen[:, None] * field)
 
 
 def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: Target, name: str) -> AnyArray:

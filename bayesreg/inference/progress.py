@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichProgress
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Told of every block."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Progress:
         """Begin."""
 
     def __exit__(self, *exception: object) -> None:
@@ -28,7 +29,7 @@ class NoProgress:
     def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
         pass
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> NoProgress:
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -50,7 +51,7 @@ class SamplingProgress(NoProgress):
         )  # fmt: skip
         self._task = self._bar.add_task("sampling", total=draws, figures="compiling", left="")
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> SamplingProgress:
         self._bar.start()
         return self
 

@@ -170,10 +170,9 @@ def sample(
     stop = stop or StopRule()
     kernel = SAMPLERS[sampler](posterior, **settings)
     began = time.perf_counter()
-    key_start, key_chains = jax.random.split(jax.random.key(seed))
+    _, key_chains = jax.random.split(jax.random.key(seed))
     if resume is None:
-        points = starting_points(posterior, start or Start(), chains, key_start)
-        checkpoint, blocks = _first(kernel, posterior, points), []
+        checkpoint, blocks = _first(kernel, posterior, first_points(posterior, start, chains, seed)), []
     else:
         checkpoint, blocks = resume[0], list(resume[1])
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
@@ -185,6 +184,18 @@ def sample(
             if on_block is not None:
                 on_block(len(blocks) - 1, found, checkpoint)
     return _samples(posterior, kernel, blocks, checkpoint, stop, draws)
+
+
+def first_points(posterior: Target, start: Start | None, chains: int, seed: int) -> dict[str, AnyArray]:
+    """Where `sample` starts its chains: estimands with chains as the leading axis.
+
+    Raises
+    ------
+    InputError
+        If a chain cannot start there.
+    """
+    key_start, _ = jax.random.split(jax.random.key(seed))
+    return starting_points(posterior, start or Start(), chains, key_start)
 
 
 def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
@@ -254,7 +265,7 @@ def _run_block(  # type: ignore[no-untyped-def]
     thin: int,
     data: Any,
     chain_keys: AnyArray,
-    first: int,
+    first: AnyArray | int,
     state: State,
     moments: Moments,
     tally: Tally,
@@ -357,10 +368,13 @@ def _samples(
 def _reason(stop: StopRule, checkpoint: Checkpoint, rhat: dict[str, np.ndarray], draws: int) -> str:
     worst = greatest_rhat(rhat)
     if _converged(stop, checkpoint):
-        return f"R̂ is below {stop.rhat:g} for every estimand (greatest {worst:.3f})"
+        return f"R̂ (unsplit) is below {stop.rhat:g} for every estimand; the greatest is {worst:.3f}"
     limit = f"{draws} draws per chain"
     if _out_of_time(stop, checkpoint):
         limit = f"{stop.max_seconds:g} s of sampling"
     if stop.rhat is None:
-        return f"the budget of {limit} is spent; no convergence rule was set (greatest R̂ {worst:.3f})"
-    return f"the budget of {limit} is spent before convergence: the greatest R̂ is {worst:.3f}, not below {stop.rhat:g}"
+        return f"the budget of {limit} is spent; no convergence rule was set (greatest unsplit R̂ {worst:.3f})"
+    return (
+        f"the budget of {limit} is spent before convergence: the greatest unsplit R̂ is {worst:.3f}, "
+        f"not below {stop.rhat:g}"
+    )

@@ -58,5 +58,8 @@ class Target(Protocol):
     def reference(self) -> dict[str, AnyArray]:
         """Values at rest."""
 
+    def allowed(self, u_boundary: AnyArray) -> AnyArray:
+        """Which sampled nodes, so displaced, satisfy the hard constraint."""
+
     def constant_data(self) -> dict[str, AnyArray]:
         """What a reader of the draws needs to know of the mesh."""

@@ -15,6 +15,7 @@ from numpyro.infer.util import log_density
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
+from bayesreg.model.constraint import is_allowed
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
@@ -156,6 +157,13 @@ class Posterior:
             "lam": jnp.asarray(self.data.lam.reference),
             "mu": jnp.asarray(self.data.mu.reference),
         }
+
+    def allowed(self, u_boundary: Float[AnyArray, "sampled 3"]) -> Bool[np.ndarray, "sampled"]:
+        """Which sampled nodes, so displaced (mm), lie outside Ω_SK."""
+        distance = self.data.skull_distance
+        if distance is None:
+            return np.ones(len(self.sampled), bool)
+        return np.asarray(is_allowed(distance, self.data.points_sampled + jnp.asarray(u_boundary)))
 
     def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """f(x_q) − m(x_q + u(x_q)) at the quadrature points."""

@@ -1,0 +1,43 @@
+# `make demo` and `make test` need nothing but Python 3.11 or newer with its venv module.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := runs/quickstart
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+INSTALL := $(PIP) install -c constraints.txt --build-constraint constraints.txt -e .
+
+.PHONY: demo test bench check
+.DELETE_ON_ERROR:
+
+# Status 3, "not converged within its budget", is an honest end of a demonstration.
+demo: $(VENV)/.installed
+	@rm -rf $(DEMO)
+	@$(BIN)/bayesreg run configs/quickstart.yaml -o $(DEMO) || test $$? -eq 3
+	@echo "The report is $(CURDIR)/$(DEMO)/report.html"
+
+test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest
+
+bench: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s
+
+# What the tests ask of the source before anything else, in half a minute.
+check: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest tests/test_habits.py -n 0
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install -c constraints.txt --upgrade pip
+	$(INSTALL)
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install -c constraints.txt --upgrade pip
+	$(INSTALL) --group dev
+	@touch $(VENV)/.installed $@
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	{ echo "bayesreg needs Python 3.11 or newer; name another one: make PYTHON=/path/to/python"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' || \
+	{ echo "This Python cannot make environments; on Debian: apt install python3-venv"; exit 1; }
+	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,137 @@
+"""The command line. Heavy imports stand inside the commands, so that help comes at once."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from bayesreg import __version__
+
+NOT_CONVERGED = 3
+
+
+class _Commands(TyperGroup):
+    """Shows what a user did wrong as one message, status 2; anything else that is raised is a bug."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except ValueError as error:
+            from bayesreg.types import InputError
+
+            if not isinstance(error, InputError):
+                raise
+            typer.echo(f"bayesreg: {error}", err=True)
+            raise typer.Exit(2) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Status: 0 done, 2 bad input, 3 not converged within its budget (results are written), 1 anything else.",
+)
+
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]
+OutFolder = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
+RunFolders = Annotated[list[Path], typer.Argument(metavar="DIR DIR...", help="Folders of two or more runs.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override an entry, e.g. sampler.chains=4; may be repeated."),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run that DIR holds.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+Page = Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="HTML file to write.")]
+
+
+def _show_version(wanted: bool) -> bool:
+    if wanted:
+        typer.echo(f"bayesreg {__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """Registration of two images with posterior distributions of displacement and stiffness."""
+
+
+@app.command()
+def run(
+    config: ConfigFile, out: OutFolder, overrides: Overrides = None, resume: Resume = False, quiet: Quiet = False
+) -> None:
+    """Sample the posterior; write draws, images and a report."""
+    from bayesreg.config import load_config
+
+    settings = load_config(config, overrides or ())
+    from bayesreg import pipeline
+
+    result = pipeline.run(settings, out, resume=resume, progress=not quiet)
+    typer.echo(f"Report: {Path(result.folder) / 'report.html'}")
+    if not result.converged:
+        typer.echo("Not converged within its budget; the results are written, and the report says how far it came.")
+        raise typer.Exit(NOT_CONVERGED)
+
+
+@app.command()
+def check(config: ConfigFile, overrides: Overrides = None) -> None:
+    """Do everything but sampling; estimate time and memory."""
+    from bayesreg.config import load_config
+
+    settings = load_config(config, overrides or ())
+    from bayesreg import pipeline
+
+    typer.echo(pipeline.check(settings).text)
+
+
+@app.command()
+def simulate(config: ConfigFile, out: OutFolder, overrides: Overrides = None) -> None:
+    """Make the synthetic pair of a configuration, with its truth."""
+    from bayesreg.config import load_config
+
+    settings = load_config(config, overrides or ())
+    from bayesreg import pipeline
+
+    pipeline.simulate(settings, out)
+    typer.echo(f"Pair: {out}")
+
+
+@app.command()
+def report(folder: RunFolder) -> None:
+    """Write the report of a run once more."""
+    from bayesreg import pipeline
+
+    typer.echo(f"Report: {pipeline.report(folder)}")
+
+
+@app.command()
+def compare(folders: RunFolders, out: Page = Path("compare.html")) -> None:
+    """Put runs side by side, as the paper does with three tissues and one."""
+    if len(folders) < 2:
+        raise typer.BadParameter("expected the folders of at least two runs", param_hint="DIR DIR...")
+    from bayesreg import pipeline
+
+    typer.echo(f"Comparison: {pipeline.compare(folders, out)}")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of a configuration, for editors."""
+    import json
+
+    from bayesreg.config import schema
+
+    typer.echo(json.dumps(schema(), indent=2))
+
+
+def main() -> None:
+    """Entry point of the `bayesreg` command."""
+    app()

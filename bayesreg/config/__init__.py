@@ -1,0 +1,10 @@
+"""What a run is to do: pydantic models of the configuration, and their YAML form.
+
+A configuration holds no arrays and builds nothing; `bayesreg.pipeline` does that.
+"""
+
+from bayesreg.config.errors import ConfigError
+from bayesreg.config.loading import load_config, resolved_yaml, schema
+from bayesreg.config.sections import Config
+
+__all__ = ["Config", "ConfigError", "load_config", "resolved_yaml", "schema"]

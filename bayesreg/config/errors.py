@@ -1,0 +1,158 @@
+"""pydantic's errors as messages for a person: where, what was found, what was expected."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from bayesreg.types import InputError
+
+Keys = tuple[str | int, ...]
+
+_KEYS, _NUMBER, _WHOLE, _LIST, _TRUTH = "keys with values", "a number", "a whole number", "a list", "true or false"
+_EXPECTED = {
+    "bool_type": _TRUTH,
+    "bool_parsing": _TRUTH,
+    "float_type": _NUMBER,
+    "float_parsing": _NUMBER,
+    "int_type": _WHOLE,
+    "int_parsing": _WHOLE,
+    "int_from_float": _WHOLE,
+    "string_type": "text",
+    "list_type": _LIST,
+    "tuple_type": _LIST,
+    "dict_type": _KEYS,
+    "model_type": _KEYS,
+    "model_attributes_type": _KEYS,
+}
+
+
+class ConfigError(InputError):
+    """A configuration that cannot be run; the message lists everything that is wrong with it."""
+
+
+def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any], origins: dict[Keys, str]) -> str:
+    """All of the errors, one a line.
+
+    Parameters
+    ----------
+    error : ValidationError
+    model : type
+        The pydantic model that `data` should fit.
+    data : dict
+        What was validated.
+    origins : dict
+        Where each key was written ("run.yaml:3"), by its path.
+    """
+    found = [(_path(details, data), details) for details in error.errors(include_url=False)]
+    messages: dict[Keys, list[str]] = {}
+    for path, details in found:
+        if not any(_explains(*other, path, details["type"]) for other in found):
+            messages.setdefault(path, []).append(_message(details, model))
+    lines = [f"  {_head(path, data, origins)}: {_joined(some)}" for path, some in messages.items()]
+    return "\n".join(lines)
+
+
+def _explains(other: Keys, by: ErrorDetails, path: Keys, kind: str) -> bool:
+    """Is an error but another member of a union complaining, where `by` says what is wrong?
+
+    A value that is wrong as a whole is right in its parts; one that is wrong in a part was meant to have parts.
+    """
+    if len(other) < len(path):
+        return path[: len(other)] == other and by["type"] in ("value_error", "wrong")
+    return len(other) > len(path) > 0 and other[: len(path)] == path and kind in (*_EXPECTED, "literal_error")
+
+
+def _joined(messages: list[str]) -> str:
+    first, *others = dict.fromkeys(messages)
+    return " or ".join((first, *(message.removeprefix("expected ") for message in others)))
+
+
+def _path(details: ErrorDetails, data: Any) -> Keys:
+    """pydantic's location less the names of union members, which no user has written."""
+    *parents, last = details["loc"] or ("",)
+    path: Keys = ()
+    for key in (*parents, last):
+        try:
+            data, path = data[key], (*path, key)
+        except (KeyError, IndexError, TypeError):
+            path = path or (key,)  # A section that was left out may be wrong, too.
+    if details["type"] == "missing" and path[-1] != last:
+        path = (*path, last)
+    return (*path, *_custom_key(details))
+
+
+def _custom_key(details: ErrorDetails) -> Keys:
+    key = details.get("ctx", {}).get("key" if details["type"] == "wrong" else "discriminator")
+    return tuple(key.strip("'").split(".")) if key else ()
+
+
+def _head(path: Keys, data: Any, origins: dict[Keys, str]) -> str:
+    """Origin, dotted path, and the value where it is short."""
+    present, value = 0, data
+    while present < len(path) and isinstance(value, dict | list):
+        try:
+            value = value[path[present]]  # type: ignore[index]
+        except (KeyError, IndexError):
+            break
+        present += 1
+    origin = next((origins[path[:n]] for n in range(present, 0, -1) if path[:n] in origins), None)
+    shown = json.dumps(value, default=str, ensure_ascii=False)
+    name = ".".join(map(str, path)) or "the whole"
+    found = f" = {shown}" if present == len(path) and len(shown) <= 60 else ""
+    return f"{origin}: {name}{found}" if origin else name + found
+
+
+def _message(details: ErrorDetails, model: type[BaseModel]) -> str:
+    *parents, key = details["loc"] or ("",)
+    kind, context = details["type"], details.get("ctx", {})
+    if kind == "extra_forbidden":
+        return _unknown(str(key), _fields_at(tuple(parents), model))
+    if kind == "missing":
+        field = _fields_at(tuple(parents), model).get(str(key))
+        return f"missing; expected: {field.description}" if field and field.description else "missing"
+    if kind == "union_tag_not_found":
+        return "missing"
+    if kind == "union_tag_invalid":
+        return f"expected one of {context['expected_tags']}"
+    text = details["msg"].removeprefix("Value error, ")
+    if kind in _EXPECTED:
+        return f"expected {_EXPECTED[kind]}"
+    return text.replace("Input should be a valid", "expected a").replace("Input should be", "expected")
+
+
+def _unknown(key: str, fields: dict[str, FieldInfo]) -> str:
+    close = difflib.get_close_matches(key, fields, n=1)
+    return f"unknown key; did you mean {close[0]}?" if close else f"unknown key; known are {', '.join(fields)}"
+
+
+def _fields_at(location: Keys, model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Fields of the model (of all members, where it is a union) that a location leads to."""
+    models = [model]
+    for key in location:
+        inner = [m for parent in models if key in parent.model_fields for m in _models(parent.model_fields[str(key)])]
+        models = inner or [m for m in models if key in _tags(m)] or models
+    return {name: field for m in models for name, field in m.model_fields.items()}
+
+
+def _models(field: FieldInfo) -> list[type[BaseModel]]:
+    return [m for m in _leaves(field.annotation) if isinstance(m, type) and issubclass(m, BaseModel)]
+
+
+def _tags(model: type[BaseModel]) -> set[object]:
+    """What pydantic may call a member of a union: its class, or a value of its discriminator."""
+    return {model.__name__, *(leaf for field in model.model_fields.values() for leaf in _leaves(field.annotation))}
+
+
+def _leaves(annotation: object) -> Iterator[object]:
+    arguments = get_args(annotation)
+    if not arguments:
+        yield annotation
+    for argument in arguments:
+        yield from _leaves(argument)

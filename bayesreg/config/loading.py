@@ -1,0 +1,172 @@
+"""YAML files to configurations and back."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
+from ruamel.yaml.representer import RoundTripRepresenter
+
+from bayesreg.config.errors import ConfigError, Keys, explain
+from bayesreg.config.sections import Config
+from bayesreg.config.values import search_folders
+
+# A section of another kind replaces the one that it extends: their keys have nothing in common.
+_KINDS = ("source", "kind", "name")
+
+
+@dataclass(frozen=True)
+class _Document:
+    """What YAML files say, where each key was written, and the folders that they lie in."""
+
+    data: dict[str, Any]
+    origins: dict[Keys, str]
+    folders: tuple[Path, ...]
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """Read, complete and check a configuration.
+
+    Parameters
+    ----------
+    path : path
+        A YAML 1.2 file. ``extends: other.yaml`` takes over another file, looked for beside it: sections are
+        merged key by key, and the value of a key replaces the other's as a whole.
+    overrides : sequence of str
+        ``"sampler.chains=4"``: a dotted path and a YAML value, applied last.
+
+    Returns
+    -------
+    Config
+        Its relative paths, looked for beside the file, in the current folder and in the folder that the
+        environment variable BAYESREG_DATA names, are made absolute.
+
+    Raises
+    ------
+    ConfigError
+        Naming every error with its place, the value and what was expected.
+    """
+    document = _override(_read(Path(path), ()), overrides)
+    try:
+        return Config.model_validate(document.data, context={"folders": search_folders(*document.folders)})
+    except ValidationError as error:
+        reasons = explain(error, Config, document.data, document.origins)
+        raise ConfigError(f"the configuration {path} cannot be run:\n{reasons}") from None
+
+
+def resolved_yaml(config: Config) -> str:
+    """The configuration as YAML, every default spelled out; `load_config` reads it back."""
+    yaml, text = YAML(), io.StringIO()
+    yaml.Representer = _Representer
+    yaml.width = 120
+    yaml.dump(config.model_dump(mode="json"), text)
+    return text.getvalue()
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema of a configuration file, for editors."""
+    result = Config.model_json_schema()
+    result["properties"]["extends"] = {"type": "string", "description": "A file that this one takes over."}
+    return result
+
+
+class _Representer(RoundTripRepresenter):
+    """Writes null, where the base class writes nothing."""
+
+
+_Representer.add_representer(
+    type(None), lambda representer, _: representer.represent_scalar("tag:yaml.org,2002:null", "null")
+)
+
+
+def _read(path: Path, seen: tuple[Path, ...]) -> _Document:
+    path = path.absolute()
+    if path in seen:
+        raise ConfigError(f"{path} extends itself, by way of {seen[-1]}")
+    data, node = _parse(_text(path), str(path))
+    data = {} if data is None else data
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: expected keys with values, such as 'seed: 1'; got {data!r:.60}")
+    origins = {keys: f"{path.name}:{line}" for keys, line in _lines(node)} if node else {}
+    document = _Document(data, origins, (path.parent,))
+    base = data.pop("extends", None)
+    if base is None:
+        return document
+    if not isinstance(base, str):
+        raise ConfigError(f"{origins['extends',]}: extends = {base!r}: expected the path of a file")
+    return _merge(_read(path.parent / base, (*seen, path)), document)
+
+
+def _text(path: Path) -> str:
+    if not path.is_file():
+        reason = "is a folder" if path.is_dir() else "does not exist"
+        raise ConfigError(f"the configuration {path} {reason}; expected a YAML file")
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not UTF-8 text ({error.reason} at byte {error.start})") from None
+    except PermissionError:
+        raise ConfigError(f"the configuration {path} may not be read; see its permissions") from None
+
+
+def _parse(text: str, name: str) -> tuple[Any, Node | None]:
+    """The content of a YAML text, and its nodes, which know their lines."""
+    try:
+        return YAML(typ="safe", pure=True).load(text), YAML(typ="safe", pure=True).compose(text)
+    except MarkedYAMLError as error:
+        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ConfigError(f"{name}{line}: not valid YAML: {error.problem}") from None
+    except YAMLError as error:
+        raise ConfigError(f"{name}: not valid YAML: {str(error).splitlines()[0]}") from None
+
+
+def _lines(node: Node, path: Keys = ()) -> Iterator[tuple[Keys, int]]:
+    """Path and line number of everything under a node."""
+    if isinstance(node, MappingNode):
+        children = [(key.value, key, value) for key, value in node.value]
+    elif isinstance(node, SequenceNode):
+        children = [(index, value, value) for index, value in enumerate(node.value)]
+    else:
+        children = []
+    for key, place, value in children:
+        yield (*path, key), place.start_mark.line + 1
+        yield from _lines(value, (*path, key))
+
+
+def _merge(base: _Document, top: _Document) -> _Document:
+    data = dict(base.data)
+    for key, section in top.data.items():
+        below = data.get(key)
+        if isinstance(section, dict) and isinstance(below, dict):
+            changed = any(k in section and section[k] != below.get(k) for k in _KINDS)
+            section = section if changed else {**below, **section}
+        data[key] = section
+    return _Document(data, base.origins | top.origins, (*top.folders, *base.folders))
+
+
+def _override(document: _Document, overrides: Sequence[str]) -> _Document:
+    data, origins = document.data, dict(document.origins)
+    for text in overrides:
+        path, equals, value = text.partition("=")
+        keys = tuple(path.strip().split("."))
+        if not equals or not all(keys):
+            raise ConfigError(f"--set {text}: expected a dotted path and a value, such as sampler.chains=4")
+        data = _with_value(data, keys, _parse(value, f"--set {text}")[0], text)
+        origins[keys] = f"--set {text}"
+    return _Document(data, origins, document.folders)
+
+
+def _with_value(data: Any, keys: Sequence[str], value: Any, text: str) -> dict[str, Any]:
+    first, *rest = keys
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"--set {text}: {first} would lie under {data!r:.60}, which has no keys")
+    return {**data, first: _with_value(data.get(first), rest, value, text) if rest else value}

@@ -1,0 +1,262 @@
+"""The sections of a configuration, as pydantic models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
+
+from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_field
+from bayesreg.model.options import ModelConfig
+
+
+class Section(BaseModel):
+    """What all parts of a configuration share: no unknown keys, no changes after the making."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Tissues(Section):
+    """One positive value per tissue."""
+
+    csf: Positive
+    gm: Positive
+    wm: Positive
+
+    def as_tuple(self) -> tuple[float, float, float]:
+        """The values in the order of the tissues: CSF, GM, WM."""
+        return self.csf, self.gm, self.wm
+
+
+class Mni152Data(Section):
+    """The MNI152 brain that ships with nilearn; a synthetic pair is made of it."""
+
+    source: Literal["mni152"]
+
+
+class BrainWebData(Section):
+    """BrainWeb's label phantom with the T1 of Colin27; a synthetic pair is made of them."""
+
+    source: Literal["brainweb"]
+    labels: FoundFile
+    """Discrete BrainWeb labels: 1 CSF, 2 GM, 3 WM, 8 glial."""
+    t1: FoundFile
+    """T1 image on the same grid."""
+    intracranial_labels: Labels = (1, 2, 3, 8)
+    """Labels inside the skull; of their union the largest connected part is taken."""
+
+
+class LabelTable(Section):
+    """Which values of a label file stand for which tissue."""
+
+    csf: Labels
+    gm: Labels
+    wm: Labels
+
+    @field_validator("gm", "wm")
+    @classmethod
+    def _no_value_twice(cls, labels: tuple[int, ...], info: ValidationInfo) -> tuple[int, ...]:
+        for other, theirs in info.data.items():
+            if shared := sorted(set(labels) & set(theirs)):
+                raise ValueError(f"label {shared[0]} belongs to {other} already")
+        return labels
+
+    def as_dict(self) -> dict[str, tuple[int, ...]]:
+        """Tissue name to label values, in the order of the tissues."""
+        return {"csf": self.csf, "gm": self.gm, "wm": self.wm}
+
+
+class FilesData(Section):
+    """A pair of one's own, in one world space (aligned beforehand)."""
+
+    source: Literal["files"]
+    fixed: FoundFile
+    """Pre-operative image."""
+    moving: FoundFile
+    """Intra-operative image."""
+    labels: FoundFile
+    """Tissue labels of the fixed image, on its grid."""
+    label_table: LabelTable
+    intracranial: FoundFile | None = None
+    """Image that is not zero where the brain may go; without it nothing bounds the motion."""
+    same_contrast: StrictBool = True
+    """Scale the intensities of both images by one common scale."""
+
+
+class _Pair(Section):
+    displacement: Positive = 15.0
+    """How far the patch moves towards the centre of gravity, mm."""
+    patch_nodes: Annotated[int, Field(strict=True, ge=3)] = 20
+    """Number of boundary nodes in the patch."""
+    direction: Annotated[Direction, Field(validate_default=True)] = (0.6, 0.3, 0.75)
+    """From the centre of gravity to the patch, world RAS; scaled to length one."""
+    lam: Tissues = Tissues(csf=1e-6, gm=10.0, wm=30.0)
+    """True first Lamé parameters."""
+    mu: Tissues = Tissues(csf=1e-6, gm=1.0, wm=1.0)
+    """True second Lamé parameters."""
+    smoothing_mm: NotNegative | None = None
+    """Width (sd, mm) of the smoothing of the anatomy beforehand; null lets the kind of pair choose."""
+
+
+class PaperPair(_Pair):
+    """A synthetic pair as in section 4.1 of the paper: one mesh for making and registering."""
+
+    kind: Literal["paper"]
+    noise_sd: NotNegative = 0.003
+    """Noise on each image; intensities run from 0 to 1."""
+
+
+class CalibratedPair(_Pair):
+    """A synthetic pair made on a finer mesh, for checks of coverage."""
+
+    kind: Literal["calibrated"]
+    noise_sd: NotNegative = 0.01
+    """Noise on each image; intensities run from 0 to 1."""
+    making_edge_length: Positive = 10.0
+    """Edge length of the making mesh, mm."""
+
+
+class MeshConfig(Section):
+    """How the mesh is made, or which one is taken."""
+
+    edge_length: Positive = 15.5
+    """Wanted length of an edge on the boundary, mm; 15.5 gives a mesh of the paper's size."""
+    envelope: Positive | None = None
+    """How far the mesh's surfaces may lie from those of the labels, mm; null is 0.32 edge lengths."""
+    skull_gap: NotNegative = 0.5
+    """Least distance of the boundary nodes from the skull, mm."""
+    file: FoundFile | None = None
+    """A mesh (.vtu) made earlier; the other entries are then left alone."""
+
+
+class SamplerConfig(Section):
+    """Which sampler, and its settings."""
+
+    name: Literal["rwmh"] = "rwmh"
+    """rwmh: random-walk Metropolis with the three Normal kernels of the paper."""
+    chains: Count = 3
+    thin: Count = 10
+    """Every how many steps a draw is kept."""
+    sigma_u: Positive = 0.008
+    """Sd of a step of each sampled displacement, mm."""
+    sigma_lam: Positive = 0.03
+    """Sd of a step of each λ."""
+    sigma_mu: Positive = 0.003
+    """Sd of a step of each μ."""
+    block: Count | None = None
+    """Kept draws between two looks at the stop rule; null lets the program choose."""
+
+
+class StartConfig(Section):
+    """Where the chains start."""
+
+    field: Annotated[Literal["identity", "truth"] | Path, BeforeValidator(find_field)] = "identity"
+    """identity, truth (of a synthetic pair), or a file with a displacement of every node (.npz, .vtu)."""
+    fraction: Range = (0.0, 1.0)
+    """Every chain starts at its own fraction of the field, evenly spread from the first to the second."""
+    lam: Positive | Tissues | None = None
+    """First Lamé parameter, for all or by tissue; null is 10, in CSF 0.01. Fixed ones keep their value."""
+    mu: Positive | Tissues | None = None
+    """Second Lamé parameter, for all or by tissue; null is 1, in CSF 0.01. Fixed ones keep their value."""
+    spread: NotNegative = 0.1
+    """Sd, between chains, of the logarithm of the Lamé parameters that they start with."""
+
+    def entries(self, name: Literal["lam", "mu"], names: Iterable[str]) -> dict[str, float] | None:
+        """Start value of every named entry of λ or μ; None where the model is to choose."""
+        given = getattr(self, name)
+        return dict.fromkeys(names, given) if isinstance(given, float) else given and given.model_dump()
+
+
+class StopConfig(Section):
+    """When to stop: as soon as every estimand's R-hat is low enough, or when a budget is spent."""
+
+    rhat: Annotated[float, Field(strict=True, gt=1)] | None = 1.2
+    """Largest R-hat of all estimands; null runs until a budget is spent."""
+    max_steps: Count = 250_000
+    """Steps per chain, thinned ones included."""
+    max_minutes: Positive | None = None
+    """Minutes of sampling."""
+
+
+class Config(Section):
+    """Everything that a run needs to know."""
+
+    description: str = ""
+    """What the run is for."""
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
+    data: Annotated[Mni152Data | BrainWebData | FilesData, Field(discriminator="source")]
+    mesh: MeshConfig = MeshConfig()
+    simulate: Annotated[
+        Annotated[PaperPair | CalibratedPair, Field(discriminator="kind")] | None, Field(validate_default=True)
+    ] = None
+    """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
+    model: ModelConfig = ModelConfig()
+    sampler: SamplerConfig = SamplerConfig()
+    start: StartConfig = StartConfig()
+    stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
+
+    # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
+
+    @field_validator("simulate")
+    @classmethod
+    def _fits_data(
+        cls, simulate: PaperPair | CalibratedPair | None, info: ValidationInfo
+    ) -> PaperPair | CalibratedPair | None:
+        data, mesh = info.data.get("data"), info.data.get("mesh")
+        if isinstance(data, FilesData) and simulate is not None:
+            raise ValueError("expected null: data.source is files, a pair that needs no making")
+        if isinstance(data, Mni152Data | BrainWebData) and simulate is None:
+            raise ValueError(
+                f"missing: data.source is {data.source}, one image, of which a pair must be made; give its kind"
+            )
+        if (
+            isinstance(simulate, CalibratedPair)
+            and mesh
+            and not mesh.file
+            and simulate.making_edge_length >= mesh.edge_length
+        ):
+            raise _wrong("making_edge_length", f"expected less than mesh.edge_length, {mesh.edge_length:g} mm")
+        return simulate
+
+    @field_validator("model")
+    @classmethod
+    def _names_tissues_and_nodes(cls, model: ModelConfig) -> ModelConfig:
+        names = tuple(Tissues.model_fields)
+        for key, section in (("fixed", model.fixed or {}), ("priors", model.priors)):
+            for parameter, given in section.items():
+                unknown = set(given) - set(names) if isinstance(given, dict) else None
+                if unknown:
+                    tissue = min(unknown)
+                    raise _wrong(f"{key}.{parameter}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
+        if not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
+            raise _wrong("sampled", "expected at least three nodes, held ones included; fewer do not hold the mesh")
+        return model
+
+    @field_validator("start")
+    @classmethod
+    def _can_start(cls, start: StartConfig, info: ValidationInfo) -> StartConfig:
+        model = info.data.get("model")
+        if start.field == "truth" and "simulate" in info.data and info.data["simulate"] is None:
+            raise _wrong("field", "the truth of this pair is not known; expected identity or a file")
+        for name in ("lam", "mu"):
+            if model is not None and model.elasticity != "tissue" and isinstance(getattr(start, name), Tissues):
+                raise _wrong(name, f"expected one number, since model.elasticity is {model.elasticity}")
+        return start
+
+    @field_validator("stop")
+    @classmethod
+    def _can_stop(cls, stop: StopConfig, info: ValidationInfo) -> StopConfig:
+        sampler = info.data.get("sampler")
+        if sampler and sampler.chains < 2 and stop.rhat is not None:
+            raise _wrong("rhat", "R-hat needs sampler.chains of at least 2; expected null with one chain")
+        if sampler and stop.max_steps < 2 * sampler.thin:
+            raise _wrong("max_steps", f"expected at least two kept draws, {2 * sampler.thin} steps")
+        return stop
+
+
+def _wrong(key: str, message: str) -> PydanticCustomError:
+    """An error that belongs to one key of the section that the validator sees."""
+    return PydanticCustomError("wrong", "{message}", {"message": message, "key": key})

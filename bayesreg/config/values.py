@@ -1,0 +1,71 @@
+"""Kinds of values in a configuration: numbers within bounds, files that are looked for, directions."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
+
+DATA_FOLDER = "BAYESREG_DATA"
+
+
+def _find_file(value: object, info: ValidationInfo) -> Path:
+    if not isinstance(value, str | Path) or not str(value):
+        raise ValueError("expected the path of a file")
+    folders = (info.context or {}).get("folders", ()) or search_folders()
+    places = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
+    for place in places:
+        if place.is_file():
+            return place
+    hint = "" if Path(value).is_absolute() or os.environ.get(DATA_FOLDER) else f" (and {DATA_FOLDER} is not set)"
+    raise ValueError(f"no such file; looked for {' and '.join(map(str, places))}{hint}")
+
+
+def search_folders(*beside: Path) -> list[Path]:
+    """Where relative paths are looked for, the first place first."""
+    data = os.environ.get(DATA_FOLDER)
+    return [*beside, Path.cwd(), *([Path(data)] if data else [])]
+
+
+def find_field(value: object, info: ValidationInfo) -> object:
+    """A word for a displacement field as it is, anything else as a file."""
+    return value if value in ("identity", "truth") else _find_file(value, info)
+
+
+def _as_pair(value: object) -> object:
+    return (value, value) if isinstance(value, int | float) else value
+
+
+def _as_list(value: object) -> object:
+    return (value,) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError("expected the lower value first")
+    return pair
+
+
+def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    length = math.hypot(*vector)
+    if length == 0:
+        raise ValueError("expected a direction that is not zero")
+    if math.isclose(length, 1, rel_tol=1e-12):
+        return vector  # What was written out as resolved reads back unchanged.
+    x, y, z = (component / length for component in vector)
+    return x, y, z
+
+
+Number = Annotated[float, Field(strict=True)]
+Positive = Annotated[float, Field(strict=True, gt=0)]
+NotNegative = Annotated[float, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+Label = Annotated[int, Field(strict=True)]
+Labels = Annotated[tuple[Label, ...], BeforeValidator(_as_list), Field(min_length=1)]
+FoundFile = Annotated[Path, BeforeValidator(_find_file)]
+Fraction = Annotated[float, Field(strict=True, ge=0, le=2)]
+Range = Annotated[tuple[Fraction, Fraction], BeforeValidator(_as_pair), AfterValidator(_ascending)]
+Direction = Annotated[tuple[Number, Number, Number], AfterValidator(_unit)]

@@ -1,0 +1,150 @@
+"""Anatomies to register: MNI152 from nilearn's wheel, BrainWeb and Colin27, and one's own, from files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import nibabel as nib
+import numpy as np
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.io.domain import TISSUES, main_part
+from bayesreg.io.volumes import LabelTable, check_same_grid, check_same_space, load_image, load_labels
+from bayesreg.types import InputError
+
+__all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152"]
+
+DATA_VARIABLE = "BAYESREG_DATA"
+BRAINWEB_TABLE: dict[str, tuple[int, ...]] = {"csf": (1,), "gm": (2, 8), "wm": (3,)}
+BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
+# How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
+MNI152_SKULL = 3.0
+
+
+class Anatomy(NamedTuple):
+    """One head: an image, its tissues, and where the brain may be.
+
+    Attributes
+    ----------
+    image : Image
+        T1.
+    tissue : Image
+        int8 on the grid of the image: 0 outside, 1 CSF, 2 GM, 3 WM.
+    intracranial : Image or None
+        uint8 on the grid of the image, 1 inside the skull; None where it is not known.
+    """
+
+    image: Image
+    tissue: Image
+    intracranial: Image | None
+
+
+def mni152() -> Anatomy:
+    """The MNI152 (ICBM 2009a, symmetric, 1 mm) that ships with nilearn; no network.
+
+    The T1, in [0, 1], is stripped of its skull. The tissue is the likeliest of GM, WM and the rest (CSF) inside
+    the brain mask; the intracranial mask is the brain mask dilated by 3 mm.
+    Fonov et al., "Unbiased average age-appropriate atlases for pediatric studies", 2011.
+    """
+    # Takes seconds to import, and only this anatomy needs it.
+    from nilearn import datasets
+
+    t1, gm, wm = (
+        _from_nibabel(load(resolution=1))
+        for load in (datasets.load_mni152_template, datasets.load_mni152_gm_template, datasets.load_mni152_wm_template)
+    )
+    brain = _from_nibabel(datasets.load_mni152_brain_mask(resolution=1)).voxels != 0
+    likelihood = np.stack([1 - gm.voxels - wm.voxels, gm.voxels, wm.voxels])
+    tissue = np.where(brain, likelihood.argmax(axis=0) + 1, 0)
+    inside = ndimage.distance_transform_edt(~brain, sampling=t1.voxel_sizes) <= MNI152_SKULL
+    return Anatomy(t1, t1.with_voxels(tissue.astype(np.int8)), t1.with_voxels(inside.astype(np.uint8)))
+
+
+def brainweb(
+    labels_path: str | Path | None = None,
+    t1_path: str | Path | None = None,
+    intracranial_labels: Sequence[int] = BRAINWEB_INTRACRANIAL,
+) -> Anatomy:
+    """BrainWeb's label phantom with Colin27, the scan that it was drawn from.
+
+    Parameters
+    ----------
+    labels_path : path, optional
+        Discrete BrainWeb labels: 1 CSF, 2 GM, 3 WM, 8 glial (counted as GM). The default is
+        brainweb_crisp_1mm.nii.gz in the folder that the environment variable BAYESREG_DATA names.
+    t1_path : path, optional
+        T1 on the same grid; the default is colin27_t1_1mm_unedited.nii.gz there.
+    intracranial_labels : sequence of int
+        Labels inside the skull; the largest connected part of their union is the intracranial mask.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or unreadable, lacks a label, the grids differ, or the mask has several large parts.
+
+    References
+    ----------
+    Collins et al., IEEE Trans. Med. Imaging 17(3), 1998; Cocosco et al., NeuroImage 5(4), 1997; Kwan et al.,
+    IEEE Trans. Med. Imaging 18(11), 1999; Holmes et al., J. Comput. Assist. Tomogr. 22(2), 1998.
+    """
+    labels_path = _data_file(labels_path, "brainweb_crisp_1mm.nii.gz")
+    t1 = load_image(_data_file(t1_path, "colin27_t1_1mm_unedited.nii.gz"))
+    tissue = load_labels(labels_path, BRAINWEB_TABLE)
+    check_same_grid(t1, tissue, ("T1", "label"))
+    inside = load_labels(labels_path, {"intracranial": tuple(intracranial_labels)})
+    mask = main_part(np.asarray(inside.voxels) != 0, "intracranial mask")
+    return Anatomy(t1, tissue.with_voxels(tissue.voxels * mask), tissue.with_voxels(mask.astype(np.uint8)))
+
+
+def from_files(
+    image_path: str | Path,
+    labels_path: str | Path,
+    label_table: LabelTable,
+    intracranial_path: str | Path | None = None,
+) -> Anatomy:
+    """An anatomy of one's own.
+
+    Parameters
+    ----------
+    image_path : path
+        The fixed image.
+    labels_path : path
+        Tissue labels on its grid.
+    label_table : mapping
+        Label values of "csf", "gm" and "wm".
+    intracranial_path : path, optional
+        Image on the same grid that is not zero where the brain may be.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or unreadable, the table names other tissues or labels that are absent, or the grids
+        differ.
+    """
+    if set(label_table) != set(TISSUES):
+        raise InputError(f"the label table must name {', '.join(TISSUES)}; got {', '.join(label_table) or 'nothing'}")
+    image = load_image(image_path)
+    tissue = load_labels(labels_path, {name: label_table[name] for name in TISSUES})
+    check_same_grid(image, tissue, ("fixed", "label"))
+    if intracranial_path is None:
+        return Anatomy(image, tissue, None)
+    mask = load_image(intracranial_path)
+    check_same_grid(image, mask, ("fixed", "intracranial"))
+    return Anatomy(image, tissue, mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)))
+
+
+def _from_nibabel(source: nib.Nifti1Image) -> Image:
+    return Image(np.asarray(source.dataobj), source.affine)
+
+
+def _data_file(path: str | Path | None, name: str) -> Path:
+    if path is not None:
+        return Path(path)
+    folder = os.environ.get(DATA_VARIABLE)
+    if not folder:
+        raise InputError(f"give the path of {name}, or let the environment variable {DATA_VARIABLE} name its folder")
+    return Path(folder) / name

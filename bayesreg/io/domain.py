@@ -1,0 +1,121 @@
+"""The region to mesh, Ω, and its tissues, from a tissue map and an intracranial mask."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from jaxtyping import Bool
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.io.volumes import check_same_grid
+from bayesreg.types import InputError
+
+TISSUES = ("csf", "gm", "wm")
+CSF, GM, WM = 1, 2, 3
+SPECK = 0.01
+
+_log = logging.getLogger(__name__)
+
+
+class MeshError(InputError):
+    """Labels cannot be meshed, or a mesh does not stand for its labels."""
+
+
+def mesh_domain(tissue: Image, intracranial: Image | None = None, closing: float = 8.0) -> Image:
+    """The region Ω: the hull of grey and white matter, inside the intracranial mask.
+
+    The hull is GM and WM closed by a ball, its holes filled, so that ventricles and sulci belong to it.
+
+    Parameters
+    ----------
+    tissue : Image
+        0 outside, 1 CSF, 2 GM, 3 WM.
+    intracranial : Image, optional
+        Nonzero inside the skull, on the grid of the tissue map; without it nothing bounds the hull.
+    closing : float
+        Radius of the ball, mm. Exact for affines whose axes are orthogonal.
+
+    Returns
+    -------
+    Image
+        uint8, 1 inside.
+
+    Raises
+    ------
+    MeshError
+        If there is no GM or no WM, the intracranial mask is empty or misses them, or a mask has several
+        large parts. Parts below 1 % of a mask are left out, and the log says so.
+    """
+    voxels = np.asarray(tissue.voxels)
+    for name, index in (("gm", GM), ("wm", WM)):
+        if not (voxels == index).any():
+            raise MeshError(f"the tissue map holds no {name} (value {index}); it holds {np.unique(voxels).tolist()}")
+    brain = (voxels == GM) | (voxels == WM)
+    hull = _filled(_closed(brain, tissue.voxel_sizes, closing))
+    if intracranial is not None:
+        hull &= _intracranial_part(tissue, intracranial)
+        if (hull & brain).sum() < 0.5 * brain.sum():
+            raise MeshError(
+                "more than half of the GM and WM lies outside the intracranial mask; do the two belong together?"
+            )
+    # The skull may cut the hull, and what it cuts off may leave holes.
+    return tissue.with_voxels(_filled(main_part(hull, "region to mesh")).astype(np.uint8))
+
+
+def domain_labels(tissue: Image, domain: Image) -> Image:
+    """Tissue of every voxel of Ω, int8: 0 outside, GM and WM as in the tissue map, all else CSF.
+
+    Raises
+    ------
+    MeshError
+        If one of the three is missing.
+    """
+    voxels = np.asarray(tissue.voxels)
+    inside = np.where((voxels == GM) | (voxels == WM), voxels, CSF)
+    labels = np.where(np.asarray(domain.voxels) != 0, inside, 0).astype(np.int8)
+    missing = [name for index, name in enumerate(TISSUES, start=1) if not (labels == index).any()]
+    if missing:
+        raise MeshError(f"the region to mesh holds no {' and no '.join(missing)}")
+    return tissue.with_voxels(labels)
+
+
+def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X Y Z"]:
+    """The connected part of a mask that is all but specks; MeshError if it is empty or has several large parts."""
+    parts, count = ndimage.label(mask)
+    if count == 0:
+        raise MeshError(f"the {name} is empty")
+    if count == 1:
+        return mask
+    sizes = np.bincount(parts.ravel())[1:]
+    large = np.flatnonzero(sizes >= SPECK * sizes.sum())
+    if len(large) > 1:
+        shares = ", ".join(f"{sizes[i] / sizes.sum():.0%}" for i in large[np.argsort(-sizes[large])])
+        raise MeshError(f"the {name} has {len(large)} separate parts ({shares} of its volume); expected one")
+    dropped = int(sizes.sum() - sizes.max())
+    _log.info("%d specks of the %s left out, %d voxels together", count - 1, name, dropped)
+    return parts == sizes.argmax() + 1
+
+
+def _intracranial_part(tissue: Image, intracranial: Image) -> Bool[np.ndarray, "X Y Z"]:
+    check_same_grid(tissue, intracranial, ("tissue", "intracranial"))
+    return main_part(np.asarray(intracranial.voxels) != 0, "intracranial mask")
+
+
+def _closed(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: float) -> Bool[np.ndarray, "X Y Z"]:
+    """Dilated, then eroded by a ball (mm); the surroundings of the grid count as empty."""
+    box = ndimage.find_objects(mask.astype(np.int8))[0]
+    margin = [(n, n) for n in np.ceil(radius / voxel_sizes).astype(int) + 1]
+    near = np.pad(mask[box], margin)
+    grown = ndimage.distance_transform_edt(~near, sampling=voxel_sizes) <= radius
+    closed = ndimage.distance_transform_edt(grown, sampling=voxel_sizes) > radius
+    result = np.zeros_like(mask)
+    result[box] = closed[tuple(slice(a, -b) for a, b in margin)]
+    return result
+
+
+def _filled(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
+    """The mask and its holes: what cannot be reached from beyond the grid."""
+    parts, _ = ndimage.label(~np.pad(mask, 1))
+    return (parts != parts[0, 0, 0])[1:-1, 1:-1, 1:-1]

@@ -1,0 +1,200 @@
+"""Is a mesh sound, and does it stand for its labels?"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from bayesreg.image import Image
+from bayesreg.io.domain import MeshError
+from bayesreg.mesh import TetMesh, signed_volumes
+
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+LEAST_MEAN_RATIO = 0.05
+# Volumes may be off by this times edge length over the cube root of the volume of Ω: an interface is known
+# to within a fraction of an edge length, and what is thinner than that is lost.
+VOLUME_TOLERANCE = 0.75
+
+
+class MeshQuality(NamedTuple):
+    """Figures of a mesh.
+
+    Attributes
+    ----------
+    nodes, cells, boundary_nodes : int
+    genus : int
+        Handles of the boundary surface; 0 for a ball.
+    edge_length : float
+        Median, mm.
+    mean_ratio : float
+        Least 12 (3V)^(2/3) / Σ l² over the tetrahedra; 1 is regular, 0 flat.
+    median_mean_ratio : float
+    dihedral_angle : float
+        Least angle between two faces of a tetrahedron, degrees.
+    tissue_cells : dict
+        Number of tetrahedra by tissue name.
+    tissue_volumes, label_volumes : dict
+        mm³ by tissue name, in the mesh and in the labels.
+    volume_tolerance : float
+        What the difference of the two may be, mm³.
+    """
+
+    nodes: int
+    cells: int
+    boundary_nodes: int
+    genus: int
+    edge_length: float
+    mean_ratio: float
+    median_mean_ratio: float
+    dihedral_angle: float
+    tissue_cells: dict[str, int]
+    tissue_volumes: dict[str, float]
+    label_volumes: dict[str, float]
+    volume_tolerance: float
+
+
+def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
+    """Check a mesh against the labels that it was made of, and measure it.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Positively oriented, which its making has checked.
+    labels : Image
+        Tissue in Ω and 0 outside, as `domain_labels` makes it; 1 + index into the mesh's names.
+
+    Returns
+    -------
+    MeshQuality
+
+    Raises
+    ------
+    MeshError
+        If the mesh has several parts, its boundary is not one closed manifold surface, a tetrahedron is
+        nearly flat (mean ratio below 0.05), a tissue has no tetrahedron, or the volume of Ω or a tissue
+        differs from that of its labels by more than 0.75 h |Ω|^(2/3), h the median edge length.
+    """
+    _check_connected(mesh)
+    genus = _check_boundary(mesh)
+    ratio = mean_ratio(mesh.points, mesh.cells)
+    if ratio.min() < LEAST_MEAN_RATIO:
+        raise MeshError(
+            f"tetrahedron {ratio.argmin()} is nearly flat: mean ratio {ratio.min():.3g}, least {LEAST_MEAN_RATIO}"
+        )
+    quality = _measure(mesh, labels, ratio, genus)
+    _check_tissues(quality)
+    return quality
+
+
+def mean_ratio(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> Float[np.ndarray, "cells"]:
+    """Shape of every tetrahedron, 12 (3V)^(2/3) / Σ l²: 1 regular, 0 flat or inverted (Liu and Joe, 1994)."""
+    volume = np.maximum(signed_volumes(points, cells), 0)
+    return 12 * np.cbrt(3 * volume) ** 2 / (edge_lengths(points, cells) ** 2).sum(axis=1)
+
+
+def edge_lengths(
+    points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]
+) -> Float[np.ndarray, "cells 6"]:
+    """Lengths of the edges of every tetrahedron, mm."""
+    ends = points[cells[:, EDGES]]
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
+
+
+def dihedral_angles(
+    points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]
+) -> Float[np.ndarray, "cells 6"]:
+    """Angles between the faces of every tetrahedron, degrees."""
+    corner = points[cells]
+    # The gradients of the barycentric coordinates are the inward normals of the faces.
+    inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])
+    normal = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2).transpose(0, 2, 1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    cosine = (normal[:, EDGES[:, 0]] * normal[:, EDGES[:, 1]]).sum(axis=-1)
+    return np.degrees(np.arccos(np.clip(-cosine, -1, 1)))
+
+
+def _check_connected(mesh: TetMesh) -> None:
+    parts = _count_parts(len(mesh.points), mesh.cells[:, EDGES].reshape(-1, 2))
+    if parts > 1:
+        raise MeshError(f"the mesh has {parts} separate parts, expected one")
+
+
+def _check_boundary(mesh: TetMesh) -> int:
+    """Genus of the boundary, once it is known to be one closed manifold surface."""
+    faces = mesh.boundary_faces
+    half_edges = faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2)
+    edges, count = np.unique(np.sort(half_edges, axis=1), axis=0, return_counts=True)
+    if (count != 2).any():
+        raise MeshError(
+            f"{(count != 2).sum()} edges of the boundary belong to more than two of its faces; it is no manifold"
+        )
+    _check_fans(faces)
+    nodes, index = np.unique(edges, return_inverse=True)
+    parts = _count_parts(len(nodes), index.reshape(-1, 2))
+    if parts > 1:
+        raise MeshError(f"the boundary has {parts} separate surfaces, expected one: the mesh has cavities")
+    return (2 - (len(nodes) - len(edges) + len(faces))) // 2
+
+
+def _check_fans(faces: Int[np.ndarray, "faces 3"]) -> None:
+    """Around each node of a manifold, the faces form one ring: corners linked across shared edges stay one part."""
+    number = np.arange(faces.size).reshape(-1, 3)
+    # Each half-edge (a → b) of one face meets (b → a) of another: their corners at a, and at b, are neighbours.
+    half = np.concatenate(
+        [np.stack([faces[:, i], faces[:, j], number[:, i], number[:, j]], axis=1) for i, j in ((0, 1), (1, 2), (2, 0))]
+    )
+    forward = half[half[:, 0] < half[:, 1]]
+    backward = half[half[:, 0] > half[:, 1]][:, (1, 0, 3, 2)]
+    forward, backward = (part[np.lexsort((part[:, 1], part[:, 0]))] for part in (forward, backward))
+    links = np.concatenate([np.stack([forward[:, k], backward[:, k]], axis=1) for k in (2, 3)])
+    pinched = _count_parts(faces.size, links) - len(np.unique(faces))
+    if pinched:
+        raise MeshError(f"the boundary touches itself at {pinched} nodes; it is no manifold")
+
+
+def _count_parts(nodes: int, links: Int[np.ndarray, "links 2"]) -> int:
+    graph = sparse.coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), (nodes, nodes))
+    return int(connected_components(graph, directed=False)[0])
+
+
+def _measure(mesh: TetMesh, labels: Image, ratio: Float[np.ndarray, "cells"], genus: int) -> MeshQuality:
+    count = len(mesh.names)
+    cells = np.bincount(mesh.tissue, minlength=count)
+    volumes = np.bincount(mesh.tissue, mesh.volumes, minlength=count)
+    voxels = np.bincount(np.asarray(labels.voxels).ravel(), minlength=count + 1)[1 : count + 1]
+    edge = float(np.median(edge_lengths(mesh.points, mesh.cells)))
+    expected = voxels * labels.voxel_volume
+    return MeshQuality(
+        nodes=len(mesh.points),
+        cells=len(mesh.cells),
+        boundary_nodes=len(mesh.boundary),
+        genus=genus,
+        edge_length=edge,
+        mean_ratio=float(ratio.min()),
+        median_mean_ratio=float(np.median(ratio)),
+        dihedral_angle=float(dihedral_angles(mesh.points, mesh.cells).min()),
+        tissue_cells=dict(zip(mesh.names, cells.tolist(), strict=True)),
+        tissue_volumes=dict(zip(mesh.names, volumes.tolist(), strict=True)),
+        label_volumes=dict(zip(mesh.names, expected.tolist(), strict=True)),
+        volume_tolerance=float(VOLUME_TOLERANCE * edge * expected.sum() ** (2 / 3)),
+    )
+
+
+def _check_tissues(quality: MeshQuality) -> None:
+    absent = [name for name, count in quality.tissue_cells.items() if count == 0]
+    if absent:
+        raise MeshError(
+            f"no tetrahedron is {' or '.join(absent)}: the tissue is too thin for this edge length, or is not there"
+        )
+    found = {**quality.tissue_volumes, "all": sum(quality.tissue_volumes.values())}
+    expected = {**quality.label_volumes, "all": sum(quality.label_volumes.values())}
+    for name, volume in found.items():
+        if abs(volume - expected[name]) > quality.volume_tolerance:
+            raise MeshError(
+                f"the mesh holds {volume / 1000:.1f} ml of {name}, the labels {expected[name] / 1000:.1f} ml; "
+                f"they may differ by {quality.volume_tolerance / 1000:.1f} ml at this edge length"
+            )

@@ -1,0 +1,274 @@
+"""The run folder: inputs, results, and the checkpoints that a killed run continues from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import meshio
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.image import Image
+from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
+from bayesreg.io.meshing import load_mesh, save_mesh
+from bayesreg.io.volumes import load_image, save_displacement, save_image
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray, InputError
+
+RESULTS = ("config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html")
+
+
+class Truth(NamedTuple):
+    """What is known of a synthetic pair.
+
+    Attributes
+    ----------
+    u : (n, 3) array
+        True displacement of every node of the run's mesh, mm.
+    lam, mu : (T,) array
+        True Lamé parameters by tissue.
+    initial : (n, 3) array or None
+        Displacement that the first chain started from, mm; None for the identity.
+    """
+
+    u: AnyArray
+    lam: AnyArray
+    mu: AnyArray
+    initial: AnyArray | None = None
+
+
+class Inputs(NamedTuple):
+    """What a run starts from, and what a resumed run must find unchanged.
+
+    Attributes
+    ----------
+    config : str
+        The resolved configuration, YAML.
+    mesh : TetMesh
+    fixed, moving : Image
+        As the model saw them (one common intensity scale).
+    tissue : Image
+        Tissue labels on a grid of the fixed space, 0 outside, 1 + index into `mesh.names` inside.
+    skull : Image or None
+        Nonzero where no sampled node may go.
+    truth : Truth or None
+    """
+
+    config: str
+    mesh: TetMesh
+    fixed: Image
+    moving: Image
+    tissue: Image
+    skull: Image | None = None
+    truth: Truth | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished run in memory; its draws travel beside it.
+
+    Attributes
+    ----------
+    config, mesh, fixed, moving, tissue, skull, truth
+        As in `Inputs`.
+    manifest : dict
+        The content of run.json.
+    u_mean, u_sd : (n, 3) array
+        Posterior mean and standard deviation of the displacement of every node, mm.
+    warped : Image
+        Moving image resampled on the fixed grid by the posterior mean.
+    metrics : dict or None
+        The content of metrics.json, where the truth is known.
+    """
+
+    config: str
+    manifest: dict[str, Any]
+    mesh: TetMesh
+    u_mean: Float[AnyArray, "nodes 3"]
+    u_sd: Float[AnyArray, "nodes 3"]
+    fixed: Image
+    moving: Image
+    tissue: Image
+    warped: Image
+    skull: Image | None = None
+    truth: Truth | None = None
+    metrics: dict[str, Any] | None = None
+
+    @property
+    def inputs(self) -> Inputs:
+        """What the run started from."""
+        return Inputs(self.config, self.mesh, self.fixed, self.moving, self.tissue, self.skull, self.truth)
+
+
+def require_fresh(folder: str | Path) -> None:
+    """Raise InputError where a folder (or a file in its place) already holds a run."""
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"the output folder {folder} is a file; name a folder that is new or empty")
+    held = [name for name in RESULTS if (folder / name).exists()]
+    if held:
+        raise InputError(
+            f"the output folder {folder} already holds a run ({', '.join(held)}); "
+            "name another folder, or continue that run with --resume"
+        )
+
+
+def write_inputs(folder: str | Path, inputs: Inputs) -> None:
+    """Write config.yaml, mesh.vtu and inputs/ into a folder, which is made if need be."""
+    folder = Path(folder)
+    images = folder / "inputs"
+    images.mkdir(parents=True, exist_ok=True)
+    for name in ("fixed", "moving", "tissue", "skull"):
+        image = getattr(inputs, name)
+        if image is not None:
+            save_image(image, images / f"{name}.nii.gz")
+    if inputs.truth is not None:
+        known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
+        save_arrays(images / "truth.npz", known)
+    save_mesh(inputs.mesh, folder / "mesh.vtu")
+    write_text(folder / "config.yaml", inputs.config)
+
+
+def read_inputs(folder: str | Path) -> Inputs:
+    """Read what `write_inputs` wrote; InputError where a part is missing or unreadable."""
+    folder = Path(folder)
+    images = folder / "inputs"
+    config = _require(folder, "config.yaml").read_text(encoding="utf-8")
+    mesh = load_mesh(_require(folder, "mesh.vtu"))
+    fixed, moving, tissue = (
+        load_image(_require(folder, f"inputs/{name}.nii.gz")) for name in ("fixed", "moving", "tissue")
+    )
+    skull = load_image(images / "skull.nii.gz") if (images / "skull.nii.gz").exists() else None
+    truth = Truth(**load_arrays(images / "truth.npz")) if (images / "truth.npz").exists() else None
+    return Inputs(config, mesh, fixed, moving, tissue, skull, truth)
+
+
+def write_run(
+    folder: str | Path,
+    run: Run,
+    displacement_mean: Float[np.ndarray, "X Y Z 3"] | None = None,
+    displacement_sd: Float[np.ndarray, "X Y Z 3"] | None = None,
+) -> None:
+    """Write everything of a run folder except the draws and the report: `write_inputs`, then `write_results`."""
+    write_inputs(folder, run.inputs)
+    write_results(folder, run, displacement_mean, displacement_sd)
+
+
+def write_results(
+    folder: str | Path,
+    run: Run,
+    displacement_mean: Float[np.ndarray, "X Y Z 3"] | None = None,
+    displacement_sd: Float[np.ndarray, "X Y Z 3"] | None = None,
+) -> None:
+    """Write what a finished run adds to its inputs, run.json last.
+
+    Parameters
+    ----------
+    folder : path
+        Where `write_inputs` has written; files of the same names are replaced, each in one step.
+    run : Run
+    displacement_mean, displacement_sd : (X, Y, Z, 3) arrays, optional
+        Posterior mean and standard deviation of u on the fixed grid, world RAS, mm. The mean is written as a
+        resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
+    """
+    folder = Path(folder)
+    save_mesh(run.mesh, folder / "mesh.vtu", point_data={"u_mean": run.u_mean, "u_sd": run.u_sd})
+    save_image(run.warped, folder / "warped_mean.nii.gz")
+    if displacement_mean is not None:
+        save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, run.fixed.affine)
+    if displacement_sd is not None:
+        # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
+        unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
+        save_displacement(folder / "displacement_sd.nii.gz", unsigned, run.fixed.affine)
+    if run.metrics is not None:
+        write_json(folder / "metrics.json", run.metrics)
+    write_json(folder / "run.json", run.manifest)
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read what `write_run` wrote.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished run, or a part of it is missing or unreadable.
+    """
+    folder = Path(folder)
+    manifest = read_json(_require(folder, "run.json"))
+    inputs = read_inputs(folder)
+    u_mean, u_sd = read_point_data(folder / "mesh.vtu", "u_mean", "u_sd")
+    warped = load_image(_require(folder, "warped_mean.nii.gz"))
+    metrics = read_json(folder / "metrics.json") if (folder / "metrics.json").exists() else None
+    return Run(manifest=manifest, u_mean=u_mean, u_sd=u_sd, warped=warped, metrics=metrics, **inputs._asdict())
+
+
+def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
+    """Named nodal arrays of a mesh file; InputError where one is missing."""
+    data = meshio.read(path).point_data
+    missing = [name for name in names if name not in data]
+    if missing:
+        raise InputError(f"{path} holds no {' and no '.join(missing)}: the run has not been finished")
+    return [np.asarray(data[name], float) for name in names]
+
+
+def read_displacement(path: Path, mesh: TetMesh) -> Float[np.ndarray, "nodes 3"]:
+    """A displacement of every node: array "u" of an .npz file, or "u" or "u_mean" of a .vtu mesh, mm.
+
+    Raises
+    ------
+    InputError
+        If the file holds none, or one for another mesh.
+    """
+    data = load_arrays(path) if path.suffix == ".npz" else meshio.read(path).point_data
+    found = [data[name] for name in ("u", "u_mean") if name in data]
+    if not found:
+        raise InputError(f"{path} holds no displacement: expected an array named 'u', got {', '.join(data) or 'none'}")
+    if np.shape(found[0]) != mesh.points.shape or not np.isfinite(found[0]).all():
+        raise InputError(
+            f"the displacement in {path} has shape {np.shape(found[0])} or is not finite; "
+            f"expected {mesh.points.shape}, one finite row per node of the run's mesh"
+        )
+    return np.asarray(found[0], float)
+
+
+def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:
+    """Write one block of draws in one step; a block of the same index is replaced."""
+    draws = Path(folder) / "draws"
+    draws.mkdir(parents=True, exist_ok=True)
+    save_arrays(draws / f"block_{index:05d}.npz", arrays)
+
+
+def count_blocks(folder: str | Path) -> int:
+    """Number of blocks of draws; InputError where one in the middle is missing."""
+    names = sorted(path.name for path in (Path(folder) / "draws").glob("block_*.npz"))
+    expected = [f"block_{index:05d}.npz" for index in range(len(names))]
+    gaps = sorted(set(expected) - set(names))
+    if gaps:
+        raise InputError(f"{Path(folder) / 'draws'} holds {len(names)} blocks, but {gaps[0]} is missing")
+    return len(names)
+
+
+def load_blocks(folder: str | Path, count: int | None = None) -> Iterator[dict[str, np.ndarray]]:
+    """The first `count` blocks of draws (all, by default), in order, one in memory at a time."""
+    for index in range(count_blocks(folder) if count is None else count):
+        yield load_arrays(_require(Path(folder), f"draws/block_{index:05d}.npz"))
+
+
+def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
+    """Replace state.npz, what the next block starts from, in one step."""
+    save_arrays(Path(folder) / "state.npz", arrays)
+
+
+def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
+    """The content of state.npz; None where there is none."""
+    path = Path(folder) / "state.npz"
+    return load_arrays(path) if path.exists() else None
+
+
+def _require(folder: Path, name: str) -> Path:
+    if not (folder / name).exists():
+        raise InputError(f"{folder} holds no finished run: {name} is missing")
+    return folder / name

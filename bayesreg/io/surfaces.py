@@ -1,0 +1,188 @@
+"""Triangulated surfaces of Ω and of the tissues in it, and how fine to mesh where."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from skimage import measure
+
+from bayesreg.image import Image
+from bayesreg.io.domain import CSF, WM, main_part
+from bayesreg.mesh import signed_volumes
+
+# In units of the edge length: what the mesh cannot show is smoothed away (standard deviation), and the
+# triangles that describe the rest need not be finer than the stride.
+SMOOTHING = 0.22
+FLUID_SMOOTHING = 0.12
+STRIDE = 0.25
+# Millimetres of edge length per millimetre of depth: neighbours stay alike in size.
+GROWTH = 0.7
+
+
+class Surface(NamedTuple):
+    """A triangulated surface.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        World RAS, mm.
+    faces : (m, 3) array
+        Indices into points, normals outwards.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    faces: Int[np.ndarray, "faces 3"]
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume, mm³; negative where the normals point inwards."""
+        a, b, c = np.moveaxis(self.points[self.faces], 1, 0)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+class Sizing(NamedTuple):
+    """Wanted edge length on a background mesh.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        World RAS, mm.
+    cells : (m, 4) array
+        Positively oriented tetrahedra.
+    values : (n,) array
+        Edge length at each point, mm.
+    """
+
+    points: Float[np.ndarray, "nodes 3"]
+    cells: Int[np.ndarray, "cells 4"]
+    values: Float[np.ndarray, "nodes"]
+
+
+def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
+    """Surfaces of Ω, of its white matter, and of the CSF deep inside, as far as a mesh can show them.
+
+    CSF nearer to the outer surface than half an edge length (sulci, the film under the skull) gets no surface
+    of its own, nor do parts and holes of a tissue smaller than a cube of half an edge length.
+
+    Parameters
+    ----------
+    labels : Image
+        As `domain_labels` makes it.
+    edge_length : float
+        mm.
+
+    Returns
+    -------
+    list of Surface
+        The outer one first. All have their normals outwards: for fTetWild, which goes by winding numbers, an
+        inner surface of opposite orientation would be the wall of a cavity.
+
+    Raises
+    ------
+    MeshError
+        If Ω vanishes or falls apart at this resolution.
+    """
+    grid = _CoarseGrid.around(labels, STRIDE * edge_length, margin=edge_length)
+    smallest = (edge_length / 2) ** 3 / grid.voxel_volume
+    outer = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length)
+    inside = main_part(outer > 0.5, f"region to mesh, smoothed for an edge length of {edge_length:g} mm,")
+    depth = ndimage.distance_transform_edt(inside, sampling=grid.spacing)
+    white = grid.smoothed(labels.voxels == WM, SMOOTHING * edge_length)
+    fluid = grid.smoothed(labels.voxels == CSF, FLUID_SMOOTHING * edge_length) * (depth > edge_length / 2)
+    fields = [np.where(inside, outer, 0), *(_without_specks(field, smallest) for field in (white, fluid))]
+    return [_surface(field, grid) for field in fields if field.max() > 0.5]
+
+
+def depth_sizing(labels: Image, edge_length: float, inner_edge_length: float) -> Sizing:
+    """Edge length that grows with the depth below the surface of Ω.
+
+    Parameters
+    ----------
+    labels : Image
+        Nonzero inside Ω.
+    edge_length, inner_edge_length : float
+        At the surface and beyond, and at most, mm.
+    """
+    grid = _CoarseGrid.around(labels, 0.6 * edge_length, margin=2 * edge_length)
+    inside = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length) > 0.5
+    # The distance is to the next voxel outside; the surface runs half-way.
+    depth = np.maximum(ndimage.distance_transform_edt(inside, sampling=grid.spacing) - grid.spacing.mean() / 2, 0)
+    indices = np.stack(np.meshgrid(*map(np.arange, depth.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    points = grid.to_world(indices)
+    values = np.minimum(edge_length + GROWTH * depth, inner_edge_length)
+    return Sizing(points, _kuhn_cells(depth.shape, points), values.ravel())
+
+
+class _CoarseGrid(NamedTuple):
+    """Every stride-th voxel of an image's padded grid, along each axis."""
+
+    stride: tuple[int, int, int]
+    padding: tuple[int, int, int]
+    affine: Float[np.ndarray, "4 4"]
+    voxel_sizes: Float[np.ndarray, "3"]
+
+    @classmethod
+    def around(cls, image: Image, spacing: float, margin: float) -> _CoarseGrid:
+        stride = np.maximum(1, np.rint(spacing / image.voxel_sizes)).astype(int)
+        padding = np.ceil(margin / image.voxel_sizes).astype(int) + stride
+        return cls(tuple(stride.tolist()), tuple(padding.tolist()), image.affine, image.voxel_sizes)
+
+    @property
+    def spacing(self) -> Float[np.ndarray, "3"]:
+        return self.voxel_sizes * self.stride
+
+    @property
+    def voxel_volume(self) -> float:
+        return float(abs(np.linalg.det(self.affine[:3, :3])) * np.prod(self.stride))
+
+    def smoothed(self, mask: Bool[np.ndarray, "X Y Z"], sigma: float) -> Float[np.ndarray, "A B C"]:
+        """The mask (0 beyond the grid) smoothed by a Gaussian of standard deviation sigma, mm."""
+        padded = np.pad(mask.astype(np.float32), [(n, n) for n in self.padding])
+        smooth = ndimage.gaussian_filter(padded, sigma / self.voxel_sizes, mode="constant")
+        coarse = smooth[tuple(slice(None, None, step) for step in self.stride)]
+        # The last plane may have been skipped; marching cubes closes a surface only inside its grid.
+        return np.pad(coarse, [(0, 1)] * 3)
+
+    def to_world(self, indices: np.ndarray) -> Float[np.ndarray, "n 3"]:
+        voxels = indices * np.array(self.stride) - self.padding
+        return voxels @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+
+def _without_specks(field: Float[np.ndarray, "A B C"], smallest: float) -> Float[np.ndarray, "A B C"]:
+    """The field, flattened where parts above 0.5 or holes in them have fewer voxels than `smallest`."""
+    for inside, level in ((field > 0.5, 0.0), (field <= 0.5, 1.0)):
+        parts, _ = ndimage.label(inside)
+        small = np.bincount(parts.ravel()) < smallest
+        small[0] = False
+        field = np.where(small[parts], np.float32(level), field)
+    return field
+
+
+def _surface(field: Float[np.ndarray, "A B C"], grid: _CoarseGrid) -> Surface:
+    vertices, faces, _, _ = measure.marching_cubes(field, 0.5)
+    surface = Surface(grid.to_world(vertices.astype(float)), faces.astype(np.int64))
+    return surface if surface.volume > 0 else surface._replace(faces=surface.faces[:, ::-1])
+
+
+def _kuhn_cells(shape: tuple[int, ...], points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 4"]:
+    """Six tetrahedra per cube of a grid, all along one diagonal, positively oriented."""
+    node = np.arange(np.prod(shape)).reshape(shape)
+    cells = []
+    for axes in permutations(range(3)):
+        corner = np.zeros((4, 3), int)
+        for step, axis in enumerate(axes, start=1):
+            corner[step:, axis] = 1
+        cells.append(np.stack([_shifted(node, offset) for offset in corner], axis=-1).reshape(-1, 4))
+    stacked = np.concatenate(cells)
+    inverted = signed_volumes(points, stacked) < 0
+    stacked[inverted] = stacked[inverted][:, (0, 2, 1, 3)]
+    return stacked
+
+
+def _shifted(node: Int[np.ndarray, "A B C"], offset: Int[np.ndarray, "3"]) -> Int[np.ndarray, "a b c"]:
+    """Nodes at an offset (0 or 1 per axis) from the first corner of every cube."""
+    return node[tuple(slice(o, n - 1 + o) for o, n in zip(offset, node.shape, strict=True))]

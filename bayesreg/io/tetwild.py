@@ -1,0 +1,121 @@
+"""fTetWild in a process of its own.
+
+It writes a file into the working directory and prints from native code, can neither be interrupted nor caught
+when it crashes, and none of that may reach the caller.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections import Counter, defaultdict
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayesreg.io.domain import MeshError
+from bayesreg.io.surfaces import Sizing, Surface
+from bayesreg.mesh import FACES, signed_volumes
+
+_PROGRAM = """
+import sys
+import numpy as np
+import pytetwild
+given = {name: value[()] for name, value in np.load("in.npz").items()}
+points, cells = pytetwild.tetrahedralize(**given, coarsen=True, vtk_ordering=True, quiet=sys.argv[1] == "quiet")
+np.savez("out.npz", points=points, cells=cells)
+"""
+
+
+def tetrahedralize(
+    surfaces: list[Surface],
+    sizing: Sizing,
+    *,
+    envelope: float,
+    stop_energy: float = 20.0,
+    threads: int = 0,
+    quiet: bool = True,
+) -> tuple[Float[np.ndarray, "nodes 3"], Int[np.ndarray, "cells 4"]]:
+    """Points and positively oriented cells of a tetrahedral mesh that follows the surfaces.
+
+    fTetWild (Hu, Schneider, Wang, Zorin, Panozzo, "Fast Tetrahedral Meshing in the Wild", 2020). Not
+    deterministic, even with one thread.
+
+    Parameters
+    ----------
+    surfaces : list of Surface
+        The mesh fills what the first encloses, and has faces along all of them.
+    sizing : Sizing
+        Wanted edge length.
+    envelope : float
+        How far the mesh's faces may lie from the surfaces, mm.
+    stop_energy : float
+        Quality (AMIPS energy, 3 at best) at which the optimisation may stop.
+    threads : int
+        0 for all cores.
+    quiet : bool
+        Whether to keep fTetWild's own output to itself.
+
+    Raises
+    ------
+    MeshError
+        If fTetWild fails or returns nothing.
+    """
+    points = np.concatenate([surface.points for surface in surfaces])
+    offsets = np.cumsum([0, *(len(surface.points) for surface in surfaces[:-1])])
+    faces = np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)])
+    given = {
+        "vertices": points,
+        "faces": faces.astype(np.int32),
+        "edge_length_abs": float(sizing.values.max()),
+        "epsilon": envelope / np.linalg.norm(np.ptp(points, axis=0)),
+        "stop_energy": stop_energy,
+        "num_threads": threads,
+        "bg_vertices": sizing.points,
+        "bg_tets": sizing.cells.astype(np.int32),
+        "bg_values": sizing.values,
+    }
+    points, cells = _run(given, quiet)
+    return points, _completed(points, cells)
+
+
+def _run(given: dict[str, object], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "in.npz", **given)
+        command = [sys.executable, "-c", _PROGRAM, "quiet" if quiet else "loud"]
+        done = subprocess.run(command, cwd=folder, capture_output=quiet, text=True, check=False)
+        if done.returncode:
+            words = (done.stderr or "no message").strip().splitlines()[-1]
+            raise MeshError(f"fTetWild failed (exit {done.returncode}: {words}); try another edge_length or envelope")
+        with np.load(Path(folder) / "out.npz") as result:
+            points, cells = result["points"], result["cells"].astype(np.int64)
+    if len(cells) == 0:
+        raise MeshError("fTetWild returned an empty mesh; try a shorter edge_length or a smaller envelope")
+    used, index = np.unique(cells, return_inverse=True)
+    return points[used].astype(float), index.reshape(-1, 4)
+
+
+def _completed(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "all 4"]:
+    """The cells and those that fTetWild leaves out by mistake: single ones, all of whose faces are there."""
+    missing = _missing_cells(cells)
+    if not missing:
+        return cells
+    added = np.array(missing)
+    inverted = signed_volumes(points, added) < 0
+    added[inverted] = added[inverted][:, (0, 2, 1, 3)]
+    return np.concatenate([cells, added])
+
+
+def _missing_cells(cells: Int[np.ndarray, "cells 4"]) -> list[tuple[int, ...]]:
+    faces, count = np.unique(np.sort(cells[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
+    around = defaultdict(list)
+    for face in faces[count == 1].tolist():
+        for edge in combinations(face, 2):
+            around[edge].append(face)
+    # Two faces that share an edge span a tetrahedron; where all four faces are there, its six edges name it.
+    spans = Counter(tuple(sorted({*a, *b})) for sharing in around.values() for a, b in combinations(sharing, 2))
+    present = set(map(tuple, np.sort(cells, axis=1).tolist()))
+    return [span for span, named in spans.items() if named == 6 and span not in present]

@@ -1,0 +1,299 @@
+"""The elastic body of least energy that touches an obstacle: held nodes, and nodes that must not enter it.
+
+minimise ½ uᵀKu over u, with u given at the held nodes and gap(p + u) ≥ floor at the others on the boundary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse.linalg import splu
+
+from bayesreg.mesh import TetMesh
+
+# How far to take the steps of the load before the last: mm, and quadratic programs.
+_ROUGHLY = 0.1
+_ITERATIONS_OF_A_PARTIAL_LOAD = 10
+
+Gap = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+class EnergyMinimum(NamedTuple):
+    """A displacement of least energy, and how well it satisfies the conditions of optimality.
+
+    Attributes
+    ----------
+    u : (n, 3) array
+        Displacement of every node, mm.
+    force : (n,) array
+        Contact force along the gradient of the gap (the multiplier), zero or positive; zero where a node is
+        not in contact.
+    violation : float
+        Largest depth below the floor of the gap, or height above it of a node with a contact force, mm.
+    stationarity : float
+        Largest force out of balance at a node that is not held, K u less the contact forces, each component
+        over its diagonal entry of K: mm.
+    iterations : int
+        Quadratic programs solved.
+    converged : bool
+        Whether both are below the tolerance.
+    """
+
+    u: Float[np.ndarray, "nodes 3"]
+    force: Float[np.ndarray, "nodes"]
+    violation: float
+    stationarity: float
+    iterations: int
+    converged: bool
+
+
+class _State(NamedTuple):
+    u: np.ndarray  # (n, 3)
+    force: np.ndarray  # (o,) multipliers of the nodes that may touch
+    penalty: np.ndarray  # (o,) weights of the ℓ1 penalty, at least the multipliers
+    direction: np.ndarray  # (n, 3) of the last step, and zero where that step was stretched
+
+
+class ContactProblem:
+    """Least elastic energy with some nodes held and the rest of the boundary outside an obstacle.
+
+    Sequential quadratic programming. The energy is quadratic already, so that each step replaces the gap by
+    its tangent planes and solves for the contact forces through the compliance of the boundary nodes; a line
+    search on the exact ℓ1 penalty makes it safe. The held nodes are moved to their places in several steps,
+    so that contact is met gradually: where there is more than one minimum, it is the one so reached.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    stiffness : (3n, 3n) sparse matrix
+        See `bayesreg.fem.elasticity.stiffness`.
+    held : (h,) int array
+        At least three nodes that are not in line, or the body is free to turn.
+    held_u : (h, 3) array
+        Their displacements, mm.
+    gap : callable
+        Positions (k, 3) to distances (k,) from the obstacle, mm, and their gradients (k, 3).
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        stiffness: scipy.sparse.csr_matrix,
+        held: Int[np.ndarray, "held"],
+        held_u: Float[np.ndarray, "held 3"],
+        gap: Gap,
+    ) -> None:
+        self.points, self.stiffness, self.gap = mesh.points, stiffness, gap
+        self.nodes = np.setdiff1d(mesh.boundary, held)
+        self._compliance = _Compliance(stiffness, held, self.nodes)
+        pushed = np.zeros_like(mesh.points)
+        pushed[held] = held_u
+        self._free = pushed - self._compliance.solve(stiffness @ pushed.ravel())
+
+    def solve(
+        self,
+        floor: Float[np.ndarray, "nodes"],
+        start: EnergyMinimum | None = None,
+        tolerance: float = 1e-6,
+        load_steps: int = 5,
+        max_iterations: int = 1000,
+    ) -> EnergyMinimum:
+        """Find the displacement of least energy.
+
+        Parameters
+        ----------
+        floor : (n,) array
+            The least gap of each node on the boundary, mm; entries of other nodes are not looked at.
+        start : EnergyMinimum, optional
+            Solution for other floors.
+        tolerance : float, default 1e-6
+            mm, for violation and stationarity.
+        load_steps : int, default 5
+            Ignored with a `start`.
+        max_iterations : int, default 1000
+            Quadratic programs in all.
+        """
+        floor, used = floor[self.nodes], 0
+        if start is None:
+            state = self._state(np.zeros_like(self.points), np.zeros(len(self.points)))
+        else:
+            state, load_steps = self._state(start.u, start.force), 0
+        for step in range(load_steps):
+            state = state._replace(u=state.u + self._free / load_steps)
+            load = (step + 1) / load_steps
+            state, count = self._iterate(state, floor, load, _ROUGHLY, _ITERATIONS_OF_A_PARTIAL_LOAD)
+            used += count
+        state, count = self._iterate(state, floor, 1.0, tolerance / 10, max_iterations - used)
+        return self._result(state, floor, used + count, tolerance)
+
+    def _state(self, u: np.ndarray, force: np.ndarray) -> _State:
+        nodal = force[self.nodes]
+        return _State(u, nodal, 1.5 * nodal, np.zeros_like(u))
+
+    def _iterate(
+        self, state: _State, floor: np.ndarray, load: float, tolerance: float, limit: int
+    ) -> tuple[_State, int]:
+        """Steps until one is shorter than the tolerance (mm); also their number."""
+        for count in range(1, limit + 1):
+            state, moved = self._step(state, floor, load)
+            if moved < tolerance:
+                return state, count
+        return state, limit
+
+    def _step(self, state: _State, floor: np.ndarray, load: float) -> tuple[_State, float]:
+        """One quadratic program and line search; also the largest distance to its solution, mm."""
+        gap, normal = self.gap((self.points + state.u)[self.nodes])
+        force = self._contact_forces(state, gap - floor, normal, load)
+        direction = load * self._free + self._compliance.solve(self._spread(force, normal)) - state.u
+        penalty = np.maximum(state.penalty, 1.5 * force)
+        first = _stretch(direction, state.direction)
+        length = self._line_search(state.u, direction, penalty, floor, gap, first)
+        kept = direction if length == 1 else np.zeros_like(direction)
+        return _State(state.u + length * direction, force, penalty, kept), float(np.abs(direction).max())
+
+    def _result(self, state: _State, floor: np.ndarray, used: int, tolerance: float) -> EnergyMinimum:
+        gap, normal = self.gap((self.points + state.u)[self.nodes])
+        out_of_balance = self.stiffness @ state.u.ravel() - self._spread(state.force, normal)
+        scaled = (out_of_balance / self.stiffness.diagonal())[self._compliance.free]
+        stationarity = float(np.abs(scaled).max())
+        lifted = np.abs(gap - floor)[state.force > 0].max(initial=0.0)
+        violation = float(max(lifted, (floor - gap).max(initial=0.0)))
+        force = np.zeros(len(self.points))
+        force[self.nodes] = state.force
+        return EnergyMinimum(state.u, force, violation, stationarity, used, max(violation, stationarity) < tolerance)
+
+    def _spread(self, force: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        nodal = np.zeros_like(self.points)
+        nodal[self.nodes] = force[:, None] * normal
+        return nodal.ravel()
+
+    def _contact_forces(self, state: _State, slack: np.ndarray, normal: np.ndarray, load: float) -> np.ndarray:
+        """Multipliers of the quadratic program; its working set grows until no tangent plane is crossed."""
+        offset = slack + (normal * (load * self._free - state.u)[self.nodes]).sum(axis=1)
+        force = np.zeros(len(self.nodes))
+        working = (state.force > 0) | (offset < 0)
+        while True:
+            index = np.flatnonzero(working)
+            block = self._compliance.block(index)
+            matrix = np.einsum("ai,aibj,bj->ab", normal[index], block[index], normal[index])
+            force[index] = complementarity(matrix, -offset[index], state.force[index] > 0)
+            moved = np.einsum("ni,nibj,bj,b->n", normal, block, normal[index], force[index], optimize=True)
+            crossed = ~working & (offset + moved < -1e-9)
+            if not crossed.any():
+                return force
+            working |= crossed
+
+    def _line_search(
+        self,
+        u: np.ndarray,
+        direction: np.ndarray,
+        penalty: np.ndarray,
+        floor: np.ndarray,
+        gap: np.ndarray,
+        first: float,
+    ) -> float:
+        """Step length at which energy and penalised violation fall (Armijo)."""
+        slope = float(direction.ravel() @ (self.stiffness @ u.ravel()))
+        curvature = float(direction.ravel() @ (self.stiffness @ direction.ravel()))
+        below = float(penalty @ np.maximum(floor - gap, 0))
+        expected = slope - below
+        length = first
+        while length > 1e-3:
+            trial, _ = self.gap((self.points + u + length * direction)[self.nodes])
+            change = length * slope + length**2 / 2 * curvature
+            change += float(penalty @ np.maximum(floor - trial, 0)) - below
+            if change <= 1e-4 * length * expected + 1e-12 * abs(slope):
+                break
+            length /= 2
+        return length
+
+
+def _stretch(direction: np.ndarray, previous: np.ndarray) -> float:
+    """Aitken's step length, where two steps in line say that the rest is a geometric series; otherwise 1.
+
+    The tangent planes leave the curvature of the obstacle out, which makes convergence linear.
+    """
+    dot, square, last = (float((a * b).sum()) for a, b in ((direction, previous), (direction,) * 2, (previous,) * 2))
+    in_line = dot**2 > 0.95 * square * last > 0
+    return 1 / (1 - dot / last) if in_line and -1 < dot / last < 0.98 else 1.0
+
+
+class _Compliance:
+    """K⁻¹ with the held nodes fixed: one factorisation, and the columns of nodes in contact as they come up."""
+
+    def __init__(self, stiffness: scipy.sparse.csr_matrix, held: np.ndarray, nodes: np.ndarray) -> None:
+        degrees = np.arange(stiffness.shape[0]).reshape(-1, 3)
+        self.free = np.delete(degrees, held, axis=0).ravel()
+        self.rows = degrees[nodes].ravel()
+        # Stiffness spans seven decades between CSF and brain; a unit diagonal lets the factor see both alike.
+        self.scale = 1 / np.sqrt(stiffness.diagonal()[self.free])
+        scaled = scipy.sparse.diags(self.scale) @ stiffness[self.free][:, self.free] @ scipy.sparse.diags(self.scale)
+        self.factor = splu(
+            scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        self.columns: dict[int, np.ndarray] = {}
+
+    def solve(self, force: np.ndarray) -> np.ndarray:
+        """Displacement (n, 3) under nodal forces (3n,); the held nodes stay."""
+        result = np.zeros_like(force)
+        result[self.free] = self._solve_free(force[self.free, None])[:, 0]
+        return result.reshape(-1, 3)
+
+    def block(self, index: np.ndarray) -> np.ndarray:
+        """(o, 3, k, 3): displacement of every node that may touch, by unit forces on those of `index`."""
+        new = [i for i in index if i not in self.columns]
+        for i, columns in zip(new, self._new_columns(np.array(new, int)), strict=True):
+            self.columns[i] = columns
+        if not len(index):
+            return np.zeros((len(self.rows) // 3, 3, 0, 3))
+        return np.stack([self.columns[i] for i in index], axis=2)
+
+    def _new_columns(self, index: np.ndarray) -> np.ndarray:
+        degrees = self.rows.reshape(-1, 3)[index].ravel()
+        unit = np.zeros((len(self.free), len(degrees)))
+        unit[np.searchsorted(self.free, degrees), np.arange(len(degrees))] = 1
+        response = self._solve_free(unit)[np.searchsorted(self.free, self.rows)]
+        return np.moveaxis(response.reshape(len(self.rows) // 3, 3, len(index), 3), 2, 0)
+
+    def _solve_free(self, force: np.ndarray) -> np.ndarray:
+        return self.scale[:, None] * self.factor.solve(self.scale[:, None] * force)
+
+
+def complementarity(
+    matrix: Float[np.ndarray, "k k"], demand: Float[np.ndarray, "k"], start: Bool[np.ndarray, "k"]
+) -> Float[np.ndarray, "k"]:
+    """Solve x ≥ 0, A x ≥ b, xᵀ(A x − b) = 0 for a symmetric positive definite A.
+
+    Block principal pivoting (Júdice and Pires, 1994): guess the support, solve, exchange all entries of the
+    wrong sign; where that stops paying, exchange the last one only (Murty), which always ends.
+
+    Parameters
+    ----------
+    matrix : (k, k) array
+        A.
+    demand : (k,) array
+        b.
+    start : (k,) bool array
+        First guess of the support of x.
+    """
+    size = 1 / np.sqrt(np.diag(matrix))
+    matrix, demand = size[:, None] * matrix * size, size * demand
+    active, fewest, patience = start.copy(), len(start) + 1, 3
+    slack_tolerance = 1e-11 * max(1.0, np.abs(demand).max(initial=0.0))
+    while True:
+        x = np.zeros(len(start))
+        if active.any():
+            x[active] = cho_solve(cho_factor(matrix[np.ix_(active, active)]), demand[active])
+        wrong = np.where(active, x < 0, matrix @ x - demand < -slack_tolerance)
+        count = int(wrong.sum())
+        if count == 0:
+            return size * x
+        patience = 3 if count < fewest else patience - 1
+        fewest = min(fewest, count)
+        exchange = wrong if patience > 0 else np.arange(len(wrong)) == np.flatnonzero(wrong)[-1]
+        active ^= exchange

@@ -1,0 +1,437 @@
+"""From a configuration to a run folder: the only place that wires everything together."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from bayesreg import __version__
+from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.distance import signed_distance
+from bayesreg.inference.diagnostics import Convergence, convergence, dataset, open_posterior, save_posterior
+from bayesreg.inference.initialise import Start
+from bayesreg.inference.run import (
+    Block,
+    Checkpoint,
+    Samples,
+    StopRule,
+    checkpoint_from_arrays,
+    checkpoint_to_arrays,
+    first_points,
+    greatest_rhat,
+    sample,
+)
+from bayesreg.io import store
+from bayesreg.io.store import Inputs, Run
+from bayesreg.mesh import TetMesh
+from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.warp import nodal_field_on_grid, warp_image
+from bayesreg.preparation import prepare
+from bayesreg.report.compare import write_comparison
+from bayesreg.report.html import write_report
+from bayesreg.report.metrics import compute_metrics
+from bayesreg.types import InputError
+
+# A sampled node counts as in contact where its mean position lies this near to the skull, mm.
+CONTACT = 0.5
+BLOCK = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder : Path
+    run : bayesreg.io.store.Run
+        Mesh, images, posterior mean and sd of u at every node, manifest, metrics.
+    """
+
+    folder: Path
+    run: Run
+
+    @cached_property
+    def idata(self) -> Any:
+        """The draws, as ArviZ opens them."""
+        return open_posterior(self.folder / "posterior.nc")
+
+    @cached_property
+    def convergence(self) -> Convergence:
+        """R̂ and effective sample sizes of every estimand."""
+        return convergence(self.idata)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh of the registration."""
+        return self.run.mesh
+
+    @property
+    def u_mean(self) -> np.ndarray:
+        """Posterior mean displacement of every node, (n, 3), mm."""
+        return np.asarray(self.run.u_mean)
+
+    @property
+    def u_sd(self) -> np.ndarray:
+        """Posterior standard deviation of the displacement of every node, (n, 3), mm."""
+        return np.asarray(self.run.u_sd)
+
+    @property
+    def metrics(self) -> dict[str, Any] | None:
+        """The paper's Tables 1 and 2 and the coverage of intervals, where the truth is known."""
+        return self.run.metrics
+
+    @property
+    def converged(self) -> bool:
+        """Whether the stop rule was met; True where none was asked for."""
+        return self.run.manifest["stopped"]["converged"] is not False
+
+    @property
+    def report(self) -> Path:
+        """The HTML report."""
+        return self.folder / "report.html"
+
+
+def run(config: str | Path | Config, out: str | Path, resume: bool = False, progress: bool = True) -> Result:
+    """Run a configuration from end to end.
+
+    Parameters
+    ----------
+    config : path or Config
+    out : path
+        The run folder, new or empty; with `resume`, that of a run that was cut off.
+    resume : bool
+        Continue after the last block that was stored.
+    progress : bool
+        Say what is being done, and show a progress bar.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the configuration or a file is wrong, or the folder holds another run.
+    """
+    config = config if isinstance(config, Config) else load_config(config)
+    out = Path(out)
+    began = time.perf_counter()
+    say = _narrator(progress)
+    resuming = resume and (out / "config.yaml").exists()
+    if resuming:
+        inputs, provenance = _resumed_inputs(out, config)
+    else:
+        store.require_fresh(out)
+        say("reading the images, meshing")
+        inputs, provenance = _prepared_inputs(config)
+    say(_described(inputs))
+    posterior = posterior_of(config, inputs)
+    start = _start(config, inputs, posterior)
+    if not resuming:
+        # Nothing is written before all input has proved sound, and everything before the first step is taken.
+        first_points(posterior, start, config.sampler.chains, config.seed)
+        store.write_inputs(out, inputs)
+        store.write_json(out / "inputs" / "provenance.json", provenance)
+    inputs = _with_initial(inputs, config, start)
+    samples = _sample(config, posterior, start, out, progress)
+    say("writing the results")
+    result = _finish(config, inputs, posterior, samples, provenance, out, began)
+    say(f"{samples.reason}")
+    return result
+
+
+def check(config: str | Path | Config) -> Check:
+    """Everything but sampling, with an estimate of time and memory."""
+    config = config if isinstance(config, Config) else load_config(config)
+    inputs, provenance = _prepared_inputs(config)
+    posterior = posterior_of(config, inputs)
+    start = _start(config, inputs, posterior)
+    settings, trial = _sampler_settings(config), 10
+    first = sample(posterior, config.sampler.name, config.sampler.chains, 1, config.seed, thin=1, start=start,
+                   progress=False, **settings)  # fmt: skip
+    timed = sample(posterior, config.sampler.name, config.sampler.chains, trial, config.seed, thin=1, block=1,
+                   start=start, progress=False, **settings)  # fmt: skip
+    seconds_per_step = max(timed.seconds - first.seconds, 1e-9) / trial
+    if timed.seconds <= first.seconds:
+        seconds_per_step = timed.seconds / trial
+    device = sum(leaf.nbytes for leaf in jax.tree.leaves(posterior.data))
+    draws = config.stop.max_steps // config.sampler.thin
+    numbers = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values()) + 8
+    return Check(
+        nodes=len(inputs.mesh.points),
+        cells=len(inputs.mesh.cells),
+        sampled=len(posterior.sampled),
+        steps_per_second=1 / seconds_per_step,
+        hours=config.stop.max_steps * seconds_per_step / 3600,
+        device_bytes=device,
+        draws_bytes=draws * config.sampler.chains * numbers * 8,
+        preparation=provenance["timings"],
+    )
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a configuration would cost; `text` says it."""
+
+    nodes: int
+    cells: int
+    sampled: int
+    steps_per_second: float
+    hours: float
+    device_bytes: int
+    draws_bytes: int
+    preparation: dict[str, float]
+
+    @property
+    def text(self) -> str:
+        """The estimate in words."""
+        preparation = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.preparation.items())
+        return (
+            "The configuration is sound.\n"
+            f"  mesh      {self.nodes} nodes, {self.cells} elements, {self.sampled} nodes sampled\n"
+            f"  prepared  {preparation}\n"
+            f"  speed     about {self.steps_per_second:.0f} steps per second and chain\n"
+            f"  time      {self.hours:.1f} h for all the steps that stop.max_steps allows\n"
+            f"  memory    {self.device_bytes / 1e6:.0f} MB on the device, whatever the number of draws; "
+            f"{self.draws_bytes / 1e6:.0f} MB of draws on the host at most"
+        )
+
+
+def simulate(config: str | Path | Config, out: str | Path) -> Path:
+    """Make the synthetic pair of a configuration: images, tissue, skull, mesh and truth in a folder."""
+    config = config if isinstance(config, Config) else load_config(config)
+    if config.simulate is None:
+        raise InputError("the configuration has no section 'simulate': its pair comes from files")
+    store.require_fresh(out)
+    inputs, provenance = _prepared_inputs(config)
+    store.write_inputs(out, inputs)
+    store.write_json(Path(out) / "inputs" / "provenance.json", provenance)
+    return Path(out)
+
+
+def load_result(folder: str | Path) -> Result:
+    """Open a finished run; InputError where the folder holds none."""
+    return Result(Path(folder), store.read_run(folder))
+
+
+def report(folder: str | Path) -> Path:
+    """Write the report of a finished run anew, and return its path."""
+    result = load_result(folder)
+    write_report(result.run, result.idata, *result.convergence, result.report)
+    return result.report
+
+
+def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
+    """Put runs side by side on one page, and return its path."""
+    results = [load_result(folder) for folder in folders]
+    write_comparison([(r.run, r.idata, *r.convergence) for r in results], out)
+    return Path(out)
+
+
+def posterior_of(config: Config, inputs: Inputs) -> Posterior:
+    """The posterior of a run, its solver preconditioned at the start parameters."""
+    posterior = build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull)
+    given = {name: config.start.entries(name, posterior.entry_names) for name in ("lam", "mu")}
+    if not any(given.values()):
+        return posterior
+    values = {name: np.array(posterior.reference()[name]) for name in given}
+    for name, entries in given.items():
+        for entry, value in (entries or {}).items():
+            values[name][posterior.entry_names.index(entry)] = value
+    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull, reference=values)
+
+
+def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
+    prepared = prepare(config)
+    return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
+
+
+def _resumed_inputs(out: Path, config: Config) -> tuple[Inputs, dict[str, Any]]:
+    inputs = store.read_inputs(out)
+    if inputs.config != resolved_yaml(config):
+        raise InputError(
+            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), "
+            "or name another folder"
+        )
+    return inputs, store.read_json(out / "inputs" / "provenance.json")
+
+
+def _narrator(progress: bool) -> Callable[[str], None]:
+    console = Console(quiet=not progress, highlight=False)
+    return lambda text: console.print(text)
+
+
+def _described(inputs: Inputs) -> str:
+    mesh = inputs.mesh
+    return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
+
+
+def _start(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
+    field = _start_field(config, inputs)
+    return Start(
+        field=None if field is None else field[posterior.sampled],
+        fraction=tuple(config.start.fraction),
+        lam=config.start.entries("lam", posterior.entry_names),
+        mu=config.start.entries("mu", posterior.entry_names),
+        spread=config.start.spread,
+    )
+
+
+def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
+    """Displacement of every node at fraction one, mm."""
+    wanted = config.start.field
+    if wanted == "identity":
+        return None
+    if wanted == "truth":
+        assert inputs.truth is not None
+        return np.asarray(inputs.truth.u)
+    return store.read_displacement(Path(wanted), inputs.mesh)
+
+
+def _with_initial(inputs: Inputs, config: Config, start: Start) -> Inputs:
+    """The truth with the centre of the chains' starts, for the paper's Table 1."""
+    field = _start_field(config, inputs)
+    if inputs.truth is None or field is None:
+        return inputs
+    return inputs._replace(truth=inputs.truth._replace(initial=np.mean(start.fraction) * field))
+
+
+def _sampler_settings(config: Config) -> dict[str, float]:
+    return config.sampler.model_dump(include={"sigma_u", "sigma_lam", "sigma_mu"})
+
+
+def _sample(config: Config, posterior: Posterior, start: Start, out: Path, progress: bool) -> Samples:
+    def keep(index: int, block: Block, checkpoint: Checkpoint) -> None:
+        store.save_block(out, index, block)
+        store.save_state(out, {"blocks": np.array(index + 1), **checkpoint_to_arrays(checkpoint)})
+
+    settings, options = _sampler_settings(config), config.sampler
+    resume, state = None, store.load_state(out)
+    if state is not None:
+        blocks = list(store.load_blocks(out, int(state.pop("blocks"))))
+        resume = checkpoint_from_arrays(state, posterior, options.name, options.chains, **settings), blocks
+    return sample(
+        posterior,
+        options.name,
+        options.chains,
+        config.stop.max_steps // options.thin,
+        config.seed,
+        thin=options.thin,
+        block=options.block or BLOCK,
+        start=start,
+        stop=StopRule(config.stop.rhat, config.stop.max_minutes and 60 * config.stop.max_minutes),
+        progress=progress,
+        resume=resume,
+        on_block=keep,
+        **settings,
+    )
+
+
+def _finish(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    samples: Samples,
+    provenance: dict[str, Any],
+    out: Path,
+    began: float,
+) -> Result:
+    """Everything after the last draw: the files of the run folder, run.json last but for the report."""
+    save_posterior(samples.idata, out / "posterior.nc")
+    judged = convergence(samples.idata)
+    mean_field = nodal_field_on_grid(inputs.mesh, samples.u_mean, inputs.fixed)
+    sd_field = nodal_field_on_grid(inputs.mesh, samples.u_sd, inputs.fixed)
+    metrics = None
+    if inputs.truth is not None:
+        metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, dataset(samples.idata, "posterior"))
+    finished = Run(
+        manifest=_manifest(config, inputs, posterior, samples, judged, provenance, began),
+        u_mean=samples.u_mean,
+        u_sd=samples.u_sd,
+        warped=warp_image(inputs.moving, mean_field, inputs.fixed),
+        metrics=metrics,
+        **inputs._asdict(),
+    )
+    store.write_run(out, finished, mean_field, sd_field)
+    result = Result(out, finished)
+    write_report(finished, samples.idata, *judged, result.report)
+    return result
+
+
+def _manifest(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    samples: Samples,
+    judged: Convergence,
+    provenance: dict[str, Any],
+    began: float,
+) -> dict[str, Any]:
+    """The content of run.json."""
+    tally = samples.tally
+    steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
+    accepted = float(tally.acceptance.sum())
+    return {
+        "name": config.description,
+        "versions": _versions(),
+        "seed": config.seed,
+        "mesh_digest": inputs.mesh.digest,
+        "image_digests": {name: getattr(inputs, name).digest for name in ("fixed", "moving")},
+        "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
+        "devices": [str(device) for device in jax.devices()],
+        "timings": {
+            **provenance["timings"],
+            "sampling": samples.seconds,
+            "total": time.perf_counter() - began,
+        },
+        "pair": provenance["pair"],
+        "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
+        "model": config.model.model_dump(mode="json"),
+        "exact": samples.exact,
+        "stopped": {"reason": samples.reason, "converged": samples.converged, "rhat_threshold": config.stop.rhat},
+        "convergence": {
+            "rhat_max": _extreme(judged.rhat, np.nanmax),
+            "ess_bulk_min": _extreme(judged.ess_bulk, np.nanmin),
+            "ess_tail_min": _extreme(judged.ess_tail, np.nanmin),
+            "rhat_paper_max": greatest_rhat(samples.rhat),
+        },
+        "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
+        "contact_nodes": _contact_nodes(inputs, posterior, samples),
+        "solver": {
+            "failed": int(tally.solver_failed.sum()),
+            "iterations_mean": float(tally.solver_iterations.sum()) / steps,
+        },
+        "steps_per_chain": int(tally.steps[0]),
+        "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
+        "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
+        "implied_noise_sd": posterior.implied_noise_sd,
+    }
+
+
+def _versions() -> dict[str, str]:
+    packages = ("jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "pytetwild")
+    return {"bayesreg": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _extreme(figures: Any, choose: Callable[[np.ndarray], float]) -> float | None:
+    values = np.concatenate([np.ravel(figures[name]) for name in figures])
+    return float(choose(values)) if np.isfinite(values).any() else None
+
+
+def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
+    if inputs.skull is None:
+        return None
+    places = inputs.mesh.points[posterior.sampled] + samples.u_mean[posterior.sampled]
+    return int((np.asarray(signed_distance(inputs.skull).interpolate(places)) < CONTACT).sum())

@@ -1,0 +1,183 @@
+"""The estimands of a run, one by one: their names, places, convergence figures and draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from bayesreg.mesh import TetMesh
+
+SYMBOLS = {"lam": "λ", "mu": "μ", "ratio": "λ/μ", "t_similarity": "T_s", "t_elastic": "T_r"}
+DISPLACEMENT = "u_boundary"
+AXES = ("x", "y", "z")
+MOST_VALUES = 10_000_000
+
+
+class Estimand(NamedTuple):
+    """One sampled number.
+
+    Attributes
+    ----------
+    variable : str
+        Name in the posterior.
+    position : tuple of int
+        Its place in that variable's array, after chain and draw.
+    name : str
+        For people, as "u_x of node 12" or "λ gm".
+    place : tuple of float or None
+        World position of its node, mm.
+    rhat, ess_bulk, ess_tail : float
+        NaN where undefined (chains that never moved, say).
+    """
+
+    variable: str
+    position: tuple[int, ...]
+    name: str
+    place: tuple[float, float, float] | None
+    rhat: float
+    ess_bulk: float
+    ess_tail: float
+
+    @property
+    def badness(self) -> float:
+        """R-hat for sorting: what is undefined is worst."""
+        return self.rhat if np.isfinite(self.rhat) else np.inf
+
+
+class Diagnosed(NamedTuple):
+    """Convergence figures of all draws: xarray Datasets with the posterior's variables, NaN where not sampled."""
+
+    rhat: xr.Dataset
+    ess_bulk: xr.Dataset
+    ess_tail: xr.Dataset
+
+
+def estimands(mesh: TetMesh, diagnosed: Diagnosed, posterior: xr.Dataset) -> list[Estimand]:
+    """Every sampled entry of every variable, in the posterior's order.
+
+    An entry without any figure that is the same in all draws was held fixed, and is none; one that only never
+    moved within its chain counts. Derived quantities (the ratios) are left out.
+    """
+    found = []
+    for variable in diagnosed.rhat.data_vars:
+        name = str(variable)
+        if name in posterior and name != "ratio":
+            found += _entries(mesh, diagnosed, posterior[name])
+    return found
+
+
+def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[Estimand]:
+    name = str(draws.name)
+    dims = [dim for dim in draws.dims if dim not in ("chain", "draw")]
+    figures = np.stack([np.asarray(part[name].transpose(*dims).to_numpy(), float) for part in diagnosed], axis=-1)
+    sampled = ~np.isnan(figures).all(axis=-1)
+    if not sampled.all():
+        spread = draws.max(("chain", "draw")) - draws.min(("chain", "draw"))
+        sampled |= spread.transpose(*dims).to_numpy() > 0
+    naming = _Naming(name, mesh, *_coordinates(draws, dims))
+    return [
+        Estimand(name, index, naming.name(index), naming.place(index), *(float(value) for value in figures[index]))
+        for index in map(tuple, np.argwhere(sampled).tolist())
+    ]
+
+
+def _coordinates(draws: xr.DataArray, dims: list) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Node indices of a displacement; else the labels of parameters."""
+    if "node" in dims:
+        return draws["node"].to_numpy(), None
+    return None, draws[dims[0]].to_numpy() if dims else None
+
+
+class _Naming(NamedTuple):
+    variable: str
+    mesh: TetMesh
+    nodes: np.ndarray | None
+    labels: np.ndarray | None
+
+    def name(self, index: tuple[int, ...]) -> str:
+        symbol = SYMBOLS.get(self.variable, self.variable)
+        if self.nodes is not None:
+            return f"u_{AXES[index[1]]} of node {int(self.nodes[index[0]])}"
+        if self._by_element:
+            return f"{symbol} of element {index[0]}"
+        return symbol if self.labels is None else f"{symbol} {self.labels[index[0]]}"
+
+    def place(self, index: tuple[int, ...]) -> tuple[float, float, float] | None:
+        if self.nodes is not None:
+            point = self.mesh.points[int(self.nodes[index[0]])]
+        elif self._by_element:
+            point = self.mesh.points[self.mesh.cells[index[0]]].mean(axis=0)
+        else:
+            return None
+        return float(point[0]), float(point[1]), float(point[2])
+
+    @property
+    def _by_element(self) -> bool:
+        return self.labels is not None and len(self.labels) == len(self.mesh.cells)
+
+
+def worst(entries: Sequence[Estimand], count: int) -> list[Estimand]:
+    """The entries of the greatest R-hat, worst first."""
+    return sorted(entries, key=lambda entry: -entry.badness)[:count]
+
+
+def above(entries: Sequence[Estimand], threshold: float) -> int:
+    """Number of entries whose R-hat is not below a threshold."""
+    return sum(not entry.rhat < threshold for entry in entries)
+
+
+def draws_of(posterior: xr.Dataset, entry: Estimand, max_draws: int) -> np.ndarray:
+    """Draws of one estimand, (chain, draw), evenly thinned to about `max_draws` per chain."""
+    draws = posterior[entry.variable]
+    dims = [dim for dim in draws.dims if dim not in ("chain", "draw")]
+    stride = max(1, draws.sizes["draw"] // max_draws)
+    chosen = draws.isel({"draw": slice(None, None, stride), **dict(zip(dims, entry.position, strict=True))})
+    return np.asarray(chosen.transpose("chain", "draw").to_numpy(), float)
+
+
+class Group(NamedTuple):
+    """Elastic parameters that belong together: a tissue's, or the whole domain's.
+
+    Attributes
+    ----------
+    name : str
+    lam, mu : (chain, draw, entries) arrays
+        Entries are one, or the elements of the tissue.
+    """
+
+    name: str
+    lam: np.ndarray
+    mu: np.ndarray
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """λ/μ, NaN where it is undefined."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = self.lam / self.mu
+        return np.where(np.isfinite(ratio), ratio, np.nan)
+
+
+def elastic_draws(posterior: xr.Dataset, max_draws: int) -> tuple[np.ndarray, np.ndarray]:
+    """λ and μ as (chain, draw, entry), thinned to about `max_draws` per chain, fewer where entries are very many."""
+    entries = max(1, posterior["lam"].size // posterior.sizes["draw"])
+    stride = max(1, posterior.sizes["draw"] // min(max_draws, max(20, MOST_VALUES // entries)))
+    thinned = posterior[["lam", "mu"]].isel(draw=slice(None, None, stride)).transpose("chain", "draw", ...)
+    return np.asarray(thinned["lam"].to_numpy(), float), np.asarray(thinned["mu"].to_numpy(), float)
+
+
+def parameter_groups(mesh: TetMesh, posterior: xr.Dataset, max_draws: int = 5000) -> list[Group]:
+    """Draws of λ and μ by tissue, as one uniform group, or, when sampled by element, gathered by tissue."""
+    lam, mu = elastic_draws(posterior, max_draws)
+    if lam.shape[-1] == 1:
+        return [Group("uniform", lam, mu)]
+    if lam.shape[-1] == len(mesh.names):
+        return [Group(name, lam[..., [k]], mu[..., [k]]) for k, name in enumerate(mesh.names)]
+    by_tissue = [np.flatnonzero(mesh.tissue == k) for k in range(len(mesh.names))]
+    return [
+        Group(name, lam[..., entries], mu[..., entries])
+        for name, entries in zip(mesh.names, by_tissue, strict=True)
+        if len(entries)
+    ]

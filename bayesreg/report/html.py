@@ -1,0 +1,162 @@
+"""The report of one run: one HTML file that needs no network."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from bayesreg import __version__
+from bayesreg.io.atomic import write_text
+from bayesreg.io.store import Run
+from bayesreg.report import anatomy, convergence, marginals, tables
+from bayesreg.report.estimands import Diagnosed, estimands
+from bayesreg.report.metrics import compute_metrics
+from bayesreg.report.panels import View
+from bayesreg.report.verdict import duration, key_facts, part, threshold_of, verdict, warnings_of
+
+SECTIONS = (
+    ("accuracy", "Registration"),
+    ("stiffnesses", "Stiffness"),
+    ("one-node", "One node"),
+    ("convergence", "Convergence"),
+    ("model", "Model"),
+    ("settings", "Settings"),
+)
+PROVENANCE = {
+    "model": "Model",
+    "sampler": "Sampler",
+    "timings": "Time",
+    "versions": "Versions",
+    "images": "Digests of the images",
+}
+
+
+def write_report(
+    run: Run, idata: Any, rhat: xr.Dataset, ess_bulk: xr.Dataset, ess_tail: xr.Dataset, path: str | Path
+) -> None:
+    """Write the report of a run.
+
+    Parameters
+    ----------
+    run : Run
+    idata : InferenceData or DataTree
+        With the groups `posterior` and `sample_stats`, as in the run folder. The coordinate `node` of u_boundary
+        holds mesh node indices.
+    rhat, ess_bulk, ess_tail : xarray.Dataset
+        The posterior's variables without chain and draw; NaN where an entry was not sampled.
+    path : path
+        The HTML file; replaced in one step.
+    """
+    posterior, sample_stats = dataset(idata.posterior), dataset(idata.sample_stats)
+    diagnosed = Diagnosed(rhat, ess_bulk, ess_tail)
+    entries = estimands(run.mesh, diagnosed, posterior)
+    metrics = {"This run": known} if (known := metrics_of(run, posterior)) else {}
+    view = View.of(run)
+    drawings = [
+        *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
+        marginals.stiffness(run, posterior),
+        anatomy.element_stiffness(view, posterior),
+        marginals.skull_node(run, posterior),
+        convergence.traces(posterior, sample_stats, entries),
+        convergence.distributions(run.mesh, entries, posterior["node"].to_numpy(), threshold_of(run.manifest)),
+    ]
+    content = {
+        "title": name_of(run),
+        "subtitle": _subtitle(run, posterior),
+        "sections": SECTIONS,
+        "verdict": verdict(run.manifest, entries),
+        "facts": key_facts(run.manifest, entries, posterior),
+        "warnings": warnings_of(run.manifest, run.mesh, posterior),
+        "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
+        "error_tables": error_tables(metrics, run.mesh.names),
+        "parameters": tables.parameter_table(run, posterior, diagnosed),
+        "worst": tables.worst_table(entries),
+        "provenance": provenance(run.manifest),
+        "config": run.config,
+    }
+    write_text(path, render("template.html", content))
+
+
+def render(template: str, content: Mapping[str, Any]) -> str:
+    """A page from a template; all text is escaped."""
+    environment = Environment(
+        loader=PackageLoader("bayesreg", "report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    environment.filters["indexed"] = _indexed
+    style = Markup(files("bayesreg.report").joinpath("style.css").read_text(encoding="utf-8"))
+    return environment.get_template(template).render(version=__version__, style=style, **content)
+
+
+def _indexed(text: str) -> Markup:
+    """Escaped text in which u_x, T_s and the like get a subscript."""
+    return Markup(re.sub(r"\b([uTE])_([xyzrs])\b", r"\1<sub>\2</sub>", str(escape(text))))
+
+
+def dataset(group: Any) -> xr.Dataset:
+    """A group of an InferenceData (a Dataset already) or of a DataTree as a Dataset."""
+    return group if isinstance(group, xr.Dataset) else group.to_dataset()
+
+
+def name_of(run: Run) -> str:
+    """The run's name, else what it sampled."""
+    return str(run.manifest.get("name") or elasticity_of(run) or "Registration")
+
+
+def elasticity_of(run: Run) -> str:
+    """How the elastic parameters vary, for people."""
+    known = {"tissue": "By tissue", "uniform": "Uniform", "element": "By element"}
+    return known.get(str(part(run.manifest, "model", "elasticity")), "")
+
+
+def metrics_of(run: Run, posterior: xr.Dataset) -> dict[str, Any] | None:
+    """The run's metrics, made now where they were not stored; None where no truth is known."""
+    if run.metrics is not None or run.truth is None:
+        return run.metrics
+    return compute_metrics(run.mesh, run.u_mean, run.truth, posterior)
+
+
+def error_tables(metrics: Mapping[str, Mapping[str, Any]], tissues: tuple[str, ...]) -> list[tables.Table]:
+    """Tables 1 and 2 and the coverage; none where no truth is known."""
+    if not metrics:
+        return []
+    made = [tables.boundary_error_table(metrics), tables.squared_error_table(metrics, tissues)]
+    covered = tables.coverage_table(metrics)
+    return made + ([covered] if covered else [])
+
+
+def _subtitle(run: Run, posterior: xr.Dataset) -> str:
+    sampler = part(run.manifest, "sampler", "name")
+    exact = {True: "exact", False: "approximate"}.get(part(run.manifest, "exact"))
+    parts = [
+        f"Joint posterior of the displacement at {posterior.sizes['node']:,} nodes and the elastic parameters",
+        f"parameters {elasticity_of(run).lower()}" if elasticity_of(run) else None,
+        f"sampler {sampler}" + (f" ({exact})" if exact else "") if sampler else None,
+    ]
+    return " · ".join(text for text in parts if text)
+
+
+def provenance(manifest: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """What made this run, in named lists of key and value."""
+    listed = []
+    for key, title in PROVENANCE.items():
+        flat = _flat(manifest.get(key) or {})
+        if key == "timings":
+            flat = [(name, duration(float(value))) for name, value in flat if value not in ("", "None")]
+        if flat:
+            listed.append((title, flat))
+    rest = [(key, manifest.get(key)) for key in ("seed", "devices", "mesh_digest", "exact")]
+    listed.append(("Run", [(key.replace("_", " "), str(value)) for key, value in rest if value is not None]))
+    return listed
+
+
+def _flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
+    if not isinstance(value, Mapping):
+        return [(prefix, str(value))]
+    return [pair for key, entry in value.items() for pair in _flat(entry, f"{prefix}.{key}" if prefix else str(key))]

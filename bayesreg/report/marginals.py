@@ -1,0 +1,261 @@
+"""Figures of marginal posteriors: stiffness ratios by tissue (Fig. 4) and one node at the skull (Fig. 5)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+
+from bayesreg.distance import signed_distance
+from bayesreg.image import Image
+from bayesreg.io.store import Run, Truth
+from bayesreg.report import panels, style
+from bayesreg.report.estimands import Group, parameter_groups
+from bayesreg.report.slices import COORDINATES, IN_PLANE, Plane, sample
+from bayesreg.report.style import Drawing
+from bayesreg.report.verdict import number, place_text
+
+BINS = 32
+REACH = 6.0
+LOG_SPAN = 20.0
+NEAR = 0.25
+SEARCH_DRAWS = 240
+SHOWN_DRAWS = 6000
+CLOUD_DRAWS = 600
+ZOOM = 13.0
+
+
+def stiffness(run: Run, posterior: xr.Dataset) -> Drawing:
+    """The paper's Fig. 4: marginal posteriors of λ/μ, with the truth where it is known."""
+    groups = parameter_groups(run.mesh, posterior)
+    with style.look():
+        columns = min(4, len(groups))
+        rows = -(-len(groups) // columns)
+        figure = style.new_figure(2.5 * rows)
+        axes = figure.subplots(rows, columns, squeeze=False)
+        for panel in axes.ravel()[len(groups) :]:
+            panel.remove()
+        for panel, group in zip(axes.ravel(), groups, strict=False):
+            ratio_panel(panel, run, group)
+        uri = style.data_uri(figure, "svg")
+    caption = (
+        "The paper’s Fig. 4 for this run: marginal posterior of λ/μ. Filled: all chains together; thin lines: each "
+        "chain by itself (they lie on one another where the chains agree); white dot and bar: median and central 95 % "
+        "interval" + ("; dashed: truth." if run.truth is not None else ".")
+    )
+    medians = ", ".join(f"{group.name} {number(float(np.nanmedian(group.ratio)))}" for group in groups)
+    return Drawing("stiffness", "Stiffness ratios", caption, f"Posterior histograms; medians of λ/μ: {medians}.", uri)
+
+
+def ratio_panel(axes: Axes, run: Run, group: Group) -> None:
+    """Histogram of λ/μ of one group, with its median, 95 % interval and truth."""
+    colour = style.UNIFORM if group.name == "uniform" else _colour(run, group.name)
+    truths = _true_ratios(run, group.name)
+    histogram(axes, group.ratio.reshape(len(group.ratio), -1), colour, list(truths.values()))
+    for name, value in truths.items():
+        drawn = style.TRUTH if len(truths) == 1 else _colour(run, name)
+        _truth_line(axes, value, "truth" if len(truths) == 1 else f"truth {name}", drawn)
+    axes.set_title(group.name.upper() if len(group.name) <= 3 else group.name, weight="bold")
+    axes.set_xlabel("λ / μ")
+
+
+def _truth_line(axes: Axes, value: float, label: str, colour: str) -> None:
+    axes.axvline(value, color=colour, ls=(0, (4, 2)), lw=1.2)
+    place: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "rotation": 90, "ha": "right", "va": "top"}
+    axes.text(value, 0.99, f"{label} ", color=colour, fontsize=7, **place)
+
+
+def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: list[float]) -> None:
+    """Density of (chain, draw) values: pooled and filled, by chain as lines, with median and 95 % interval."""
+    finite = draws[np.isfinite(draws)]
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+    if finite.size == 0 or np.ptp(finite) == 0:
+        value = number(float(finite[0])) if finite.size else "undefined"
+        axes.text(0.5, 0.5, f"fixed: {value}" if finite.size else value, transform=axes.transAxes, ha="center")
+        return
+    edges = _edges(finite)
+    if edges[0] > 0 and not np.allclose(np.diff(edges), edges[1] - edges[0]):
+        axes.set_xscale("log")
+    axes.stairs(_density(finite, edges), edges, fill=True, color=colour, alpha=0.45, lw=0)
+    for chain, line in zip(draws, style.chain_colours(len(draws)), strict=True):
+        axes.stairs(_density(chain[np.isfinite(chain)], edges), edges, color=line, lw=0.7, alpha=0.85)
+    low, median, high = np.quantile(finite, (0.025, 0.5, 0.975))
+    base = -0.05 * axes.get_ylim()[1]
+    axes.plot([low, high], [base, base], color=colour, lw=3, solid_capstyle="butt")
+    axes.plot([median], [base], "o", mfc="white", mec=colour, ms=5)
+    axes.set_ylim(2 * base, None)
+    axes.set_ylim(top=axes.get_ylim()[1] * (1.22 if marks else 1.05))
+    interval = f"{number(median)} [{number(low)}, {number(high)}]"
+    axes.set_title(interval, fontsize=7, color=style.MUTED, loc="right")
+
+
+def _density(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    return np.histogram(values, edges)[0] / max(1, values.size) / np.diff(edges)
+
+
+def _edges(values: np.ndarray) -> np.ndarray:
+    """Bins of equal width, or of equal ratio where the central interval spans more than a factor of twenty."""
+    low, high = np.quantile(values, (0.002, 0.998))
+    inner = np.quantile(values, (0.025, 0.975))
+    if low > 0 and inner[1] > LOG_SPAN * inner[0]:
+        return np.geomspace(low, high, BINS)
+    margin = 0.02 * (high - low) or 1e-9
+    return np.linspace(low - margin, high + margin, BINS)
+
+
+def _colour(run: Run, name: str) -> str:
+    return dict(zip(run.mesh.names, style.tissue_colours(run.mesh.names), strict=True))[name]
+
+
+def _true_ratios(run: Run, name: str) -> dict[str, float]:
+    """λ/μ of the named tissue; of all tissues where the parameters are uniform."""
+    if run.truth is None:
+        return {}
+    ratios = dict(zip(run.mesh.names, np.asarray(run.truth.lam) / np.asarray(run.truth.mu), strict=True))
+    return {key: float(ratio) for key, ratio in ratios.items() if name in (key, "uniform")}
+
+
+class SkullNode(NamedTuple):
+    """A sampled node and how close to the skull its draws come.
+
+    Attributes
+    ----------
+    entry : int
+        Position along the posterior's `node` axis.
+    node : int
+        Index in the mesh.
+    near : float
+        Fraction of draws within 0.25 mm of the skull.
+    """
+
+    entry: int
+    node: int
+    near: float
+
+
+def node_at_skull(run: Run, posterior: xr.Dataset) -> SkullNode:
+    """The sampled node with most draws at the skull; without a skull, the one that moves most."""
+    draws = posterior["u_boundary"].transpose("chain", "draw", "node", "axis")
+    nodes = draws["node"].to_numpy().astype(int)
+    if run.skull is None:
+        entry = int(np.linalg.norm(np.asarray(run.u_mean)[nodes], axis=1).argmax())
+        return SkullNode(entry, int(nodes[entry]), 0.0)
+    stride = max(1, draws.sizes["chain"] * draws.sizes["draw"] // SEARCH_DRAWS)
+    some = draws.isel(draw=slice(None, None, stride)).to_numpy().reshape(-1, len(nodes), 3)
+    at = run.mesh.points[nodes] + some
+    distance = np.stack([skull_distance(run.skull, at[:, k]) for k in range(len(nodes))], axis=1)
+    near, mean = (np.abs(distance) < NEAR).mean(axis=0), np.abs(distance).mean(axis=0)
+    entry = int(np.lexsort((mean, -near))[0])
+    return SkullNode(entry, int(nodes[entry]), float(near[entry]))
+
+
+def skull_distance(skull: Image, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
+    """Signed distance to the skull (mm, negative inside it) of points close together, cut off at ±6 mm.
+
+    Only the voxels about the points are looked at: the distance map of a whole image takes seconds.
+    """
+    indices = skull.world_to_voxel(points)
+    reach = REACH / skull.voxel_sizes + 1
+    low = np.clip(np.floor(indices.min(axis=0) - reach), 0, skull.shape).astype(int)
+    high = np.clip(np.ceil(indices.max(axis=0) + reach) + 1, 0, skull.shape).astype(int)
+    window = np.asarray(skull.voxels)[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    if not (window == 0).any():
+        return np.full(len(points), -REACH)
+    affine = skull.affine.copy()
+    affine[:3, 3] = skull.voxel_to_world(low.astype(float))
+    return np.clip(sample(signed_distance(Image(window, affine)), points, outside=-REACH), -REACH, REACH)
+
+
+def skull_node(run: Run, posterior: xr.Dataset) -> Drawing:
+    """The paper's Fig. 5: marginals of one node at the skull, where it is, and its distance to the skull."""
+    chosen = node_at_skull(run, posterior)
+    stride = max(1, posterior.sizes["draw"] // SHOWN_DRAWS)
+    draws = posterior["u_boundary"].transpose("chain", "draw", "node", "axis").isel(node=chosen.entry)
+    u = np.asarray(draws.isel(draw=slice(None, None, stride)).to_numpy(), float)
+    place = run.mesh.points[chosen.node]
+    with style.look():
+        figure = style.new_figure(2.5)
+        count = 4 if run.skull is None else 5
+        axes = figure.subplots(1, count, width_ratios=[1.15] + [1.0] * (count - 1))
+        _neighbourhood(axes[0], run, place, u)
+        for k, panel in enumerate(axes[1:4]):
+            _component(panel, u[..., k], COORDINATES[k], _true_component(run.truth, chosen.node, k))
+        if run.skull is not None:
+            _to_skull(axes[4], skull_distance(run.skull, (place + u).reshape(-1, 3)).reshape(u.shape[:2]))
+        for letter, panel in zip("abcde", axes, strict=False):
+            panel.set_title(f"({letter})", fontsize=8)
+        uri = style.data_uri(figure)
+    where = f"node {chosen.node} at {place_text((float(place[0]), float(place[1]), float(place[2])))}"
+    title = "One node" if run.skull is None else "One node at the skull"
+    return Drawing("node", title, _node_caption(run, chosen, where), f"Marginals of u of {where}.", uri)
+
+
+def _node_caption(run: Run, chosen: SkullNode, where: str) -> str:
+    if run.skull is None:
+        choice = f"No skull bounds this run; shown is the node that moves most, {where}."
+    else:
+        share = f"{chosen.near:.0%}".replace("%", " %")
+        choice = f"Shown is the sampled node with most draws within {NEAR:g} mm of the skull ({share}), {where}."
+    last = "" if run.skull is None else " (e) distance to the skull, which cuts the posterior off at zero."
+    shaded = "" if run.skull is None else ", the skull shaded"
+    truth = "; dashed: truth" if run.truth is not None else ""
+    return (
+        f"The paper’s Fig. 5 for this run. {choice} (a) its place at rest (ring) and drawn positions (dots) on the "
+        f"fixed image{shaded}; (b–d) marginals of u along x, y and z with median and 95 % interval, pooled "
+        f"(filled) and by chain (lines){truth}.{last}"
+    )
+
+
+def _true_component(truth: Truth | None, node: int, axis: int) -> float | None:
+    return None if truth is None else float(np.asarray(truth.u)[node, axis])
+
+
+def _component(axes: Axes, draws: np.ndarray, name: str, truth: float | None) -> None:
+    histogram(axes, draws, style.UNIFORM, [] if truth is None else [truth])
+    if truth is not None:
+        _truth_line(axes, truth, "truth", style.TRUTH)
+    axes.set_xlabel(f"$u_{name}$, mm")
+
+
+def _to_skull(axes: Axes, distance: np.ndarray) -> None:
+    histogram(axes, distance, style.UNIFORM, [0.0])
+    axes.axvline(0, color=style.SKULL, lw=1.4)
+    axes.axvspan(axes.get_xlim()[0], 0, color=style.SKULL, alpha=0.25, lw=0, zorder=0)
+    axes.set_xlabel("distance to skull, mm")
+
+
+def _neighbourhood(axes: Axes, run: Run, place: np.ndarray, u: np.ndarray) -> None:
+    """Image, skull and draws on the plane that shows the way to the skull best."""
+    axis = _level_axis(run, place)
+    across, up = IN_PLANE[axis]
+    centre = place + u.reshape(-1, 3).mean(axis=0)
+    sides = [(float(centre[k] - ZOOM), float(centre[k] + ZOOM)) for k in (across, up)]
+    plane = Plane(axis, float(centre[axis]), sides[0], sides[1], 2 * ZOOM / 200)
+    panels.image_panel(axes, run.fixed, plane, panels.grey_limits(run))
+    if run.skull is not None:
+        forbidden = sample(run.skull, plane.points(), order=0, outside=1.0) != 0
+        shade = np.where(forbidden[..., None], (*_rgb(style.SKULL), 0.72), 0.0)
+        panels.field_panel(axes, shade, plane, Normalize(0, 1), style.GREY, dark=True)
+    stride = max(1, u.shape[1] * len(u) // CLOUD_DRAWS)
+    for chain, colour in zip(place + u, style.chain_colours(len(u)), strict=True):
+        axes.plot(chain[::stride, across], chain[::stride, up], ".", ms=2, color=colour, alpha=0.8, mew=0)
+    axes.plot([place[across]], [place[up]], "o", mfc="none", mec="#f5d76e", ms=7, mew=1.4)
+
+
+def _level_axis(run: Run, place: np.ndarray) -> int:
+    """The world axis along which the distance to the skull (else u) changes least."""
+    if run.skull is None:
+        return 2
+    steps = np.concatenate([np.eye(3), -np.eye(3)]) * float(run.skull.voxel_sizes.mean())
+    values = skull_distance(run.skull, place + steps)
+    return int(np.abs(values[:3] - values[3:]).argmin())
+
+
+def _rgb(colour: str) -> tuple[float, float, float]:
+    red, green, blue = (int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return red, green, blue

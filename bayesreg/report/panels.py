@@ -1,0 +1,223 @@
+"""Single panels: an image, a field, a label map or a mesh cut on one plane, with directions and a scale bar."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LogNorm, Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.io.store import Run
+from bayesreg.mesh import TetMesh
+from bayesreg.report import style
+from bayesreg.report.metrics import divergence
+from bayesreg.report.slices import DIRECTIONS, IN_PLANE, MeshSlice, Plane, cut, main_plane, planes_through, sample
+
+BAR_LENGTHS = (5, 10, 20, 50, 100)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A run seen on three planes; `main` is the one that sees most of the displacement.
+
+    Attributes
+    ----------
+    run : Run
+    planes : tuple of Plane
+        Sagittal, coronal, axial.
+    main : Plane
+    """
+
+    run: Run
+    planes: tuple[Plane, Plane, Plane]
+    main: Plane
+    _slices: dict[Plane, MeshSlice] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, run: Run) -> View:
+        """Planes through the node of greatest displacement (true where known)."""
+        u = reference_displacement(run)
+        planes = planes_through(run.mesh, run.mesh.points[(u**2).sum(axis=1).argmax()])
+        return cls(run, planes, main_plane(run.mesh, planes, u))
+
+    def on(self, run: Run) -> View:
+        """The same planes, on another run."""
+        return View(run, self.planes, self.main)
+
+    def slice(self, plane: Plane) -> MeshSlice:
+        """The mesh on a plane."""
+        if plane not in self._slices:
+            self._slices[plane] = MeshSlice(self.run.mesh, plane)
+        return self._slices[plane]
+
+    def error(self, plane: Plane) -> np.ndarray:
+        """|ū − u_true| on a plane, mm."""
+        if self.run.truth is None:
+            raise ValueError("the error of a run is known only where the truth is")
+        difference = np.asarray(self.run.u_mean) - np.asarray(self.run.truth.u)
+        return np.linalg.norm(self.slice(plane).nodal(difference), axis=-1)
+
+    def spread(self, plane: Plane) -> np.ndarray:
+        """Root of the summed variances of u on a plane, mm."""
+        return np.linalg.norm(self.slice(plane).nodal(self.run.u_sd), axis=-1)
+
+    def magnitude(self, plane: Plane) -> np.ndarray:
+        """|ū| on a plane, mm."""
+        return np.linalg.norm(self.slice(plane).nodal(self.run.u_mean), axis=-1)
+
+    def divergence(self, plane: Plane, u: np.ndarray) -> np.ndarray:
+        """Div u on a plane."""
+        return self.slice(plane).cellwise(divergence(self.run.mesh, u))
+
+
+def reference_displacement(run: Run) -> np.ndarray:
+    """The true displacement where it is known, else the posterior mean; (n, 3), mm."""
+    return np.asarray(run.u_mean if run.truth is None else run.truth.u, float)
+
+
+def image_panel(axes: Axes, image: Image, plane: Plane, limits: tuple[float, float]) -> AxesImage:
+    """An image on a plane; black where it ends."""
+    picture = sample(image, plane.points(), outside=limits[0])
+    return field_panel(axes, picture, plane, Normalize(*limits), style.GREY, dark=True)
+
+
+def field_panel(
+    axes: Axes, picture: np.ndarray, plane: Plane, norm: Normalize, cmap: str, dark: bool = False
+) -> AxesImage:
+    """Values, or colours, on the pixels of a plane; white where not finite."""
+    drawn = axes.imshow(picture, origin="lower", extent=plane.extent, cmap=cmap, norm=norm, interpolation="auto")
+    _frame(axes, plane, dark)
+    return drawn
+
+
+def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True) -> None:
+    """The mesh's border and, by default, the interfaces between its tissues."""
+    tissue = np.nan_to_num(view.slice(plane).cellwise(view.run.mesh.tissue), nan=-1.0)
+    x, y = np.linspace(*plane.horizontal, tissue.shape[1]), np.linspace(*plane.vertical, tissue.shape[0])
+    for label in np.unique(tissue) if interfaces else [-1.0]:
+        # Blurred by a pixel, so that the staircase of the pixels does not show.
+        level = ndimage.gaussian_filter((tissue == label).astype(float), 1.0)
+        width, alpha = (0.8, 0.9) if label < 0 else (0.35, 0.5)
+        axes.contour(x, y, level, [0.5], colors=style.INK, linewidths=width, alpha=alpha)
+
+
+def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
+    """Tissue labels and skull."""
+    points = plane.points()
+    palette = np.array([to_rgb("white"), *map(to_rgb, style.tissue_colours(run.mesh.names))])
+    labels = sample(run.tissue, points, order=0, outside=0.0).astype(int)
+    picture = palette[np.clip(labels, 0, len(run.mesh.names))]
+    if run.skull is not None:
+        forbidden = sample(run.skull, points, order=0, outside=1.0) != 0
+        picture[forbidden] = to_rgb(style.SKULL)
+    field_panel(axes, picture, plane, Normalize(0, 1), style.GREY, dark=run.skull is not None)
+
+
+def mesh_panel(axes: Axes, mesh: TetMesh, plane: Plane) -> None:
+    """The exact cut through the mesh, coloured by tissue."""
+    section = cut(mesh, plane.axis, plane.position)
+    colours = np.array([to_rgb(colour) for colour in style.tissue_colours(mesh.names)])[mesh.tissue[section.cell]]
+    axes.add_collection(PolyCollection(list(section.polygons), facecolors=colours, edgecolors="white", linewidths=0.45))
+    _frame(axes, plane, dark=False)
+
+
+def arrows(axes: Axes, view: View, plane: Plane, u: np.ndarray) -> None:
+    """In-plane displacement at true length, every few millimetres."""
+    picture = view.slice(plane).nodal(u)
+    stride = max(1, picture.shape[1] // 16)
+    some = (slice(stride // 2, None, stride),) * 2
+    across, up = IN_PLANE[plane.axis]
+    at, moved = plane.points()[some], picture[some]
+    axes.quiver(
+        *(at[..., across], at[..., up], moved[..., across], moved[..., up]),
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        color="white",
+        width=0.005,
+        headwidth=4,
+        headlength=4.5,
+    )
+
+
+def symmetric(values: np.ndarray, quantile: float = 0.995) -> Normalize:
+    """Colour range −a … a that holds nearly all finite values."""
+    bound = _bound(np.abs(values), quantile)
+    return Normalize(-bound, bound)
+
+
+def from_zero(*values: np.ndarray, quantile: float = 0.998) -> Normalize:
+    """Colour range 0 … a that holds nearly all finite values of all pictures."""
+    return Normalize(0, max(_bound(value, quantile) for value in values))
+
+
+def _bound(values: np.ndarray, quantile: float) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.quantile(finite, quantile)) or 1e-9 if finite.size else 1.0
+
+
+def grey_limits(run: Run) -> tuple[float, float]:
+    """One grey scale for the images of a run: the range of the fixed image, without its extremes."""
+    low, high = np.quantile(np.asarray(run.fixed.voxels, float), (0.005, 0.998))
+    return float(low), float(max(high, low + 1e-9))
+
+
+def colourbar(figure: Figure, drawn: ScalarMappable, axes: Axes | Sequence[Axes], label: str, **place: Any) -> None:
+    """A slim colour bar with its unit."""
+    settings: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "aspect": 28, "shrink": 0.94} | place
+    bar = figure.colorbar(drawn, ax=axes, **settings)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(length=2, labelsize=7)
+    if isinstance(drawn.norm, LogNorm):
+        bar.locator, bar.minorlocator = LogLocator(subs=(1, 2, 5)), NullLocator()
+        bar.formatter = FuncFormatter(lambda value, _: f"{value:.3g}")
+    else:
+        bar.locator = MaxNLocator(5)
+    bar.update_ticks()
+    bar.set_label(label, fontsize=8)
+
+
+def tissue_legend(names: Sequence[str], skull: bool) -> list[Patch]:
+    """Handles for the tissues, and the skull."""
+    handles = [
+        Patch(color=colour, label=name.upper() if len(name) <= 3 else name)
+        for name, colour in zip(names, style.tissue_colours(names), strict=True)
+    ]
+    return handles + ([Patch(color=style.SKULL, label="skull (forbidden)")] if skull else [])
+
+
+def _frame(axes: Axes, plane: Plane, dark: bool) -> None:
+    axes.set(xlim=plane.horizontal, ylim=plane.vertical, aspect="equal", xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    colour = "#e4e7eb" if dark else style.MUTED
+    across, up = IN_PLANE[plane.axis]
+    places = {(0.015, 0.5): DIRECTIONS[across][0], (0.985, 0.5): DIRECTIONS[across][1]}
+    places |= {(0.5, 0.015): DIRECTIONS[up][0], (0.5, 0.985): DIRECTIONS[up][1]}
+    for (x, y), letter in places.items():
+        aligned: dict[str, Any] = {"ha": _side(x, "left", "right"), "va": _side(y, "bottom", "top")}
+        axes.text(x, y, letter, transform=axes.transAxes, fontsize=7, color=colour, **aligned)
+    _scale_bar(axes, plane, colour)
+
+
+def _side(position: float, low: str, high: str) -> str:
+    return low if position < 0.1 else high if position > 0.9 else "center"
+
+
+def _scale_bar(axes: Axes, plane: Plane, colour: str) -> None:
+    width, height = np.ptp(plane.horizontal), np.ptp(plane.vertical)
+    length = max((size for size in BAR_LENGTHS if size <= width / 4), default=BAR_LENGTHS[0])
+    left, bottom = plane.horizontal[0] + 0.03 * width, plane.vertical[0] + 0.03 * height
+    axes.plot([left, left + length], [bottom, bottom], color=colour, lw=1.2, solid_capstyle="butt")
+    axes.text(left + length / 2, bottom + 0.012 * height, f"{length} mm", fontsize=6, color=colour, ha="center")

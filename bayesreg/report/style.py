@@ -1,0 +1,122 @@
+"""Colours, type and the embedding of figures: one look for all of them."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+INK = "#1f2933"
+MUTED = "#66727f"
+FAINT = "#cbd2d9"
+ACCENT = "#9b2335"
+TRUTH = "#111111"
+
+# Distinct in hue and in lightness, also for colour-blind eyes and in grey.
+KNOWN_TISSUES = {"csf": "#3a6ea5", "gm": "#c26a6f", "wm": "#e3b95a"}
+OTHER_TISSUES = ("#5c9a86", "#7d6aa8", "#b07c46", "#8aa34f", "#a3597f", "#4f8fa3")
+SKULL = "#39424e"
+UNIFORM = "#5b6b7b"
+
+MAGNITUDE = "viridis"
+ERROR = "magma"
+SIGNED = "RdBu_r"
+GREY = "gray"
+
+WIDTH = 10.8
+DPI = 160
+
+_SETTINGS: Any = {
+    "font.family": "sans-serif",
+    "font.size": 8.5,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.linewidth": 0.7,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 3,
+    "ytick.major.size": 3,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.facecolor": "white",
+    "figure.constrained_layout.h_pad": 0.06,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "bayesreg",
+}
+
+
+class Drawing(NamedTuple):
+    """A figure of the report.
+
+    Attributes
+    ----------
+    key : str
+        Its anchor.
+    title : str
+    caption : str
+    alt : str
+        What it shows, for those who cannot see it.
+    uri : str
+        The picture itself, a data URI.
+    """
+
+    key: str
+    title: str
+    caption: str
+    alt: str
+    uri: str
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Draw inside this block for the common look."""
+    with mpl.rc_context(_SETTINGS):
+        yield
+
+
+def new_figure(height: float, width: float = WIDTH) -> Figure:
+    """A figure of the page's width, inches."""
+    return Figure(figsize=(width, height), layout=ConstrainedLayoutEngine(hspace=0.04))
+
+
+def data_uri(figure: Figure, kind: str = "png") -> str:
+    """A figure as a data URI: "png" for pictures, "svg" for curves."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=DPI, metadata={"Date": None} if kind == "svg" else None)
+    media = "image/svg+xml" if kind == "svg" else "image/png"
+    return f"data:{media};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def tissue_colours(names: Sequence[str]) -> list[str]:
+    """A colour per tissue, the same in every figure."""
+    others = iter(OTHER_TISSUES * (1 + len(names) // len(OTHER_TISSUES)))
+    return [KNOWN_TISSUES.get(name.lower()) or next(others) for name in names]
+
+
+def chain_colours(count: int) -> list[str]:
+    """A colour per chain."""
+    if count <= len(_FEW_CHAINS):
+        return list(_FEW_CHAINS[:count])
+    colours = mpl.colormaps["viridis"].resampled(count)
+    return [mpl.colors.to_hex(colours(index)) for index in range(count)]
+
+
+_FEW_CHAINS = ("#2b5c8a", "#d08c3f", "#4f9d86", "#a84a63")

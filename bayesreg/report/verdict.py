@@ -1,0 +1,234 @@
+"""The first words of a report: did it converge, the key numbers, and what to beware of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from bayesreg.mesh import TetMesh
+from bayesreg.report.estimands import Estimand, above, parameter_groups, worst
+
+DEFAULT_THRESHOLD = 1.01
+LEAST_ESS = 100.0
+NU_LOCKING = 0.48
+NOISE_FACTOR = 1.5
+NONE = "–"
+
+
+class Verdict(NamedTuple):
+    """Whether the chains converged.
+
+    Attributes
+    ----------
+    converged : bool
+        Whether R-hat is below the threshold for every estimand, whatever the manifest says.
+    headline : str
+        One sentence.
+    detail : str
+        Why it stopped, and what that means for the figures below.
+    """
+
+    converged: bool
+    headline: str
+    detail: str
+
+
+class Fact(NamedTuple):
+    """One key number: its label, its value as text, and a note."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+def number(value: float | int | None, digits: int = 3) -> str:
+    """A number to so many significant digits; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if value == 0:
+        return "0"
+    if abs(value) >= 10**digits:
+        return f"{value:,.0f}"
+    if abs(value) < 1e-3:
+        return f"{value:.{digits - 1}g}".replace("-", "−")
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def fixed(value: float | int | None, decimals: int = 2) -> str:
+    """A number with so many decimals; a dash where there is none."""
+    return NONE if value is None or not math.isfinite(value) else f"{value:,.{decimals}f}".replace("-", "−")
+
+
+def percent(value: float | int | None) -> str:
+    """A fraction as per cent."""
+    return NONE if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
+
+
+def duration(seconds: float | int | None) -> str:
+    """Seconds as "45 s", "3 min 20 s" or "2 h 05 min"."""
+    if seconds is None or not math.isfinite(seconds):
+        return NONE
+    if seconds < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def part(manifest: Mapping[str, Any], *keys: str) -> Any:
+    """A nested entry of the manifest, or None."""
+    value: Any = manifest
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
+
+
+def threshold_of(manifest: Mapping[str, Any]) -> float:
+    """The R-hat that was asked for."""
+    return float(part(manifest, "stopped", "rhat_threshold") or DEFAULT_THRESHOLD)
+
+
+def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict:
+    """Judge by the estimands themselves; the manifest only says why it stopped."""
+    threshold = threshold_of(manifest)
+    reason = str(part(manifest, "stopped", "reason") or "").strip().rstrip(".")
+    stopped = f"It stopped because {reason}. " if reason else ""
+    if not entries:
+        return Verdict(False, "Not converged: no estimand has a convergence figure.", stopped)
+    first, failing = worst(entries, 1)[0], above(entries, threshold)
+    named = f"{rhat_text(first.rhat)} ({first.name}{_at(first)})"
+    if not failing:
+        headline = f"Converged: R̂ is below {threshold:g} for all {len(entries):,} estimands; the greatest is {named}."
+        return Verdict(True, headline, (stopped + _few_draws(entries)).strip())
+    headline = (
+        f"Not converged: R̂ is {threshold:g} or more for {failing:,} of {len(entries):,} estimands; "
+        f"the greatest is {named}."
+    )
+    detail = (
+        "What follows describes where the chains have been so far, not the posterior: "
+        "means may still move, and intervals and effective sample sizes are unreliable."
+    )
+    return Verdict(False, headline, stopped + detail)
+
+
+def rhat_text(rhat: float) -> str:
+    """R-hat for people; undefined where a chain never moved."""
+    return "undefined" if math.isnan(rhat) else "infinite" if math.isinf(rhat) else number(rhat, 4)
+
+
+def _at(entry: Estimand) -> str:
+    return f" at {place_text(entry.place)}" if entry.place else ""
+
+
+def place_text(place: tuple[float, float, float]) -> str:
+    """A world position, mm."""
+    # Adding zero turns −0 into 0.
+    return ("(" + ", ".join(f"{round(coordinate) + 0:d}" for coordinate in place) + ") mm").replace("-", "−")
+
+
+def _few_draws(entries: Sequence[Estimand]) -> str:
+    least = _least(entries, "ess_bulk")
+    if math.isnan(least) or least >= LEAST_ESS:
+        return ""
+    return f"But the least effective sample size is only {number(least)}: means are rough and the tails rougher."
+
+
+def _least(entries: Sequence[Estimand], figure: str) -> float:
+    values = [getattr(entry, figure) for entry in entries]
+    return float(np.nanmin(values)) if values and not np.isnan(values).all() else float("nan")
+
+
+def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterior: xr.Dataset) -> list[Fact]:
+    """The numbers of the first panel."""
+    sizes = posterior.sizes
+    failed, solved = part(manifest, "solver", "failed"), part(manifest, "solver", "iterations_mean")
+    greatest = worst(entries, 1)
+    implied, sampling = part(manifest, "implied_noise_sd"), part(manifest, "timings", "sampling")
+    return [
+        Fact("Greatest R̂", rhat_text(greatest[0].rhat) if greatest else NONE, f"asked for {threshold_of(manifest):g}"),
+        Fact(
+            "Least ESS",
+            f"{number(_least(entries, 'ess_bulk'), 2)} bulk",
+            f"{number(_least(entries, 'ess_tail'), 2)} tail, of {sizes['chain'] * sizes['draw']:,} draws",
+        ),
+        Fact(
+            "Acceptance",
+            percent(part(manifest, "acceptance", "inside_support")),
+            f"inside the support; {percent(part(manifest, 'acceptance', 'overall'))} overall",
+        ),
+        Fact("Chains × draws", f"{sizes['chain']} × {sizes['draw']:,}", "kept"),
+        Fact("Contact with the skull", _count(part(manifest, "contact_nodes")), "nodes"),
+        Fact("Failed solves", _count(failed), f"{number(solved)} iterations on average" if solved else ""),
+        Fact(
+            "Time",
+            duration(part(manifest, "timings", "total")),
+            f"{duration(sampling)} of it sampling" if sampling else "",
+        ),
+        Fact("Speed", number(part(manifest, "steps_per_second_per_chain")), "steps per second and chain"),
+        Fact("Residual sd", number(part(manifest, "residual_sd")), f"T_s implies {number(implied)}" if implied else ""),
+    ]
+
+
+def _count(value: float | int | None) -> str:
+    return NONE if value is None else f"{int(value):,}"
+
+
+def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
+    """What to beware of, beyond convergence: the manifest's own warnings, then those that its numbers call for.
+
+    Parameters
+    ----------
+    manifest : mapping
+        Of which `warnings`, `exact`, `solver`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
+    mesh : TetMesh
+    posterior : xarray.Dataset
+        With `lam` and `mu`, for Poisson's ratio.
+    """
+    found = list(part(manifest, "warnings") or [])
+    found += _approximate(manifest) + _solver(manifest) + _noise(manifest) + _locking(mesh, posterior)
+    return list(dict.fromkeys(found))
+
+
+def _approximate(manifest: Mapping[str, Any]) -> list[str]:
+    if part(manifest, "exact") is not False:
+        return []
+    return ["The sampler is approximate: even with endless draws it would not give exactly the posterior of the model."]
+
+
+def _solver(manifest: Mapping[str, Any]) -> list[str]:
+    failed = part(manifest, "solver", "failed")
+    if not failed:
+        return []
+    return [
+        f"{int(failed):,} elastic solves failed and counted as density zero: the posterior near those states is "
+        "under-explored. Allow more iterations or a stronger preconditioner."
+    ]
+
+
+def _noise(manifest: Mapping[str, Any]) -> list[str]:
+    implied, residual = part(manifest, "implied_noise_sd"), part(manifest, "residual_sd")
+    if not implied or not residual or 1 / NOISE_FACTOR <= residual / implied <= NOISE_FACTOR:
+        return []
+    wide = residual > implied
+    return [
+        f"T_s implies a noise sd of {number(implied)} (variance T_s / 2w at a quadrature point of weight w), but the "
+        f"residual at the mean has sd {number(residual)}: the posterior is too {'narrow' if wide else 'wide'}. "
+        f"A T_s {number((residual / implied) ** 2, 2)} times the present one would agree."
+    ]
+
+
+def _locking(mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
+    found = []
+    for group in parameter_groups(mesh, posterior, max_draws=1000):
+        lam, mu = float(np.median(group.lam)), float(np.median(group.mu))
+        nu = lam / (2 * (lam + mu)) if mu > 0 else 0.0
+        if nu > NU_LOCKING:
+            found.append(
+                f"Poisson’s ratio of {group.name} is {nu:.3f} at the medians (λ/μ = {number(lam / mu)}), above "
+                f"{NU_LOCKING}: linear tetrahedra lock near incompressibility, and the tissue moves too stiffly."
+            )
+    return found

@@ -1,0 +1,18 @@
+"""Shapes and types are checked while the tests run, and compiled programs are kept from one run to the next."""
+
+import os
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+_ROOT = Path(__file__).parent.parent
+
+# Before anything imports JAX; `setdefault`, so that a caller may choose otherwise.
+os.environ.setdefault("JAX_ENABLE_X64", "true")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_ROOT / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("MPLBACKEND", "agg")
+
+# Not for the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
+_MODULES = [f"bayesreg.{path.stem}" for path in (_ROOT / "bayesreg").iterdir() if path.stem[0] not in "_."]
+install_import_hook([name for name in _MODULES if name != "bayesreg.config"], "beartype.beartype")

@@ -1,0 +1,215 @@
+"""The sampler against posteriors that are known exactly.
+
+Where the moving image is linear in x, E_s is quadratic in u_B, and the posterior of u_B at fixed λ, μ is a Gaussian
+whose mean and precision the oracle computes. With a flat skull it is that Gaussian, cut off: rejection samples it.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import bayesreg as br
+from tests.oracles import paper
+from tests.phantoms import box_mesh, flat_skull, linear_image, rotated_affine, smooth_image
+
+MESH = box_mesh(2)
+LAM, MU = np.array([0.5, 1.0, 1.5]), np.array([0.7, 1.0, 1.4])
+OFFSET, GRADIENT = 0.4, np.array([0.03, -0.02, 0.04])
+TEMPERATURES = {"t_similarity": 1.0, "t_elastic": 20.0, "rigid_sd": 0.3}
+WALL = 21.0
+
+CHAINS, STEPS_PER_DRAW = 32, 15
+DRAWS, WARM_UP = 400, 80
+
+
+class Problem(NamedTuple):
+    posterior: br.Posterior
+    oracle: paper.Paper
+    exact: paper.Gaussian
+    skull: br.Image
+
+
+@cache
+def problem() -> Problem:
+    moving = linear_image(MESH.points, GRADIENT, OFFSET)
+    affine = rotated_affine(MESH.points, (14, 11, 16))
+    texture = smooth_image(MESH.points, seed=4)
+    # What the moving image shows after a shift by (0.8, -0.5, 0.3) mm, and a texture that it cannot explain.
+    ramp = OFFSET + (texture.grid_points() + np.array([0.8, -0.5, 0.3])) @ GRADIENT
+    fixed = br.Image(ramp + 0.1 * (texture.voxels - 0.5), affine)
+    skull = flat_skull(MESH.points, axis=0, wall=WALL, voxel=2.0)
+    known = {name: dict(zip(MESH.names, values, strict=True)) for name, values in (("lam", LAM), ("mu", MU))}
+    model = br.ModelConfig(fixed=known, **TEMPERATURES)
+    arrays = ((image.voxels, image.affine) for image in (fixed, moving))
+    oracle = paper.Paper(MESH.points, MESH.cells, MESH.tissue, *arrays, MESH.boundary, **TEMPERATURES)
+    exact = paper.gaussian_posterior(oracle, LAM, MU, OFFSET, GRADIENT)
+    return Problem(br.build_posterior(fixed, moving, MESH, model=model), oracle, exact, skull)
+
+
+@cache
+def walled() -> br.Posterior:
+    found = problem()
+    images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
+    return br.build_posterior(*images, MESH, model=found.posterior.options, skull=found.skull)
+
+
+def run(posterior, sigma_u, seed):
+    return br.sample(
+        posterior,
+        sampler="rwmh",
+        chains=CHAINS,
+        draws=DRAWS,
+        seed=seed,
+        thin=STEPS_PER_DRAW,
+        block=DRAWS,
+        sigma_u=sigma_u,
+        progress=False,
+    )
+
+
+def draws_of(result):
+    """(chain, draw, coordinate) after the warm-up."""
+    draws = result.idata.posterior["u_boundary"]
+    assert draws.dims == ("chain", "draw", "node", "axis")
+    return draws.values[:, WARM_UP:].reshape(CHAINS, DRAWS - WARM_UP, -1)
+
+
+def z_scores(per_chain, expected, expected_variance=0.0):
+    """Of the mean over independent chains, its error estimated from their scatter: Student t, CHAINS − 1."""
+    error = np.sqrt(per_chain.var(axis=0, ddof=1) / len(per_chain) + expected_variance)
+    return (per_chain.mean(axis=0) - expected) / error
+
+
+def assert_gaussian(draws, exact):
+    """Mean and covariance of the draws are the exact ones within their Monte Carlo error.
+
+    In coordinates whitened by the exact posterior: mean 0, covariance I. Single entries, and two statistics that
+    collect small errors everywhere: the mean square of all z, and the trace.
+    """
+    whitened = np.linalg.cholesky(exact.precision).T @ (draws - exact.mean)[..., None]
+    z_mean, z_second = whitened_scores(whitened[..., 0])
+    assert abs(z_mean).max() < 5
+    assert (z_mean**2).mean() == pytest.approx(1.0, abs=0.6)
+    assert abs(z_second).max() < 6
+    assert (z_second**2).mean() == pytest.approx(1.0, abs=0.3)
+    trace = (whitened[..., 0] ** 2).mean(axis=(1, 2))
+    assert abs(z_scores(trace, 1.0)) < 4.5
+    # The chains are long enough for this to mean something: a shift of all means by a tenth of their standard
+    # deviations, or a posterior wider by a twentieth, fails.
+    assert whitened[..., 0].mean(axis=1).std(axis=0).max() / np.sqrt(CHAINS) < 0.12
+
+
+def whitened_scores(y):
+    """z of every mean and of every entry of the second moment (upper triangle)."""
+    second = np.einsum("cdi,cdj->cij", y, y) / y.shape[1]
+    rows, columns = np.triu_indices(y.shape[2])
+    return z_scores(y.mean(axis=1), 0.0), z_scores(second[:, rows, columns], np.eye(y.shape[2])[rows, columns])
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run(problem().posterior, sigma_u=0.25, seed=0)
+
+
+class TestGaussianPosterior:
+    def test_density_is_the_gaussian(self):
+        """No sampling: log p is quadratic, with the exact mean and precision."""
+        posterior, _, exact, _ = problem()
+
+        def density(flat):
+            return posterior.logdensity_constrained({"u_boundary": flat.reshape(-1, 3), "lam": LAM, "mu": MU})
+
+        scale = np.sqrt(np.diag(exact.precision))
+        np.testing.assert_allclose(jax.grad(density)(exact.mean) / scale, 0, atol=1e-6)
+        rng = np.random.default_rng(0)
+        at_mean = float(density(exact.mean))
+        for step in rng.normal(size=(5, len(exact.mean))):
+            expected = -0.5 * step @ exact.precision @ step
+            assert float(density(exact.mean + step)) - at_mean == pytest.approx(expected, rel=1e-9)
+
+    def test_mean_and_covariance(self, result):
+        assert_gaussian(draws_of(result), problem().exact)
+
+    def test_mean_against_one_chains_own_error(self, result):
+        """The error from batch means within chains agrees with the scatter between them."""
+        draws, exact = draws_of(result), problem().exact
+        batches = draws.reshape(CHAINS * 4, -1, draws.shape[2]).mean(axis=1)
+        error = batches.std(axis=0, ddof=1) / np.sqrt(len(batches))
+        assert abs((batches.mean(axis=0) - exact.mean) / error).max() < 5.5
+
+    def test_acceptance_and_known_parameters(self, result):
+        stats, posterior = result.idata.sample_stats, result.idata.posterior
+        assert 0.1 < float(stats["acceptance_rate"].mean()) < 0.5
+        assert not stats["solver_failed"].any()
+        assert not stats["outside_support"].any()
+        np.testing.assert_allclose(posterior["lam"], np.broadcast_to(LAM, posterior["lam"].shape), rtol=1e-12)
+        np.testing.assert_allclose(posterior["mu"], np.broadcast_to(MU, posterior["mu"].shape), rtol=1e-12)
+
+    def test_log_density_of_the_draws(self, result):
+        """lp belongs to the draw beside it."""
+        draws, lp = draws_of(result), result.idata.sample_stats["lp"].values[:, WARM_UP:]
+        exact = problem().exact
+        distance = np.einsum("di,ij,dj->d", *(draws[0] - exact.mean,), exact.precision, draws[0] - exact.mean)
+        offset = lp[0] + 0.5 * distance
+        assert np.ptp(offset) < 1e-6 * np.ptp(lp[0])
+
+    def test_displacement_at_every_node(self, result):
+        """Moments accumulated while sampling are those of the extended draws, interior included."""
+        _, oracle, _, _ = problem()
+        extension = paper.extension(oracle.stiffness(LAM, MU), MESH.boundary)
+        every = result.idata.posterior["u_boundary"].values.reshape(CHAINS * DRAWS, -1) @ extension.T
+        np.testing.assert_allclose(result.u_mean.ravel(), every.mean(axis=0), atol=1e-6)
+        np.testing.assert_allclose(result.u_sd.ravel(), every.std(axis=0, ddof=1), rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """Brute force: draw from the Gaussian, drop what has a node in the skull."""
+    exact, rng = problem().exact, np.random.default_rng(1)
+    height = MESH.points[MESH.boundary, 0]
+    kept = []
+    while sum(map(len, kept)) < 20_000:
+        draws = exact.draw(rng, 100_000)
+        kept.append(draws[(height + draws[:, ::3] < WALL).all(axis=1)])
+    return np.concatenate(kept)
+
+
+@pytest.fixture(scope="module")
+def draws():
+    return draws_of(run(walled(), sigma_u=0.22, seed=1))
+
+
+class TestTruncatedPosterior:
+    """A flat skull one millimetre beyond a face of the box: some three in a hundred draws of the Gaussian avoid it."""
+
+    LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+
+    def scores(self, draws, reference):
+        """z of the means, and of the probabilities below the reference's quantiles, for every coordinate."""
+        below = np.stack([(draws < q).mean(axis=1) for q in np.quantile(reference, self.LEVELS, axis=0)], axis=-1)
+        spread = (self.LEVELS * (1 - self.LEVELS)) / len(reference)
+        mean = z_scores(draws.mean(axis=1), reference.mean(axis=0), reference.var(axis=0) / len(reference))
+        return mean, z_scores(below, self.LEVELS, spread)
+
+    def test_no_draw_is_in_the_skull(self, draws):
+        deepest = (MESH.points[MESH.boundary, 0] + draws[..., ::3]).max()
+        assert WALL - 0.05 < deepest < WALL
+
+    def test_marginals(self, draws, reference):
+        mean, quantiles = self.scores(draws, reference)
+        assert abs(mean).max() < 5
+        assert (mean**2).mean() == pytest.approx(1.0, abs=0.6)
+        assert abs(quantiles).max() < 6
+        assert (quantiles**2).mean() == pytest.approx(1.0, abs=0.6)
+
+    def test_the_wall_matters(self, draws):
+        """Against the Gaussian without the wall the same scores fail by far."""
+        free = problem().exact.draw(np.random.default_rng(2), 20_000)
+        mean, quantiles = self.scores(draws, free)
+        assert abs(mean).max() > 10
+        assert abs(quantiles).max() > 10

@@ -1,0 +1,111 @@
+"""Anatomies: MNI152 from nilearn's wheel, BrainWeb where its files are, and one's own files."""
+
+import os
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from bayesreg.io.datasets import brainweb, check_same_grid, from_files, mni152
+
+needs_brainweb = pytest.mark.skipif(
+    not os.environ.get("BAYESREG_DATA"), reason="needs the BrainWeb files, in a folder that BAYESREG_DATA names"
+)
+
+
+@pytest.fixture(scope="module")
+def mni():
+    return mni152()
+
+
+@pytest.fixture
+def files(tmp_path):
+    labels = np.zeros((6, 6, 6), np.int16)
+    labels[1:5, 1:5, 1:5] = 12
+    labels[2:4, 2:4, 2:4] = 13
+    labels[3, 3, 3] = 11
+    paths = {name: tmp_path / f"{name}.nii" for name in ("t1", "labels", "inside")}
+    for name, voxels in {"t1": labels * 2.5, "labels": labels, "inside": (labels > 0) * 255.0}.items():
+        nib.save(nib.Nifti1Image(voxels, np.diag([2.0, 2.0, 2.0, 1.0])), paths[name])
+    return paths
+
+
+OWN_TABLE = {"wm": 13, "gm": 12, "csf": 11}
+
+
+def check_anatomy(anatomy):
+    check_same_grid(anatomy.image, anatomy.tissue)
+    check_same_grid(anatomy.image, anatomy.intracranial)
+    assert set(np.unique(anatomy.tissue.voxels)) == {0, 1, 2, 3}
+    assert set(np.unique(anatomy.intracranial.voxels)) == {0, 1}
+    assert (anatomy.intracranial.voxels[anatomy.tissue.voxels > 0] == 1).all()
+
+
+def mean_intensities(anatomy):
+    return [anatomy.image.voxels[anatomy.tissue.voxels == tissue].mean() for tissue in (1, 2, 3)]
+
+
+class TestMni152:
+    def test_is_a_complete_anatomy(self, mni):
+        check_anatomy(mni)
+
+    def test_tissues_have_the_contrast_of_t1(self, mni):
+        csf, gm, wm = mean_intensities(mni)
+        assert 0.3 < csf < 0.45 < gm < 0.75 < wm < 1
+
+    def test_volumes_are_those_of_a_brain(self, mni):
+        litres = np.bincount(mni.tissue.voxels.ravel())[1:] * mni.tissue.voxel_volume / 1e6
+        np.testing.assert_allclose(litres, (0.156, 1.091, 0.636), atol=0.02)
+
+    def test_ventricles_are_csf_on_both_sides(self, mni):
+        points = np.array([[-14.0, -30, 18], [14.0, -30, 18], [-25.0, -20, 28], [25.0, -20, 28]])
+        index = np.rint(mni.tissue.world_to_voxel(points)).astype(int)
+        np.testing.assert_array_equal(mni.tissue.voxels[tuple(index.T)], [1, 1, 3, 3])
+
+
+@needs_brainweb
+class TestBrainWeb:
+    def test_is_a_complete_anatomy(self):
+        anatomy = brainweb()
+        check_anatomy(anatomy)
+        np.testing.assert_array_equal(anatomy.image.voxel_to_world(np.zeros(3)), (-90, -126, -72))
+        assert (anatomy.intracranial.voxels != 0).sum() == 1_955_020
+        csf, gm, wm = mean_intensities(anatomy)
+        assert csf < 60 < gm < 120 < wm
+
+    def test_refuses_a_t1_on_another_grid(self, files):
+        with pytest.raises(ValueError, match="the T1 and the label image must share one grid"):
+            brainweb(t1_path=files["t1"])
+
+
+def test_brainweb_says_how_to_find_its_files(monkeypatch):
+    monkeypatch.delenv("BAYESREG_DATA", raising=False)
+    with pytest.raises(ValueError, match="environment variable BAYESREG_DATA"):
+        brainweb()
+
+
+def test_brainweb_says_which_file_is_missing(monkeypatch, tmp_path):
+    monkeypatch.setenv("BAYESREG_DATA", str(tmp_path))
+    with pytest.raises(ValueError, match=r"colin27_t1_1mm_unedited\.nii\.gz: there is no such file"):
+        brainweb()
+
+
+class TestFromFiles:
+    def test_reads_one_s_own(self, files):
+        anatomy = from_files(files["t1"], files["labels"], OWN_TABLE, files["inside"])
+        check_anatomy(anatomy)
+        assert anatomy.tissue.voxels[3, 3, 3] == 1
+        assert anatomy.tissue.voxels[1, 1, 1] == 2
+        assert anatomy.tissue.voxels[2, 2, 2] == 3
+
+    def test_goes_without_an_intracranial_mask(self, files):
+        assert from_files(files["t1"], files["labels"], OWN_TABLE).intracranial is None
+
+    def test_refuses_other_tissues(self, files):
+        with pytest.raises(ValueError, match="must name csf, gm, wm; got gm, tumour"):
+            from_files(files["t1"], files["labels"], {"gm": 12, "tumour": 13})
+
+    def test_refuses_labels_on_another_grid(self, files, tmp_path):
+        nib.save(nib.Nifti1Image(np.zeros((6, 6, 6)), np.eye(4)), tmp_path / "other.nii")
+        with pytest.raises(ValueError, match="the fixed and the label image must share one grid"):
+            from_files(tmp_path / "other.nii", files["labels"], OWN_TABLE)

@@ -1,0 +1,168 @@
+from dataclasses import fields, replace
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from bayesreg.image import Image
+from bayesreg.io import store
+from bayesreg.io.store import Run, Truth
+from tests.phantoms import ball_mesh, rotated_affine
+
+
+@pytest.fixture
+def run():
+    rng = np.random.default_rng(0)
+    mesh = ball_mesh(40.0, 30.0)
+    shape, n = (7, 6, 5), len(mesh.points)
+    affine = rotated_affine(mesh.points, shape)
+    images = {name: Image(rng.normal(size=shape).astype(np.float32), affine) for name in ("fixed", "moving", "warped")}
+    return Run(
+        config="sampler:\n  step: 1e-3 # λ\n",
+        manifest={"seed": 3, "stopped": {"converged": False, "reason": "budget"}},
+        mesh=mesh,
+        u_mean=rng.normal(size=(n, 3)),
+        u_sd=rng.uniform(size=(n, 3)),
+        tissue=Image(rng.integers(0, 4, shape).astype(np.int8), affine),
+        skull=Image(rng.uniform(size=shape) > 0.5, affine),
+        truth=Truth(rng.normal(size=(n, 3)), np.array([1e-6, 10.0, 30.0]), np.ones(3), rng.normal(size=(n, 3))),
+        metrics={"boundary_error": {"max": 2.5}},
+        **images,
+    )
+
+
+def assert_same(a: Run, b: Run) -> None:
+    assert (a.config, a.manifest, a.metrics) == (b.config, b.manifest, b.metrics)
+    assert a.mesh.digest == b.mesh.digest
+    np.testing.assert_array_equal(a.u_mean, b.u_mean)
+    np.testing.assert_array_equal(a.u_sd, b.u_sd)
+    for name in (field.name for field in fields(Run)):
+        one, other = getattr(a, name), getattr(b, name)
+        if isinstance(one, Image):
+            np.testing.assert_array_equal(one.voxels, other.voxels, err_msg=name)
+            np.testing.assert_allclose(one.affine, other.affine, atol=1e-4, err_msg=name)
+
+
+def test_a_run_comes_back_as_it_was_written(run, tmp_path):
+    folder = tmp_path / "new" / "run"
+    store.write_run(folder, run)
+    back = store.read_run(folder)
+    assert_same(run, back)
+    for one, other in zip(run.truth, back.truth, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
+    run = replace(run, truth=None, skull=None, metrics=None)
+    store.write_run(tmp_path, run)
+    back = store.read_run(tmp_path)
+    assert_same(run, back)
+    assert back.truth is None
+    assert back.skull is None
+    assert back.metrics is None
+
+
+def test_a_truth_without_a_start_comes_back_without(run, tmp_path):
+    store.write_run(tmp_path, replace(run, truth=run.truth._replace(initial=None)))
+    assert store.read_run(tmp_path).truth.initial is None
+
+
+def test_displacements_are_written_as_lps_transform_and_the_sd_stays_positive(run, tmp_path):
+    mean = np.zeros((*run.fixed.shape, 3))
+    mean[2, 3, 1] = (1.0, 2.0, 3.0)
+    store.write_run(tmp_path, run, mean, np.abs(mean))
+    for name, expected in (("displacement_mean", (-1.0, -2.0, 3.0)), ("displacement_sd", (1.0, 2.0, 3.0))):
+        file = nib.load(tmp_path / f"{name}.nii.gz")
+        assert file.shape == (*run.fixed.shape, 1, 3)
+        assert file.header["intent_code"] == 1007
+        np.testing.assert_allclose(np.asarray(file.dataobj)[2, 3, 1, 0], expected)
+        np.testing.assert_allclose(file.affine, run.fixed.affine, atol=1e-4)
+
+
+def test_inputs_can_be_read_before_the_run_has_finished(run, tmp_path):
+    store.write_inputs(tmp_path, run.inputs)
+    inputs = store.read_inputs(tmp_path)
+    assert inputs.config == run.config
+    assert inputs.mesh.digest == run.mesh.digest
+    np.testing.assert_array_equal(inputs.truth.u, run.truth.u)
+    with pytest.raises(ValueError, match=r"run\.json is missing"):
+        store.read_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", ["run.json", "config.yaml", "mesh.vtu", "inputs/fixed.nii.gz", "inputs/tissue.nii.gz", "warped_mean.nii.gz"]
+)
+def test_each_missing_part_is_named(run, tmp_path, name):
+    store.write_run(tmp_path, run)
+    (tmp_path / name).unlink()
+    with pytest.raises(ValueError, match=f"holds no finished run: {name} is missing"):
+        store.read_run(tmp_path)
+
+
+def test_a_mesh_without_results_is_no_finished_run(run, tmp_path):
+    store.write_run(tmp_path, run)
+    store.save_mesh(run.mesh, tmp_path / "mesh.vtu")
+    with pytest.raises(ValueError, match="holds no u_mean and no u_sd"):
+        store.read_run(tmp_path)
+
+
+def test_fresh_folders_are_accepted(tmp_path):
+    store.require_fresh(tmp_path / "not there yet")
+    store.require_fresh(tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    store.require_fresh(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["run.json", "config.yaml", "draws/block_00000.npz", "posterior.nc"])
+def test_a_folder_that_holds_another_run_is_refused(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"already holds a run .*--resume"):
+        store.require_fresh(tmp_path)
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "out").touch()
+    with pytest.raises(ValueError, match="is a file"):
+        store.require_fresh(tmp_path / "out")
+
+
+def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
+    assert store.count_blocks(tmp_path) == 0
+    assert list(store.load_blocks(tmp_path)) == []
+    for k in range(12):
+        store.save_block(tmp_path, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
+    store.save_block(tmp_path, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
+    assert store.count_blocks(tmp_path) == 12
+    blocks = list(store.load_blocks(tmp_path))
+    assert [int(block["step"]) for block in blocks] == list(range(12))
+    assert (blocks[11]["u"] == -1).all()
+    assert len(list(store.load_blocks(tmp_path, count=5))) == 5
+
+
+def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, monkeypatch):
+    store.save_block(tmp_path, 0, {"u": np.zeros(3)})
+    store.save_state(tmp_path, {"step": np.array(1)})
+
+    def killed(file, **_):
+        file.write(b"PK half a file")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez", killed)
+    with pytest.raises(KeyboardInterrupt):
+        store.save_block(tmp_path, 1, {"u": np.ones(3)})
+    with pytest.raises(KeyboardInterrupt):
+        store.save_state(tmp_path, {"step": np.array(2)})
+    assert store.count_blocks(tmp_path) == 1
+    assert int(store.load_state(tmp_path)["step"]) == 1
+
+
+def test_a_gap_among_the_blocks_is_an_error(tmp_path):
+    for k in (0, 2):
+        store.save_block(tmp_path, k, {"u": np.zeros(1)})
+    with pytest.raises(ValueError, match=r"block_00001\.npz is missing"):
+        store.count_blocks(tmp_path)
+
+
+def test_without_a_checkpoint_there_is_no_state(tmp_path):
+    assert store.load_state(tmp_path) is None

@@ -1,0 +1,253 @@
+"""Volumes in files: round trips, what other programs read, and clear refusals."""
+
+import gzip
+
+import nibabel as nib
+import numpy as np
+import pytest
+import SimpleITK
+
+from bayesreg.image import Image
+from bayesreg.io.volumes import (
+    check_same_grid,
+    check_same_space,
+    load_image,
+    load_labels,
+    save_displacement,
+    save_image,
+)
+from tests.test_image import AFFINES, affine_of
+
+SHAPE = (5, 6, 4)
+RIGID = {name: affine for name, affine in AFFINES.items() if name != "sheared"}
+TABLE = {"csf": 1, "gm": (2, 8), "wm": [3]}
+
+
+def some_image(affine=None, dtype=float):
+    voxels = np.random.default_rng(0).integers(0, 200, SHAPE).astype(dtype)
+    return Image(voxels, affine_of() if affine is None else affine)
+
+
+def write(path, voxels, affine=None, **kwargs):
+    nib.save(nib.Nifti1Image(voxels, np.eye(4) if affine is None else affine, **kwargs), path)
+    return path
+
+
+class TestRoundTrip:
+    @pytest.mark.parametrize("affine", AFFINES.values(), ids=AFFINES.keys())
+    @pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+    def test_keeps_voxels_and_orientation(self, tmp_path, affine, suffix):
+        image = some_image(affine)
+        save_image(image, tmp_path / f"image{suffix}")
+        loaded = load_image(tmp_path / f"image{suffix}")
+        np.testing.assert_array_equal(loaded.voxels, image.voxels)
+        np.testing.assert_allclose(loaded.affine, affine, rtol=1e-6, atol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("given", "stored"),
+        [("f8", "f4"), ("f4", "f4"), ("i2", "i2"), ("u1", "u1"), ("i8", "i4"), ("?", "u1")],
+    )
+    def test_number_types(self, tmp_path, given, stored):
+        image = some_image(dtype=given)
+        save_image(image, tmp_path / "image.nii.gz")
+        loaded = load_image(tmp_path / "image.nii.gz").voxels
+        assert loaded.dtype == np.dtype(stored)
+        np.testing.assert_array_equal(loaded, image.voxels)
+
+    def test_integers_too_large_for_32_bits_are_kept(self, tmp_path):
+        save_image(Image(np.full(SHAPE, 2**40), np.eye(4)), tmp_path / "image.nii")
+        np.testing.assert_array_equal(load_image(tmp_path / "image.nii").voxels, 2**40)
+
+    def test_a_failing_write_leaves_the_old_file(self, tmp_path, monkeypatch):
+        save_image(some_image(), tmp_path / "image.nii.gz")
+        before = (tmp_path / "image.nii.gz").read_bytes()
+
+        def fail(image, path):
+            path.write_bytes(b"half")
+            raise OSError("disk full")
+
+        monkeypatch.setattr(nib, "save", fail)
+        with pytest.raises(OSError, match="disk full"):
+            save_image(some_image(np.eye(4)), tmp_path / "image.nii.gz")
+        assert (tmp_path / "image.nii.gz").read_bytes() == before
+        assert [path.name for path in tmp_path.iterdir()] == ["image.nii.gz"]
+
+    def test_refuses_other_names(self, tmp_path):
+        with pytest.raises(ValueError, match=r"must end in \.nii or \.nii\.gz"):
+            save_image(some_image(), tmp_path / "image.png")
+
+    def test_refuses_a_folder_that_is_not_there(self, tmp_path):
+        with pytest.raises(ValueError, match=r"there is no folder .*missing"):
+            save_image(some_image(), tmp_path / "missing" / "image.nii")
+
+
+@pytest.mark.parametrize("affine", RIGID.values(), ids=RIGID.keys())
+def test_simpleitk_sees_the_voxels_at_the_same_places(tmp_path, affine):
+    image = some_image(affine)
+    save_image(image, tmp_path / "image.nii.gz")
+    other = SimpleITK.ReadImage(str(tmp_path / "image.nii.gz"))
+    index = (3, 1, 2)
+    ras = np.array(other.TransformIndexToPhysicalPoint(index)) * (-1, -1, 1)
+    np.testing.assert_allclose(ras, image.voxel_to_world(np.array(index, float)), atol=1e-4)
+    assert other[index] == image.voxels[index]
+
+
+class TestLoadImage:
+    def test_drops_trailing_axes_of_length_one(self, tmp_path):
+        path = write(tmp_path / "a.nii", np.zeros((*SHAPE, 1, 1), np.float32))
+        assert load_image(path).shape == SHAPE
+
+    def test_applies_the_scale_of_the_file(self, tmp_path):
+        source = nib.Nifti1Image(np.arange(8, dtype=np.int16).reshape(2, 2, 2), np.eye(4))
+        source.header.set_slope_inter(0.5, 10)
+        nib.save(source, tmp_path / "a.nii")
+        np.testing.assert_allclose(load_image(tmp_path / "a.nii").voxels.ravel(), 10 + 0.5 * np.arange(8))
+
+    def test_reads_the_qform_where_there_is_no_sform(self, tmp_path):
+        source = nib.Nifti1Image(np.zeros(SHAPE, np.float32), None)
+        source.set_qform(RIGID["oblique left-handed"], code=1)
+        nib.save(source, tmp_path / "a.nii")
+        np.testing.assert_allclose(load_image(tmp_path / "a.nii").affine, RIGID["oblique left-handed"], atol=1e-5)
+
+    def test_turns_foreign_byte_order_around(self, tmp_path):
+        path = write(tmp_path / "a.nii", np.arange(8, dtype=">i2").reshape(2, 2, 2))
+        voxels = load_image(path).voxels
+        assert voxels.dtype.isnative
+        np.testing.assert_array_equal(voxels.ravel(), np.arange(8))
+
+    def test_warns_of_a_missing_orientation(self, tmp_path, caplog):
+        path = write(tmp_path / "a.nii", np.zeros(SHAPE, np.float32), affine=None)
+        source = nib.load(path)
+        bare = nib.Nifti1Image(np.asarray(source.dataobj), None)
+        nib.save(bare, tmp_path / "bare.nii")
+        load_image(tmp_path / "bare.nii")
+        assert "says nothing of its orientation" in caplog.text
+
+    def test_refuses_a_missing_file(self, tmp_path):
+        with pytest.raises(ValueError, match=r"missing\.nii: there is no such file"):
+            load_image(tmp_path / "missing.nii")
+
+    def test_refuses_what_is_no_image(self, tmp_path):
+        (tmp_path / "a.nii").write_text("not an image")
+        with pytest.raises(ValueError, match=r"a\.nii cannot be read"):
+            load_image(tmp_path / "a.nii")
+
+    def test_refuses_a_surface(self, tmp_path):
+        nib.save(nib.gifti.GiftiImage(), tmp_path / "a.gii")
+        with pytest.raises(ValueError, match="holds no image on a grid, but GiftiImage"):
+            load_image(tmp_path / "a.gii")
+
+    def test_refuses_a_file_cut_short(self, tmp_path):
+        path = write(tmp_path / "a.nii.gz", np.random.default_rng(0).normal(size=(9, 9, 9)))
+        path.write_bytes(path.read_bytes()[:-3000])
+        with pytest.raises(ValueError, match=r"a\.nii\.gz.*(cut short|cannot be read)"):
+            load_image(path)
+
+    def test_refuses_damaged_compression(self, tmp_path):
+        path = write(tmp_path / "a.nii", np.random.default_rng(0).integers(0, 9, (20, 20, 20)).astype(float))
+        packed = bytearray(gzip.compress(path.read_bytes()))
+        packed[1000:1100] = bytes(100)
+        (tmp_path / "b.nii.gz").write_bytes(packed)
+        with pytest.raises(ValueError, match=r"b\.nii\.gz.*(cut short|cannot be read)"):
+            load_image(tmp_path / "b.nii.gz")
+
+    @pytest.mark.parametrize("shape", [(4, 5), (*SHAPE, 2), (*SHAPE, 1, 3)])
+    def test_refuses_other_than_three_axes(self, tmp_path, shape):
+        path = write(tmp_path / "a.nii", np.zeros(shape, np.float32))
+        with pytest.raises(ValueError, match=r"a\.nii: expected a 3D image, got shape"):
+            load_image(path)
+
+    def test_refuses_colours(self, tmp_path):
+        path = write(tmp_path / "a.nii", np.zeros(SHAPE, [("R", "u1"), ("G", "u1"), ("B", "u1")]))
+        with pytest.raises(ValueError, match="one real number per voxel"):
+            load_image(path)
+
+    def test_refuses_a_singular_affine(self, tmp_path):
+        source = nib.Nifti1Image(np.zeros(SHAPE, np.float32), np.eye(4))
+        source.header["srow_z"] = 0
+        source.header["sform_code"] = 1
+        raw = nib.Nifti1Image(np.zeros(SHAPE, np.float32), None, source.header)
+        nib.save(raw, tmp_path / "a.nii")
+        with pytest.raises(ValueError, match=r"a\.nii: the affine is singular"):
+            load_image(tmp_path / "a.nii")
+
+    def test_refuses_nan(self, tmp_path):
+        voxels = np.zeros(SHAPE, np.float32)
+        voxels[1, 2, 3] = np.nan
+        with pytest.raises(ValueError, match=r"a\.nii: 1 voxels are NaN"):
+            load_image(write(tmp_path / "a.nii", voxels))
+
+
+class TestLoadLabels:
+    voxels = np.array([0, 1, 2, 3, 8, 9, 0, 2], np.uint8).reshape(2, 2, 2)
+
+    def test_maps_values_to_tissues(self, tmp_path):
+        tissue = load_labels(write(tmp_path / "a.nii", self.voxels), TABLE)
+        np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
+        assert tissue.voxels.dtype == np.int8
+
+    def test_reads_whole_numbers_stored_as_floats(self, tmp_path):
+        tissue = load_labels(write(tmp_path / "a.nii", self.voxels.astype(np.float32)), TABLE)
+        np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
+
+    def test_names_absent_labels_and_those_present(self, tmp_path):
+        path = write(tmp_path / "a.nii", self.voxels)
+        with pytest.raises(ValueError, match=r"no label 7 \(gm\), 41 \(wm\); it holds 0, 1, 2, 3, 8, 9"):
+            load_labels(path, {"csf": 1, "gm": (2, 7), "wm": 41})
+
+    def test_refuses_a_value_with_two_meanings(self, tmp_path):
+        with pytest.raises(ValueError, match="label 2 stands for both gm and wm"):
+            load_labels(write(tmp_path / "a.nii", self.voxels), {"gm": 2, "wm": (2, 3)})
+
+    def test_refuses_a_tissue_without_values(self, tmp_path):
+        with pytest.raises(ValueError, match="no value for wm"):
+            load_labels(write(tmp_path / "a.nii", self.voxels), {"gm": 2, "wm": ()})
+
+    def test_refuses_intensities(self, tmp_path):
+        with pytest.raises(ValueError, match="not integers"):
+            load_labels(write(tmp_path / "a.nii", np.linspace(0, 1, 8).reshape(2, 2, 2)), TABLE)
+
+
+class TestDisplacement:
+    vector = np.array([1.5, -2.0, 4.0])
+
+    def test_file_holds_lps_vectors(self, tmp_path):
+        save_displacement(tmp_path / "u.nii.gz", np.tile(self.vector, (*SHAPE, 1)), np.eye(4))
+        source = nib.load(tmp_path / "u.nii.gz")
+        assert source.shape == (*SHAPE, 1, 3)
+        assert source.header["intent_code"] == 1007
+        np.testing.assert_allclose(np.asarray(source.dataobj)[0, 0, 0, 0], (-1.5, 2.0, 4.0))
+
+    @pytest.mark.parametrize("affine", RIGID.values(), ids=RIGID.keys())
+    def test_simpleitk_moves_points_by_it(self, tmp_path, affine):
+        grid = Image(np.zeros(SHAPE), affine)
+        field = self.vector + 0.05 * grid.grid_points() @ np.array([[1.0, 2, 0], [0, -1, 1], [0.5, 0, 1]])
+        save_displacement(tmp_path / "u.nii.gz", field, affine)
+        source = SimpleITK.ReadImage(str(tmp_path / "u.nii.gz"), SimpleITK.sitkVectorFloat64)
+        transform = SimpleITK.DisplacementFieldTransform(source)
+        flip = np.array([-1, -1, 1])
+        point = grid.voxel_to_world(np.array([2.0, 3.0, 1.0]))
+        moved = np.array(transform.TransformPoint(tuple((point * flip).tolist()))) * flip
+        np.testing.assert_allclose(moved - point, field[2, 3, 1], atol=1e-4)
+
+
+class TestSameGrid:
+    def test_accepts_the_same_grid(self):
+        check_same_grid(some_image(), some_image(dtype="i2"))
+
+    def test_refuses_another_shape(self):
+        with pytest.raises(ValueError, match=r"the fixed and the label image must share one grid.*\(2, 2, 2\)"):
+            check_same_grid(some_image(), Image(np.zeros((2, 2, 2)), np.eye(4)), ("fixed", "label"))
+
+    def test_refuses_another_affine(self):
+        with pytest.raises(ValueError, match=r"corners up to .* mm apart"):
+            check_same_grid(some_image(), some_image(affine_of(origin=(-20.0, 7.5, 3.0))))
+
+
+class TestSameSpace:
+    def test_accepts_images_that_overlap(self):
+        check_same_space(some_image(), some_image(AFFINES["oblique"]))
+
+    def test_refuses_images_apart(self):
+        with pytest.raises(ValueError, match=r"the moving image covers 0% of the fixed one.*\[-18.0, 9.5, 4.5\]"):
+            check_same_space(some_image(), some_image(affine_of(origin=(500.0, 0, 0))), ("fixed", "moving"))

@@ -1,0 +1,114 @@
+import base64
+import io
+
+import numpy as np
+import pytest
+from matplotlib import image
+from matplotlib.figure import Figure
+
+from bayesreg.report import anatomy, convergence, marginals, style
+from bayesreg.report.estimands import Diagnosed, estimands, parameter_groups
+from bayesreg.report.panels import View, from_zero, symmetric
+from tests.report.conftest import make_study
+
+
+@pytest.fixture(scope="module")
+def view(study):
+    return View.of(study.run)
+
+
+@pytest.fixture(scope="module")
+def by_element():
+    """Two chains of two draws, one stiffness per element, no convergence figures."""
+    study = make_study(draws=2, chains=2, spacing=24.0, shape=(20, 22, 18))
+    posterior = study.idata.posterior.drop_dims("tissue")
+    lam = np.random.default_rng(0).gamma(3, size=(2, 2, len(study.run.mesh.cells)))
+    for name, values in (("lam", lam), ("mu", 2 * np.ones_like(lam))):
+        posterior[name] = (("chain", "draw", "tissue"), values)
+    return study.run, posterior, study.idata.sample_stats
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    monkeypatch.setattr(style, "DPI", 40)
+
+
+def pixels(drawing) -> np.ndarray:
+    return image.imread(io.BytesIO(base64.b64decode(drawing.uri.split(",")[1])))[..., :3]
+
+
+def test_the_error_on_a_plane_is_the_norm_of_the_interpolated_error(study, view):
+    plane, run = view.main, study.run
+    picture = view.error(plane)
+    inside = view.slice(plane).inside
+    difference = view.slice(plane).nodal(run.u_mean) - view.slice(plane).nodal(run.truth.u)
+    np.testing.assert_allclose(picture[inside], np.sqrt((difference[inside] ** 2).sum(axis=-1)), atol=1e-12)
+    assert np.isnan(picture[~inside]).all()
+
+
+def test_an_error_without_truth_is_refused(clinical_study):
+    view = View.of(clinical_study.run)
+    with pytest.raises(ValueError, match="only where the truth is"):
+        view.error(view.main)
+
+
+def test_the_residual_is_that_of_the_labelled_voxels(study):
+    run = study.run
+    inside = np.asarray(run.tissue.voxels) > 0
+    expected = np.sqrt(np.mean((np.asarray(run.moving.voxels) - np.asarray(run.fixed.voxels))[inside] ** 2))
+    assert anatomy.residual_sd(run, run.moving) == pytest.approx(expected, rel=1e-9)
+    assert f"{expected:.3f}" in anatomy.registration(View.of(run)).caption
+
+
+def test_one_colour_range_holds_all_pictures_and_signs_balance():
+    assert from_zero(np.array([1.0, np.nan]), np.array([5.0]), quantile=1.0).vmax == 5.0
+    norm = symmetric(np.array([-3.0, 1.0, np.nan]), quantile=1.0)
+    assert (norm.vmin, norm.vmax) == (-3.0, 3.0)
+
+
+def test_pictures_differ_where_the_runs_do(study, view):
+    mirrored = study.run.u_mean * (-1.0)
+    other = View(type(study.run)(**{**vars(study.run), "u_mean": mirrored}), view.planes, view.main)
+    assert np.abs(pixels(anatomy.displacement(view)) - pixels(anatomy.displacement(other))).max() > 0.2
+
+
+def test_stiffness_by_element_is_mapped_by_its_median(by_element):
+    run, posterior, _ = by_element
+    found = anatomy.element_ratio(run, posterior)
+    np.testing.assert_allclose(found, np.median(posterior["lam"].to_numpy() / 2, axis=(0, 1)))
+    drawing = anatomy.element_stiffness(View.of(run), posterior)
+    assert drawing.key == "elements"
+    assert pixels(drawing).std() > 0.02
+
+
+def test_there_is_no_map_by_element_for_parameters_by_tissue(study, view):
+    assert anatomy.element_stiffness(view, study.idata.posterior) is None
+
+
+def test_two_draws_without_any_convergence_figure_are_drawn_all_the_same(by_element):
+    run, posterior, statistics = by_element
+    nothing = posterior.isel(chain=0, draw=0, drop=True) * np.nan
+    entries = estimands(run.mesh, Diagnosed(nothing, nothing, nothing), posterior)
+    drawings = [
+        marginals.stiffness(run, posterior),
+        marginals.skull_node(run, posterior),
+        convergence.traces(posterior, statistics, entries),
+        convergence.distributions(run.mesh, entries, posterior["node"].to_numpy(), 1.01),
+    ]
+    assert [drawing.key for drawing in drawings] == ["stiffness", "node", "traces", "distributions"]
+    assert all(len(drawing.uri) > 5000 for drawing in drawings)
+
+
+def test_the_median_and_interval_stand_above_a_histogram(study):
+    axes = Figure().subplots()
+    group = parameter_groups(study.run.mesh, study.idata.posterior)[1]
+    marginals.ratio_panel(axes, study.run, group)
+    low, median, high = np.quantile(group.ratio, (0.025, 0.5, 0.975))
+    assert axes.get_title(loc="right") == f"{median:.2f} [{low:.2f}, {high:.1f}]"
+    assert "truth" in [text.get_text().strip() for text in axes.texts]
+
+
+def test_many_chains_have_many_colours():
+    assert len(set(style.chain_colours(16))) == 16
+    assert len(set(style.tissue_colours(["csf", "gm", "wm", "tumour", "oedema"]))) == 5
+    assert style.tissue_colours(["WM", "tumour"])[0] == style.tissue_colours(["csf", "gm", "wm"])[2]

@@ -1,0 +1,169 @@
+import base64
+import io
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from bayesreg.report import style
+from bayesreg.report.html import write_report
+
+FIGURES = {"registration", "data", "result", "displacement", "stiffness", "node", "traces", "distributions"}
+
+
+class Page(HTMLParser):
+    """Pictures, table rows, text, and whatever would be loaded from elsewhere."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.figures: dict[str, str] = {}
+        self.rows: list[list[str]] = []
+        self.text = ""
+        self.tags: set[str] = set()
+        self.links: list[str] = []
+        self._key = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.tags.add(tag)
+        self._key = found.get("id", "") if tag == "figure" else self._key
+        if tag == "img":
+            self.figures[self._key] = found["src"]
+            assert found["alt"]
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th") and self.rows:
+            self.rows[-1].append("")
+        self.links += [value for key, value in found.items() if key in ("href", "src") and value]
+
+    def handle_data(self, data):
+        self.text += data
+        if self.rows and self.rows[-1]:
+            self.rows[-1][-1] += data
+
+    def row(self, name: str) -> list[str]:
+        return next(row[1:] for row in self.named(name))
+
+    def named(self, name: str) -> list[list[str]]:
+        return [row for row in self.rows if row and row[0] == name]
+
+
+def page(path, study) -> Page:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "DPI", 40)
+        write_report(*study, path / "report.html")
+    return Page((path / "report.html").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory, study):
+    return page(tmp_path_factory.mktemp("full"), study)
+
+
+@pytest.fixture(scope="module")
+def clinical(tmp_path_factory, uniform_study):
+    """Uniform parameters, not converged, no truth, no skull, and a name that is no markup."""
+    run = uniform_study.run
+    manifest = run.manifest | {"name": '<script>alert("x")</script> & Ω', "warnings": ["beware of <i>this</i>"]}
+    run = replace(run, manifest=manifest, config="a: </pre><b>bold</b>\n", truth=None, skull=None, metrics=None)
+    return page(tmp_path_factory.mktemp("clinical"), uniform_study._replace(run=run))
+
+
+def test_every_figure_is_drawn_and_embedded(full):
+    assert set(full.figures) == FIGURES
+    for key, uri in full.figures.items():
+        kind, content = re.fullmatch(r"data:image/(png|svg\+xml);base64,(.+)", uri).groups()
+        content = base64.b64decode(content)
+        if kind == "png":
+            pixels = image.imread(io.BytesIO(content))[..., :3]
+            assert pixels.shape[1] == round(style.WIDTH * 40)
+            assert pixels.std() > 0.02, key
+        else:
+            assert content.count(b"<path") > 50, key
+
+
+def test_the_page_needs_no_network_and_no_script(full):
+    assert all(link.startswith(("#", "data:")) for link in full.links)
+    assert not full.tags & {"script", "link", "iframe"}
+
+
+def test_table_1_holds_the_errors_of_the_boundary_nodes(full, study):
+    run = study.run
+    distance = np.linalg.norm((run.u_mean - run.truth.u)[run.mesh.boundary], axis=1)
+    expected = [np.median(distance), np.quantile(distance, 0.95), distance.max()]
+    assert full.row("Posterior mean") == [f"{value:.2f}" for value in expected]
+    moved = np.linalg.norm(run.truth.u[run.mesh.boundary], axis=1)
+    assert full.row("No motion")[2] == f"{moved.max():.2f}"
+    assert full.row("Start of the chains")[2] == f"{moved.max() / 2:.2f}"
+
+
+def test_table_2_holds_the_integrated_errors(full, study):
+    run = study.run
+    error = run.u_mean - run.truth.u
+    rng = np.random.default_rng(0)
+    shares = rng.dirichlet(np.ones(4), 4000)
+    # Monte Carlo over every cell: uniform points in a simplex.
+    inside = np.array([((shares @ error[cell]) ** 2).sum(axis=1).mean() for cell in run.mesh.cells])
+    weights = run.mesh.volumes
+    found = [float(text) for text in full.named("Posterior mean")[1][1:]]
+    expected = [np.average(inside, weights=weights)]
+    expected += [np.average(inside[run.mesh.tissue == k], weights=weights[run.mesh.tissue == k]) for k in range(3)]
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+
+
+def test_the_papers_numbers_stand_beside(full):
+    assert [row[1:] for row in full.named("By tissue")] == [
+        ["0.16", "0.72", "2.43"],
+        ["0.040", "0.049", "0.049", "0.023"],
+    ]
+    assert full.row("Initial configuration") == ["2.56", "8.24", "15.08"]
+
+
+def test_parameters_with_intervals_truth_and_what_is_fixed(full, study):
+    ratio = study.idata.posterior["lam"].isel(tissue=2) / study.idata.posterior["mu"].isel(tissue=2)
+    wm = full.named("λ/μ")[2]
+    assert wm[1] == f"{float(ratio.median()):.1f}"
+    assert wm[3] == "30.0"
+    assert full.named("μ")[1][2] == "fixed"
+
+
+def test_the_worst_estimands_are_named_with_their_place(full, study):
+    rhat = study.rhat["u_boundary"]
+    node, axis = np.unravel_index(int(np.argmax(rhat.data)), rhat.shape)
+    x, y, z = study.run.mesh.points[int(rhat["node"][node])].round().astype(int)
+    row = full.row(f"u{'xyz'[axis]} of node {int(rhat['node'][node])}")
+    assert row[0] == f"({x}, {y}, {z}) mm".replace("-", "−")
+    assert row[1] == f"{float(rhat.max()):.3f}"
+
+
+def test_verdict_warnings_settings_and_convention_are_told(full):
+    assert "Converged: R̂ is below 1.01 for all 563 estimands" in full.text
+    assert "24.3 %" in full.text
+    assert "8.7 % overall" in full.text
+    assert "Neurological convention" in full.text
+    assert "elasticity: tissue" in full.text
+    assert "How to cite" in full.text
+
+
+def test_without_truth_and_skull_the_page_is_whole(clinical):
+    assert set(clinical.figures) == FIGURES
+    assert "Table 1" not in clinical.text
+    assert "no truth is known" in clinical.text
+    assert "No skull bounds this run" in clinical.text
+
+
+def test_names_warnings_and_config_are_text_not_markup(clinical):
+    assert '<script>alert("x")</script> & Ω' in clinical.text
+    assert "beware of <i>this</i>" in clinical.text
+    assert "a: </pre><b>bold</b>" in clinical.text
+    assert not clinical.tags & {"script", "i", "b"}
+
+
+def test_chains_that_did_not_converge_are_called_so(clinical):
+    assert "Not converged: R̂ is 1.01 or more for" in clinical.text
+    assert "It stopped because the budget of 5 min was spent." in clinical.text
+    assert "parameters uniform" in clinical.text

@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+
+from bayesreg.image import Image
+from bayesreg.mesh import TetMesh
+from bayesreg.report.slices import MeshSlice, Plane, cut, main_plane, planes_through, sample
+from tests.phantoms import ball_mesh, box_mesh, linear_image, rotated_affine
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("position", [0.0, 3.7, 10.0, 19.99])
+def test_sections_of_a_cube_are_squares(axis, position):
+    mesh = box_mesh(cells_per_side=3, size=20.0)
+    section = cut(mesh, axis, position)
+    # A face in the plane belongs to the cells below it, of which there are none at the lower end.
+    assert section.areas.sum() == pytest.approx(0.0 if position == 0 else 400.0)
+    if position:
+        assert section.polygons.reshape(-1, 2).min() == pytest.approx(0.0, abs=1e-12)
+        assert section.polygons.reshape(-1, 2).max() == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize("position", [0.25, 0.5, 0.75])
+def test_section_of_one_tetrahedron(position):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    mesh = TetMesh.from_arrays(corners, np.array([[0, 1, 2, 3]]), np.array([0]), ("one",))
+    section = cut(mesh, 2, position)
+    assert section.areas == pytest.approx([(1 - position) ** 2 / 2])
+    found = np.unique(section.polygons[0].round(12), axis=0)
+    np.testing.assert_allclose(found, [[0, 0], [0, 1 - position], [1 - position, 0]], atol=1e-12)
+
+
+def test_every_cell_has_its_volume_as_the_integral_of_its_sections():
+    mesh = ball_mesh(40.0, 24.0)
+    low, high = mesh.points[:, 1].min(), mesh.points[:, 1].max()
+    steps = 1500
+    volume = np.zeros(len(mesh.cells))
+    for position in low + (np.arange(steps) + 0.5) * (high - low) / steps:
+        section = cut(mesh, 1, position)
+        np.add.at(volume, section.cell, section.areas * (high - low) / steps)
+    np.testing.assert_allclose(volume, mesh.volumes, rtol=0.02)
+
+
+def test_fields_on_a_plane_are_exact_where_they_are_linear():
+    mesh = ball_mesh(40.0, 18.0)
+    plane = Plane(0, 7.0, (-60.0, 50.0), (-40.0, 60.0), 1.0)
+    matrix = np.random.default_rng(0).normal(size=(3, 3))
+    sliced = MeshSlice(mesh, plane)
+    picture, points = sliced.nodal(mesh.points @ matrix.T), plane.points()
+    assert picture.shape == points.shape == (100, 110, 3)
+    np.testing.assert_allclose(picture[sliced.inside], points[sliced.inside] @ matrix.T, atol=1e-9)
+    assert np.isnan(picture[~sliced.inside]).all()
+    assert sliced.inside.sum() == pytest.approx(cut(mesh, 0, 7.0).areas.sum(), rel=0.01)
+
+
+def test_cellwise_fields_name_the_cell_of_each_pixel():
+    mesh = ball_mesh(40.0, 24.0)
+    plane = Plane(2, 5.0, (-40.0, 50.0), (-50.0, 40.0), 2.0)
+    sliced = MeshSlice(mesh, plane)
+    cells = sliced.cellwise(np.arange(len(mesh.cells)))
+    row, column = np.argwhere(sliced.inside)[300]
+    corner = mesh.points[mesh.cells[int(cells[row, column])]]
+    weights = np.linalg.solve(np.vstack([corner.T, np.ones(4)]), [*plane.points()[row, column], 1.0])
+    assert weights.min() > -1e-9
+
+
+def test_pictures_lie_the_right_way_round_whatever_the_grid():
+    """A bright spot at the right, front and top shows right of the centre, and towards the upper edge."""
+    spot = np.array([20.0, 30.0, 25.0])
+    corners = np.array([[-40.0, -50, -35], [40, 50, 35]])
+    grid = Image(np.zeros((60, 70, 50)), rotated_affine(corners, (60, 70, 50), left_handed=True))
+    image = grid.with_voxels(np.exp(-((grid.grid_points() - spot) ** 2).sum(axis=-1) / 50))
+    for axis, (across, up) in enumerate(((1, 2), (0, 2), (0, 1))):
+        plane = Plane(axis, spot[axis], (-50.0, 50.0), (-50.0, 50.0), 1.0)
+        picture = sample(image, plane.points(), outside=0.0)
+        row, column = np.unravel_index(picture.argmax(), picture.shape)
+        # imshow with the origin below puts row 0 at the bottom edge.
+        assert plane.vertical[0] + row + 0.5 == pytest.approx(spot[up], abs=1.5)
+        assert plane.horizontal[0] + column + 0.5 == pytest.approx(spot[across], abs=1.5)
+
+
+def test_sampling_is_linear_inside_and_says_what_lies_outside():
+    points = ball_mesh(40.0, 24.0).points
+    image = linear_image(points, (0.1, -0.2, 0.3), 2.0)
+    np.testing.assert_allclose(sample(image, points), 2 + points @ (0.1, -0.2, 0.3), atol=1e-9)
+    assert np.isnan(sample(image, np.array([[1e4, 0, 0]]))).all()
+    assert (sample(image, np.array([[1e4, 0, 0]]), outside=-7.0) == -7).all()
+
+
+def test_labels_are_sampled_without_mixing():
+    image = Image(np.array([0, 5, 0]).reshape(3, 1, 1), np.eye(4))
+    found = sample(image, np.array([[0.4, 0, 0], [0.6, 0, 0], [1.4, 0, 0], [1.6, 0, 0]]), order=0)
+    np.testing.assert_array_equal(found, [0, 5, 5, 0])
+
+
+def test_planes_pass_through_an_inner_point_and_leave_one_that_would_only_graze():
+    mesh = ball_mesh(40.0, 13.0)
+    inner = np.array([4.0, -10.0, 12.0])
+    assert [plane.position for plane in planes_through(mesh, inner)] == pytest.approx(inner)
+    top = mesh.points[mesh.points[:, 2].argmax()]
+    sagittal, coronal, axial = planes_through(mesh, top)
+    assert sagittal.position == pytest.approx(top[0])
+    assert coronal.position == pytest.approx(top[1])
+    area = cut(mesh, 2, axial.position).areas.sum()
+    assert 0.6 * np.pi * 40**2 * 0.9 < area < 0.85 * np.pi * 40**2
+    assert axial.position > 8.0
+
+
+def test_the_main_plane_sees_most_of_the_displacement():
+    mesh = ball_mesh(40.0, 13.0)
+    planes = planes_through(mesh, np.array([5.0, 20.0, 8.0]))
+    u = np.where(np.abs(mesh.points[:, [1]] - 20) < 8, 5.0, 0.0) * np.ones(3)
+    assert main_plane(mesh, planes, u).axis == 1
+
+
+def test_titles_name_the_plane_with_a_proper_minus():
+    assert Plane(2, -12.3, (0.0, 1.0), (0.0, 1.0), 1.0).title == "axial, z = −12 mm"
+    assert Plane(0, -0.2, (0.0, 1.0), (0.0, 1.0), 1.0).title == "sagittal, x = 0 mm"

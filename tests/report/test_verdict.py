@@ -1,0 +1,133 @@
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from bayesreg.report.estimands import Estimand
+from bayesreg.report.verdict import duration, fixed, key_facts, number, percent, verdict, warnings_of
+from tests.phantoms import box_mesh
+
+
+def entry(rhat: float, bulk: float = 500.0, tail: float = 400.0, name: str = "u_x of node 7") -> Estimand:
+    return Estimand("u_boundary", (0, 0), name, (1.0, -20.4, 3.0), rhat, bulk, tail)
+
+
+def stopped(reason: str = "the budget of 60 s was spent", threshold: float = 1.2, converged: bool = False) -> dict:
+    return {"stopped": {"reason": reason, "converged": converged, "rhat_threshold": threshold}}
+
+
+def elastic(lam: list[float], mu: list[float]) -> xr.Dataset:
+    dims = ("chain", "draw", "tissue")
+    spread = np.array([0.9, 1.0, 1.1])[None, :, None]
+    return xr.Dataset({"lam": (dims, spread * lam), "mu": (dims, np.ones_like(spread) * mu)})
+
+
+def test_converged_only_if_every_estimand_is_below_the_threshold():
+    found = verdict(stopped("R̂ is below 1.2"), [entry(1.01), entry(1.19, name="λ gm")])
+    assert found.converged
+    assert found.headline.startswith("Converged: R̂ is below 1.2 for all 2 estimands; the greatest is 1.190 (λ gm")
+    assert found.detail == "It stopped because R̂ is below 1.2."
+
+
+def test_one_estimand_above_is_not_converged_whatever_the_manifest_says():
+    found = verdict(stopped(converged=True), [entry(1.01)] * 9 + [entry(1.2)])
+    assert not found.converged
+    assert "Not converged: R̂ is 1.2 or more for 1 of 10 estimands" in found.headline
+    assert "u_x of node 7 at (1, −20, 3) mm" in found.headline
+    assert "the budget of 60 s was spent" in found.detail
+    assert "not the posterior" in found.detail
+
+
+@pytest.mark.parametrize("rhat", [math.nan, math.inf])
+def test_undefined_figures_are_not_converged(rhat):
+    found = verdict(stopped(), [entry(1.0), entry(rhat)])
+    assert not found.converged
+    assert ("undefined" if math.isnan(rhat) else "infinite") in found.headline
+
+
+def test_nothing_sampled_is_not_converged():
+    assert not verdict(stopped(), []).converged
+
+
+def test_few_effective_draws_are_admitted_even_when_converged():
+    assert "effective sample size is only 35" in verdict(stopped(), [entry(1.0), entry(1.0, bulk=35.2)]).detail
+    assert "effective" not in verdict(stopped(), [entry(1.0)]).detail
+
+
+def test_key_facts_hold_the_numbers_of_the_manifest():
+    manifest = stopped() | {
+        "acceptance": {"overall": 0.0871, "inside_support": 0.243},
+        "contact_nodes": 17,
+        "solver": {"failed": 1234, "iterations_mean": 14.2},
+        "timings": {"total": 3725.0, "sampling": 61.0},
+        "steps_per_second_per_chain": 63.4,
+        "residual_sd": 0.0151,
+        "implied_noise_sd": 0.0146,
+    }
+    entries = [entry(1.3, 12.0, 9.0), entry(1.1, 40.0, 33.0)]
+    posterior = elastic([1.0], [1.0])
+    facts = {fact.label: f"{fact.value} {fact.note}" for fact in key_facts(manifest, entries, posterior)}
+    assert facts["Greatest R̂"] == "1.300 asked for 1.2"
+    assert facts["Least ESS"] == "12 bulk 9.0 tail, of 3 draws"
+    assert facts["Acceptance"] == "24.3 % inside the support; 8.7 % overall"
+    assert facts["Contact with the skull"] == "17 nodes"
+    assert facts["Failed solves"] == "1,234 14.2 iterations on average"
+    assert facts["Time"] == "1 h 02 min 1 min 01 s of it sampling"
+    assert facts["Speed"] == "63.4 steps per second and chain"
+    assert facts["Residual sd"] == "0.0151 T_s implies 0.0146"
+
+
+def test_an_empty_manifest_gives_dashes():
+    facts = {fact.label: fact.value for fact in key_facts({}, [], elastic([1.0], [1.0]))}
+    assert facts["Acceptance"] == facts["Time"] == facts["Contact with the skull"] == facts["Greatest R̂"] == "–"
+
+
+@pytest.mark.parametrize(
+    ("residual", "expected"), [(0.0292, "too narrow. A T_s 4.0 times"), (0.0073, "too wide. A T_s 0.25 times")]
+)
+def test_a_residual_that_does_not_fit_t_s_is_warned_of(residual, expected):
+    manifest = {"residual_sd": residual, "implied_noise_sd": 0.0146}
+    assert any(expected in text for text in warnings_of(manifest, box_mesh(), elastic([1.0] * 3, [1.0] * 3)))
+
+
+def test_a_residual_that_fits_is_not():
+    manifest = {"residual_sd": 0.015, "implied_noise_sd": 0.0146, "exact": True, "solver": {"failed": 0}}
+    assert warnings_of(manifest, box_mesh(), elastic([1.0, 10.0, 20.0], [1.0] * 3)) == []
+
+
+def test_locking_names_the_tissue_and_poissons_ratio():
+    (text,) = warnings_of({}, box_mesh(), elastic([1.0, 10.0, 30.0], [1.0] * 3))
+    assert "Poisson’s ratio of wm is 0.484" in text
+    assert warnings_of({}, box_mesh(), elastic([30.0], [1.0]))[0].startswith("Poisson’s ratio of uniform")
+
+
+def test_failed_solves_and_approximation_are_warned_of_and_nothing_is_said_twice():
+    manifest = {"solver": {"failed": 3}, "exact": False, "warnings": ["The mesh is coarse."]}
+    quiet = elastic([1.0] * 3, [1.0] * 3)
+    first = warnings_of(manifest, box_mesh(), quiet)
+    assert first[0] == "The mesh is coarse."
+    assert any(text.startswith("3 elastic solves failed") for text in first)
+    assert any("approximate" in text for text in first)
+    assert warnings_of(manifest | {"warnings": first}, box_mesh(), quiet) == first
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (1234.5, "1,234"), (12.345, "12.3"), (-0.5, "−0.500"), (1e-6, "1e−06"), (math.nan, "–"), (None, "–")],
+)
+def test_numbers(value, text):
+    assert number(value) == text
+
+
+def test_other_formats():
+    assert fixed(2.4) == "2.40"
+    assert fixed(None) == "–"
+    assert percent(0.0871) == "8.7 %"
+    assert [duration(x) for x in (4.26, 59.0, 119.6, 3725.0, None)] == [
+        "4.3 s",
+        "59 s",
+        "2 min 00 s",
+        "1 h 02 min",
+        "–",
+    ]

@@ -1,0 +1,109 @@
+"""What a user can get wrong in files and folders is told at once, with status 2, before any long work."""
+
+import nibabel as nib
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from bayesreg import preparation
+from bayesreg.cli import app
+
+SHAPE = (24, 24, 24)
+
+
+class LongWorkError(Exception):
+    """Meshing has been asked for."""
+
+
+@pytest.fixture
+def pair(tmp_path, monkeypatch):
+    """The files of a sound pair; `pair(key=value)` checks a configuration with some entries of `data` changed."""
+
+    def build_mesh(*_):
+        raise LongWorkError
+
+    monkeypatch.setattr(preparation, "build_mesh", build_mesh)
+    radius = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0)
+    labels = np.select([radius < 2, radius < 6, radius < 8], [1, 3, 2], 0)
+    image = np.random.default_rng(0).normal(labels, 0.1)
+    contents = {"fixed": image, "moving": image, "labels": labels, "intracranial": radius < 10}
+    data = {"source": "files", "label_table": {"csf": [1], "gm": [2], "wm": [3]}}
+    for name, voxels in contents.items():
+        data[name] = str(save(tmp_path / f"{name}.nii.gz", voxels))
+
+    def check(*command: str, **changed):
+        YAML(typ="safe").dump({"data": data | changed}, tmp_path / "run.yaml")
+        command = command or ("check",)
+        return CliRunner().invoke(app, [command[0], str(tmp_path / "run.yaml"), *command[1:]])
+
+    return check
+
+
+def save(path, voxels, affine=None):
+    header = nib.Nifti1Header()
+    header.set_sform(np.diag([4, 4, 4, 1]) if affine is None else affine, code=1)  # Singular ones, too.
+    nib.save(nib.Nifti1Image(np.asarray(voxels, np.float32), None, header), path)
+    return path
+
+
+def not_an_image(folder):
+    (folder / "bad.nii.gz").write_bytes(b"no image")
+    return folder / "bad.nii.gz"
+
+
+def two_parts():
+    mask = np.zeros(SHAPE)
+    mask[3:10, 3:21, 3:21] = mask[14:21, 3:21, 3:21] = 1
+    return mask
+
+
+BALL = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0) < 8
+
+
+@pytest.mark.parametrize(
+    ("key", "make", "part"),
+    [
+        ("moving", not_an_image, "bad.nii.gz cannot be read"),
+        ("moving", lambda f: save(f / "bad.nii.gz", np.zeros((*SHAPE, 3))), "expected a 3D image"),
+        ("moving", lambda f: save(f / "bad.nii.gz", BALL, np.diag([4, 4, 0, 1])), "affine is singular"),
+        ("moving", lambda f: save(f / "bad.nii.gz", np.where(BALL, np.nan, 1)), "NaN"),
+        (
+            "moving",
+            lambda f: save(f / "bad.nii.gz", BALL, nib.affines.from_matvec(4 * np.eye(3), [900, 0, 0])),
+            "covers 0% of the fixed one",
+        ),
+        ("labels", lambda f: save(f / "bad.nii.gz", BALL), "holds no label"),
+        ("labels", lambda f: save(f / "bad.nii.gz", BALL * 0.5), "not integers"),
+        ("labels", lambda f: save(f / "bad.nii.gz", np.arange(729).reshape(9, 9, 9) % 4), "grid"),
+        ("intracranial", lambda f: save(f / "bad.nii.gz", two_parts()), "2 separate parts"),
+        ("intracranial", lambda f: save(f / "bad.nii.gz", np.zeros(SHAPE)), "empty"),
+        ("intracranial", lambda f: f / "gone.nii.gz", "no such file"),
+    ],
+)
+def test_a_bad_file_is_named(pair, tmp_path, key, make, part):
+    result = pair(**{key: str(make(tmp_path))})
+    assert result.exit_code == 2, result
+    assert part in result.stderr
+    assert result.stderr.startswith("bayesreg: ")
+
+
+def test_a_sound_pair_reaches_the_long_work(pair):
+    assert isinstance(pair().exception, LongWorkError)
+
+
+def test_a_folder_that_holds_another_run_is_left_alone(pair, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text("{}")
+    result = pair("run", "-o", str(out))
+    assert result.exit_code == 2
+    assert str(out) in result.stderr
+    assert [path.name for path in out.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize("command", ["report", "compare"])
+def test_a_folder_without_a_run(tmp_path, command):
+    result = CliRunner().invoke(app, [command, *[str(tmp_path)] * (2 if command == "compare" else 1)])
+    assert result.exit_code == 2
+    assert "holds no finished run" in result.stderr

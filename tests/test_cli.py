@@ -1,0 +1,156 @@
+"""The command line: its statuses, what it says, and how fast help comes."""
+
+import inspect
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+import bayesreg
+from bayesreg.cli import app
+from bayesreg.types import InputError
+
+QUICK = str(Path(__file__).parent.parent / "configs" / "quickstart.yaml")
+PROGRAM = str(Path(sys.executable).parent / "bayesreg")
+
+
+@pytest.fixture
+def pipeline(monkeypatch):
+    """A pipeline that keeps what it was asked to do."""
+    calls = {}
+
+    def run(config, out, resume=False, progress=True):
+        calls["run"] = (config, out, resume, progress)
+        return SimpleNamespace(converged=config.seed == 1, folder=out)
+
+    def check(config):
+        calls["check"] = (config,)
+        return SimpleNamespace(text="about 3 minutes")
+
+    def simulate(config, out):
+        calls["simulate"] = (config, out)
+
+    def report(folder):
+        return folder / "report.html"
+
+    def compare(folders, out):
+        calls["compare"] = (folders, out)
+        return out
+
+    stub = SimpleNamespace(run=run, check=check, simulate=simulate, report=report, compare=compare)
+    monkeypatch.setattr(bayesreg, "pipeline", stub, raising=False)
+    return SimpleNamespace(stub=stub, calls=calls)
+
+
+def invoke(*arguments: str):
+    return CliRunner().invoke(app, arguments)
+
+
+def test_run_passes_overrides_and_flags_on_and_names_the_report(pipeline):
+    result = invoke(
+        "run", QUICK, "-o", "out", "--set", "sampler.chains=7", "--set", "stop.max_steps=50", "--resume", "-q"
+    )
+    config, out, resume, progress = pipeline.calls["run"]
+    assert result.exit_code == 0
+    assert (config.sampler.chains, config.stop.max_steps) == (7, 50)
+    assert (out, resume, progress) == (Path("out"), True, False)
+    assert f"Report: {Path('out') / 'report.html'}" in result.output
+
+
+def test_run_that_did_not_converge_says_so_with_status_3(pipeline):
+    result = invoke("run", QUICK, "-o", "out", "--set", "seed=2")
+    assert result.exit_code == 3
+    assert "Not converged" in result.output
+    assert "report.html" in result.output
+
+
+def test_other_commands_call_the_pipeline(pipeline):
+    assert "about 3 minutes" in invoke("check", QUICK, "--set", "seed=4").output
+    assert pipeline.calls["check"][0].seed == 4
+    assert invoke("simulate", QUICK, "-o", "pair").exit_code == 0
+    assert pipeline.calls["simulate"][1] == Path("pair")
+    assert str(Path("a") / "report.html") in invoke("report", "a").output
+    assert invoke("compare", "a", "b", "c", "-o", "page.html").exit_code == 0
+    assert pipeline.calls["compare"] == ([Path("a"), Path("b"), Path("c")], Path("page.html"))
+
+
+def test_the_real_pipeline_takes_what_the_commands_give():
+    from bayesreg import pipeline
+
+    for name, arguments in {
+        "run": ("config", "out", "resume", "progress"),
+        "check": ("config",),
+        "simulate": ("config", "out"),
+        "report": ("folder",),
+        "compare": ("folders", "out"),
+    }.items():
+        assert set(arguments) <= set(inspect.signature(getattr(pipeline, name)).parameters)
+
+
+def test_bad_input_is_one_message_with_status_2(pipeline):
+    def run(config, out, resume, progress):
+        raise InputError(f"{out} holds another run; choose another folder, or go on with --resume")
+
+    pipeline.stub.run = run
+    result = invoke("run", QUICK, "-o", "out")
+    assert result.exit_code == 2
+    assert result.stderr == "bayesreg: out holds another run; choose another folder, or go on with --resume\n"
+
+
+def test_a_bug_is_not_taken_for_bad_input(pipeline):
+    def check(config):
+        raise ValueError("shapes do not match")
+
+    pipeline.stub.check = check
+    result = invoke("check", QUICK)
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["run", QUICK], ["compare", "one"], ["runn"], ["run", QUICK, "-o", "x", "--fast"]]
+)
+def test_wrong_usage_has_status_2(arguments):
+    assert invoke(*arguments).exit_code == 2
+
+
+def test_schema_is_json():
+    assert json.loads(invoke("schema").output)["title"] == "Config"
+
+
+@pytest.mark.parametrize("command", ["run", "check", "simulate"])
+def test_program_shows_no_traceback_for_a_bad_configuration(tmp_path, command):
+    path = tmp_path / "run.yaml"
+    path.write_text("data: {source: mni152}\nsimulate: {kind: paper}\nsampler: {chans: 4}\n")
+    out = [] if command == "check" else ["-o", str(tmp_path / "out")]
+    done = subprocess.run([PROGRAM, command, str(path), *out], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "run.yaml:3: sampler.chans = 4: unknown key; did you mean chains?" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_version_is_the_packages():
+    done = subprocess.run([PROGRAM, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"bayesreg {bayesreg.__version__}\n"
+
+
+def test_help_loads_nothing_heavy_and_comes_at_once():
+    code = (
+        "import sys; from typer.testing import CliRunner; from bayesreg.cli import app;"
+        "assert 'compare' in CliRunner().invoke(app, ['--help']).output;"
+        "print(*{'jax', 'numpy', 'scipy', 'pydantic', 'matplotlib', 'arviz'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+    durations = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([PROGRAM, "--help"], capture_output=True, check=True)
+        durations.append(time.perf_counter() - start)
+    assert min(durations) < 1.5
