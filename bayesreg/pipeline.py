@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +13,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from bayesreg import __version__
 from bayesreg.config import Config, load_config, resolved_yaml
-from bayesreg.distance import signed_distance
 from bayesreg.inference.diagnostics import Convergence, convergence, dataset, open_posterior, save_posterior
 from bayesreg.inference.initialise import Start
 from bayesreg.inference.run import (
@@ -29,11 +24,11 @@ from bayesreg.inference.run import (
     checkpoint_from_arrays,
     checkpoint_to_arrays,
     first_points,
-    greatest_rhat,
     sample,
 )
 from bayesreg.io import store
 from bayesreg.io.store import Inputs, Run
+from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
@@ -43,8 +38,6 @@ from bayesreg.report.html import write_report
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 
-# A sampled node counts as in contact where its mean position lies this near to the skull, mm.
-CONTACT = 0.5
 BLOCK = 50
 
 
@@ -282,7 +275,7 @@ def _start(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
     field = _start_field(config, inputs)
     return Start(
         field=None if field is None else field[posterior.sampled],
-        fraction=tuple(config.start.fraction),
+        fraction=config.start.fraction,
         lam=config.start.entries("lam", posterior.entry_names),
         mu=config.start.entries("mu", posterior.entry_names),
         spread=config.start.spread,
@@ -308,7 +301,7 @@ def _with_initial(inputs: Inputs, config: Config, start: Start) -> Inputs:
     return inputs._replace(truth=inputs.truth._replace(initial=np.mean(start.fraction) * field))
 
 
-def _sampler_settings(config: Config) -> dict[str, float]:
+def _sampler_settings(config: Config) -> dict[str, Any]:
     return config.sampler.model_dump(include={"sigma_u", "sigma_lam", "sigma_mu"})
 
 
@@ -357,7 +350,7 @@ def _finish(
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, dataset(samples.idata, "posterior"))
     finished = Run(
-        manifest=_manifest(config, inputs, posterior, samples, judged, provenance, began),
+        manifest=manifest(config, inputs, posterior, samples, judged, provenance, began),
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
         warped=warp_image(inputs.moving, mean_field, inputs.fixed),
@@ -368,70 +361,3 @@ def _finish(
     result = Result(out, finished)
     write_report(finished, samples.idata, *judged, result.report)
     return result
-
-
-def _manifest(
-    config: Config,
-    inputs: Inputs,
-    posterior: Posterior,
-    samples: Samples,
-    judged: Convergence,
-    provenance: dict[str, Any],
-    began: float,
-) -> dict[str, Any]:
-    """The content of run.json."""
-    tally = samples.tally
-    steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
-    accepted = float(tally.acceptance.sum())
-    return {
-        "name": config.description,
-        "versions": _versions(),
-        "seed": config.seed,
-        "mesh_digest": inputs.mesh.digest,
-        "image_digests": {name: getattr(inputs, name).digest for name in ("fixed", "moving")},
-        "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
-        "devices": [str(device) for device in jax.devices()],
-        "timings": {
-            **provenance["timings"],
-            "sampling": samples.seconds,
-            "total": time.perf_counter() - began,
-        },
-        "pair": provenance["pair"],
-        "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
-        "model": config.model.model_dump(mode="json"),
-        "exact": samples.exact,
-        "stopped": {"reason": samples.reason, "converged": samples.converged, "rhat_threshold": config.stop.rhat},
-        "convergence": {
-            "rhat_max": _extreme(judged.rhat, np.nanmax),
-            "ess_bulk_min": _extreme(judged.ess_bulk, np.nanmin),
-            "ess_tail_min": _extreme(judged.ess_tail, np.nanmin),
-            "rhat_paper_max": greatest_rhat(samples.rhat),
-        },
-        "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
-        "contact_nodes": _contact_nodes(inputs, posterior, samples),
-        "solver": {
-            "failed": int(tally.solver_failed.sum()),
-            "iterations_mean": float(tally.solver_iterations.sum()) / steps,
-        },
-        "steps_per_chain": int(tally.steps[0]),
-        "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
-        "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
-        "implied_noise_sd": posterior.implied_noise_sd,
-    }
-
-
-def _versions() -> dict[str, str]:
-    packages = ("jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "pytetwild")
-    return {"bayesreg": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}
-
-
-def _extreme(figures: Any, choose: Callable[[np.ndarray], float]) -> float | None:
-    values = np.concatenate([np.ravel(figures[name]) for name in figures])
-    return float(choose(values)) if np.isfinite(values).any() else None
-
-
-def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
-    if inputs.skull is None:
-        return None
-    places = inputs.mesh.points[posterior.sampled] + samples.u_mean[posterior.sampled]
-    return int((np.asarray(signed_distance(inputs.skull).interpolate(places)) < CONTACT).sum())

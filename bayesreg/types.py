@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-AnyArray = jax.Array | np.ndarray
+if TYPE_CHECKING:
+    # NumPy's and JAX's arrays share no base class; jaxtyping checks them while the tests run.
+    AnyArray = Any
+else:
+    AnyArray = jax.Array | np.ndarray
 
 Scalar = Float[AnyArray, ""]
 Points = Float[AnyArray, "nodes 3"]

@@ -54,7 +54,7 @@ def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> An
     values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
     with np.errstate(divide="ignore", invalid="ignore"):
         values["ratio"] = values["lam"] / values["mu"]
-    groups = {
+    groups: dict[str, Any] = {
         "posterior": values,
         "sample_stats": {name: draws[name] for name in STATISTICS},
         "constant_data": {name: np.asarray(value) for name, value in target.constant_data().items()},

@@ -12,6 +12,7 @@ import tempfile
 from collections import Counter, defaultdict
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -67,7 +68,7 @@ def tetrahedralize(
     points = np.concatenate([surface.points for surface in surfaces])
     offsets = np.cumsum([0, *(len(surface.points) for surface in surfaces[:-1])])
     faces = np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)])
-    given = {
+    given: dict[str, Any] = {
         "vertices": points,
         "faces": faces.astype(np.int32),
         "edge_length_abs": float(sizing.values.max()),
@@ -82,7 +83,7 @@ def tetrahedralize(
     return points, _completed(points, cells)
 
 
-def _run(given: dict[str, object], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
+def _run(given: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
     with tempfile.TemporaryDirectory() as folder:
         np.savez(Path(folder) / "in.npz", **given)
         command = [sys.executable, "-c", _PROGRAM, "quiet" if quiet else "loud"]

@@ -90,6 +90,7 @@ class ContactProblem:
     ) -> None:
         self.points, self.stiffness, self.gap = mesh.points, stiffness, gap
         self.nodes = np.setdiff1d(mesh.boundary, held)
+        self._size = float(np.ptp(mesh.points, axis=0).max())
         self._compliance = _Compliance(stiffness, held, self.nodes)
         pushed = np.zeros_like(mesh.points)
         pushed[held] = held_u
@@ -101,7 +102,7 @@ class ContactProblem:
         start: EnergyMinimum | None = None,
         tolerance: float = 1e-6,
         load_steps: int = 5,
-        max_iterations: int = 1000,
+        max_iterations: int = 400,
     ) -> EnergyMinimum:
         """Find the displacement of least energy.
 
@@ -115,7 +116,7 @@ class ContactProblem:
             mm, for violation and stationarity.
         load_steps : int, default 5
             Ignored with a `start`.
-        max_iterations : int, default 1000
+        max_iterations : int, default 400
             Quadratic programs in all.
         """
         floor, used = floor[self.nodes], 0
@@ -138,9 +139,12 @@ class ContactProblem:
     def _iterate(
         self, state: _State, floor: np.ndarray, load: float, tolerance: float, limit: int
     ) -> tuple[_State, int]:
-        """Steps until one is shorter than the tolerance (mm); also their number."""
+        """Steps until one is shorter than the tolerance (mm) or longer than the body; also their number."""
         for count in range(1, limit + 1):
-            state, moved = self._step(state, floor, load)
+            after, moved = self._step(state, floor, load)
+            if not moved < self._size:
+                return state, count
+            state = after
             if moved < tolerance:
                 return state, count
         return state, limit
@@ -176,14 +180,16 @@ class ContactProblem:
         """Multipliers of the quadratic program; its working set grows until no tangent plane is crossed."""
         offset = slack + (normal * (load * self._free - state.u)[self.nodes]).sum(axis=1)
         force = np.zeros(len(self.nodes))
-        working = (state.force > 0) | (offset < 0)
+        # A node that has fled to where the gap is flat has no tangent plane to be held by.
+        steep = np.abs(normal).max(axis=1) > 1e-6
+        working = steep & ((state.force > 0) | (offset < 0))
         while True:
             index = np.flatnonzero(working)
             block = self._compliance.block(index)
             matrix = np.einsum("ai,aibj,bj->ab", normal[index], block[index], normal[index])
             force[index] = complementarity(matrix, -offset[index], state.force[index] > 0)
             moved = np.einsum("ni,nibj,bj,b->n", normal, block, normal[index], force[index], optimize=True)
-            crossed = ~working & (offset + moved < -1e-9)
+            crossed = steep & ~working & (offset + moved < -1e-9)
             if not crossed.any():
                 return force
             working |= crossed

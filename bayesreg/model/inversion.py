@@ -21,10 +21,10 @@ def deformed_image(
     there give x in the tetrahedron at rest, and m(y) = f(x) by cubic interpolation. No iteration, no
     approximation but the interpolation.
 
-    Outside the deformed mesh y is one of three things, the skull being what stays where it is:
-    tissue that the mesh left out and that rides on its surface, with the displacement of the nearest
-    surface point: m(y) = f(y − u); space that tissue has left: CSF; anything else (skull, or nothing
-    labelled before or after): m(y) = f(y).
+    Outside the deformed mesh y is one of these, in this order: a voxel next to it, which the interpolation of
+    m inside the mesh reads too: m(y) = f(y − u), u being the displacement of the nearest point of the surface;
+    skull, which stays where it is: m(y) = f(y); tissue that the mesh left out and that rides on its surface:
+    m(y) = f(y − u) again; space that tissue has left: CSF; nothing labelled before or after: m(y) = f(y).
 
     Parameters
     ----------
@@ -47,10 +47,12 @@ def deformed_image(
     index, rest = _rest_positions(fixed, mesh, deformed)
     inside[tuple(index.T)] = True
     values[tuple(index.T)] = _cubic(fixed, rest)
-    index = np.argwhere(~inside & (np.asarray(skull.voxels) == 0))
+    beside = ndimage.binary_dilation(inside, np.ones((3, 3, 3))) & ~inside
+    index = np.argwhere(beside | ~inside & (np.asarray(skull.voxels) == 0))
     rest = fixed.voxel_to_world(index.astype(float))
     rest -= _surface_displacement(mesh, deformed, rest)
-    carried, left = _is_tissue(tissue, rest), np.asarray(tissue.voxels)[tuple(index.T)] > 0
+    carried = beside[tuple(index.T)] | _is_tissue(tissue, rest)
+    left = np.asarray(tissue.voxels)[tuple(index.T)] > 0
     values[tuple(index[left & ~carried].T)] = csf_intensity
     values[tuple(index[carried].T)] = _cubic(fixed, rest[carried])
     return fixed.with_voxels(values)

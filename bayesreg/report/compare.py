@@ -22,6 +22,7 @@ from bayesreg.report.panels import View
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import Verdict, key_facts, verdict
+from bayesreg.types import InputError
 
 RUN_COLOURS = ("#2b5c8a", "#b3560f", "#4f9d86", "#7d6aa8", "#a84a63", "#8aa34f")
 
@@ -77,12 +78,12 @@ def write_comparison(runs: Sequence[Study | tuple], path: str | Path) -> None:
 
     Raises
     ------
-    ValueError
+    InputError
         If there are fewer than two runs.
     """
     studies = [Study(*run) for run in runs]
     if len(studies) < 2:
-        raise ValueError(f"a comparison needs two or more runs, got {len(studies)}")
+        raise InputError(f"a comparison needs two or more runs, got {len(studies)}")
     named = dict(zip(_names([study.run for study in studies]), studies, strict=True))
     metrics = {name: found for name, study in named.items() if (found := metrics_of(study.run, study.posterior))}
     tissues = studies[0].run.mesh.names

@@ -111,7 +111,8 @@ def _trace(axes: Axes, trace: Trace, total: int) -> None:
 
 
 def _short(value: float, _: int) -> str:
-    return f"{value / 1000:,.6g}k" if abs(value) >= 1e4 else f"{value:.6g}".replace("-", "−")
+    text = f"{value / 1000:,.6g}k" if abs(value) >= 1e4 else f"{value:.6g}"
+    return text.replace("-", "−")
 
 
 def _ranks(axes: Axes, draws: np.ndarray) -> None:
@@ -180,13 +181,8 @@ def _ticks(axes: Axes, entries: Sequence[Estimand], figure: str) -> None:
     names = sorted({entry.variable for entry in entries})
     for name in names:
         values = [getattr(entry, figure) for entry in entries if entry.variable == name]
-        mark = {
-            "color": PARAMETER_COLOURS.get(name, style.ACCENT),
-            "ms": 9,
-            "mew": 1.6,
-            "label": SYMBOLS.get(name, name),
-        }
-        axes.plot(values, np.full(len(values), -0.05 * top), "|", **mark)
+        colour, label = PARAMETER_COLOURS.get(name, style.ACCENT), SYMBOLS.get(name, name)
+        axes.plot(values, np.full(len(values), -0.05 * top), "|", color=colour, ms=9, mew=1.6, label=label)
     axes.set_ylim(-0.1 * top, top)
     if figure == "rhat" and names:
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": len(names)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 import pytest
 
@@ -75,6 +76,47 @@ def test_density_is_the_papers(elasticity, interpolation):
     paper = oracle(MESH.boundary, interpolation=interpolation)
     post = posterior(elasticity=elasticity, interpolation=interpolation)
     compare(post, paper, states(len(MESH.boundary), elasticity))
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_density_far_off_the_moving_images_grid(interpolation):
+    """Tens of mm: many points leave the grid, where the image continues with its nearest value."""
+    trial = [s._replace(u=20 * s.u) for s in states(len(MESH.boundary), "tissue")]
+    paper = oracle(MESH.boundary, interpolation=interpolation)
+    compare(posterior(interpolation=interpolation), paper, trial)
+    reached = MOVING.world_to_voxel(MESH.points[MESH.boundary] + trial[-1].u)
+    assert ((reached < 0) | (reached > np.array(MOVING.shape) - 1)).any(axis=1).mean() > 0.1
+
+
+def test_each_term_has_its_name_and_they_add_up():
+    post = posterior(rigid_sd=0.4, priors={"lam": {"alpha": 2.0, "beta": 3.0, "high": 60.0}})
+    prior = Prior(2.0, 3.0, 0.0, 60.0)
+    paper = oracle(MESH.boundary, rigid_sd=0.4, prior_lam=prior)
+    for state in states(len(MESH.boundary), "tissue"):
+        terms = {name: float(value) for name, value in post.energies(state.values).items()}
+        u = paper.displacement(*state)
+        assert terms["similarity_energy"] == pytest.approx(paper.similarity(u), rel=1e-9)
+        assert terms["strain_energy"] == pytest.approx(paper.strain(u, state.lam, state.mu), rel=1e-9)
+        assert terms["log_similarity"] == pytest.approx(-paper.similarity(u) / T_SIMILARITY, rel=1e-9)
+        assert terms["log_elastic"] == pytest.approx(-paper.strain(u, state.lam, state.mu) / T_ELASTIC, rel=1e-9)
+        assert terms["log_rigid"] == pytest.approx(paper.log_rigid(state.u), rel=1e-9)
+        assert terms["log_prior_lam"] == pytest.approx(sum(map(prior.logpdf, state.lam)), rel=1e-9)
+        assert terms["log_prior_mu"] == terms["log_support"] == terms["log_solved"] == 0
+        total = sum(value for name, value in terms.items() if name.startswith("log_"))
+        assert float(post.logdensity_constrained(state.values)) == pytest.approx(total, rel=1e-12)
+
+
+def test_chains_side_by_side_do_not_disturb_one_another():
+    """Under vmap, with one chain outside the support and one not a number among them."""
+    trial = states(len(MESH.boundary), "tissue")
+    trial[1].mu[2] = -1.0
+    trial[2].u[4, 1] = np.nan
+    post = posterior()
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(s.values for s in trial))
+    found = jax.vmap(post.logdensity_constrained)(batch)
+    alone = np.array([float(post.logdensity_constrained(s.values)) for s in trial])
+    np.testing.assert_allclose(found, alone, rtol=1e-10)
+    np.testing.assert_array_equal(np.isfinite(alone), [True, False, False, True])
 
 
 @pytest.mark.parametrize("quadrature", ["gauss32", "voxels"])

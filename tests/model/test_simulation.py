@@ -12,8 +12,9 @@ from bayesreg.fem.equilibrium import solve_interior
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
+from bayesreg.model.deformation import centre_of_gravity, push_patch, surface_patch
 from bayesreg.model.inversion import deformed_image, residuals
-from bayesreg.model.simulation import centre_of_gravity, make_pair, push_patch, surface_patch
+from bayesreg.model.simulation import make_pair
 from bayesreg.model.warp import volume_ratio
 from bayesreg.types import InputError
 from tests.phantoms import PAPER_LAM, PAPER_MU, ball_mesh, refined
@@ -129,8 +130,12 @@ def test_the_least_energy_is_an_equilibrium_with_contact_forces(small, clean):
 
 
 def test_moving_at_displaced_points_is_fixed_at_rest(clean, inside):
-    assert np.abs(mismatch(clean, inside)).max() < 0.02
-    assert mismatch(clean, inside).std() < 1.5e-3
+    error = np.abs(mismatch(clean, inside))
+    deep = np.linalg.norm(inside[2] - CENTRE, axis=1) < 34
+    assert deep.sum() > 1000
+    assert error[deep].max() < 5e-3
+    # At the surface the interpolation of m reaches across, into what did not move.
+    assert np.quantile(error, 0.95) < 6e-3
     assert clean.residual_sd == clean.interpolation_sd < 0.006
     # The deformation matters: without it the images disagree by far more.
     assert np.std(np.asarray(clean.moving.interpolate(inside[2])) - analytic(inside[2])) > 0.05
@@ -197,8 +202,7 @@ def test_a_finer_mesh_makes_the_truth_of_a_coarser_one(clean):
     fine = refined(clean.mesh)
     u = transfer(clean.u, clean.mesh, fine.points)
     np.testing.assert_allclose(transfer(u, fine, clean.mesh.points), clean.u, atol=1e-9)
-    spread = residuals(clean.fixed, clean.moving, fine, u).std()
-    assert spread == pytest.approx(clean.interpolation_sd, rel=0.3)
+    assert residuals(clean.fixed, clean.moving, fine, u).std() < 0.003
 
 
 def test_surface_patches_grow_with_their_number():
@@ -210,7 +214,8 @@ def test_surface_patches_grow_with_their_number():
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"displacement": 60.0}, r"inverts \d+ of \d+ tetrahedra .*direction"),
+        ({"displacement": 25.0}, r"inverts \d+ of \d+ tetrahedra .*direction"),
+        ({"displacement": 60.0}, "no least energy found"),
         ({"displacement": -4.0}, r"8 of the 8 patch nodes .*skull"),
         ({"patch_nodes": 2}, "at least 3 nodes"),
         ({"patch_nodes": 500}, r"surface \(\d+\), got 500"),

@@ -1,0 +1,104 @@
+"""What run.json says of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import numpy as np
+
+from bayesreg import __version__
+from bayesreg.config import Config
+from bayesreg.distance import signed_distance
+from bayesreg.inference.diagnostics import Convergence
+from bayesreg.inference.run import Samples, greatest_rhat
+from bayesreg.io.store import Inputs
+from bayesreg.model.posterior import Posterior
+
+# A sampled node counts as in contact where its mean position lies this near to the skull, mm.
+CONTACT = 0.5
+
+
+def manifest(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    samples: Samples,
+    judged: Convergence,
+    provenance: dict[str, Any],
+    began: float,
+) -> dict[str, Any]:
+    """The content of run.json: versions, digests, timings, and how well the sampling went.
+
+    Parameters
+    ----------
+    config : Config
+    inputs : Inputs
+    posterior : Posterior
+    samples : Samples
+    judged : Convergence
+    provenance : dict
+        "timings" (s) of the preparation, and what is known of a synthetic "pair".
+    began : float
+        `time.perf_counter()` when the run began.
+    """
+    tally = samples.tally
+    steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
+    accepted = float(tally.acceptance.sum())
+    return {
+        "name": config.description,
+        "versions": _versions(),
+        "seed": config.seed,
+        "mesh_digest": inputs.mesh.digest,
+        "image_digests": {name: getattr(inputs, name).digest for name in ("fixed", "moving")},
+        "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
+        "devices": [str(device) for device in jax.devices()],
+        "timings": {
+            **provenance["timings"],
+            "sampling": samples.seconds,
+            "total": time.perf_counter() - began,
+        },
+        "pair": provenance["pair"],
+        "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
+        "model": config.model.model_dump(mode="json"),
+        "exact": samples.exact,
+        "stopped": {"reason": samples.reason, "converged": samples.converged, "rhat_threshold": config.stop.rhat},
+        "convergence": {
+            "rhat_max": _extreme(judged.rhat, np.nanmax),
+            "ess_bulk_min": _extreme(judged.ess_bulk, np.nanmin),
+            "ess_tail_min": _extreme(judged.ess_tail, np.nanmin),
+            "rhat_paper_max": greatest_rhat(samples.rhat),
+        },
+        "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
+        "contact_nodes": _contact_nodes(inputs, posterior, samples),
+        "solver": {
+            "failed": int(tally.solver_failed.sum()),
+            "iterations_mean": float(tally.solver_iterations.sum()) / steps,
+        },
+        "steps_per_chain": int(tally.steps[0]),
+        "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
+        "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
+        "implied_noise_sd": posterior.implied_noise_sd,
+    }
+
+
+def _versions() -> dict[str, str]:
+    packages = ("jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "pytetwild")
+    return {"bayesreg": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _extreme(figures: Any, choose: Callable[[np.ndarray], float]) -> float | None:
+    values = np.concatenate([np.ravel(figures[name]) for name in figures])
+    return float(choose(values)) if np.isfinite(values).any() else None
+
+
+def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
+    if inputs.skull is None:
+        return None
+    places = inputs.mesh.points[posterior.sampled] + samples.u_mean[posterior.sampled]
+    return int((np.asarray(signed_distance(inputs.skull).interpolate(places)) < CONTACT).sum())

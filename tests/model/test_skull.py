@@ -1,0 +1,81 @@
+"""The signed distance to the skull against geometry that is known, and against the nearest voxel."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from bayesreg.distance import signed_distance
+from bayesreg.image import Image
+from bayesreg.model.constraint import is_allowed
+from tests.oracles.paper import in_skull
+from tests.phantoms import flat_skull, rotated_affine
+
+CORNERS = np.array(list(product((-40.0, 40.0), repeat=3)))
+
+
+def blobs(shape=(34, 22, 28), **kwargs):
+    """Irregular forbidden region of about two fifths on a rotated, anisotropic, left-handed grid."""
+    values = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=shape), 3)
+    return Image((values > np.quantile(values, 0.6)).astype(np.uint8), rotated_affine(CORNERS, shape, **kwargs))
+
+
+def sphere(radius, shape=(44, 52, 40)):
+    """All forbidden but a ball about the origin."""
+    empty = Image(np.zeros(shape), rotated_affine(CORNERS, shape, margin=2.0))
+    return empty.with_voxels((np.linalg.norm(empty.grid_points(), axis=-1) > radius).astype(np.uint8))
+
+
+@pytest.mark.parametrize("left_handed", [True, False])
+def test_sign_is_that_of_the_nearest_voxel_away_from_the_interface(left_handed):
+    skull = blobs(left_handed=left_handed)
+    points = np.random.default_rng(1).uniform(-75, 75, (20_000, 3))
+    voxel = np.linalg.norm(skull.voxel_sizes)
+    distance = signed_distance(skull)
+    away = abs(np.asarray(distance.interpolate(points))) > voxel
+    expected = ~in_skull(skull.voxels, skull.affine, points)
+    found = np.asarray(is_allowed(distance.interpolator("linear"), points))
+    np.testing.assert_array_equal(found[away], expected[away])
+    assert 100 < expected[away].sum() < away.sum() - 100
+    # Near the interface the two may differ, by a fraction of a voxel.
+    assert (found == expected).mean() > 0.97
+
+
+def test_every_voxel_centre_has_its_own_sign():
+    skull = blobs()
+    points = skull.grid_points().reshape(-1, 3)
+    found = np.asarray(is_allowed(signed_distance(skull).interpolator("linear"), points))
+    np.testing.assert_array_equal(found, skull.voxels.ravel() == 0)
+
+
+def test_distance_to_a_flat_wall_is_exact_around_it():
+    skull = flat_skull(CORNERS, axis=2, wall=7.0, voxel=2.0)
+    x = np.random.default_rng(2).uniform((-20, -20, 4), (20, 20, 10), (200, 3))
+    np.testing.assert_allclose(signed_distance(skull).interpolate(x), 7.0 - x[:, 2], atol=1e-9)
+
+
+def test_distance_to_a_sphere():
+    skull = sphere(30.0)
+    x = np.random.default_rng(3).normal(size=(500, 3))
+    x *= np.random.default_rng(4).uniform(24, 36, (500, 1)) / np.linalg.norm(x, axis=1, keepdims=True)
+    found = np.asarray(signed_distance(skull).interpolate(x))
+    expected = 30.0 - np.linalg.norm(x, axis=1)
+    assert abs(found - expected).max() < skull.voxel_sizes.max()
+    assert abs((found - expected).mean()) < 0.25 * skull.voxel_sizes.max()
+
+
+def test_nothing_is_allowed_off_the_grid():
+    shape = (10, 10, 10)
+    skull = Image(np.zeros(shape, np.uint8), rotated_affine(CORNERS, shape, margin=0.0))
+    distance = signed_distance(skull).interpolator("linear")
+    indices = np.random.default_rng(5).uniform(-6, 15, (4000, 3))
+    inside = ((indices > -0.5) & (indices < 9.5)).all(axis=1)
+    beyond = ((indices < -0.51) | (indices > 9.51)).any(axis=1)
+    allowed = np.asarray(is_allowed(distance, skull.voxel_to_world(indices)))
+    assert not allowed[beyond].any()
+    # Edges and corners of the allowed box are rounded off a little, as the interface lies between centres.
+    assert allowed[inside].mean() > 0.9
+    assert allowed[((indices >= 0) & (indices <= 9)).all(axis=1)].all()
