@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -83,7 +84,7 @@ def rotated_affine(
 
 
 def smooth_image(
-    points: np.ndarray, shape: tuple[int, int, int] = (14, 11, 16), seed: int = 0, blur: float = 1.5, **kwargs: object
+    points: np.ndarray, shape: tuple[int, int, int] = (14, 11, 16), seed: int = 0, blur: float = 1.5, **kwargs: Any
 ) -> Image:
     """Smooth random image in [0, 1] on a rotated grid that covers points; further arguments: `rotated_affine`."""
     noise = np.random.default_rng(seed).normal(size=shape)

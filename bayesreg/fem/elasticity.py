@@ -45,23 +45,23 @@ def lame_entries(mesh: TetMesh, shape: tuple[int, ...]) -> np.ndarray:
     )
 
 
-def element_strain_energy(
+def strain_energy_density(
     elements: Elements,
     lam: Float[AnyArray, "cells"],
     mu: Float[AnyArray, "cells"],
     u: Float[AnyArray, "nodes 3"],
 ) -> Float[AnyArray, "cells"]:
-    """∫ μ/4 Σ_jk (∂_j u_k + ∂_k u_j)² + λ/2 (div u)² over each cell: eq. (2), which equals eq. (3)."""
+    """μ/4 Σ_jk (∂_j u_k + ∂_k u_j)² + λ/2 (div u)² in each cell: eq. (2), which equals eq. (3)."""
     gradient = displacement_gradient(elements, u)
     twice_strain = gradient + jnp.swapaxes(gradient, 0, 1)
     divergence = gradient[0, 0] + gradient[1, 1] + gradient[2, 2]
     shear = (twice_strain**2).sum(axis=(0, 1))
-    return elements.volumes * (mu / 4 * shear + lam / 2 * divergence**2)
+    return mu / 4 * shear + lam / 2 * divergence**2
 
 
 def total_strain_energy(elements: Elements, lam: AnyArray, mu: AnyArray, u: AnyArray) -> Scalar:
     """E_r of eq. (3), with λ and μ given by cell."""
-    return element_strain_energy(elements, lam, mu, u).sum()
+    return elements.volumes @ strain_energy_density(elements, lam, mu, u)
 
 
 def internal_force(

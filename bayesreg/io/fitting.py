@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from bayesreg.image import Image
 from bayesreg.io.domain import MeshError
@@ -34,7 +35,7 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
     Raises
     ------
     MeshError
-        If a node finds no allowed place, or cannot get there.
+        If there is no allowed place, or a node cannot get to one.
     """
     points = mesh.points.copy()
     moving = mesh.boundary[_sample(distance, points[mesh.boundary]) < gap]
@@ -55,8 +56,8 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
 
 def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: float) -> Float[np.ndarray, "n 3"]:
     """The points, followed up the gradient of the distance until they are far enough from the skull."""
-    points = points.copy()
-    for _ in range(50):
+    start, points = points, points.copy()
+    for _ in range(20):
         value = _sample(distance, points)
         near = value < gap
         if not near.any():
@@ -64,9 +65,18 @@ def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: floa
         slope = _gradient(distance, points[near])
         steep = np.maximum((slope**2).sum(axis=1), 0.25)
         points[near] += slope * ((gap + MARGIN - value[near]) / steep)[:, None]
-    raise MeshError(
-        f"{near.sum()} boundary nodes find no place {gap:g} mm inside the intracranial mask: it is too thin there"
-    )
+    # In a crevice of the skull the gradient leads from wall to wall.
+    points[near] = _nearest_allowed(distance, start[near], gap)
+    return points
+
+
+def _nearest_allowed(distance: Image, points: Float[np.ndarray, "n 3"], gap: float) -> Float[np.ndarray, "n 3"]:
+    """The nearest voxel centres that are far enough from the skull."""
+    shell = (distance.voxels >= gap + MARGIN) & (distance.voxels < gap + 3 * distance.voxel_sizes.max())
+    if not shell.any():
+        raise MeshError(f"the intracranial mask is nowhere thick enough for a gap of {gap:g} mm to the skull")
+    centres = distance.voxel_to_world(np.argwhere(shell))
+    return centres[cKDTree(centres).query(points)[1]]
 
 
 def _sample(distance: Image, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -91,13 +101,13 @@ def _advance(
     least = np.minimum(mean_ratio(points, touched), LEAST_MEAN_RATIO)
     start = points[moving]
     share = np.ones(len(moving))
-    for _ in range(12):
+    while True:
         points[moving] = np.where(share[:, None] == 1, goal, start + share[:, None] * (goal - start))
         spoilt = touched[mean_ratio(points, touched) < least]
         if len(spoilt) == 0:
             return
-        share[np.isin(moving, spoilt)] /= 2
-    points[moving] = start
+        held_back = np.isin(moving, spoilt)
+        share[held_back] = np.where(share[held_back] > 0.02, share[held_back] / 2, 0)
 
 
 def _interior_near(mesh: TetMesh, moving: Int[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:

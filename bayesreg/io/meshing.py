@@ -201,8 +201,9 @@ def load_mesh(path: str | Path) -> TetMesh:
     if not path.is_file():
         raise InputError(f"mesh {path}: there is no such file")
     try:
-        content = meshio.read(path)
-    except (meshio.ReadError, ET.ParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        # Not `meshio.read`, which ends the program where it fails.
+        content = meshio.vtu.read(path)
+    except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
         raise InputError(f"mesh {path} cannot be read: {error or type(error).__name__}") from error
     kinds = sorted({block.type for block in content.cells})
     if kinds != ["tetra"]:

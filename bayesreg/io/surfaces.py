@@ -63,7 +63,7 @@ class Sizing(NamedTuple):
 
 
 def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
-    """Surfaces of Ω, of its white matter, and of the CSF deep inside, as far as a mesh can show them.
+    """Surfaces of Ω, of its white matter with the CSF deep inside, and of this CSF, as far as a mesh can show them.
 
     CSF nearer to the outer surface than half an edge length (sulci, the film under the skull) gets no surface
     of its own, nor do parts and holes of a tissue smaller than a cube of half an edge length.
@@ -91,9 +91,14 @@ def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
     outer = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length)
     inside = main_part(outer > 0.5, f"region to mesh, smoothed for an edge length of {edge_length:g} mm,")
     depth = ndimage.distance_transform_edt(inside, sampling=grid.spacing)
+    deep = depth > edge_length / 2
+    fluid = labels.voxels == CSF
+    # Together with the fluid, lest the walls of the ventricles be there twice, a little apart.
     white = grid.smoothed(labels.voxels == WM, SMOOTHING * edge_length)
-    fluid = grid.smoothed(labels.voxels == CSF, FLUID_SMOOTHING * edge_length) * (depth > edge_length / 2)
-    fields = [np.where(inside, outer, 0), *(_without_specks(field, smallest) for field in (white, fluid))]
+    white += deep * grid.smoothed(fluid, SMOOTHING * edge_length)
+    inner = (white, deep * grid.smoothed(fluid, FLUID_SMOOTHING * edge_length))
+    outer[(outer > 0.5) & ~inside] = 0
+    fields = [outer, *(_without_specks(field, smallest) for field in inner)]
     return [_surface(field, grid) for field in fields if field.max() > 0.5]
 
 

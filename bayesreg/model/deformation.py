@@ -18,7 +18,10 @@ from bayesreg.types import InputError
 
 Direction = tuple[float, float, float]
 
+# How often to raise the floors of nodes that ended nearer to the skull than the margin, and by what share of
+# the margin they may.
 _ROUNDS_OF_FLOORS = 20
+_SLIP = 0.01
 
 
 class Deformation(NamedTuple):
@@ -88,6 +91,8 @@ def push_patch(
     """
     if not (np.asarray(mu) > 0).all() or not (np.asarray(lam) >= 0).all():
         raise InputError(f"the truth needs mu > 0 and lam >= 0 everywhere, got mu = {mu}, lam = {lam}")
+    if not margin > 0:
+        raise InputError(f"the margin must be positive, mm, or nodes end on the skull itself; got {margin}")
     obstacle = SmoothObstacle(skull, skull_smoothing_mm)
     centre = centre_of_gravity(mesh)
     patch = surface_patch(mesh, patch_nodes, np.asarray(direction, float))
@@ -153,9 +158,9 @@ def _settle(problem: ContactProblem, obstacle: SmoothObstacle, margin: float) ->
     for _ in range(_ROUNDS_OF_FLOORS):
         place = (problem.points + minimum.u)[problem.nodes]
         missing = margin - obstacle.distance(place)
-        if missing.max() <= 1e-3 or not minimum.converged:
+        if missing.max() <= _SLIP * margin or not minimum.converged:
             break
-        raised = np.where(missing > 1e-3, obstacle(place)[0] + missing, -np.inf)
+        raised = np.where(missing > _SLIP * margin, obstacle(place)[0] + missing, -np.inf)
         floor[problem.nodes] = np.maximum(floor[problem.nodes], raised)
         minimum = problem.solve(floor, start=minimum, tolerance=1e-3)
     if minimum.converged:

@@ -23,7 +23,9 @@ def sum_of_squared_differences(
     weights : (q,) array
         Quadrature weights, mm³.
     """
-    return (weights * (fixed - moving) ** 2).sum()
+    # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
+    # and then redo the index arithmetic for each of its taps.
+    return weights @ (fixed - moving) ** 2
 
 
 SIMILARITIES: dict[str, Similarity] = {"ssd": sum_of_squared_differences}

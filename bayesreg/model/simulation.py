@@ -64,7 +64,7 @@ def make_pair(
     patch_nodes: int = 20,
     direction: Direction = (0.6, 0.3, 0.75),
     margin: float = 0.1,
-    smoothing_mm: float = 1.0,
+    smoothing_mm: float = 0.75,
     noise_sd: float = 0.003,
     seed: int = 0,
 ) -> SyntheticPair:
@@ -87,9 +87,9 @@ def make_pair(
         Lamé parameters by tissue.
     displacement, patch_nodes, direction, margin
         See `push_patch`.
-    smoothing_mm : float, default 1.0
-        Standard deviation of the Gaussian that f is smoothed by beforehand, so that interpolation leaves
-        less than the noise does. 0 leaves f as it is.
+    smoothing_mm : float, default 0.75
+        Standard deviation of the Gaussian that f is smoothed by beforehand, 0 for none. Linear interpolation
+        of Colin27 leaves a residual of sd 0.010 at the truth unsmoothed, 0.005 with the default, 0.003 with 1 mm.
     noise_sd : float, default 0.003
         Standard deviation of the independent Normal noise on each image.
     seed : int, default 0

@@ -29,12 +29,15 @@ SECTIONS = (
     ("model", "Model"),
     ("settings", "Settings"),
 )
+LONGEST_LIST = 8
 PROVENANCE = {
     "model": "Model",
     "sampler": "Sampler",
     "timings": "Time",
     "versions": "Versions",
+    "pair": "Synthetic pair",
     "images": "Digests of the images",
+    "image_digests": "Digests of the images",
 }
 
 
@@ -157,6 +160,8 @@ def provenance(manifest: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, s
 
 
 def _flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
+    if isinstance(value, list) and len(value) > LONGEST_LIST:
+        return [(prefix, f"{len(value)} entries")]
     if not isinstance(value, Mapping):
         return [(prefix, str(value))]
     return [pair for key, entry in value.items() for pair in _flat(entry, f"{prefix}.{key}" if prefix else str(key))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from bayesreg.report.verdict import number, place_text
 BINS = 32
 REACH = 6.0
 LOG_SPAN = 20.0
+FAR = 2.0
 NEAR = 0.25
 SEARCH_DRAWS = 240
 SHOWN_DRAWS = 6000
@@ -45,32 +47,40 @@ def stiffness(run: Run, posterior: xr.Dataset) -> Drawing:
     caption = (
         "The paper’s Fig. 4 for this run: marginal posterior of λ/μ. Filled: all chains together; thin lines: each "
         "chain by itself (they lie on one another where the chains agree); white dot and bar: median and central 95 % "
-        "interval" + ("; dashed: truth." if run.truth is not None else ".")
+        "interval" + ("; dashed: truth, named at the edge where it lies far off." if run.truth is not None else ".")
     )
     medians = ", ".join(f"{group.name} {number(float(np.nanmedian(group.ratio)))}" for group in groups)
     return Drawing("stiffness", "Stiffness ratios", caption, f"Posterior histograms; medians of λ/μ: {medians}.", uri)
+
+
+class Mark(NamedTuple):
+    """A value to point out in a histogram, its label and colour."""
+
+    value: float
+    label: str
+    colour: str
 
 
 def ratio_panel(axes: Axes, run: Run, group: Group) -> None:
     """Histogram of λ/μ of one group, with its median, 95 % interval and truth."""
     colour = style.UNIFORM if group.name == "uniform" else _colour(run, group.name)
     truths = _true_ratios(run, group.name)
-    histogram(axes, group.ratio.reshape(len(group.ratio), -1), colour, list(truths.values()))
-    for name, value in truths.items():
-        drawn = style.TRUTH if len(truths) == 1 else _colour(run, name)
-        _truth_line(axes, value, "truth" if len(truths) == 1 else f"truth {name}", drawn)
+    one = len(truths) == 1
+    marks = [
+        Mark(value, "truth" if one else f"truth {name}", style.TRUTH if one else _colour(run, name))
+        for name, value in truths.items()
+    ]
+    histogram(axes, group.ratio.reshape(len(group.ratio), -1), colour, marks, ratio=True)
     axes.set_title(group.name.upper() if len(group.name) <= 3 else group.name, weight="bold")
     axes.set_xlabel("λ / μ")
 
 
-def _truth_line(axes: Axes, value: float, label: str, colour: str) -> None:
-    axes.axvline(value, color=colour, ls=(0, (4, 2)), lw=1.2)
-    place: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "rotation": 90, "ha": "right", "va": "top"}
-    axes.text(value, 0.99, f"{label} ", color=colour, fontsize=7, **place)
+def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: Sequence[Mark], ratio: bool = False) -> None:
+    """Density of (chain, draw) values: pooled and filled, by chain as lines, with median, 95 % interval and marks.
 
-
-def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: list[float]) -> None:
-    """Density of (chain, draw) values: pooled and filled, by chain as lines, with median and 95 % interval."""
+    A ratio whose central interval spans more than a factor of twenty gets a logarithmic axis. A mark far outside
+    the draws is named at the edge it lies beyond.
+    """
     finite = draws[np.isfinite(draws)]
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
@@ -78,32 +88,48 @@ def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: list[float]) ->
         value = number(float(finite[0])) if finite.size else "undefined"
         axes.text(0.5, 0.5, f"fixed: {value}" if finite.size else value, transform=axes.transAxes, ha="center")
         return
-    edges = _edges(finite)
-    if edges[0] > 0 and not np.allclose(np.diff(edges), edges[1] - edges[0]):
-        axes.set_xscale("log")
+    low, median, high = (float(value) for value in np.quantile(finite, (0.025, 0.5, 0.975)))
+    logarithmic = bool(ratio and low > 0 and high > LOG_SPAN * low)
+    edges = _edges(finite, logarithmic)
+    axes.set_xscale("log" if logarithmic else "linear")
     axes.stairs(_density(finite, edges), edges, fill=True, color=colour, alpha=0.45, lw=0)
     for chain, line in zip(draws, style.chain_colours(len(draws)), strict=True):
         axes.stairs(_density(chain[np.isfinite(chain)], edges), edges, color=line, lw=0.7, alpha=0.85)
-    low, median, high = np.quantile(finite, (0.025, 0.5, 0.975))
     base = -0.05 * axes.get_ylim()[1]
     axes.plot([low, high], [base, base], color=colour, lw=3, solid_capstyle="butt")
     axes.plot([median], [base], "o", mfc="white", mec=colour, ms=5)
-    axes.set_ylim(2 * base, None)
-    axes.set_ylim(top=axes.get_ylim()[1] * (1.22 if marks else 1.05))
+    axes.set_ylim(2 * base, axes.get_ylim()[1] * (1.22 if marks else 1.05))
     interval = f"{number(median)} [{number(low)}, {number(high)}]"
     axes.set_title(interval, fontsize=7, color=style.MUTED, loc="right")
+    _point_out(axes, edges, marks, logarithmic)
+
+
+def _point_out(axes: Axes, edges: np.ndarray, marks: Sequence[Mark], logarithmic: bool) -> None:
+    """A dashed line at every mark near the draws, an arrow towards every other."""
+    scale = np.log10 if logarithmic else np.asarray
+    first, last = scale(edges[0]), scale(edges[-1])
+    for index, mark in enumerate(marks):
+        at = scale(mark.value) if mark.value > 0 or not logarithmic else -np.inf
+        place: dict[str, Any] = {"color": mark.colour, "fontsize": 7, "va": "top"}
+        if first - FAR * (last - first) <= at <= last + FAR * (last - first):
+            axes.axvline(mark.value, color=mark.colour, ls=(0, (4, 2)), lw=1.2)
+            place |= {"transform": axes.get_xaxis_transform(), "rotation": 90, "ha": "right"}
+            axes.text(mark.value, 0.99, f"{mark.label} ", **place)
+        else:
+            below = at < first
+            text = f"← {mark.label} {number(mark.value)}" if below else f"{mark.label} {number(mark.value)} →"
+            place |= {"transform": axes.transAxes, "ha": "left" if below else "right"}
+            axes.text(0.0 if below else 1.0, 0.98 - 0.09 * index, text, **place)
 
 
 def _density(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.histogram(values, edges)[0] / max(1, values.size) / np.diff(edges)
 
 
-def _edges(values: np.ndarray) -> np.ndarray:
-    """Bins of equal width, or of equal ratio where the central interval spans more than a factor of twenty."""
+def _edges(values: np.ndarray, logarithmic: bool) -> np.ndarray:
     low, high = np.quantile(values, (0.002, 0.998))
-    inner = np.quantile(values, (0.025, 0.975))
-    if low > 0 and inner[1] > LOG_SPAN * inner[0]:
-        return np.geomspace(low, high, BINS)
+    if logarithmic:
+        return np.geomspace(max(low, 1e-12), high, BINS)
     margin = 0.02 * (high - low) or 1e-9
     return np.linspace(low - margin, high + margin, BINS)
 
@@ -216,14 +242,12 @@ def _true_component(truth: Truth | None, node: int, axis: int) -> float | None:
 
 
 def _component(axes: Axes, draws: np.ndarray, name: str, truth: float | None) -> None:
-    histogram(axes, draws, style.UNIFORM, [] if truth is None else [truth])
-    if truth is not None:
-        _truth_line(axes, truth, "truth", style.TRUTH)
+    histogram(axes, draws, style.UNIFORM, [] if truth is None else [Mark(truth, "truth", style.TRUTH)])
     axes.set_xlabel(f"$u_{name}$, mm")
 
 
 def _to_skull(axes: Axes, distance: np.ndarray) -> None:
-    histogram(axes, distance, style.UNIFORM, [0.0])
+    histogram(axes, distance, style.UNIFORM, [])
     axes.axvline(0, color=style.SKULL, lw=1.4)
     axes.axvspan(axes.get_xlim()[0], 0, color=style.SKULL, alpha=0.25, lw=0, zorder=0)
     axes.set_xlabel("distance to skull, mm")

@@ -17,6 +17,10 @@ LEAST_ESS = 100.0
 NU_LOCKING = 0.48
 NOISE_FACTOR = 1.5
 NONE = "–"
+UNCONVERGED = (
+    "What follows describes where the chains have been so far, not the posterior: "
+    "means may still move, and intervals and effective sample sizes are unreliable."
+)
 
 
 class Verdict(NamedTuple):
@@ -25,7 +29,7 @@ class Verdict(NamedTuple):
     Attributes
     ----------
     converged : bool
-        Whether R-hat is below the threshold for every estimand, whatever the manifest says.
+        Whether R-hat is below the threshold for every estimand, and the run's own stop rule does not deny it.
     headline : str
         One sentence.
     detail : str
@@ -88,12 +92,15 @@ def part(manifest: Mapping[str, Any], *keys: str) -> Any:
 
 
 def threshold_of(manifest: Mapping[str, Any]) -> float:
-    """The R-hat that was asked for."""
+    """The R-hat that was asked for; 1.01 where none was."""
     return float(part(manifest, "stopped", "rhat_threshold") or DEFAULT_THRESHOLD)
 
 
 def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict:
-    """Judge by the estimands themselves; the manifest only says why it stopped."""
+    """Judge by the estimands, and by the stop rule's own R-hat (unsplit, as in the paper) where it is known.
+
+    Rank-normalised R-hat cannot grow far beyond one with few chains, the unsplit one misses drifts: both must be low.
+    """
     threshold = threshold_of(manifest)
     reason = str(part(manifest, "stopped", "reason") or "").strip().rstrip(".")
     stopped = f"It stopped because {reason}. " if reason else ""
@@ -101,6 +108,12 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
         return Verdict(False, "Not converged: no estimand has a convergence figure.", stopped)
     first, failing = worst(entries, 1)[0], above(entries, threshold)
     named = f"{rhat_text(first.rhat)} ({first.name}{_at(first)})"
+    if not failing and part(manifest, "stopped", "converged") is False:
+        headline = (
+            f"Not converged by the rule of this run: its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, "
+            f"asked for {threshold:g}, though the rank-normalised R̂ is below it; the greatest is {named}."
+        )
+        return Verdict(False, headline, stopped + UNCONVERGED)
     if not failing:
         headline = f"Converged: R̂ is below {threshold:g} for all {len(entries):,} estimands; the greatest is {named}."
         return Verdict(True, headline, (stopped + _few_draws(entries)).strip())
@@ -108,11 +121,11 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
         f"Not converged: R̂ is {threshold:g} or more for {failing:,} of {len(entries):,} estimands; "
         f"the greatest is {named}."
     )
-    detail = (
-        "What follows describes where the chains have been so far, not the posterior: "
-        "means may still move, and intervals and effective sample sizes are unreliable."
-    )
-    return Verdict(False, headline, stopped + detail)
+    return Verdict(False, headline, stopped + UNCONVERGED)
+
+
+def _unsplit(manifest: Mapping[str, Any]) -> str:
+    return number(part(manifest, "convergence", "rhat_paper_max"), 4)
 
 
 def rhat_text(rhat: float) -> str:
@@ -149,7 +162,7 @@ def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterio
     greatest = worst(entries, 1)
     implied, sampling = part(manifest, "implied_noise_sd"), part(manifest, "timings", "sampling")
     return [
-        Fact("Greatest R̂", rhat_text(greatest[0].rhat) if greatest else NONE, f"asked for {threshold_of(manifest):g}"),
+        Fact("Greatest R̂", rhat_text(greatest[0].rhat) if greatest else NONE, _asked(manifest)),
         Fact(
             "Least ESS",
             f"{number(_least(entries, 'ess_bulk'), 2)} bulk",
@@ -171,6 +184,13 @@ def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterio
         Fact("Speed", number(part(manifest, "steps_per_second_per_chain")), "steps per second and chain"),
         Fact("Residual sd", number(part(manifest, "residual_sd")), f"T_s implies {number(implied)}" if implied else ""),
     ]
+
+
+def _asked(manifest: Mapping[str, Any]) -> str:
+    threshold = part(manifest, "stopped", "rhat_threshold")
+    asked = f"asked for {threshold:g}" if threshold else "none asked for"
+    unsplit = _unsplit(manifest)
+    return asked if unsplit == NONE else f"{asked}; unsplit, as in the paper: {unsplit}"
 
 
 def _count(value: float | int | None) -> str:
@@ -214,10 +234,12 @@ def _noise(manifest: Mapping[str, Any]) -> list[str]:
     if not implied or not residual or 1 / NOISE_FACTOR <= residual / implied <= NOISE_FACTOR:
         return []
     wide = residual > implied
+    early = part(manifest, "stopped", "converged") is False
     return [
         f"T_s implies a noise sd of {number(implied)} (variance T_s / 2w at a quadrature point of weight w), but the "
         f"residual at the mean has sd {number(residual)}: the posterior is too {'narrow' if wide else 'wide'}. "
         f"A T_s {number((residual / implied) ** 2, 2)} times the present one would agree."
+        + (" Before convergence this may only show that the chains have not arrived yet." if early else "")
     ]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import cache
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import pytest
 
@@ -24,7 +23,7 @@ TEMPERATURES = {"t_similarity": 1.0, "t_elastic": 20.0, "rigid_sd": 0.3}
 WALL = 21.0
 
 CHAINS, STEPS_PER_DRAW = 32, 15
-DRAWS, WARM_UP = 400, 80
+DRAWS, WARM_UP = 320, 80
 
 
 class Problem(NamedTuple):
@@ -111,34 +110,36 @@ def whitened_scores(y):
     return z_scores(y.mean(axis=1), 0.0), z_scores(second[:, rows, columns], np.eye(y.shape[2])[rows, columns])
 
 
+def test_density_is_the_gaussian():
+    """No sampling: log p is quadratic, with the exact mean and precision."""
+    posterior, _, exact, _ = problem()
+
+    def density(flat):
+        return posterior.logdensity_constrained({"u_boundary": flat.reshape(-1, 3), "lam": LAM, "mu": MU})
+
+    rng = np.random.default_rng(0)
+    at_mean = float(density(exact.mean))
+    for step in rng.normal(size=(5, len(exact.mean))):
+        expected = -0.5 * step @ exact.precision @ step
+        for sign in (-1, 1):
+            found = float(density(exact.mean + sign * step)) - at_mean
+            assert found == pytest.approx(expected, rel=1e-9)
+
+
 @pytest.fixture(scope="module")
 def result():
     return run(problem().posterior, sigma_u=0.25, seed=0)
 
 
+@pytest.mark.slow
 class TestGaussianPosterior:
-    def test_density_is_the_gaussian(self):
-        """No sampling: log p is quadratic, with the exact mean and precision."""
-        posterior, _, exact, _ = problem()
-
-        def density(flat):
-            return posterior.logdensity_constrained({"u_boundary": flat.reshape(-1, 3), "lam": LAM, "mu": MU})
-
-        scale = np.sqrt(np.diag(exact.precision))
-        np.testing.assert_allclose(jax.grad(density)(exact.mean) / scale, 0, atol=1e-6)
-        rng = np.random.default_rng(0)
-        at_mean = float(density(exact.mean))
-        for step in rng.normal(size=(5, len(exact.mean))):
-            expected = -0.5 * step @ exact.precision @ step
-            assert float(density(exact.mean + step)) - at_mean == pytest.approx(expected, rel=1e-9)
-
     def test_mean_and_covariance(self, result):
         assert_gaussian(draws_of(result), problem().exact)
 
-    def test_mean_against_one_chains_own_error(self, result):
-        """The error from batch means within chains agrees with the scatter between them."""
+    def test_mean_within_its_error_by_batch_means(self, result):
+        """A second estimate of the Monte Carlo error, from the scatter of half chains."""
         draws, exact = draws_of(result), problem().exact
-        batches = draws.reshape(CHAINS * 4, -1, draws.shape[2]).mean(axis=1)
+        batches = draws.reshape(CHAINS * 2, -1, draws.shape[2]).mean(axis=1)
         error = batches.std(axis=0, ddof=1) / np.sqrt(len(batches))
         assert abs((batches.mean(axis=0) - exact.mean) / error).max() < 5.5
 
@@ -184,6 +185,7 @@ def draws():
     return draws_of(run(walled(), sigma_u=0.22, seed=1))
 
 
+@pytest.mark.slow
 class TestTruncatedPosterior:
     """A flat skull one millimetre beyond a face of the box: some three in a hundred draws of the Gaussian avoid it."""
 

@@ -29,3 +29,13 @@ def test_the_gradient_is_that_of_the_value_on_a_rotated_left_handed_grid():
     steps = 1e-4 * np.eye(3)
     numeric = np.stack([(obstacle(points + h)[0] - obstacle(points - h)[0]) / 2e-4 for h in steps], axis=1)
     np.testing.assert_allclose(gradient, numeric, atol=1e-7)
+
+
+def test_beyond_the_grid_the_way_back_is_downhill():
+    empty = Image(np.zeros((20, 20, 20)), np.diag([2.0, 2.0, 2.0, 1.0]))
+    obstacle = SmoothObstacle(empty, smoothing_mm=2.0)
+    below = np.array([[19.0, 19.0, z] for z in (-9.0, -6.0)])
+    gap, gradient = obstacle(below)
+    np.testing.assert_allclose(gap, below[:, 2] + 1, atol=0.05)
+    np.testing.assert_allclose(gradient, np.tile([0, 0, 1], (2, 1)), atol=0.05)
+    np.testing.assert_allclose(obstacle.distance(below), below[:, 2] + 1, atol=1e-9)

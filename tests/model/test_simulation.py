@@ -75,7 +75,7 @@ def inside() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return cell, barycentric, np.einsum("ka,kai->ki", barycentric, mesh.points[mesh.cells[cell]])
 
 
-def mismatch(pair, inside, method="cubic") -> np.ndarray:
+def mismatch(pair, inside, method) -> np.ndarray:
     """m(x + u(x)) less the analytic f(x) at random points inside the mesh."""
     cell, barycentric, rest = inside
     moved = rest + np.einsum("ka,kai->ki", barycentric, pair.u[pair.mesh.cells[cell]])
@@ -130,26 +130,26 @@ def test_the_least_energy_is_an_equilibrium_with_contact_forces(small, clean):
 
 
 def test_moving_at_displaced_points_is_fixed_at_rest(clean, inside):
-    error = np.abs(mismatch(clean, inside))
+    # Linear interpolation over 2.5 mm of waves of 50 mm, up to the surface itself.
+    assert np.abs(mismatch(clean, inside, "linear")).max() < 0.015
+    assert mismatch(clean, inside, "linear").std() < 3e-3
+    # A cubic B-spline is better, but reaches farther across the surface, into what did not move.
     deep = np.linalg.norm(inside[2] - CENTRE, axis=1) < 34
     assert deep.sum() > 1000
-    assert error[deep].max() < 5e-3
-    # At the surface the interpolation of m reaches across, into what did not move.
-    assert np.quantile(error, 0.95) < 6e-3
+    assert np.abs(mismatch(clean, inside, "cubic")[deep]).max() < 6e-3
     assert clean.residual_sd == clean.interpolation_sd < 0.006
     # The deformation matters: without it the images disagree by far more.
     assert np.std(np.asarray(clean.moving.interpolate(inside[2])) - analytic(inside[2])) > 0.05
 
 
 def test_the_error_falls_with_the_voxel_size(clean, inside):
-    u = clean.u
     error = []
     for voxel in (5.0, 2.5, 1.25):
         given = head(voxel)
-        moving = deformed_image(given.fixed, given.tissue, given.skull, given.mesh, u, 0.0)
-        error.append(np.abs(mismatch(clean._replace(moving=moving), inside)).mean())
-    assert error[1] < error[0] / 4
-    assert error[2] < error[1] / 4
+        moving = deformed_image(given.fixed, given.tissue, given.skull, given.mesh, clean.u, 0.0)
+        error.append(np.abs(mismatch(clean._replace(moving=moving), inside, "linear")).mean())
+    assert error[1] < error[0] / 3
+    assert error[2] < error[1] / 3
 
 
 def test_no_displacement_leaves_the_image_alone(small):
@@ -161,10 +161,10 @@ def test_outside_the_mesh_csf_fills_what_the_brain_leaves_and_the_skull_stays(sm
     csf = np.median(small.fixed.voxels[small.tissue.voxels == 1])
     moving, points = np.asarray(clean.moving.voxels), small.fixed.grid_points()
     patch = clean.deformation.patch[0]
-    left = np.linalg.norm(points - (small.mesh.points + 0.3 * clean.u)[patch], axis=-1) < 2.5
+    left = np.linalg.norm(points - (small.mesh.points + 0.2 * clean.u)[patch], axis=-1) < 1.8
     assert left.any()
     np.testing.assert_allclose(moving[left], csf)
-    skull = np.asarray(small.skull.voxels) != 0
+    skull = np.linalg.norm(points - CENTRE, axis=-1) > SKULL_RADIUS + 5
     np.testing.assert_array_equal(moving[skull], small.fixed.voxels[skull])
 
 
@@ -215,7 +215,7 @@ def test_surface_patches_grow_with_their_number():
     ("changed", "message"),
     [
         ({"displacement": 25.0}, r"inverts \d+ of \d+ tetrahedra .*direction"),
-        ({"displacement": 60.0}, "no least energy found"),
+        ({"margin": 0.0}, "margin must be positive"),
         ({"displacement": -4.0}, r"8 of the 8 patch nodes .*skull"),
         ({"patch_nodes": 2}, "at least 3 nodes"),
         ({"patch_nodes": 500}, r"surface \(\d+\), got 500"),

@@ -108,6 +108,30 @@ def test_the_median_and_interval_stand_above_a_histogram(study):
     assert "truth" in [text.get_text().strip() for text in axes.texts]
 
 
+def test_a_truth_far_from_the_draws_is_named_at_the_edge(study):
+    draws = np.random.default_rng(0).normal(10.0, 1.0, size=(3, 200))
+    axes = Figure().subplots()
+    marks = [
+        marginals.Mark(-90.0, "a", "black"),
+        marginals.Mark(12.0, "b", "black"),
+        marginals.Mark(90.0, "c", "black"),
+    ]
+    marginals.histogram(axes, draws, "grey", marks)
+    assert [text.get_text().strip() for text in axes.texts] == ["← a −90.0", "b", "c 90.0 →"]
+    low, high = axes.get_xlim()
+    assert 5 < low < high < 16
+
+
+def test_only_ratios_get_a_logarithmic_axis():
+    draws = np.random.default_rng(0).lognormal(0.0, 2.0, size=(3, 200))
+    scales = []
+    for ratio in (True, False):
+        axes = Figure().subplots()
+        marginals.histogram(axes, draws, "grey", [], ratio=ratio)
+        scales.append(axes.get_xscale())
+    assert scales == ["log", "linear"]
+
+
 def test_many_chains_have_many_colours():
     assert len(set(style.chain_colours(16))) == 16
     assert len(set(style.tissue_colours(["csf", "gm", "wm", "tumour", "oedema"]))) == 5

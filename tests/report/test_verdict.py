@@ -24,7 +24,7 @@ def elastic(lam: list[float], mu: list[float]) -> xr.Dataset:
 
 
 def test_converged_only_if_every_estimand_is_below_the_threshold():
-    found = verdict(stopped("R̂ is below 1.2"), [entry(1.01), entry(1.19, name="λ gm")])
+    found = verdict(stopped("R̂ is below 1.2", converged=True), [entry(1.01), entry(1.19, name="λ gm")])
     assert found.converged
     assert found.headline.startswith("Converged: R̂ is below 1.2 for all 2 estimands; the greatest is 1.190 (λ gm")
     assert found.detail == "It stopped because R̂ is below 1.2."
@@ -51,8 +51,24 @@ def test_nothing_sampled_is_not_converged():
 
 
 def test_few_effective_draws_are_admitted_even_when_converged():
-    assert "effective sample size is only 35" in verdict(stopped(), [entry(1.0), entry(1.0, bulk=35.2)]).detail
-    assert "effective" not in verdict(stopped(), [entry(1.0)]).detail
+    manifest = stopped(converged=True)
+    assert "effective sample size is only 35" in verdict(manifest, [entry(1.0), entry(1.0, bulk=35.2)]).detail
+    assert "effective" not in verdict(manifest, [entry(1.0)]).detail
+
+
+def test_a_run_whose_own_rule_says_no_has_not_converged():
+    manifest = stopped() | {"convergence": {"rhat_paper_max": 1.4321}}
+    found = verdict(manifest, [entry(1.01)])
+    assert not found.converged
+    assert "unsplit, as in the paper) is 1.432, asked for 1.2" in found.headline
+    assert "not the posterior" in found.detail
+
+
+def test_without_a_stop_rule_the_estimands_decide():
+    manifest = {"stopped": {"reason": "all draws are taken", "converged": None, "rhat_threshold": None}}
+    assert verdict(manifest, [entry(1.005)]).converged
+    assert not verdict(manifest, [entry(1.015)]).converged
+    assert key_facts(manifest, [], elastic([1.0], [1.0]))[0].note == "none asked for"
 
 
 def test_key_facts_hold_the_numbers_of_the_manifest():
@@ -64,11 +80,12 @@ def test_key_facts_hold_the_numbers_of_the_manifest():
         "steps_per_second_per_chain": 63.4,
         "residual_sd": 0.0151,
         "implied_noise_sd": 0.0146,
+        "convergence": {"rhat_paper_max": 2.3451},
     }
     entries = [entry(1.3, 12.0, 9.0), entry(1.1, 40.0, 33.0)]
     posterior = elastic([1.0], [1.0])
     facts = {fact.label: f"{fact.value} {fact.note}" for fact in key_facts(manifest, entries, posterior)}
-    assert facts["Greatest R̂"] == "1.300 asked for 1.2"
+    assert facts["Greatest R̂"] == "1.300 asked for 1.2; unsplit, as in the paper: 2.345"
     assert facts["Least ESS"] == "12 bulk 9.0 tail, of 3 draws"
     assert facts["Acceptance"] == "24.3 % inside the support; 8.7 % overall"
     assert facts["Contact with the skull"] == "17 nodes"
