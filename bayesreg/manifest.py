@@ -50,6 +50,7 @@ def manifest(
     tally = samples.tally
     steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
     accepted = float(tally.acceptance.sum())
+    greatest = _extreme(judged.rhat, np.nanmax)
     return {
         "name": config.description,
         "versions": _versions(),
@@ -67,9 +68,13 @@ def manifest(
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
         "model": config.model.model_dump(mode="json"),
         "exact": samples.exact,
-        "stopped": {"reason": samples.reason, "converged": samples.converged, "rhat_threshold": config.stop.rhat},
+        "stopped": {
+            "reason": samples.reason,
+            "converged": _converged(samples, config.stop.rhat, greatest),
+            "rhat_threshold": config.stop.rhat,
+        },
         "convergence": {
-            "rhat_max": _extreme(judged.rhat, np.nanmax),
+            "rhat_max": greatest,
             "ess_bulk_min": _extreme(judged.ess_bulk, np.nanmin),
             "ess_tail_min": _extreme(judged.ess_tail, np.nanmin),
             "rhat_paper_max": greatest_rhat(samples.rhat),
@@ -85,6 +90,13 @@ def manifest(
         "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
         "implied_noise_sd": posterior.implied_noise_sd,
     }
+
+
+def _converged(samples: Samples, threshold: float | None, greatest: float | None) -> bool | None:
+    """The stop rule's R̂ and the stricter one of the report, rank-normalised and split, must both agree."""
+    if threshold is None:
+        return None
+    return bool(samples.converged) and greatest is not None and greatest < threshold
 
 
 def _versions() -> dict[str, str]:

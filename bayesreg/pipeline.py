@@ -122,23 +122,23 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     out = Path(out)
     began = time.perf_counter()
     say = _narrator(progress)
-    resuming = resume and (out / "config.yaml").exists()
-    if resuming:
+    if resume and (out / "run.json").exists():
+        say(f"{out} holds a finished run already")
+        return load_result(out)
+    if resume and (out / "config.yaml").exists():
         inputs, provenance = _resumed_inputs(out, config)
+        posterior = posterior_of(config, inputs)
     else:
         store.require_fresh(out)
         say("reading the images, meshing")
         inputs, provenance = _prepared_inputs(config)
+        # Nothing is written before all input has proved sound, and all of it before the first step is taken.
+        posterior = posterior_of(config, inputs)
+        first_points(posterior, _start(config, inputs, posterior), config.sampler.chains, config.seed)
+        inputs = _with_initial(inputs, config)
+        _store(out, inputs, provenance)
     say(_described(inputs))
-    posterior = posterior_of(config, inputs)
-    start = _start(config, inputs, posterior)
-    if not resuming:
-        # Nothing is written before all input has proved sound, and everything before the first step is taken.
-        first_points(posterior, start, config.sampler.chains, config.seed)
-        store.write_inputs(out, inputs)
-        store.write_json(out / "inputs" / "provenance.json", provenance)
-    inputs = _with_initial(inputs, config, start)
-    samples = _sample(config, posterior, start, out, progress)
+    samples = _sample(config, posterior, _start(config, inputs, posterior), out, progress)
     say("writing the results")
     result = _finish(config, inputs, posterior, samples, provenance, out, began)
     say(f"{samples.reason}")
@@ -209,8 +209,7 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
         raise InputError("the configuration has no section 'simulate': its pair comes from files")
     store.require_fresh(out)
     inputs, provenance = _prepared_inputs(config)
-    store.write_inputs(out, inputs)
-    store.write_json(Path(out) / "inputs" / "provenance.json", provenance)
+    _store(Path(out), inputs, provenance)
     return Path(out)
 
 
@@ -293,12 +292,17 @@ def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
     return store.read_displacement(Path(wanted), inputs.mesh)
 
 
-def _with_initial(inputs: Inputs, config: Config, start: Start) -> Inputs:
+def _with_initial(inputs: Inputs, config: Config) -> Inputs:
     """The truth with the centre of the chains' starts, for the paper's Table 1."""
     field = _start_field(config, inputs)
     if inputs.truth is None or field is None:
         return inputs
-    return inputs._replace(truth=inputs.truth._replace(initial=np.mean(start.fraction) * field))
+    return inputs._replace(truth=inputs.truth._replace(initial=np.mean(config.start.fraction) * field))
+
+
+def _store(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
+    store.write_inputs(out, inputs)
+    store.write_json(out / "inputs" / "provenance.json", provenance)
 
 
 def _sampler_settings(config: Config) -> dict[str, Any]:
@@ -357,7 +361,8 @@ def _finish(
         metrics=metrics,
         **inputs._asdict(),
     )
-    store.write_run(out, finished, mean_field, sd_field)
+    store.write_results(out, finished, mean_field, sd_field)
+    store.remove_checkpoints(out)
     result = Result(out, finished)
     write_report(finished, samples.idata, *judged, result.report)
     return result

@@ -57,13 +57,15 @@ def prepare(config: Config) -> Prepared:
     if isinstance(config.data, FilesData):
         assert moving is not None
         own_scale = scale if config.data.same_contrast else robust_scale(moving, _within(domain, moving))
-        inputs = Inputs(resolved_yaml(config), mesh, fixed, own_scale(moving), tissue, skull)
+        images = _as_stored(fixed), _as_stored(own_scale(moving))
+        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull)
         return Prepared(inputs, clock.laps, {})
     pair = _pair(config, fixed, anatomy, skull, mesh)
     clock.lap("pair")
     u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
-    inputs = Inputs(resolved_yaml(config), mesh, pair.fixed, pair.moving, tissue, skull, truth)
+    images = _as_stored(pair.fixed), _as_stored(pair.moving)
+    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth)
     return Prepared(inputs, clock.laps, _described(config, pair))
 
 
@@ -106,6 +108,11 @@ def _mesh(anatomy: Anatomy, settings: MeshConfig, edge_length: float | None = No
 def _forbidden(intracranial: Image) -> Image:
     """Ω_SK: everything outside the intracranial mask."""
     return intracranial.with_voxels((np.asarray(intracranial.voxels) == 0).astype(np.uint8))
+
+
+def _as_stored(image: Image) -> Image:
+    """In the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
+    return Image(np.asarray(image.voxels, np.float32), np.asarray(image.affine, np.float32))
 
 
 def _within(domain: Image, image: Image) -> np.ndarray:

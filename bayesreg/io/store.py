@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -266,6 +267,13 @@ def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
     """The content of state.npz; None where there is none."""
     path = Path(folder) / "state.npz"
     return load_arrays(path) if path.exists() else None
+
+
+def remove_checkpoints(folder: str | Path) -> None:
+    """Remove draws/ and state.npz of a run whose results are complete."""
+    folder = Path(folder)
+    shutil.rmtree(folder / "draws", ignore_errors=True)
+    (folder / "state.npz").unlink(missing_ok=True)
 
 
 def _require(folder: Path, name: str) -> Path:

@@ -1,18 +1,15 @@
-"""Labels to mesh: the region, the surfaces, fTetWild, the tissue of cells, the gap to the skull, the files."""
+"""Labels to mesh, the tissue of cells, and meshes in files."""
 
-import logging
 from dataclasses import replace
 
 import meshio
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
 from bayesreg.io import meshing, tetwild
 from bayesreg.io.datasets import brainweb, mni152
-from bayesreg.io.fitting import pull_inside
 from bayesreg.io.meshing import (
     MeshError,
     MeshOptions,
@@ -24,40 +21,12 @@ from bayesreg.io.meshing import (
     save_mesh,
     tissue_of_cells,
 )
-from bayesreg.io.quality import dihedral_angles, mean_ratio
-from bayesreg.io.surfaces import depth_sizing, tissue_surfaces
 from bayesreg.mesh import TetMesh
+from tests.io.balls import CENTRE, balls, grid
 from tests.io.test_datasets import needs_brainweb
-from tests.phantoms import ball_mesh, box_mesh, flat_skull
+from tests.phantoms import ball_mesh, box_mesh
 
-CENTRE = np.array([5.0, -3.0, 8.0])
-RADII = {"csf": 12.0, "wm": 26.0, "gm": 36.0, "skull": 38.0}
 OPTIONS = MeshOptions(edge_length=16.0, envelope=4.0)
-
-
-def grid(sizes=(2.0, 2.0, 2.0), angles=(0.0, 0.0, 0.0), flip=False, extent=84.0):
-    """Empty image about CENTRE."""
-    shape = np.ceil(extent / np.array(sizes)).astype(int)
-    affine = np.eye(4)
-    affine[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix() * sizes
-    affine[:3, 0] *= -1 if flip else 1
-    affine[:3, 3] = CENTRE - affine[:3, :3] @ ((shape - 1) / 2)
-    return Image(np.zeros(shape, np.int8), affine)
-
-
-def offset_from_centre(image):
-    return np.moveaxis(image.grid_points() - CENTRE, -1, 0)
-
-
-def balls(image):
-    """A ball of CSF in a ball of WM in a ball of GM, inside a skull."""
-    distance = np.linalg.norm(offset_from_centre(image), axis=0)
-    tissue = np.select([distance < RADII[name] for name in ("csf", "wm", "gm")], [1, 3, 2], 0)
-    return image.with_voxels(tissue.astype(np.int8)), image.with_voxels((distance < RADII["skull"]).astype(np.uint8))
-
-
-def litres(image, value):
-    return np.count_nonzero(image.voxels == value) * image.voxel_volume
 
 
 @pytest.fixture(scope="module")
@@ -73,130 +42,6 @@ def labels(phantom):
 @pytest.fixture(scope="module")
 def mesh(phantom):
     return build_mesh(*phantom, OPTIONS)
-
-
-class TestDomain:
-    def test_is_the_hull_with_its_inner_csf(self, phantom):
-        np.testing.assert_array_equal(mesh_domain(*phantom).voxels, phantom[0].voxels > 0)
-
-    def test_needs_no_intracranial_mask(self, phantom):
-        np.testing.assert_array_equal(mesh_domain(phantom[0]).voxels, phantom[0].voxels > 0)
-
-    @pytest.mark.parametrize("sizes", [(2.0, 2.0, 2.0), (1.5, 3.0, 4.0)])
-    @pytest.mark.parametrize(("half_width", "closed"), [(5.0, True), (12.0, False)])
-    def test_closes_slits_by_their_width_in_millimetres(self, sizes, half_width, closed):
-        tissue, _ = balls(grid(sizes))
-        x, y, z = offset_from_centre(tissue)
-        slit = (np.abs(x) < half_width) & (z > 14)
-        domain = mesh_domain(tissue.with_voxels(np.where(slit, 0, tissue.voxels))).voxels
-        middle = (np.abs(x) < 2) & (np.abs(y) < 4) & (np.abs(z - 24) < 4)
-        assert domain[middle].all() == closed
-        assert domain[middle].any() == closed
-
-    def test_stays_inside_the_intracranial_mask(self, phantom):
-        tissue, inside = phantom
-        cut = inside.with_voxels(inside.voxels * (offset_from_centre(tissue)[0] < 20))
-        np.testing.assert_array_equal(mesh_domain(tissue, cut).voxels, (tissue.voxels > 0) & (cut.voxels > 0))
-
-    def test_drops_specks_and_says_so(self, phantom, caplog):
-        tissue, inside = phantom
-        speckled = inside.voxels.copy()
-        speckled[:2, :2, :2] = speckled[0, 0, -1] = 1
-        with caplog.at_level(logging.INFO):
-            domain = mesh_domain(tissue, inside.with_voxels(speckled))
-        np.testing.assert_array_equal(domain.voxels, tissue.voxels > 0)
-        assert "2 specks of the intracranial mask left out, 9 voxels together" in caplog.text
-
-    def test_refuses_a_mask_in_large_parts(self, phantom):
-        tissue, inside = phantom
-        x = offset_from_centre(tissue)[0]
-        parted = inside.with_voxels(inside.voxels * ((x < 16) | (x > 20)))
-        with pytest.raises(MeshError, match=r"intracranial mask has 2 separate parts \(\d+%, \d+% of its volume\)"):
-            mesh_domain(tissue, parted)
-
-    def test_refuses_an_empty_mask(self, phantom):
-        with pytest.raises(MeshError, match="intracranial mask is empty"):
-            mesh_domain(phantom[0], phantom[1].with_voxels(phantom[1].voxels * 0))
-
-    @pytest.mark.parametrize(("index", "name"), [(2, "gm"), (3, "wm")])
-    def test_refuses_a_missing_tissue(self, phantom, index, name):
-        tissue = phantom[0].with_voxels(np.where(phantom[0].voxels == index, 1, phantom[0].voxels))
-        with pytest.raises(MeshError, match=f"holds no {name} "):
-            mesh_domain(tissue)
-
-    def test_refuses_a_brain_without_csf(self, phantom):
-        solid = phantom[0].with_voxels(np.where(phantom[0].voxels == 1, 3, phantom[0].voxels))
-        with pytest.raises(MeshError, match="region to mesh holds no csf"):
-            build_mesh(solid)
-
-    def test_refuses_a_mask_elsewhere(self, phantom):
-        tissue, inside = phantom
-        elsewhere = inside.with_voxels(inside.voxels * (offset_from_centre(tissue)[0] > 10))
-        with pytest.raises(MeshError, match="more than half of the GM and WM lies outside the intracranial mask"):
-            mesh_domain(tissue, elsewhere)
-
-    def test_refuses_another_grid(self, phantom):
-        with pytest.raises(ValueError, match="the tissue and the intracranial image must share one grid"):
-            mesh_domain(phantom[0], balls(grid((3.0, 3.0, 3.0)))[1])
-
-    def test_counts_what_is_neither_gm_nor_wm_as_csf(self, phantom):
-        tissue, inside = phantom
-        hollow = tissue.with_voxels(np.where(tissue.voxels == 1, 0, tissue.voxels))
-        np.testing.assert_array_equal(domain_labels(hollow, mesh_domain(hollow, inside)).voxels, tissue.voxels)
-
-
-GRIDS = {
-    "upright": {},
-    "left-handed": {"flip": True},
-    "oblique, anisotropic": {"sizes": (1.5, 2.5, 3.0), "angles": (20.0, -35.0, 50.0)},
-}
-
-
-class TestSurfaces:
-    @pytest.mark.parametrize("kwargs", GRIDS.values(), ids=GRIDS.keys())
-    def test_lie_at_their_radii_with_normals_outwards(self, kwargs):
-        tissue, _ = balls(grid(**kwargs))
-        outer, white, fluid = tissue_surfaces(tissue, 8.0)
-        for surface, name in ((outer, "gm"), (white, "wm"), (fluid, "csf")):
-            radius = np.linalg.norm(surface.points - CENTRE, axis=1)
-            np.testing.assert_allclose(radius.mean(), RADII[name], atol=1.2)
-            a, b, c = np.moveaxis(surface.points[surface.faces], 1, 0)
-            outwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - CENTRE)
-            assert (outwards > 0).mean() > 0.99
-
-    def test_enclose_about_the_volume_of_their_labels(self, labels):
-        outer, *_ = tissue_surfaces(labels, 6.0)
-        assert outer.volume == pytest.approx(litres(labels, 1) + litres(labels, 2) + litres(labels, 3), rel=0.03)
-
-    def test_are_closed_where_the_labels_touch_the_edge_of_the_grid(self):
-        cut, _ = balls(grid(extent=56.0))
-        for surface in tissue_surfaces(cut, 8.0):
-            edges = np.sort(surface.faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2), axis=1)
-            assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
-
-    def test_leave_out_what_is_too_small(self, labels):
-        spotted = labels.voxels.copy()
-        spotted[20:22, 20:22, 4:6] = 3
-        with_spot = tissue_surfaces(labels.with_voxels(spotted), 8.0)
-        assert [len(s.faces) for s in with_spot] == [len(s.faces) for s in tissue_surfaces(labels, 8.0)]
-
-
-class TestSizing:
-    def test_grows_with_depth_between_its_bounds(self, labels):
-        sizing = depth_sizing(labels, 8.0, 20.0)
-        radius = np.linalg.norm(sizing.points - CENTRE, axis=1)
-        np.testing.assert_allclose(sizing.values[radius > 38], 8.0)
-        np.testing.assert_allclose(sizing.values[radius < 10], 20.0)
-        between = (radius > 22) & (radius < 32)
-        np.testing.assert_allclose(sizing.values[between], 8.0 + 0.7 * (36 - radius[between]), atol=3.0)
-
-    def test_background_mesh_fills_its_box(self, labels):
-        sizing = depth_sizing(labels, 8.0, 20.0)
-        box = np.ptp(sizing.points, axis=0)
-        volumes = TetMesh.from_arrays(sizing.points, sizing.cells, np.zeros(len(sizing.cells), int)).volumes
-        assert volumes.sum() == pytest.approx(box.prod())
-        assert (sizing.points.min(axis=0) < CENTRE - 36).all()
-        assert (sizing.points.max(axis=0) > CENTRE + 36).all()
 
 
 class TestBuildMesh:
@@ -234,13 +79,6 @@ class TestBuildMesh:
         assert mesh.volumes.sum() == pytest.approx(np.count_nonzero(tissue.voxels) * tissue.voxel_volume, rel=0.2)
         assert tissue.contains(mesh.points).mean() > 0.5
 
-    def test_leaves_neither_files_nor_words_behind(self, phantom, tmp_path, monkeypatch, capfd):
-        monkeypatch.chdir(tmp_path)
-        surfaces = tissue_surfaces(phantom[0], 20.0)
-        tetwild.tetrahedralize(surfaces, depth_sizing(phantom[0], 20.0, 30.0), envelope=5.0, threads=1)
-        assert not list(tmp_path.iterdir())
-        assert capfd.readouterr() == ("", "")
-
     def test_tries_again_where_a_mesh_is_not_sound(self, phantom, mesh, monkeypatch, caplog):
         results = iter([MeshError("no luck"), (mesh.points, mesh.cells)])
 
@@ -276,25 +114,6 @@ class TestBuildMesh:
             MeshOptions(**options)
 
 
-class TestMissingCells:
-    def test_puts_back_single_cells(self):
-        whole = ball_mesh()
-        outer = {frozenset(face) for face in whole.boundary_faces.tolist()}
-        buried = [not any(face <= set(cell) for face in outer) for cell in whole.cells.tolist()]
-        inner = np.isin(whole.cells, whole.boundary).sum(axis=1) == 0
-        # One deep inside, and one that touches the surface.
-        gone = np.isin(np.arange(len(whole.cells)), (inner.argmax(), (buried & ~inner).argmax()))
-        assert gone.sum() == 2
-        completed = tetwild._completed(whole.points, whole.cells[~gone])
-        mesh = TetMesh.from_arrays(whole.points, completed, np.zeros(len(completed), int))
-        assert {frozenset(cell) for cell in mesh.cells.tolist()} == {frozenset(cell) for cell in whole.cells.tolist()}
-        assert mesh.volumes.sum() == pytest.approx(whole.volumes.sum())
-
-    def test_adds_nothing_to_a_whole_mesh(self):
-        mesh = ball_mesh()
-        np.testing.assert_array_equal(tetwild._completed(mesh.points, mesh.cells), mesh.cells)
-
-
 class TestTissueOfCells:
     def test_is_the_majority(self):
         mesh = box_mesh(3, size=20.0)
@@ -313,162 +132,6 @@ class TestTissueOfCells:
         mesh = box_mesh(2)
         image = Image(np.full((3, 3, 3), 2, np.int8), np.diag([-1.0, -1.0, -1.0, 1.0]))
         np.testing.assert_array_equal(tissue_of_cells(mesh.points, mesh.cells, image), 0)
-
-
-def block_labels(mesh, voxel=1.0):
-    """Labels of a mesh, voxel by voxel of its bounding box."""
-    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    affine = np.diag([voxel, voxel, voxel, 1.0])
-    affine[:3, 3] = low + voxel / 2
-    image = Image(np.zeros(np.rint((high - low) / voxel).astype(int)), affine)
-    corner = mesh.points[mesh.cells]
-    inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])
-    points = image.grid_points().reshape(-1, 3)
-    weights = np.einsum("pmi,mij->pmj", points[:, None] - corner[None, :, 0], inverse)
-    inside = (weights > -1e-9).all(axis=2) & (weights.sum(axis=2) < 1 + 1e-9)
-    value = np.where(inside.any(axis=1), 1 + mesh.tissue[inside.argmax(axis=1)], 0)
-    return image.with_voxels(value.reshape(image.shape).astype(np.int8))
-
-
-@pytest.fixture(scope="module")
-def box():
-    mesh = box_mesh(3)
-    return mesh, block_labels(mesh)
-
-
-def part_of(mesh, keep):
-    used, cells = np.unique(mesh.cells[keep], return_inverse=True)
-    return TetMesh.from_arrays(mesh.points[used], cells.reshape(-1, 4), mesh.tissue[keep])
-
-
-class TestCheckMesh:
-    def test_measures(self, box):
-        mesh, labels = box
-        quality = check_mesh(mesh, labels)
-        assert (quality.nodes, quality.cells, quality.boundary_nodes) == (
-            len(mesh.points),
-            len(mesh.cells),
-            len(mesh.boundary),
-        )
-        assert sum(quality.tissue_cells.values()) == len(mesh.cells)
-        for index, name in enumerate(mesh.names):
-            assert quality.tissue_volumes[name] == pytest.approx(mesh.volumes[mesh.tissue == index].sum())
-            assert quality.label_volumes[name] == litres(labels, index + 1)
-
-    def test_refuses_two_parts(self, box):
-        mesh, labels = box
-        both = TetMesh.from_arrays(
-            np.vstack([mesh.points, mesh.points + 100]),
-            np.vstack([mesh.cells, mesh.cells + len(mesh.points)]),
-            np.tile(mesh.tissue, 2),
-        )
-        with pytest.raises(MeshError, match="the mesh has 2 separate parts"):
-            check_mesh(both, labels)
-
-    def test_refuses_a_cavity(self, box):
-        mesh, labels = box
-        inner = np.flatnonzero(~np.isin(mesh.cells, mesh.boundary).any(axis=1))
-        with pytest.raises(MeshError, match="boundary has 2 separate surfaces"):
-            check_mesh(part_of(mesh, np.arange(len(mesh.cells)) != inner[0]), labels)
-
-    @pytest.mark.parametrize(
-        ("points", "message"),
-        [
-            (
-                [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]],
-                "touches itself at 1 nodes",
-            ),
-            ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]], "1 edges of the boundary"),
-        ],
-        ids=["at a node", "along an edge"],
-    )
-    def test_refuses_pinches(self, box, points, message):
-        cells = {7: [[0, 1, 2, 3], [0, 4, 6, 5]], 6: [[0, 1, 2, 3], [0, 1, 4, 5]]}[len(points)]
-        mesh = TetMesh.from_arrays(np.array(points, float), np.array(cells), np.array([0, 1]))
-        with pytest.raises(MeshError, match=message):
-            check_mesh(mesh, box[1])
-
-    def test_refuses_flat_cells(self, box):
-        mesh, labels = box
-        flat = TetMesh.from_arrays(mesh.points * (1, 1, 0.01), mesh.cells, mesh.tissue)
-        with pytest.raises(MeshError, match="nearly flat: mean ratio"):
-            check_mesh(flat, labels)
-
-    def test_refuses_a_missing_tissue(self, box):
-        mesh, labels = box
-        without = TetMesh.from_arrays(mesh.points, mesh.cells, np.where(mesh.tissue == 0, 2, mesh.tissue))
-        with pytest.raises(MeshError, match="no tetrahedron is csf"):
-            check_mesh(without, labels)
-
-    def test_refuses_other_volumes(self, box):
-        mesh, labels = box
-        swollen = labels.with_voxels(np.where(labels.grid_points()[..., 0] < 10, 2, labels.voxels))
-        fine = TetMesh.from_arrays(mesh.points, mesh.cells, mesh.tissue)
-        coarse = Image(swollen.voxels, np.diag([4.0, 4.0, 4.0, 1.0]))
-        with pytest.raises(MeshError, match=r"the mesh holds 8\.0 ml of all|the mesh holds .* ml of (csf|gm|wm)"):
-            check_mesh(fine, coarse)
-
-    def test_counts_handles(self):
-        mesh = box_mesh(5, jitter=0.0)
-        centre = mesh.points[mesh.cells].mean(axis=1)
-        ring = part_of(mesh, (np.abs(centre[:, :2] - 10) > 2).any(axis=1))
-        assert check_mesh(ring, block_labels(ring)).genus == 1
-
-
-class TestShape:
-    def test_regular_tetrahedron(self):
-        points = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        cells = np.array([[0, 2, 1, 3]])
-        assert TetMesh.from_arrays(points, cells, np.array([0])).volumes[0] > 0
-        np.testing.assert_allclose(mean_ratio(points, cells), 1)
-        np.testing.assert_allclose(dihedral_angles(points, cells), np.degrees(np.arccos(1 / 3)))
-
-    def test_corner_of_a_cube(self):
-        points = np.vstack([np.zeros(3), np.eye(3)])
-        angles = np.sort(dihedral_angles(points, np.array([[0, 1, 2, 3]]))[0])
-        np.testing.assert_allclose(angles, [np.degrees(np.arctan(2**0.5))] * 3 + [90] * 3)
-
-    def test_does_not_depend_on_size_or_place(self):
-        mesh = ball_mesh()
-        turned = Rotation.from_rotvec([1.0, 2.0, 3.0]).apply(3 * mesh.points) + 50
-        np.testing.assert_allclose(mean_ratio(turned, mesh.cells), mean_ratio(mesh.points, mesh.cells))
-
-    def test_inverted_is_zero(self):
-        mesh = ball_mesh()
-        np.testing.assert_array_equal(mean_ratio(mesh.points, mesh.cells[:, (1, 0, 2, 3)]), 0)
-
-
-class TestPullInside:
-    @pytest.mark.parametrize("depth", [1.0, 4.0, 10.0])
-    def test_pulls_boundary_nodes_behind_a_wall(self, depth):
-        mesh = ball_mesh(spacing=13.0)
-        distance = signed_distance(flat_skull(mesh.points, axis=0, wall=mesh.points[:, 0].max() - depth))
-        before = np.asarray(distance.interpolate(mesh.points))
-        pulled = pull_inside(mesh, distance, 0.5)
-        after = np.asarray(distance.interpolate(pulled.points[mesh.boundary]))
-        assert before[mesh.boundary].min() < 0.5 <= after.min()
-        assert (pulled.volumes > 0).all()
-        assert mean_ratio(pulled.points, pulled.cells).min() > 0.5 * min(0.1, mean_ratio(mesh.points, mesh.cells).min())
-        untouched = np.intersect1d(mesh.boundary, np.flatnonzero(before >= 0.5))
-        np.testing.assert_array_equal(pulled.points[untouched], mesh.points[untouched])
-
-    def test_leaves_a_mesh_that_is_clear_alone(self):
-        mesh = ball_mesh()
-        distance = signed_distance(flat_skull(mesh.points, axis=0, wall=mesh.points[:, 0].max() + 2))
-        assert pull_inside(mesh, distance, 0.5) is mesh
-
-    def test_refuses_the_impossible(self):
-        mesh = ball_mesh()
-        distance = signed_distance(flat_skull(mesh.points, axis=0, wall=mesh.points[:, 0].min() + 8))
-        with pytest.raises(MeshError, match=r"boundary nodes cannot be moved to 0\.5 mm inside the intracranial mask"):
-            pull_inside(mesh, distance, 0.5)
-
-    def test_refuses_a_mask_that_is_too_thin(self):
-        mesh = ball_mesh()
-        wall = flat_skull(mesh.points, axis=0, wall=0.0)
-        thin = wall.with_voxels((np.arange(wall.shape[0]) != 30)[:, None, None] | (wall.voxels > 1))
-        with pytest.raises(MeshError, match="nowhere thick enough"):
-            pull_inside(mesh, signed_distance(thin.with_voxels(thin.voxels.astype(np.uint8))), 3.0)
 
 
 class TestFiles:
