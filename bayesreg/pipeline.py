@@ -23,7 +23,7 @@ from bayesreg.inference.run import (
     StopRule,
     checkpoint_from_arrays,
     checkpoint_to_arrays,
-    first_points,
+    first_checkpoint,
     sample,
 )
 from bayesreg.io import store
@@ -128,17 +128,18 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     if resume and (out / "config.yaml").exists():
         inputs, provenance = _resumed_inputs(out, config)
         posterior = posterior_of(config, inputs)
+        reached = _reached(config, inputs, posterior, out)
     else:
         store.require_fresh(out)
         say("reading the images, meshing")
         inputs, provenance = _prepared_inputs(config)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs)
-        first_points(posterior, _start(config, inputs, posterior), config.sampler.chains, config.seed)
+        reached = _first(config, inputs, posterior)
         inputs = _with_initial(inputs, config)
         _store(out, inputs, provenance)
     say(_described(inputs))
-    samples = _sample(config, posterior, _start(config, inputs, posterior), out, progress)
+    samples = _sample(config, posterior, reached, out, progress)
     say("writing the results")
     result = _finish(config, inputs, posterior, samples, provenance, out, began)
     say(f"{samples.reason}")
@@ -309,16 +310,32 @@ def _sampler_settings(config: Config) -> dict[str, Any]:
     return config.sampler.model_dump(include={"sigma_u", "sigma_lam", "sigma_mu"})
 
 
-def _sample(config: Config, posterior: Posterior, start: Start, out: Path, progress: bool) -> Samples:
+Reached = tuple[Checkpoint, list[Block]]
+
+
+def _first(config: Config, inputs: Inputs, posterior: Posterior) -> Reached:
+    """The chains before their first step; InputError where one cannot start."""
+    options, start = config.sampler, _start(config, inputs, posterior)
+    settings = _sampler_settings(config)
+    return first_checkpoint(posterior, options.name, options.chains, config.seed, start, **settings), []
+
+
+def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path) -> Reached:
+    """The chains as the run that was cut off stored them last."""
+    state = store.load_state(out)
+    if state is None:
+        return _first(config, inputs, posterior)
+    blocks = list(store.load_blocks(out, int(state.pop("blocks"))))
+    options, settings = config.sampler, _sampler_settings(config)
+    return checkpoint_from_arrays(state, posterior, options.name, options.chains, **settings), blocks
+
+
+def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
     def keep(index: int, block: Block, checkpoint: Checkpoint) -> None:
         store.save_block(out, index, block)
         store.save_state(out, {"blocks": np.array(index + 1), **checkpoint_to_arrays(checkpoint)})
 
-    settings, options = _sampler_settings(config), config.sampler
-    resume, state = None, store.load_state(out)
-    if state is not None:
-        blocks = list(store.load_blocks(out, int(state.pop("blocks"))))
-        resume = checkpoint_from_arrays(state, posterior, options.name, options.chains, **settings), blocks
+    options = config.sampler
     return sample(
         posterior,
         options.name,
@@ -327,12 +344,11 @@ def _sample(config: Config, posterior: Posterior, start: Start, out: Path, progr
         config.seed,
         thin=options.thin,
         block=options.block or BLOCK,
-        start=start,
         stop=StopRule(config.stop.rhat, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
-        resume=resume,
+        resume=reached,
         on_block=keep,
-        **settings,
+        **_sampler_settings(config),
     )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.inference.target import Target
+from bayesreg.inference.target import Evaluation, Target
 from bayesreg.types import AnyArray, InputError
 
 
@@ -43,7 +43,7 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
     Raises
     ------
     ValueError
-        If the field has the wrong shape, or a chain would start where the density is zero.
+        If the field has the wrong shape or a parameter's name is unknown.
     """
     at_rest = target.reference()
     field = np.zeros(at_rest["u_boundary"].shape) if start.field is None else np.asarray(start.field, float)
@@ -58,7 +58,6 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
         if name in centre:
             noise = jax.random.normal(subkey, (chains, *centre[name].shape))
             points[name] = centre[name] * jnp.exp(start.spread * noise)
-    _require_density(target, points, fractions)
     return points
 
 
@@ -89,14 +88,13 @@ def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: T
     return values
 
 
-def _require_density(target: Target, points: dict[str, AnyArray], fractions: np.ndarray) -> None:
-    evaluate = jax.jit(jax.vmap(target.evaluate_estimands, in_axes=(None, 0)))
-    found = evaluate(target.data, points)
+def require_density(found: Evaluation) -> None:
+    """Raise InputError where a chain (leading axis) would start with density zero."""
     for chain in np.flatnonzero(~np.isfinite(found.logdensity)):
         why = "a node lies in the skull or a parameter outside its prior's range"
         if not found.outside_support[chain]:
             why = "the elastic solve failed" if found.solver_failed[chain] else "it is not a number"
         raise InputError(
-            f"chain {chain} cannot start at {fractions[chain]:.2f} of the start field: its density is zero because "
-            f"{why}; give another start field or fraction, or other start parameters"
+            f"chain {chain} cannot start: its density is zero because {why}; "
+            "give another start field or fraction, or other start parameters"
         )

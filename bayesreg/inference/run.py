@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayesreg.inference.diagnostics import to_inference_data
-from bayesreg.inference.initialise import Start, starting_points
+from bayesreg.inference.initialise import Start, require_density, starting_points
 from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
 from bayesreg.inference.samplers import SAMPLERS, Info, Sampler, State
@@ -172,7 +172,7 @@ def sample(
     began = time.perf_counter()
     _, key_chains = jax.random.split(jax.random.key(seed))
     if resume is None:
-        checkpoint, blocks = _first(kernel, posterior, first_points(posterior, start, chains, seed)), []
+        checkpoint, blocks = first_checkpoint(posterior, sampler, chains, seed, start, **settings), []
     else:
         checkpoint, blocks = resume[0], list(resume[1])
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
@@ -186,8 +186,10 @@ def sample(
     return _samples(posterior, kernel, blocks, checkpoint, stop, draws)
 
 
-def first_points(posterior: Target, start: Start | None, chains: int, seed: int) -> dict[str, AnyArray]:
-    """Where `sample` starts its chains: estimands with chains as the leading axis.
+def first_checkpoint(
+    posterior: Target, sampler: str, chains: int, seed: int, start: Start | None = None, **settings: float
+) -> Checkpoint:
+    """The checkpoint before any draw: where `sample` starts its chains, unless it resumes.
 
     Raises
     ------
@@ -195,7 +197,10 @@ def first_points(posterior: Target, start: Start | None, chains: int, seed: int)
         If a chain cannot start there.
     """
     key_start, _ = jax.random.split(jax.random.key(seed))
-    return starting_points(posterior, start or Start(), chains, key_start)
+    points = starting_points(posterior, start or Start(), chains, key_start)
+    checkpoint = _first(SAMPLERS[sampler](posterior, **settings), posterior, points)
+    require_density(checkpoint.state.evaluation)
+    return checkpoint
 
 
 def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
@@ -258,7 +263,7 @@ def _advance(
         yield found, checkpoint
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2), donate_argnums=(6, 7))
+@partial(jax.jit, static_argnums=(0, 1, 2))
 def _run_block(  # type: ignore[no-untyped-def]
     step,
     length: int,

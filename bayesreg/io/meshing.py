@@ -94,7 +94,12 @@ class MeshOptions:
             )
 
 
-def build_mesh(tissue: Image, intracranial: Image | None = None, options: MeshOptions = MeshOptions()) -> TetMesh:
+def build_mesh(
+    tissue: Image,
+    intracranial: Image | None = None,
+    options: MeshOptions = MeshOptions(),
+    domain: Image | None = None,
+) -> TetMesh:
     """Mesh the brain: Ω, one tissue per tetrahedron, the boundary nodes clear of the skull.
 
     Not deterministic, since fTetWild is not: keep the mesh, do not build it again.
@@ -106,6 +111,8 @@ def build_mesh(tissue: Image, intracranial: Image | None = None, options: MeshOp
     intracranial : Image, optional
         Nonzero inside the skull, on the same grid; without it nothing bounds the mesh.
     options : MeshOptions
+    domain : Image, optional
+        Ω, where `mesh_domain` has made it already.
 
     Returns
     -------
@@ -118,8 +125,7 @@ def build_mesh(tissue: Image, intracranial: Image | None = None, options: MeshOp
         If the labels or the mask cannot be meshed (see `mesh_domain`), or no attempt gave a mesh that passes
         `check_mesh`.
     """
-    domain = mesh_domain(tissue, intracranial, options.closing)
-    labels = domain_labels(tissue, domain)
+    labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing))
     surfaces = tissue_surfaces(labels, options.edge_length)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
     distance = None if intracranial is None else _skull_distance(intracranial)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,18 @@ from bayesreg.model.obstacle import SmoothObstacle
 from bayesreg.types import InputError
 
 Direction = tuple[float, float, float]
+
+# Right and left frontal, top, right and left temporal, and parietal: all over the hull of the brain.
+DIRECTIONS: tuple[Direction, ...] = (
+    (0.6, 0.3, 0.75),
+    (-0.6, 0.3, 0.75),
+    (0.5, 0.7, 0.4),
+    (0.8, 0.1, 0.5),
+    (-0.8, 0.3, 0.4),
+    (0.0, -0.6, 0.8),
+)
+
+_log = logging.getLogger(__name__)
 
 # How often to raise the floors of nodes that ended nearer to the skull than the margin, and by what share of
 # the margin they may.
@@ -56,7 +69,7 @@ def push_patch(
     mu: Float[np.ndarray, "entries"],
     displacement: float = 15.0,
     patch_nodes: int = 20,
-    direction: Direction = (0.6, 0.3, 0.75),
+    direction: Direction | None = None,
     margin: float = 0.1,
     skull_smoothing_mm: float = 2.0,
 ) -> Deformation:
@@ -76,8 +89,9 @@ def push_patch(
         Of each node of the patch, mm.
     patch_nodes : int, default 20
         The boundary node farthest out along `direction`, and those nearest to it over the surface.
-    direction : (x, y, z), default (0.6, 0.3, 0.75)
-        From the centre of gravity towards the patch, RAS; any length.
+    direction : (x, y, z), optional
+        From the centre of gravity towards the patch, RAS; any length. The default is the first of `DIRECTIONS`
+        along which no tetrahedron inverts.
     margin : float, default 0.1
         Least distance of a boundary node from the skull after the deformation, mm.
     skull_smoothing_mm : float, default 2.0
@@ -94,15 +108,29 @@ def push_patch(
     if not margin > 0:
         raise InputError(f"the margin must be positive, mm, or nodes end on the skull itself; got {margin}")
     obstacle = SmoothObstacle(skull, skull_smoothing_mm)
-    centre = centre_of_gravity(mesh)
-    patch = surface_patch(mesh, patch_nodes, np.asarray(direction, float))
-    towards = centre - mesh.points[patch]
+    stiff = stiffness(mesh, lam, mu)
+    for chosen in DIRECTIONS if direction is None else (direction,):
+        patch = surface_patch(mesh, patch_nodes, np.asarray(chosen, float))
+        found = _pushed(mesh, stiff, obstacle, patch, displacement, margin)
+        if found.volume_ratio.min() > 0:
+            return found
+        _log.info("a push along %s inverts %d tetrahedra", chosen, (found.volume_ratio <= 0).sum())
+    raise InputError(_inversion(mesh, found.volume_ratio, displacement))
+
+
+def _pushed(
+    mesh: TetMesh,
+    stiff: scipy.sparse.csr_matrix,
+    obstacle: SmoothObstacle,
+    patch: np.ndarray,
+    displacement: float,
+    margin: float,
+) -> Deformation:
+    towards = centre_of_gravity(mesh) - mesh.points[patch]
     pushed = displacement * towards / np.linalg.norm(towards, axis=1, keepdims=True)
     _require_outside_skull(obstacle, mesh, patch, pushed, margin)
-    problem = ContactProblem(mesh, stiffness(mesh, lam, mu), patch, pushed, obstacle)
-    minimum = _settle(problem, obstacle, margin)
+    minimum = _settle(ContactProblem(mesh, stiff, patch, pushed, obstacle), obstacle, margin)
     ratio = signed_volumes(mesh.points + minimum.u, mesh.cells) / mesh.volumes
-    _require_no_inversion(mesh, ratio, displacement)
     return Deformation(minimum.u, patch, np.flatnonzero(minimum.force), minimum, ratio)
 
 
@@ -189,11 +217,10 @@ def _require_outside_skull(
         )
 
 
-def _require_no_inversion(mesh: TetMesh, ratio: np.ndarray, displacement: float) -> None:
+def _inversion(mesh: TetMesh, ratio: np.ndarray, displacement: float) -> str:
     inverted = mesh.tissue[ratio <= 0]
-    if len(inverted):
-        counts = ", ".join(f"{(inverted == t).sum()} {name}" for t, name in enumerate(mesh.names))
-        raise InputError(
-            f"the push of {displacement} mm inverts {len(inverted)} of {len(ratio)} tetrahedra ({counts}), so that the "
-            "deformation has no inverse; choose another direction, a smaller displacement or more patch nodes"
-        )
+    counts = ", ".join(f"{(inverted == t).sum()} {name}" for t, name in enumerate(mesh.names))
+    return (
+        f"the push of {displacement} mm inverts {len(inverted)} of {len(ratio)} tetrahedra ({counts}), so that the "
+        "deformation has no inverse; choose another direction, a smaller displacement or fewer patch nodes"
+    )

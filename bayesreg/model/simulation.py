@@ -62,7 +62,7 @@ def make_pair(
     mu: Float[np.ndarray, "tissues"],
     displacement: float = 15.0,
     patch_nodes: int = 20,
-    direction: Direction = (0.6, 0.3, 0.75),
+    direction: Direction | None = None,
     margin: float = 0.1,
     smoothing_mm: float = 0.75,
     noise_sd: float = 0.003,
@@ -71,7 +71,8 @@ def make_pair(
     """A pair of images with a known deformation and stiffness.
 
     The *paper pair*: the defaults, and the same mesh for making and for registering, as the paper did (an
-    inverse crime). The *calibrated pair*: `noise_sd` 0.01, and a finer mesh here than in the registration.
+    inverse crime). The *calibrated pair*: `noise_sd` 0.01, and a finer mesh here than in the registration; the
+    same number of patch nodes is then a smaller patch.
 
     Parameters
     ----------

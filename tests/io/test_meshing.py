@@ -93,6 +93,12 @@ class TestBuildMesh:
         np.testing.assert_array_equal(again.points, mesh.points)
         assert "mesh 1 of at most 3 is not sound: no luck" in caplog.text
 
+    def test_takes_a_region_made_already(self, phantom, mesh, monkeypatch):
+        domain = mesh_domain(*phantom)
+        monkeypatch.setattr(meshing, "mesh_domain", None)
+        monkeypatch.setattr(meshing, "tetrahedralize", lambda *args, **kwargs: (mesh.points, mesh.cells))
+        assert build_mesh(*phantom, OPTIONS, domain).digest == mesh.digest
+
     def test_gives_up_after_the_last_attempt(self, phantom, monkeypatch):
         monkeypatch.setattr(tetwild, "_PROGRAM", "import sys; sys.exit('out of luck')")
         with pytest.raises(MeshError, match=r"none of 2 meshes is sound.*fTetWild failed \(exit 1: out of luck\)"):

@@ -229,6 +229,16 @@ def test_bad_arguments(small, changed, message):
         pair_of(small, **changed)
 
 
+def test_another_direction_is_tried_where_none_is_asked_for(small, monkeypatch):
+    options = {"lam": PAPER_LAM, "mu": PAPER_MU, "displacement": 13.0, "patch_nodes": 8}
+    bad, good = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    with pytest.raises(InputError, match="inverts"):
+        push_patch(small.mesh, small.skull, direction=bad, **options)
+    monkeypatch.setattr("bayesreg.model.deformation.DIRECTIONS", (bad, good))
+    found = push_patch(small.mesh, small.skull, **options)
+    np.testing.assert_array_equal(found.patch, surface_patch(small.mesh, 8, np.array(good)))
+
+
 def test_bad_images(small):
     shifted = small.tissue.affine.copy()
     shifted[0, 3] += 3

@@ -1,0 +1,163 @@
+"""Blocks, budgets and checkpoints: what is kept, and that it does not depend on how the work was cut."""
+
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+
+import bayesreg as br
+from bayesreg.inference.diagnostics import convergence, open_posterior, save_posterior
+from bayesreg.inference.initialise import starting_points
+from bayesreg.inference.run import checkpoint_from_arrays, checkpoint_to_arrays
+from tests.phantoms import box_mesh, flat_skull, smooth_image
+
+MESH = box_mesh(2)
+OPTIONS = {"chains": 3, "thin": 3, "seed": 5, "progress": False, "sigma_u": 0.05}
+
+
+@cache
+def posterior() -> br.Posterior:
+    fixed = smooth_image(MESH.points, seed=1)
+    skull = flat_skull(MESH.points, axis=2, wall=MESH.points[:, 2].max() + 0.05, voxel=2.0)
+    return br.build_posterior(fixed, smooth_image(MESH.points, seed=2), MESH, skull=skull)
+
+
+@cache
+def whole():
+    blocks = []
+    samples = br.sample(posterior(), draws=12, block=4, on_block=lambda *found: blocks.append(found), **OPTIONS)
+    return samples, blocks
+
+
+def draws(samples):
+    return {name: samples.idata.posterior[name].values for name in ("u_boundary", "lam", "mu")}
+
+
+def test_draws_do_not_depend_on_the_blocks():
+    one = br.sample(posterior(), draws=12, block=12, **OPTIONS)
+    for name, values in draws(whole()[0]).items():
+        np.testing.assert_array_equal(values, draws(one)[name])
+
+
+def test_a_resumed_run_is_the_run_that_was_not_cut_off():
+    samples, blocks = whole()
+    arrays = {name: value.copy() for name, value in checkpoint_to_arrays(blocks[0][2]).items()}
+    checkpoint = checkpoint_from_arrays(arrays, posterior(), "rwmh", 3)
+    assert int(checkpoint.draws) == 4
+    resumed = br.sample(posterior(), draws=12, block=4, resume=(checkpoint, [blocks[0][1]]), **OPTIONS)
+    for name, values in draws(samples).items():
+        np.testing.assert_array_equal(values, draws(resumed)[name])
+    np.testing.assert_array_equal(resumed.u_sd, samples.u_sd)
+    np.testing.assert_array_equal(resumed.tally.acceptance, samples.tally.acceptance)
+
+
+def test_a_checkpoint_of_another_problem_is_refused():
+    arrays = checkpoint_to_arrays(whole()[1][0][2])
+    with pytest.raises(ValueError, match="another problem"):
+        checkpoint_from_arrays(arrays, posterior(), "rwmh", 4)
+
+
+def test_accumulated_mean_and_sd_are_those_of_the_draws():
+    samples, _ = whole()
+    values = draws(samples)["u_boundary"]
+    flat = values.reshape(-1, *values.shape[2:])
+    np.testing.assert_allclose(samples.u_mean[MESH.boundary], flat.mean(axis=0), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(samples.u_sd[MESH.boundary], flat.std(axis=0, ddof=1), rtol=1e-9)
+    inner = [
+        np.asarray(posterior().evaluate({name: value[c, d] for name, value in draws(samples).items()}).u)
+        for c, d in np.ndindex(values.shape[:2])
+    ]
+    np.testing.assert_allclose(samples.u_mean[MESH.interior], np.mean(inner, axis=0)[MESH.interior], rtol=1e-6)
+
+
+def test_running_rhat_is_the_textbooks():
+    """√(var⁺/W) as Gelman et al. write it, from the draws themselves."""
+    samples, _ = whole()
+    lam = draws(samples)["lam"]
+    count = lam.shape[1]
+    within = lam.var(axis=1, ddof=1).mean(axis=0)
+    between = count * lam.mean(axis=1).var(axis=0, ddof=1)
+    expected = np.sqrt(((count - 1) / count * within + between / count) / within)
+    np.testing.assert_allclose(samples.rhat["lam"], expected, rtol=1e-9)
+
+
+def test_statistics_count_what_happened_to_the_proposals():
+    samples, _ = whole()
+    stats = samples.idata.sample_stats
+    assert (samples.tally.steps == 36).all()
+    np.testing.assert_array_equal(stats.outside_support.sum("draw"), samples.tally.outside_support)
+    # The wall is 0.05 mm from a whole face of the box: most proposals enter it, and none is accepted.
+    assert samples.tally.outside_support.sum() > 50
+    for d in range(12):
+        values = {name: value[0, d] for name, value in draws(samples).items()}
+        found = posterior().evaluate(values)
+        assert not found.outside_support
+        assert float(found.logdensity) == pytest.approx(float(stats.lp[0, d]), rel=1e-9)
+
+
+def test_stop_rules():
+    spent = br.sample(posterior(), draws=1000, block=2, stop=br.StopRule(max_seconds=0.01), **OPTIONS)
+    assert spent.idata.posterior.sizes["draw"] == 2
+    assert "0.01 s" in spent.reason
+    assert spent.converged is None
+    loose = br.sample(posterior(), draws=1000, block=10, stop=br.StopRule(rhat=1e9, min_draws=20), **OPTIONS)
+    assert loose.idata.posterior.sizes["draw"] == 20
+    assert loose.converged is True
+    strict = br.sample(posterior(), draws=20, block=10, stop=br.StopRule(rhat=1.0001, min_draws=20), **OPTIONS)
+    assert strict.converged is False
+    assert "not below 1.0001" in strict.reason
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; there are rwmh"),
+        ({"chains": 0}, "chains must be at least 1, got 0"),
+        ({"thin": 0}, "thin must be at least 1"),
+        ({"sigma_u": -1.0}, "step of u_boundary must be positive"),
+        ({"start": br.Start(field=np.zeros((2, 3)))}, "start field must have shape"),
+        ({"start": br.Start(field=np.full((26, 3), np.nan))}, "chain 0 cannot start"),
+        ({"start": br.Start(lam={"bone": 1.0})}, "names 'bone'"),
+    ],
+)
+def test_wrong_options_are_told(wrong, message):
+    with pytest.raises(br.InputError, match=message):
+        br.sample(posterior(), **({"draws": 2} | OPTIONS | wrong))
+
+
+def test_starts_spread_over_the_field_and_stay_out_of_the_skull():
+    """The far end of the field crosses the wall: nodes that would enter it stop before it."""
+    target = posterior()
+    field = np.zeros((len(target.sampled), 3))
+    field[:, 2] = 2.0
+    points = starting_points(target, br.Start(field=field, fraction=(0.0, 1.0)), 3, jax.random.key(0))
+    moves = np.asarray(points["u_boundary"])[:, :, 2]
+    assert (moves[0] == 0).all()
+    assert moves[2].max() == 2.0
+    top = MESH.points[target.sampled, 2] > MESH.points[:, 2].max() - 1e-9
+    assert (moves[2, top] < 0.06).all()
+    for chain in range(3):
+        assert target.allowed(np.asarray(points["u_boundary"])[chain]).all()
+
+
+def test_posterior_file_round_trip(tmp_path):
+    samples, _ = whole()
+    save_posterior(samples.idata, tmp_path / "posterior.nc")
+    found = open_posterior(tmp_path / "posterior.nc")
+    assert set(found.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
+    assert found.posterior.u_boundary.dims == ("chain", "draw", "node", "axis")
+    np.testing.assert_array_equal(found.posterior.node, MESH.boundary)
+    np.testing.assert_allclose(found.posterior.u_boundary, samples.idata.posterior.u_boundary, rtol=1e-6, atol=1e-8)
+    np.testing.assert_array_equal(found.posterior.mu.sel(tissue="gm"), 1.0)
+    np.testing.assert_allclose(found.posterior.ratio, found.posterior.lam / found.posterior.mu)
+    for name in ("lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "diverging"):
+        assert found.sample_stats[name].dims == ("chain", "draw")
+    np.testing.assert_array_equal(found.constant_data.cells, MESH.cells)
+
+
+def test_known_entries_have_no_diagnostics():
+    judged = convergence(whole()[0].idata)
+    assert np.isnan(judged.rhat.mu.sel(tissue="gm"))
+    assert np.isfinite(judged.rhat.lam).all()
+    assert (judged.ess_bulk.u_boundary > 0).all()
