@@ -12,7 +12,7 @@ NOT_CONVERGED = 3
 
 
 class _Commands(TyperGroup):
-    """Shows what a user did wrong as one message, status 2; anything else that is raised is a bug."""
+    """What a user did wrong is one message and status 2, a failing disk status 1; anything else raised is a bug."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -24,6 +24,10 @@ class _Commands(TyperGroup):
                 raise
             typer.echo(f"bayesreg: {error}", err=True)
             raise typer.Exit(2) from None
+        except OSError as error:
+            # A full disk, a folder that may not be written: no bug, and nothing that was stored is lost.
+            typer.echo(f"bayesreg: {error}; what has been stored is kept: go on with bayesreg run --resume", err=True)
+            raise typer.Exit(1) from None
 
 
 app = typer.Typer(

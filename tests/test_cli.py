@@ -1,5 +1,6 @@
 """The command line: its statuses, what it says, and how fast help comes."""
 
+import errno
 import inspect
 import json
 import subprocess
@@ -100,6 +101,18 @@ def test_bad_input_is_one_message_with_status_2(pipeline):
     result = invoke("run", QUICK, "-o", "out")
     assert result.exit_code == 2
     assert result.stderr == "bayesreg: out holds another run; choose another folder, or go on with --resume\n"
+
+
+def test_a_full_disk_is_one_message_that_names_the_way_on(pipeline):
+    def run(config, out, resume, progress):
+        raise OSError(errno.ENOSPC, "No space left on device", f"{out}/draws/block_00003.npz")
+
+    pipeline.stub.run = run
+    result = invoke("run", QUICK, "-o", "out")
+    assert result.exit_code == 1
+    assert "No space left on device: 'out/draws/block_00003.npz'" in result.stderr
+    assert "--resume" in result.stderr
+    assert "Traceback" not in result.stderr
 
 
 def test_a_bug_is_not_taken_for_bad_input(pipeline):

@@ -1,6 +1,8 @@
 """The whole path on a phantom: run folder, resumption, comparison, and what a synthetic pair adds."""
 
+import errno
 import json
+import shutil
 
 import meshio
 import nibabel as nib
@@ -105,15 +107,17 @@ def test_a_folder_that_holds_a_run_is_left_alone(finished, folder):
     np.testing.assert_array_equal(again.u_mean, br.load_result(folder / "out").u_mean)
 
 
-def test_a_killed_run_resumes_to_the_same_draws(finished, folder, monkeypatch):
-    def killed(where, arrays):
+@pytest.mark.parametrize("cause", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monkeypatch, cause):
+    def cut_off(where, arrays):
         if arrays["blocks"] == 2:
-            raise KeyboardInterrupt
+            raise cause
         return save(where, arrays)
 
     save = store.save_state
-    monkeypatch.setattr(store, "save_state", killed)
-    with pytest.raises(KeyboardInterrupt):
+    shutil.rmtree(folder / "cut", ignore_errors=True)
+    monkeypatch.setattr(store, "save_state", cut_off)
+    with pytest.raises(type(cause)):
         br.run(folder / "run.yaml", folder / "cut", progress=False)
     monkeypatch.undo()
     with pytest.raises(br.InputError, match="another configuration"):

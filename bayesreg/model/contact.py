@@ -185,10 +185,9 @@ class ContactProblem:
         working = steep & ((state.force > 0) | (offset < 0))
         while True:
             index = np.flatnonzero(working)
-            block = self._compliance.block(index)
-            matrix = np.einsum("ai,aibj,bj->ab", normal[index], block[index], normal[index])
+            matrix = np.einsum("ai,aibj,bj->ab", normal[index], self._compliance.among(index), normal[index])
             force[index] = complementarity(matrix, -offset[index], state.force[index] > 0)
-            moved = np.einsum("ni,nibj,bj,b->n", normal, block, normal[index], force[index], optimize=True)
+            moved = (normal * self._compliance.response(index, force[index, None] * normal[index])).sum(axis=1)
             crossed = steep & ~working & (offset + moved < -1e-9)
             if not crossed.any():
                 return force
@@ -242,7 +241,8 @@ class _Compliance:
         self.factor = splu(
             scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-        self.columns: dict[int, np.ndarray] = {}
+        self.position = np.full(len(nodes), -1)
+        self.columns = np.zeros((len(self.rows), 0))
 
     def solve(self, force: np.ndarray) -> np.ndarray:
         """Displacement (n, 3) under nodal forces (3n,); the held nodes stay."""
@@ -250,21 +250,28 @@ class _Compliance:
         result[self.free] = self._solve_free(force[self.free, None])[:, 0]
         return result.reshape(-1, 3)
 
-    def block(self, index: np.ndarray) -> np.ndarray:
-        """(o, 3, k, 3): displacement of every node that may touch, by unit forces on those of `index`."""
-        new = [i for i in index if i not in self.columns]
-        for i, columns in zip(new, self._new_columns(np.array(new, int)), strict=True):
-            self.columns[i] = columns
-        if not len(index):
-            return np.zeros((len(self.rows) // 3, 3, 0, 3))
-        return np.stack([self.columns[i] for i in index], axis=2)
+    def among(self, index: np.ndarray) -> np.ndarray:
+        """(k, 3, k, 3): displacement of the nodes of `index` by unit forces on them."""
+        self._add(index[self.position[index] < 0])
+        rows, columns = (3 * i[:, None] + np.arange(3) for i in (index, self.position[index]))
+        return self.columns[rows[:, :, None, None], columns]
 
-    def _new_columns(self, index: np.ndarray) -> np.ndarray:
+    def response(self, index: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """(o, 3): displacement of every node that may touch, by forces (k, 3) on those of `index`."""
+        every = np.zeros((self.columns.shape[1] // 3, 3))
+        every[self.position[index]] = force
+        return (self.columns @ every.ravel()).reshape(-1, 3)
+
+    def _add(self, index: np.ndarray) -> None:
+        """Columns of the compliance for forces on the nodes of `index`."""
+        if not len(index):
+            return
         degrees = self.rows.reshape(-1, 3)[index].ravel()
         unit = np.zeros((len(self.free), len(degrees)))
         unit[np.searchsorted(self.free, degrees), np.arange(len(degrees))] = 1
-        response = self._solve_free(unit)[np.searchsorted(self.free, self.rows)]
-        return np.moveaxis(response.reshape(len(self.rows) // 3, 3, len(index), 3), 2, 0)
+        self.position[index] = self.columns.shape[1] // 3 + np.arange(len(index))
+        new = self._solve_free(unit)[np.searchsorted(self.free, self.rows)]
+        self.columns = np.concatenate([self.columns, new], axis=1)
 
     def _solve_free(self, force: np.ndarray) -> np.ndarray:
         return self.scale[:, None] * self.factor.solve(self.scale[:, None] * force)
