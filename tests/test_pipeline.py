@@ -25,7 +25,7 @@ SAMPLER = {"chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
 @pytest.fixture(scope="module")
 def anatomy():
     affine = np.diag([-4.0, 4.0, 4.0, 1.0])  # Left-handed.
-    affine[:3, 3] = CENTRE + [50.0, -50.0, -50.0]
+    affine[:3, 3] = CENTRE + np.array([50.0, -50.0, -50.0])
     grid = br.Image(np.zeros((26, 26, 26)), affine)
     radius = np.linalg.norm(grid.grid_points() - CENTRE, axis=-1)
     labels = np.select([radius < 14, radius < 28, radius < 41], [1, 3, 2], 0)
@@ -42,7 +42,7 @@ def anatomy():
 def folder(anatomy, tmp_path_factory):
     """A folder with the files of a pair and `run.yaml`."""
     folder = tmp_path_factory.mktemp("pair")
-    moved = anatomy.image.interpolate(anatomy.image.grid_points() + [0.0, 0.8, 0.0])
+    moved = anatomy.image.interpolate(anatomy.image.grid_points() + np.array([0.0, 0.8, 0.0]))
     br.save_image(anatomy.image, folder / "fixed.nii.gz")
     br.save_image(anatomy.image.with_voxels(np.asarray(moved)), folder / "moving.nii.gz")
     br.save_image(anatomy.tissue, folder / "labels.nii.gz")

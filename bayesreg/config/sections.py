@@ -91,8 +91,8 @@ class _Pair(Section):
     """How far the patch moves towards the centre of gravity, mm."""
     patch_nodes: Annotated[int, Field(strict=True, ge=3)] = 20
     """Number of boundary nodes in the patch."""
-    direction: Annotated[Direction, Field(validate_default=True)] = (0.6, 0.3, 0.75)
-    """From the centre of gravity to the patch, world RAS; scaled to length one."""
+    direction: Direction | None = None
+    """From the centre of gravity to the patch, world RAS; null tries several and takes the first that inverts nothing."""
     lam: Tissues = Tissues(csf=1e-6, gm=10.0, wm=30.0)
     """True first Lamé parameters."""
     mu: Tissues = Tissues(csf=1e-6, gm=1.0, wm=1.0)

@@ -9,17 +9,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections import Counter, defaultdict
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayesreg.io.cavities import without_cavities
 from bayesreg.io.domain import MeshError
 from bayesreg.io.surfaces import Sizing, Surface
-from bayesreg.mesh import FACES, signed_volumes
 
 _PROGRAM = """
 import sys
@@ -79,8 +77,7 @@ def tetrahedralize(
         "bg_tets": sizing.cells.astype(np.int32),
         "bg_values": sizing.values,
     }
-    points, cells = _run(given, quiet)
-    return points, _completed(points, cells)
+    return without_cavities(*_run(given, quiet))
 
 
 def _run(given: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -97,26 +94,3 @@ def _run(given: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError("fTetWild returned an empty mesh; try a shorter edge_length or a smaller envelope")
     used, index = np.unique(cells, return_inverse=True)
     return points[used].astype(float), index.reshape(-1, 4)
-
-
-def _completed(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "all 4"]:
-    """The cells and those that fTetWild leaves out by mistake: single ones, all of whose faces are there."""
-    missing = _missing_cells(cells)
-    if not missing:
-        return cells
-    added = np.array(missing)
-    inverted = signed_volumes(points, added) < 0
-    added[inverted] = added[inverted][:, (0, 2, 1, 3)]
-    return np.concatenate([cells, added])
-
-
-def _missing_cells(cells: Int[np.ndarray, "cells 4"]) -> list[tuple[int, ...]]:
-    faces, count = np.unique(np.sort(cells[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
-    around = defaultdict(list)
-    for face in faces[count == 1].tolist():
-        for edge in combinations(face, 2):
-            around[edge].append(face)
-    # Two faces that share an edge span a tetrahedron; where all four faces are there, its six edges name it.
-    spans = Counter(tuple(sorted({*a, *b})) for sharing in around.values() for a, b in combinations(sharing, 2))
-    present = set(map(tuple, np.sort(cells, axis=1).tolist()))
-    return [span for span, named in spans.items() if named == 6 and span not in present]

@@ -19,7 +19,7 @@ from bayesreg.types import InputError
 
 Direction = tuple[float, float, float]
 
-# Right and left frontal, top, right and left temporal, and parietal: all over the hull of the brain.
+# Frontal (right, left, right and lower), lateral (right, left) and parietal: all where the hull of the brain is free.
 DIRECTIONS: tuple[Direction, ...] = (
     (0.6, 0.3, 0.75),
     (-0.6, 0.3, 0.75),

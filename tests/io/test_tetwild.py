@@ -8,7 +8,6 @@ from bayesreg.io.domain import MeshError
 from bayesreg.io.surfaces import depth_sizing, tissue_surfaces
 from bayesreg.mesh import TetMesh
 from tests.io.balls import balls, grid
-from tests.phantoms import ball_mesh
 
 
 @pytest.fixture(scope="module")
@@ -41,22 +40,3 @@ class TestTetrahedralize:
         monkeypatch.setattr(tetwild, "_PROGRAM", program)
         with pytest.raises(MeshError, match=message):
             tetwild.tetrahedralize(*task, envelope=5.0)
-
-
-class TestMissingCells:
-    def test_puts_back_single_cells(self):
-        whole = ball_mesh()
-        outer = {frozenset(face) for face in whole.boundary_faces.tolist()}
-        buried = [not any(face <= set(cell) for face in outer) for cell in whole.cells.tolist()]
-        inner = np.isin(whole.cells, whole.boundary).sum(axis=1) == 0
-        # One deep inside, and one that touches the surface.
-        gone = np.isin(np.arange(len(whole.cells)), (inner.argmax(), (buried & ~inner).argmax()))
-        assert gone.sum() == 2
-        completed = tetwild._completed(whole.points, whole.cells[~gone])
-        mesh = TetMesh.from_arrays(whole.points, completed, np.zeros(len(completed), int))
-        assert {frozenset(cell) for cell in mesh.cells.tolist()} == {frozenset(cell) for cell in whole.cells.tolist()}
-        assert mesh.volumes.sum() == pytest.approx(whole.volumes.sum())
-
-    def test_adds_nothing_to_a_whole_mesh(self):
-        mesh = ball_mesh()
-        np.testing.assert_array_equal(tetwild._completed(mesh.points, mesh.cells), mesh.cells)

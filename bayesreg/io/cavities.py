@@ -1,0 +1,86 @@
+"""Cavities that fTetWild leaves inside a mesh by mistake, filled."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import optimize, sparse
+from scipy.sparse.csgraph import connected_components
+
+from bayesreg.mesh import FACES, signed_volumes
+
+
+def without_cavities(
+    points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]
+) -> tuple[Float[np.ndarray, "all_nodes 3"], Int[np.ndarray, "all_cells 4"]]:
+    """A mesh with its small cavities filled.
+
+    fTetWild takes for outside what has a low winding number, and its inner surfaces are locally turned inside
+    out: then a few tetrahedra that touch one are missing. Such a hole gets a node in its middle, unless it is a
+    single tetrahedron. One that has no point in sight of all its walls stays open.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+    cells : (m, 4) array
+        Positively oriented.
+
+    Returns
+    -------
+    points, cells
+        The given ones first.
+    """
+    faces = _boundary_faces(cells)
+    part = _surface_parts(faces)
+    a, b, c = np.moveaxis(points[faces], 1, 0)
+    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
+    for cavity in np.flatnonzero(volume < 0):
+        points, cells = _filled(points, cells, faces[part == cavity])
+    return points, cells
+
+
+def _boundary_faces(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "faces 3"]:
+    faces = cells[:, FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[count == 1]]
+
+
+def _surface_parts(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces"]:
+    """Number of the closed surface of each face; surfaces that meet along an edge, of four faces then, are two."""
+    edges = np.sort(faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2), axis=1)
+    _, edge, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(edge, kind="stable")
+    pairs = (order // 3)[count[edge[order]] == 2].reshape(-1, 2)
+    graph = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces), len(faces)))
+    return connected_components(graph, directed=False)[1]
+
+
+def _filled(
+    points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], walls: Int[np.ndarray, "walls 3"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with the hole between walls filled, their normals pointing into it."""
+    corners = np.unique(walls)
+    if len(corners) == 4:
+        last = np.setdiff1d(corners, walls[0])
+        return points, np.vstack([cells, np.append(walls[0], last)])
+    middle = _middle(points, walls)
+    grown = np.vstack([points, middle])
+    added = np.column_stack([walls, np.full(len(walls), len(points))])
+    if not (signed_volumes(grown, added) > 0).all():
+        return points, cells
+    return grown, np.vstack([cells, added])
+
+
+def _middle(points: Float[np.ndarray, "nodes 3"], walls: Int[np.ndarray, "walls 3"]) -> Float[np.ndarray, "3"]:
+    """The point deepest inside all walls: centre of the largest ball between their planes."""
+    a, b, c = np.moveaxis(points[walls], 1, 0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    # Largest r with normal · (x − a) ≥ r.
+    result = optimize.linprog(
+        (0, 0, 0, -1),
+        A_ub=np.column_stack([-normal, np.ones(len(walls))]),
+        b_ub=-(normal * a).sum(axis=1),
+        bounds=[(None, None)] * 4,
+    )
+    return result.x[:3] if result.success else points[np.unique(walls)].mean(axis=0)
