@@ -6,7 +6,7 @@ import sys
 from typing import Any
 
 # Float64 without paying for the import of JAX here: it reads the variable when it is first imported.
-os.environ.setdefault("JAX_ENABLE_X64", "true")
+os.environ["JAX_ENABLE_X64"] = "true"
 if "jax" in sys.modules:
     sys.modules["jax"].config.update("jax_enable_x64", True)
 

@@ -81,7 +81,7 @@ def run(
     result = pipeline.run(settings, out, resume=resume, progress=not quiet)
     typer.echo(f"Report: {Path(result.folder) / 'report.html'}")
     if not result.converged:
-        typer.echo("Not converged within its budget; the results are written, and the report says how far it came.")
+        typer.echo("Not converged; the results are written, and the report says how far it came.")
         raise typer.Exit(NOT_CONVERGED)
 
 

@@ -43,6 +43,8 @@ class Image:
         voxels, affine = np.asarray(self.voxels), np.asarray(self.affine, float)
         if voxels.ndim != 3 or voxels.size == 0:
             raise InputError(f"an image is a non-empty 3D array (X, Y, Z); got shape {voxels.shape}")
+        if voxels.dtype.kind not in "biuf":
+            raise InputError(f"the voxels of an image are real numbers; got {voxels.dtype}")
         if affine.shape != (4, 4) or not np.isfinite(affine).all() or not np.allclose(affine[3], (0, 0, 0, 1)):
             raise InputError(f"an affine is a finite 4 × 4 matrix with last row 0 0 0 1; got {affine.tolist()}")
         if np.linalg.cond(affine[:3, :3]) > 1e8:

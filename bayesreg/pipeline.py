@@ -39,6 +39,7 @@ from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 
 BLOCK = 50
+PROVENANCE = Path("inputs") / "provenance.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,15 +123,20 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     out = Path(out)
     began = time.perf_counter()
     say = _narrator(progress)
-    if resume and (out / "run.json").exists():
-        say(f"{out} holds a finished run already")
-        return load_result(out)
     if resume and (out / "config.yaml").exists():
-        inputs, provenance = _resumed_inputs(out, config)
+        _require_same_config(out, config)
+        if (out / "run.json").exists():
+            say(f"{out} holds a finished run already")
+            if not (out / "report.html").exists():
+                report(out)
+            return load_result(out)
+        inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
         reached = _reached(config, inputs, posterior, out)
     else:
-        store.require_fresh(out)
+        # A run that was cut off before its configuration was written has nothing yet that is worth keeping.
+        if not (resume and (out / PROVENANCE).exists()):
+            store.require_fresh(out)
         say("reading the images, meshing")
         inputs, provenance = _prepared_inputs(config)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
@@ -152,16 +158,17 @@ def check(config: str | Path | Config) -> Check:
     inputs, provenance = _prepared_inputs(config)
     posterior = posterior_of(config, inputs)
     start = _start(config, inputs, posterior)
-    settings, trial = _sampler_settings(config), 10
-    first = sample(posterior, config.sampler.name, config.sampler.chains, 1, config.seed, thin=1, start=start,
-                   progress=False, **settings)  # fmt: skip
-    timed = sample(posterior, config.sampler.name, config.sampler.chains, trial, config.seed, thin=1, block=1,
-                   start=start, progress=False, **settings)  # fmt: skip
-    seconds_per_step = max(timed.seconds - first.seconds, 1e-9) / trial
-    if timed.seconds <= first.seconds:
-        seconds_per_step = timed.seconds / trial
+    options, trial, reached = config.sampler, 10, []
+
+    def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
+        reached.append(float(checkpoint.seconds))
+
+    # Two blocks: the first holds the compilation.
+    sample(posterior, options.name, options.chains, 2 * trial, config.seed, block=trial, start=start,
+           progress=False, on_block=keep, **_sampler_settings(config))  # fmt: skip
+    seconds_per_step = (reached[1] - reached[0]) / trial
     device = sum(leaf.nbytes for leaf in jax.tree.leaves(posterior.data))
-    draws = config.stop.max_steps // config.sampler.thin
+    draws = config.stop.max_steps // options.thin
     numbers = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values()) + 8
     return Check(
         nodes=len(inputs.mesh.points),
@@ -170,7 +177,7 @@ def check(config: str | Path | Config) -> Check:
         steps_per_second=1 / seconds_per_step,
         hours=config.stop.max_steps * seconds_per_step / 3600,
         device_bytes=device,
-        draws_bytes=draws * config.sampler.chains * numbers * 8,
+        draws_bytes=draws * options.chains * numbers * 8,
         preparation=provenance["timings"],
     )
 
@@ -251,14 +258,12 @@ def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
 
 
-def _resumed_inputs(out: Path, config: Config) -> tuple[Inputs, dict[str, Any]]:
-    inputs = store.read_inputs(out)
-    if inputs.config != resolved_yaml(config):
+def _require_same_config(out: Path, config: Config) -> None:
+    if (out / "config.yaml").read_text(encoding="utf-8") != resolved_yaml(config):
         raise InputError(
             f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), "
             "or name another folder"
         )
-    return inputs, store.read_json(out / "inputs" / "provenance.json")
 
 
 def _narrator(progress: bool) -> Callable[[str], None]:
@@ -302,8 +307,9 @@ def _with_initial(inputs: Inputs, config: Config) -> Inputs:
 
 
 def _store(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
+    (out / PROVENANCE).parent.mkdir(parents=True, exist_ok=True)
+    store.write_json(out / PROVENANCE, provenance)
     store.write_inputs(out, inputs)
-    store.write_json(out / "inputs" / "provenance.json", provenance)
 
 
 def _sampler_settings(config: Config) -> dict[str, Any]:

@@ -48,10 +48,10 @@ def prepare(config: Config) -> Prepared:
     anatomy, moving = _anatomy(config)
     clock.lap("anatomy")
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial)
-    tissue = domain_labels(anatomy.tissue, domain)
+    tissue = _as_stored(domain_labels(anatomy.tissue, domain))
     mesh = _mesh(anatomy, config.mesh)
     clock.lap("mesh")
-    skull = None if anatomy.intracranial is None else _forbidden(anatomy.intracranial)
+    skull = None if anatomy.intracranial is None else _as_stored(_forbidden(anatomy.intracranial))
     scale = robust_scale(anatomy.image, domain.voxels != 0)
     fixed = scale(anatomy.image)
     if isinstance(config.data, FilesData):
@@ -112,7 +112,8 @@ def _forbidden(intracranial: Image) -> Image:
 
 def _as_stored(image: Image) -> Image:
     """In the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
-    return Image(np.asarray(image.voxels, np.float32), np.asarray(image.affine, np.float32))
+    voxels = np.asarray(image.voxels)
+    return Image(voxels.astype(np.float32) if voxels.dtype.kind == "f" else voxels, image.affine.astype(np.float32))
 
 
 def _within(domain: Image, image: Image) -> np.ndarray:

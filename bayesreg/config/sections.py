@@ -92,7 +92,7 @@ class _Pair(Section):
     patch_nodes: Annotated[int, Field(strict=True, ge=3)] = 20
     """Number of boundary nodes in the patch."""
     direction: Direction | None = None
-    """From the centre of gravity to the patch, world RAS; null tries several and takes the first that inverts nothing."""
+    """From the centre of gravity to the patch, world RAS; null takes the first of several that inverts no element."""
     lam: Tissues = Tissues(csf=1e-6, gm=10.0, wm=30.0)
     """True first Lamé parameters."""
     mu: Tissues = Tissues(csf=1e-6, gm=1.0, wm=1.0)

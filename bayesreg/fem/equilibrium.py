@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -18,6 +18,9 @@ from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
 
 TOLERANCE = 1e-8
 MAX_ITERATIONS = 2000
+
+
+LinearMap = Callable[[AnyArray], AnyArray]
 
 
 class ElasticSystem(NamedTuple):
@@ -72,11 +75,13 @@ def equilibrium(
     mu: Float[AnyArray, "cells"],
     u_prescribed: Float[AnyArray, "prescribed 3"],
     tolerance: float = TOLERANCE,
+    guess: Float[AnyArray, "nodes 3"] | None = None,
 ) -> Equilibrium:
     """Displacement of every node, λ and μ given by cell; differentiable in λ, μ and u (implicitly).
 
-    The residual is measured in the norm of the inverse diagonal of K, so that it also speaks for tissues
-    a million times softer than their neighbours.
+    The residual is measured in the norm of the inverse diagonal of K, so that it also speaks for tissues a
+    million times softer than their neighbours. A `guess` (mm, the equilibrium of a state near by) saves
+    iterations, and costs the derivative: reverse-mode differentiation then raises.
     """
     elements, prescribed, free, reference = system
     nodes = len(prescribed) + len(free)
@@ -94,18 +99,29 @@ def equilibrium(
     def precondition(r: AnyArray) -> AnyArray:
         return inverse_diagonal * r if reference is None else reference(r)
 
-    solve = partial(
-        _conjugate_gradients, precondition=precondition, inverse_diagonal=inverse_diagonal, tolerance=tolerance
-    )
+    def solve(apply: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
+        first = jnp.zeros_like(load) if guess is None else guess[free]
+        return _conjugate_gradients(apply, load, first, precondition, inverse_diagonal, tolerance)
+
     load = -internal_force(elements, lam, mu, u_given)[free]
-    u_free, info = jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
+    if guess is None:
+        u_free, info = jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
+    else:
+        u_free, info = solve(apply, load)
     u = u_given.at[free].set(u_free)
     # A node whose cells have no free node never enters the solve, but must be finite all the same.
     return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
 
 
-def _conjugate_gradients(apply, load, *, precondition, inverse_diagonal, tolerance):  # type: ignore[no-untyped-def]
-    """Preconditioned conjugate gradients; NaN anywhere ends the iteration unconverged."""
+def _conjugate_gradients(
+    apply: LinearMap,
+    load: AnyArray,
+    first: AnyArray,
+    precondition: LinearMap,
+    inverse_diagonal: AnyArray,
+    tolerance: float,
+) -> tuple[AnyArray, SolverInfo]:
+    """Preconditioned conjugate gradients from `first`; NaN anywhere ends the iteration unconverged."""
 
     def norm(r: AnyArray) -> Scalar:
         return jnp.sqrt((inverse_diagonal * r**2).sum())
@@ -126,8 +142,9 @@ def _conjugate_gradients(apply, load, *, precondition, inverse_diagonal, toleran
         rho, previous = (residual * z).sum(), rho
         return x, residual, z + (rho / previous) * direction, rho, iteration + 1
 
-    z = precondition(load)
-    start = jnp.zeros_like(load), load, z, (load * z).sum(), jnp.zeros((), int)
+    residual = load - apply(first)
+    z = precondition(residual)
+    start = first, residual, z, (residual * z).sum(), jnp.zeros((), int)
     x, residual, _, _, iterations = jax.lax.while_loop(unfinished, iterate, start)
     relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
     return x, SolverInfo(relative, iterations, relative <= tolerance)

@@ -28,7 +28,7 @@ _DIMS = {
     "ratio": ["tissue"],
     "points": ["point", "axis"],
     "cells": ["cell", "corner"],
-    "tissue_of_cell": ["cell"],
+    "tissue": ["cell"],
     "boundary": ["node"],
 }
 

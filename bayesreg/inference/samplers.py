@@ -80,16 +80,21 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
         # The proposal is drawn and evaluated here, once, so that its energies and its solve are seen;
         # BlackJAX is handed both and decides.
         key_proposal, key_accept = jax.random.split(key)
-        move = _normal_step(key_proposal, state.kernel.position, sigma)
-        proposal = jax.tree.map(jnp.add, state.kernel.position, move)
-        evaluation = target.evaluate_estimands(data, proposal)
-        kernel = blackjax.additive_step_random_walk(lambda _: evaluation.logdensity, lambda *_: move)
+        position, current = state.kernel.position, state.evaluation
+        move = _normal_step(key_proposal, position, sigma)
+        proposal = jax.tree.map(jnp.add, position, move)
+        # A proposal outside the support needs no solve: the chain evaluates where it stands, at no iteration.
+        inside = target.supports(data, proposal)
+        place = jax.tree.map(lambda new, old: jnp.where(inside, new, old), proposal, position)
+        evaluation = target.evaluate_estimands(data, place, guess=current.u)
+        logdensity = jnp.where(inside, evaluation.logdensity, -jnp.inf)
+        kernel = blackjax.additive_step_random_walk(lambda _: logdensity, lambda *_: move)
         kernel_state, kernel_info = kernel.step(key_accept, state.kernel)
         kept = jax.tree.map(lambda new, old: jnp.where(kernel_info.is_accepted, new, old), evaluation, state.evaluation)
         info = Info(
             acceptance_rate=kernel_info.acceptance_rate,
-            outside_support=evaluation.outside_support,
-            solver_failed=evaluation.solver_failed,
+            outside_support=~inside,
+            solver_failed=inside & evaluation.solver_failed,
             solver_iterations=evaluation.solver_iterations,
             diverging=jnp.zeros((), bool),
         )

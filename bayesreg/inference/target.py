@@ -46,8 +46,11 @@ class Target(Protocol):
     def entry_names(self) -> tuple[str, ...]:
         """Names of all entries of "lam" and "mu"."""
 
-    def evaluate_estimands(self, data: Any, estimands: Estimands) -> Any:
-        """An `Evaluation` in the constrained space."""
+    def evaluate_estimands(self, data: Any, estimands: Estimands, guess: AnyArray | None = None) -> Any:
+        """An `Evaluation` in the constrained space; a guess of its u makes it faster and costs the gradient."""
+
+    def supports(self, data: Any, estimands: Estimands) -> AnyArray:
+        """Whether the density may be positive there."""
 
     def complete(self, estimands: Estimands) -> dict[str, AnyArray]:
         """Estimands with the known entries of "lam" and "mu" put back."""

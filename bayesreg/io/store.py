@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +34,7 @@ class Truth(NamedTuple):
     lam, mu : (T,) array
         True Lamé parameters by tissue.
     initial : (n, 3) array or None
-        Displacement that the first chain started from, mm; None for the identity.
+        Centre of the displacements that the chains started from, mm; None for the identity.
     """
 
     u: AnyArray
@@ -105,10 +107,13 @@ class Run:
 
 
 def require_fresh(folder: str | Path) -> None:
-    """Raise InputError where a folder (or a file in its place) already holds a run."""
+    """Raise InputError where a folder (or a file in its place) already holds a run, or cannot be written."""
     folder = Path(folder)
+    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if folder.exists() and not folder.is_dir():
         raise InputError(f"the output folder {folder} is a file; name a folder that is new or empty")
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"the output folder {folder} cannot be written: {nearest} is no folder that you may write")
     held = [name for name in RESULTS if (folder / name).exists()]
     if held:
         raise InputError(
@@ -208,7 +213,7 @@ def read_run(folder: str | Path) -> Run:
 
 def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
     """Named nodal arrays of a mesh file; InputError where one is missing."""
-    data = meshio.read(path).point_data
+    data = _point_data(Path(path))
     missing = [name for name in names if name not in data]
     if missing:
         raise InputError(f"{path} holds no {' and no '.join(missing)}: the run has not been finished")
@@ -223,7 +228,7 @@ def read_displacement(path: Path, mesh: TetMesh) -> Float[np.ndarray, "nodes 3"]
     InputError
         If the file holds none, or one for another mesh.
     """
-    data = load_arrays(path) if path.suffix == ".npz" else meshio.read(path).point_data
+    data = load_arrays(path) if path.suffix == ".npz" else _point_data(path)
     found = [data[name] for name in ("u", "u_mean") if name in data]
     if not found:
         raise InputError(f"{path} holds no displacement: expected an array named 'u', got {', '.join(data) or 'none'}")
@@ -233,6 +238,14 @@ def read_displacement(path: Path, mesh: TetMesh) -> Float[np.ndarray, "nodes 3"]
             f"expected {mesh.points.shape}, one finite row per node of the run's mesh"
         )
     return np.asarray(found[0], float)
+
+
+def _point_data(path: Path) -> dict[str, np.ndarray]:
+    try:
+        # Not `meshio.read`, which ends the program where it fails.
+        return meshio.vtu.read(path).point_data
+    except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as a .vtu mesh: {error or type(error).__name__}") from error
 
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:

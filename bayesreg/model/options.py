@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, field_validator, model_validator
 
 Lame = Literal["lam", "mu"]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 
 
@@ -25,10 +26,10 @@ class PriorConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    alpha: PositiveFloat = 1.0
-    beta: PositiveFloat = 1.0
-    low: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
-    high: Annotated[float, Field(allow_inf_nan=True)] = math.inf
+    alpha: Positive = 1.0
+    beta: Positive = 1.0
+    low: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] = 0.0
+    high: Annotated[float, Field(strict=True, allow_inf_nan=True)] = math.inf
 
     @model_validator(mode="after")
     def _range(self) -> PriorConfig:
@@ -79,17 +80,17 @@ class ModelConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     elasticity: Literal["tissue", "uniform", "element"] = "tissue"
-    fixed: dict[Lame, PositiveFloat | dict[str, PositiveFloat]] | None = None
+    fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
     priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = {}
     similarity: Literal["ssd"] = "ssd"
-    t_similarity: PositiveFloat = 0.05
-    t_elastic: PositiveFloat = 1e4
-    normalised: bool = False
+    t_similarity: Positive = 0.05
+    t_elastic: Positive = 1e4
+    normalised: StrictBool = False
     interpolation: Literal["linear", "cubic"] = "linear"
     quadrature: Literal["gauss4", "gauss32", "gauss256", "voxels"] = "gauss4"
     sampled: Literal["boundary", "all"] | list[Annotated[int, Field(ge=0)]] = "boundary"
     held: dict[Annotated[int, Field(ge=0)], Vector] = {}
-    rigid_sd: PositiveFloat | None = None
+    rigid_sd: Positive | None = None
 
     @field_validator("normalised")
     @classmethod

@@ -19,7 +19,7 @@ from bayesreg.model.constraint import is_allowed
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
-from bayesreg.model.program import LameParameter, RegistrationData, registration
+from bayesreg.model.program import LameParameter, RegistrationData, in_support, registration
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -113,9 +113,18 @@ class Posterior:
         self._require_shapes(values)
         return _evaluate(self.data, dict(values), self.options.similarity)
 
-    def evaluate_estimands(self, data: RegistrationData, estimands: Values) -> Evaluation:
-        """`evaluate` as a pure function of the data, for samplers of the constrained space."""
-        return _evaluate(data, _complete(data, estimands, self.free), self.options.similarity)
+    def evaluate_estimands(
+        self, data: RegistrationData, estimands: Values, guess: Float[AnyArray, "nodes 3"] | None = None
+    ) -> Evaluation:
+        """`evaluate` as a pure function of the data, for samplers of the constrained space.
+
+        With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
+        """
+        return _evaluate(data, _complete(data, estimands, self.free), self.options.similarity, guess)
+
+    def supports(self, data: RegistrationData, estimands: Values) -> Bool[AnyArray, ""]:
+        """Whether estimands lie where the density may be positive; costs no elastic solve."""
+        return in_support(data, **_complete(data, estimands, self.free))
 
     def logdensity(self, position: Values) -> Scalar:
         """Log density of the unconstrained position, the Jacobian of `constrain` included."""
@@ -177,7 +186,7 @@ class Posterior:
     def constant_data(self) -> dict[str, AnyArray]:
         """Points (mm), cells, tissue of every cell and the sampled nodes."""
         mesh = self.mesh
-        return {"points": mesh.points, "cells": mesh.cells, "tissue_of_cell": mesh.tissue, "boundary": self.sampled}
+        return {"points": mesh.points, "cells": mesh.cells, "tissue": mesh.tissue, "boundary": self.sampled}
 
     def initial(self, key: AnyArray) -> dict[str, AnyArray]:
         """A random position near `reference`: displacements of 0.01 mm, parameters within about 10 %."""
@@ -275,8 +284,13 @@ def _to_estimands(
 
 
 @partial(jax.jit, static_argnames="similarity")
-def _evaluate(data: RegistrationData, values: dict[str, AnyArray], similarity: str) -> Evaluation:
-    total, trace = log_density(registration, (data, similarity), {}, values)
+def _evaluate(
+    data: RegistrationData,
+    values: dict[str, AnyArray],
+    similarity: str,
+    guess: Float[AnyArray, "nodes 3"] | None = None,
+) -> Evaluation:
+    total, trace = log_density(registration, (data, similarity, guess), {}, values)
     found = {name: trace[name]["value"] for name in Evaluation._fields if name != "logdensity"}
     # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
     return Evaluation(logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), **found)

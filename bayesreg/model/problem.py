@@ -152,7 +152,10 @@ def lame_parameter(
     prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
     fixed = _default_fixed(mesh, model) if model.fixed is None else model.fixed
     known = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
-    start = _default_reference(name, mesh, model, entries) if reference is None else np.asarray(reference[name], float)
+    if reference is None:
+        start = _within(prior, _default_reference(name, mesh, model, entries))
+    else:
+        start = np.asarray(reference[name], float)
     if start.shape != (entries,) or not (np.isfinite(start) & (start > 0)).all():
         raise InputError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
     values = np.array([s if k is None else float(k) for s, k in zip(start, known, strict=True)])
@@ -177,6 +180,13 @@ def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: i
     solid = 10.0 if name == "lam" else 1.0
     by_tissue = np.array([0.01 if tissue == "csf" else solid for tissue in mesh.names])
     return {"tissue": by_tissue, "uniform": np.full(1, solid), "element": by_tissue[mesh.tissue]}[model.elasticity]
+
+
+def _within(prior: list[PriorConfig], values: Float[np.ndarray, "entries"]) -> Float[np.ndarray, "entries"]:
+    """The values, those outside the range of their prior replaced by one inside."""
+    low, high = np.array([(p.low, p.high) for p in prior]).T
+    inside = np.where(np.isinf(high), low + values, (low + high) / 2)
+    return np.where((values > low) & (values < high), values, inside)
 
 
 def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: ModelConfig, entries: int) -> list:

@@ -97,12 +97,15 @@ class RegistrationData(NamedTuple):
     t_elastic: Scalar
 
 
-def registration(data: RegistrationData, similarity: str = "ssd") -> None:
+def registration(
+    data: RegistrationData, similarity: str = "ssd", guess: Float[AnyArray, "nodes 3"] | None = None
+) -> None:
     """p(m, u, λ, μ) of eq. (8): the program whose log joint density is the posterior's up to a constant.
 
     The displacements have a flat base measure, on which the Boltzmann elastic prior (12), the rigid prior
     and the Boltzmann likelihood (11) are factors. The skull belongs to the likelihood: a configuration with
-    a sampled node in Ω_SK cannot have produced the image. So does an elastic solve that failed.
+    a sampled node in Ω_SK cannot have produced the image. So does an elastic solve that failed. A `guess` of
+    the displacement of all nodes speeds up the solve (see `equilibrium`).
     """
     flat = dist.ImproperUniform(constraints.real_matrix, (), event_shape=data.points_sampled.shape)
     u_boundary = numpyro.sample("u_boundary", flat)
@@ -113,7 +116,8 @@ def registration(data: RegistrationData, similarity: str = "ssd") -> None:
     physical = _physical(lam, mu)
     lam_cells = jnp.where(physical, lam, data.lam.reference)[data.cell_entry]
     mu_cells = jnp.where(physical, mu, data.mu.reference)[data.cell_entry]
-    state = equilibrium(data.system, lam_cells, mu_cells, data.held.at[data.slots].set(u_boundary), SOLVER_TOLERANCE)
+    u_prescribed = data.held.at[data.slots].set(u_boundary)
+    state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, SOLVER_TOLERANCE, guess)
 
     elements, quadrature = data.system.elements, data.quadrature
     moved = data.positions + displacement_at(elements, quadrature, state.u)
@@ -121,7 +125,7 @@ def registration(data: RegistrationData, similarity: str = "ssd") -> None:
     strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)
     # Without the barrier XLA computes both energies twice, for the density and for the record.
     similarity_energy, strain_energy = jax.lax.optimization_barrier((similarity_energy, strain_energy))
-    inside = physical & _clear_of_skull(data, u_boundary) & _in_range(lam, data.lam) & _in_range(mu, data.mu)
+    inside = in_support(data, u_boundary, lam, mu)
 
     numpyro.factor("log_similarity", -similarity_energy / data.t_similarity)
     numpyro.factor("log_elastic", -strain_energy / data.t_elastic)
@@ -135,6 +139,12 @@ def registration(data: RegistrationData, similarity: str = "ssd") -> None:
     numpyro.deterministic("solver_iterations", state.iterations)
     numpyro.deterministic("solver_failed", ~state.converged)
     numpyro.deterministic("outside_support", ~inside)
+
+
+def in_support(data: RegistrationData, u_boundary: AnyArray, lam: AnyArray, mu: AnyArray) -> Bool[AnyArray, ""]:
+    """Whether no sampled node lies in Ω_SK and every parameter is physical and in the range of its prior."""
+    in_range = _in_range(lam, data.lam) & _in_range(mu, data.mu)
+    return _physical(lam, mu) & in_range & _clear_of_skull(data, u_boundary)
 
 
 def _physical(lam: AnyArray, mu: AnyArray) -> Bool[AnyArray, ""]:
