@@ -101,7 +101,9 @@ def convergence(idata: Any) -> Convergence:
         nothing = xr.full_like(posterior.isel(chain=0, draw=0, drop=True), np.nan)
         return Convergence(nothing, nothing, nothing)
     constant = posterior.min(("chain", "draw")) == posterior.max(("chain", "draw"))
-    found = (az.rhat(posterior), az.ess(posterior, method="bulk"), az.ess(posterior, method="tail"))
+    # ArviZ divides zero by zero for the known entries, which are left out below.
+    with np.errstate(invalid="ignore"):
+        found = (az.rhat(posterior), az.ess(posterior, method="bulk"), az.ess(posterior, method="tail"))
     return Convergence(*(_plain(result).where(~constant) for result in found))
 
 
