@@ -1,5 +1,6 @@
 """The command line. Heavy imports stand inside the commands, so that help comes at once."""
 
+import errno
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +10,7 @@ from typer.core import TyperGroup
 from bayesreg import __version__
 
 NOT_CONVERGED = 3
+STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
 class _Commands(TyperGroup):
@@ -25,8 +27,9 @@ class _Commands(TyperGroup):
             typer.echo(f"bayesreg: {error}", err=True)
             raise typer.Exit(2) from None
         except OSError as error:
-            # A full disk, a folder that may not be written: no bug, and nothing that was stored is lost.
-            typer.echo(f"bayesreg: {error}; what has been stored is kept: go on with bayesreg run --resume", err=True)
+            if error.errno not in STORAGE_FAILURES:
+                raise
+            typer.echo(f"bayesreg: {error}; what was stored before is kept, and a run goes on with --resume", err=True)
             raise typer.Exit(1) from None
 
 
@@ -36,7 +39,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Status: 0 done, 2 bad input, 3 not converged within its budget (results are written), 1 anything else.",
+    epilog="Status: 0 done, 2 bad input, 3 not converged (results are written), 1 anything else.",
 )
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]
@@ -80,7 +83,7 @@ def run(
 
     result = pipeline.run(settings, out, resume=resume, progress=not quiet)
     typer.echo(f"Report: {Path(result.folder) / 'report.html'}")
-    if not result.converged:
+    if result.converged is False:
         typer.echo("Not converged; the results are written, and the report says how far it came.")
         raise typer.Exit(NOT_CONVERGED)
 

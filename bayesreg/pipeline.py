@@ -87,9 +87,9 @@ class Result:
         return self.run.metrics
 
     @property
-    def converged(self) -> bool:
-        """Whether the stop rule was met; True where none was asked for."""
-        return self.run.manifest["stopped"]["converged"] is not False
+    def converged(self) -> bool | None:
+        """Whether both R̂, unsplit and rank-normalised, met the stop rule's threshold; None where there is none."""
+        return self.run.manifest["stopped"]["converged"]
 
     @property
     def report(self) -> Path:
@@ -235,6 +235,8 @@ def report(folder: str | Path) -> Path:
 
 def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
     """Put runs side by side on one page, and return its path."""
+    if not Path(out).absolute().parent.is_dir():
+        raise InputError(f"{out} cannot be written: there is no folder {Path(out).parent}")
     results = [load_result(folder) for folder in folders]
     write_comparison([(r.run, r.idata, *r.convergence) for r in results], out)
     return Path(out)

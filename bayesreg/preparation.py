@@ -49,7 +49,7 @@ def prepare(config: Config) -> Prepared:
     clock.lap("anatomy")
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain))
-    mesh = _mesh(anatomy, config.mesh)
+    mesh = _mesh(anatomy, domain, config.mesh)
     clock.lap("mesh")
     skull = None if anatomy.intracranial is None else _as_stored(_forbidden(anatomy.intracranial))
     scale = robust_scale(anatomy.image, domain.voxels != 0)
@@ -60,7 +60,7 @@ def prepare(config: Config) -> Prepared:
         images = _as_stored(fixed), _as_stored(own_scale(moving))
         inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull)
         return Prepared(inputs, clock.laps, {})
-    pair = _pair(config, fixed, anatomy, skull, mesh)
+    pair = _pair(config, fixed, anatomy, domain, skull, mesh)
     clock.lap("pair")
     u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
@@ -94,7 +94,7 @@ def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
     return mni152(), None
 
 
-def _mesh(anatomy: Anatomy, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
+def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
     if settings.file is not None and edge_length is None:
         return load_mesh(settings.file)
     options = MeshOptions(
@@ -102,7 +102,7 @@ def _mesh(anatomy: Anatomy, settings: MeshConfig, edge_length: float | None = No
         envelope=None if edge_length else settings.envelope,
         skull_gap=settings.skull_gap,
     )
-    return build_mesh(anatomy.tissue, anatomy.intracranial, options)
+    return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain)
 
 
 def _forbidden(intracranial: Image) -> Image:
@@ -121,13 +121,15 @@ def _within(domain: Image, image: Image) -> np.ndarray:
     return np.asarray(domain.interpolate(image.grid_points())) > 0.5
 
 
-def _pair(config: Config, fixed: Image, anatomy: Anatomy, skull: Image | None, mesh: TetMesh) -> SyntheticPair:
+def _pair(
+    config: Config, fixed: Image, anatomy: Anatomy, domain: Image, skull: Image | None, mesh: TetMesh
+) -> SyntheticPair:
     settings = config.simulate
     assert settings is not None
     assert skull is not None
     making = mesh
     if isinstance(settings, CalibratedPair):
-        making = _mesh(anatomy, config.mesh, settings.making_edge_length)
+        making = _mesh(anatomy, domain, config.mesh, settings.making_edge_length)
     given = {} if settings.smoothing_mm is None else {"smoothing_mm": settings.smoothing_mm}
     return make_pair(
         fixed,

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from bayesreg.inference.target import Target
+from bayesreg.types import InputError
 
 _OLD = int(az.__version__.split(".")[0]) < 1
 
@@ -131,5 +132,7 @@ def save_posterior(idata: Any, path: str | Path) -> None:
 
 
 def open_posterior(path: str | Path) -> Any:
-    """Read draws written by `save_posterior`."""
+    """Read draws written by `save_posterior`; InputError where there are none."""
+    if not Path(path).is_file():
+        raise InputError(f"{path} is missing: the folder holds no draws")
     return az.from_netcdf(str(path))

@@ -52,9 +52,6 @@ class Target(Protocol):
     def supports(self, data: Any, estimands: Estimands) -> AnyArray:
         """Whether the density may be positive there."""
 
-    def complete(self, estimands: Estimands) -> dict[str, AnyArray]:
-        """Estimands with the known entries of "lam" and "mu" put back."""
-
     def estimands(self, values: Estimands) -> dict[str, AnyArray]:
         """The sampled entries of values."""
 

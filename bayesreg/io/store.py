@@ -245,7 +245,7 @@ def _point_data(path: Path) -> dict[str, np.ndarray]:
         # Not `meshio.read`, which ends the program where it fails.
         return meshio.vtu.read(path).point_data
     except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a .vtu mesh: {error or type(error).__name__}") from error
+        raise InputError(f"{path} cannot be read as a .vtu mesh: {str(error) or type(error).__name__}") from error
 
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:

@@ -155,10 +155,6 @@ class Posterior:
         free = {name: jnp.asarray(values[name], float)[free] for name, free in self.free.items() if len(free)}
         return {"u_boundary": jnp.asarray(values["u_boundary"], float), **free}
 
-    def complete(self, estimands: Values) -> dict[str, AnyArray]:
-        """Values with the known entries put back."""
-        return _complete(self.data, estimands, self.free)
-
     def reference(self) -> dict[str, AnyArray]:
         """Values at rest: no displacement, λ and μ at their known or reference values."""
         return {
