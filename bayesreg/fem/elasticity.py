@@ -25,7 +25,7 @@ def lame_by_cell(values: Float[AnyArray, "entries"], mesh: TetMesh) -> Float[Any
 
     Raises
     ------
-    ValueError
+    InputError
         If the number of entries is none of these.
     """
     return jnp.asarray(values)[lame_entries(mesh, np.shape(values))]
@@ -108,7 +108,7 @@ def strain_energy(
 
     Raises
     ------
-    ValueError
+    InputError
         If a shape does not fit the mesh.
     """
     if np.shape(u) != mesh.points.shape:

@@ -59,7 +59,7 @@ def elastic_system(
 
     Raises
     ------
-    ValueError
+    InputError
         If the prescribed nodes do not hold the mesh in place.
     """
     free = np.setdiff1d(np.arange(len(mesh.points)), np.asarray(prescribed))
@@ -176,7 +176,7 @@ def solve_interior(
 
     Raises
     ------
-    ValueError
+    InputError
         If a shape does not fit the mesh.
     """
     if np.shape(u_boundary) != (len(mesh.boundary), 3):

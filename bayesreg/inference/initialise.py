@@ -42,7 +42,7 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
 
     Raises
     ------
-    ValueError
+    InputError
         If the field has the wrong shape or a parameter's name is unknown.
     """
     at_rest = target.reference()

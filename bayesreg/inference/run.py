@@ -159,7 +159,7 @@ def sample(
 
     Raises
     ------
-    ValueError
+    InputError
         If an option is out of range or a chain cannot start.
     """
     if sampler not in SAMPLERS:

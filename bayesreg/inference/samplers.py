@@ -63,7 +63,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
 
     Raises
     ------
-    ValueError
+    InputError
         If a standard deviation is not positive.
     """
     sigma = {"u_boundary": sigma_u, "lam": sigma_lam, "mu": sigma_mu}

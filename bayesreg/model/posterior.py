@@ -103,7 +103,7 @@ class Posterior:
 
         Raises
         ------
-        ValueError
+        InputError
             If a name or a shape is wrong.
         """
         return self.evaluate(values).logdensity
@@ -246,7 +246,7 @@ def build_posterior(
 
     Raises
     ------
-    ValueError
+    InputError
         If the mesh does not overlap an image, lies partly in the skull, an option names a tissue or node that
         does not exist, or the sampled and held nodes do not hold the mesh.
     """

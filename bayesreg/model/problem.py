@@ -62,7 +62,7 @@ def registration_data(
 
 
 def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
-    """Raise ValueError if less than half of the mesh's nodes lie on the image's grid."""
+    """Raise InputError if less than half of the mesh's nodes lie on the image's grid."""
     inside = image.contains(mesh.points)
     if inside.mean() < 0.5:
         corners = image.voxel_to_world(np.array([(0, 0, 0), np.array(image.shape) - 1]))
@@ -79,7 +79,7 @@ def skull_distance(skull: Image, mesh: TetMesh, sampled: Int[np.ndarray, "sample
 
     Raises
     ------
-    ValueError
+    InputError
         If a sampled node lies in the skull before it has moved.
     """
     distance = signed_distance(skull).interpolator("linear")
@@ -99,7 +99,7 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
 
     Raises
     ------
-    ValueError
+    InputError
         If a node does not exist, or sampled and held nodes together are fewer than three or on one line.
     """
     count = len(mesh.points)
@@ -144,7 +144,7 @@ def lame_parameter(
 
     Raises
     ------
-    ValueError
+    InputError
         If the options name a tissue that the mesh does not have, two tissues that share one entry are given
         different values, or the reference has the wrong shape or sign.
     """
@@ -210,7 +210,7 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
 
     Raises
     ------
-    ValueError
+    InputError
         If the rule is "voxels" and no voxel centre lies inside the mesh.
     """
     if model.quadrature in GAUSS_SUBDIVISIONS:

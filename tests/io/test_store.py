@@ -111,6 +111,7 @@ def test_fresh_folders_are_accepted(tmp_path):
     store.require_fresh(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
     store.require_fresh(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 @pytest.mark.parametrize("name", ["run.json", "config.yaml", "draws/block_00000.npz", "posterior.nc"])
