@@ -167,26 +167,72 @@ class Interpolator:
         """Values at world points, mm."""
         last = jnp.asarray([n - 1.0 for n in self.shape])
         indices = jnp.clip(points @ self.to_voxel[:3, :3].T + self.to_voxel[:3, 3], 0.0, last)
-        corner = jax.lax.stop_gradient(jnp.floor(indices))
-        weights = (_linear_weights if self.method == "linear" else _cubic_weights)(indices - corner)
-        strides = np.cumprod((1, *self.coefficients.shape[:0:-1]))[::-1]
-        first = (corner.astype(int) * strides).sum(axis=-1)
-        flat = self.coefficients.reshape(-1)
-        value = jnp.zeros(points.shape[:-1])
-        for tap in product(range(len(weights)), repeat=3):
-            weight = weights[tap[0]][..., 0] * weights[tap[1]][..., 1] * weights[tap[2]][..., 2]
-            value = value + weight * flat[first + int(np.dot(tap, strides))]
-        return value
+        return (_trilinear if self.method == "linear" else _cubic)(self.coefficients, indices)
 
 
-def _linear_weights(t: AnyArray) -> tuple[AnyArray, ...]:
-    return 1 - t, t
+def _first_tap(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, AnyArray, np.ndarray]:
+    """Flat index of the first tap of every point, its offset from there in voxels, and the strides."""
+    corner = jax.lax.stop_gradient(jnp.floor(indices))
+    strides = np.cumprod((1, *coefficients.shape[:0:-1]))[::-1]
+    return (corner.astype(int) * strides).sum(axis=-1), indices - corner, strides
+
+
+def _trilinear(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
+    first, offset, strides = _first_tap(coefficients, indices)
+    weights = (1 - offset, offset)
+    flat = coefficients.reshape(-1)
+    value = jnp.zeros(indices.shape[:-1])
+    for tap in product(range(2), repeat=3):
+        weight = weights[tap[0]][..., 0] * weights[tap[1]][..., 1] * weights[tap[2]][..., 2]
+        value = value + weight * flat[first + int(np.dot(tap, strides))]
+    return value
+
+
+@jax.custom_jvp
+def _cubic(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
+    """Tricubic B-spline; its derivative is in the indices alone."""
+    return _cubic_and_gradient(coefficients, indices)[0]
+
+
+@_cubic.defjvp
+def _cubic_jvp(primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
+    # Value and gradient from one gather of the taps: they are what costs.
+    value, gradient = _cubic_and_gradient(*primals)
+    return value, (gradient * tangents[1]).sum(axis=-1)
+
+
+def _cubic_and_gradient(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Value, and its gradient in the indices (last axis); sums one axis after the other."""
+    first, offset, strides = _first_tap(coefficients, indices)
+    steps = np.array([np.dot(tap, strides) for tap in product(range(4), repeat=3)])
+    steps = steps.reshape(64, *(1,) * first.ndim)
+    taps = coefficients.reshape(-1).at[first + steps].get(mode="clip").reshape(4, 4, 4, *first.shape)
+    weights = [_cubic_weights(offset[..., axis]) for axis in range(3)]
+    slopes = [_cubic_slopes(offset[..., axis]) for axis in range(3)]
+    # Without the barriers XLA fuses the stages and gathers every tap anew for each of the four results.
+    taps, weights, slopes = jax.lax.optimization_barrier((taps, weights, slopes))
+
+    def along(axis: int, taps: AnyArray, weights: list[tuple[AnyArray, ...]]) -> AnyArray:
+        return sum(taps[..., k, :] * weights[axis][k] for k in range(4))
+
+    taps = taps.reshape(4, 4, 4, -1)
+    weights, slopes = ([tuple(w.reshape(-1) for w in axis) for axis in both] for both in (weights, slopes))
+    z, dz = jax.lax.optimization_barrier((along(2, taps, weights), along(2, taps, slopes)))
+    y, dy, y_dz = jax.lax.optimization_barrier((along(1, z, weights), along(1, z, slopes), along(1, dz, weights)))
+    gradient = jnp.stack([along(0, y, slopes), along(0, dy, weights), along(0, y_dz, weights)], axis=-1)
+    return along(0, y, weights).reshape(first.shape), gradient.reshape(indices.shape)
 
 
 def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:
     """Uniform cubic B-spline at distances t + 1, t, 1 − t, 2 − t from its centre, 0 ≤ t ≤ 1."""
     s = 1 - t
     return s**3 / 6, 2 / 3 - t**2 * (2 - t) / 2, 2 / 3 - s**2 * (2 - s) / 2, t**3 / 6
+
+
+def _cubic_slopes(t: AnyArray) -> tuple[AnyArray, ...]:
+    """Derivatives of `_cubic_weights` in t."""
+    s = 1 - t
+    return -(s**2) / 2, t * (3 * t / 2 - 2), s * (2 - 3 * s / 2), t**2 / 2
 
 
 class IntensityScale(NamedTuple):

@@ -16,6 +16,7 @@ from numpyro.infer.util import log_density
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
+from bayesreg.model.curvature import displacement_precision
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
@@ -134,6 +135,29 @@ class Posterior:
         """`logdensity` as a pure function of the data, for samplers."""
         estimands, log_jacobian = _to_estimands(data, position, self.free)
         return self.evaluate_estimands(data, estimands).logdensity + log_jacobian
+
+    def clearance(
+        self, data: RegistrationData, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
+    ) -> Float[AnyArray, "*batch nodes"]:
+        """Signed distance to Ω_SK, mm, of some rows of "u_boundary" displaced by u; infinite without a skull."""
+        places = data.points_sampled[nodes] + u
+        if data.skull_distance is None:
+            return jnp.full(places.shape[:-1], jnp.inf)
+        return data.skull_distance(places)
+
+    def displacement_precision(self, values: Values) -> Float[np.ndarray, "rows rows"]:
+        """Curvature of −log p(u, λ, μ | m) in "u_boundary": Gauss–Newton, positive semidefinite.
+
+        Returns
+        -------
+        (3b, 3b) array
+            1/mm², row 3 · node + axis.
+        """
+        self._require_shapes(values)
+        lam, mu = (np.asarray(values[name])[np.asarray(self.data.cell_entry)] for name in LAME)
+        precision = displacement_precision(self.mesh, self.data, lam, mu, self.evaluate(values).u)
+        weight = 1 / (len(self.sampled) * float(self.data.rigid_sd) ** 2)
+        return precision + weight * np.asarray(self.data.rigid_modes @ self.data.rigid_modes.T)
 
     def constrain(self, position: Values) -> dict[str, AnyArray]:
         """Values (known entries included) of an unconstrained position."""
