@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
@@ -30,7 +31,9 @@ from bayesreg.io import store
 from bayesreg.io.store import Inputs, Run
 from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
+from bayesreg.model.options import Lame
 from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.problem import cell_entries, lame_parameter
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
 from bayesreg.preparation import prepare
 from bayesreg.report.compare import write_comparison
@@ -244,15 +247,18 @@ def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
 
 def posterior_of(config: Config, inputs: Inputs) -> Posterior:
     """The posterior of a run, its solver preconditioned at the start parameters."""
-    posterior = build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull)
-    given = {name: config.start.entries(name, posterior.entry_names) for name in ("lam", "mu")}
-    if not any(given.values()):
-        return posterior
-    values = {name: np.array(posterior.reference()[name]) for name in given}
-    for name, entries in given.items():
-        for entry, value in (entries or {}).items():
-            values[name][posterior.entry_names.index(entry)] = value
-    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull, reference=values)
+    reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
+    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull, reference)
+
+
+def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
+    """All entries of λ or μ at the start: as the configuration gives them, else as the model chooses."""
+    values = np.array(lame_parameter(name, mesh, config.model, None).reference)
+    given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
+    for index, tissue in enumerate(mesh.names):
+        if tissue in given:
+            values[entry[mesh.tissue == index]] = given[tissue]
+    return values
 
 
 def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:

@@ -13,8 +13,10 @@ from ruamel.yaml import YAML
 
 import bayesreg as br
 from bayesreg import pipeline, preparation
+from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy
+from bayesreg.model import problem
 from tests.phantoms import ball_mesh
 
 CENTRE = np.array([5.0, -3.0, 8.0])
@@ -134,6 +136,24 @@ def test_nothing_is_written_where_a_chain_cannot_start(folder):
     with pytest.raises(br.InputError, match=r"far\.npz"):
         br.run(config, folder / "never", progress=False)
     assert not (folder / "never").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "lam", "mu"),
+    [
+        ([], [0.01, 10, 10], [0.01, 1, 1]),
+        (["start.lam=7"], [7, 7, 7], [0.01, 1, 1]),
+        (["start.mu={csf: 0.2, gm: 3, wm: 4}"], [0.01, 10, 10], [0.2, 1, 4]),  # μ of GM is known to be 1.
+        (["start.lam=7", "model.elasticity=uniform"], [7], [1]),
+    ],
+)
+def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, monkeypatch, overrides, lam, mu):
+    built = []
+    monkeypatch.setattr(problem, "elastic_system", lambda *args: built.append(args) or elastic_system(*args))
+    posterior = pipeline.posterior_of(br.load_config(folder / "run.yaml", overrides), finished.run.inputs)
+    assert len(built) == 1
+    np.testing.assert_allclose(posterior.reference()["lam"], lam)
+    np.testing.assert_allclose(posterior.reference()["mu"], mu)
 
 
 def test_check_estimates_without_writing(folder):
