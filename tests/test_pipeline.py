@@ -150,7 +150,7 @@ def test_nothing_is_written_where_a_chain_cannot_start(folder):
 def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, monkeypatch, overrides, lam, mu):
     built = []
     monkeypatch.setattr(problem, "elastic_system", lambda *args: built.append(args) or elastic_system(*args))
-    posterior = pipeline.posterior_of(br.load_config(folder / "run.yaml", overrides), finished.run.inputs)
+    posterior = pipeline.posterior_of(br.load_config(folder / "run.yaml", overrides), store.read_inputs(folder / "out"))
     assert len(built) == 1
     np.testing.assert_allclose(posterior.reference()["lam"], lam)
     np.testing.assert_allclose(posterior.reference()["mu"], mu)

@@ -100,11 +100,6 @@ class Run:
     truth: Truth | None = None
     metrics: dict[str, Any] | None = None
 
-    @property
-    def inputs(self) -> Inputs:
-        """What the run started from."""
-        return Inputs(self.config, self.mesh, self.fixed, self.moving, self.tissue, self.skull, self.truth)
-
 
 def require_fresh(folder: str | Path) -> None:
     """Raise InputError where a folder (or a file in its place) already holds a run, or cannot be written."""
@@ -152,22 +147,11 @@ def read_inputs(folder: str | Path) -> Inputs:
     return Inputs(config, mesh, fixed, moving, tissue, skull, truth)
 
 
-def write_run(
-    folder: str | Path,
-    run: Run,
-    displacement_mean: Float[np.ndarray, "X Y Z 3"] | None = None,
-    displacement_sd: Float[np.ndarray, "X Y Z 3"] | None = None,
-) -> None:
-    """Write everything of a run folder except the draws and the report: `write_inputs`, then `write_results`."""
-    write_inputs(folder, run.inputs)
-    write_results(folder, run, displacement_mean, displacement_sd)
-
-
 def write_results(
     folder: str | Path,
     run: Run,
-    displacement_mean: Float[np.ndarray, "X Y Z 3"] | None = None,
-    displacement_sd: Float[np.ndarray, "X Y Z 3"] | None = None,
+    displacement_mean: Float[np.ndarray, "X Y Z 3"],
+    displacement_sd: Float[np.ndarray, "X Y Z 3"],
 ) -> None:
     """Write what a finished run adds to its inputs, run.json last.
 
@@ -176,26 +160,24 @@ def write_results(
     folder : path
         Where `write_inputs` has written; files of the same names are replaced, each in one step.
     run : Run
-    displacement_mean, displacement_sd : (X, Y, Z, 3) arrays, optional
+    displacement_mean, displacement_sd : (X, Y, Z, 3) arrays
         Posterior mean and standard deviation of u on the fixed grid, world RAS, mm. The mean is written as a
         resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
     """
     folder = Path(folder)
     save_mesh(run.mesh, folder / "mesh.vtu", point_data={"u_mean": run.u_mean, "u_sd": run.u_sd})
     save_image(run.warped, folder / "warped_mean.nii.gz")
-    if displacement_mean is not None:
-        save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, run.fixed.affine)
-    if displacement_sd is not None:
-        # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
-        unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
-        save_displacement(folder / "displacement_sd.nii.gz", unsigned, run.fixed.affine)
+    save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, run.fixed.affine)
+    # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
+    unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
+    save_displacement(folder / "displacement_sd.nii.gz", unsigned, run.fixed.affine)
     if run.metrics is not None:
         write_json(folder / "metrics.json", run.metrics)
     write_json(folder / "run.json", run.manifest)
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read what `write_run` wrote.
+    """Read what `write_inputs` and `write_results` wrote.
 
     Raises
     ------
@@ -255,19 +237,9 @@ def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -
     save_arrays(draws / f"block_{index:05d}.npz", arrays)
 
 
-def count_blocks(folder: str | Path) -> int:
-    """Number of blocks of draws; InputError where one in the middle is missing."""
-    names = sorted(path.name for path in (Path(folder) / "draws").glob("block_*.npz"))
-    expected = [f"block_{index:05d}.npz" for index in range(len(names))]
-    gaps = sorted(set(expected) - set(names))
-    if gaps:
-        raise InputError(f"{Path(folder) / 'draws'} holds {len(names)} blocks, but {gaps[0]} is missing")
-    return len(names)
-
-
-def load_blocks(folder: str | Path, count: int | None = None) -> Iterator[dict[str, np.ndarray]]:
-    """The first `count` blocks of draws (all, by default), in order, one in memory at a time."""
-    for index in range(count_blocks(folder) if count is None else count):
+def load_blocks(folder: str | Path, count: int) -> Iterator[dict[str, np.ndarray]]:
+    """The first `count` blocks of draws, in order, one in memory at a time; InputError where one is missing."""
+    for index in range(count):
         yield load_arrays(_require(Path(folder), f"draws/block_{index:05d}.npz"))
 
 
