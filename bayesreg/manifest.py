@@ -16,7 +16,8 @@ from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.distance import signed_distance
 from bayesreg.inference.diagnostics import Convergence
-from bayesreg.inference.run import Samples, greatest_rhat
+from bayesreg.inference.moments import greatest_rhat
+from bayesreg.inference.run import Samples
 from bayesreg.io.store import Inputs
 from bayesreg.model.posterior import Posterior
 
