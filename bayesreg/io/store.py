@@ -143,7 +143,8 @@ def read_inputs(folder: str | Path) -> Inputs:
         load_image(_require(folder, f"inputs/{name}.nii.gz")) for name in ("fixed", "moving", "tissue")
     )
     skull = load_image(images / "skull.nii.gz") if (images / "skull.nii.gz").exists() else None
-    truth = Truth(**load_arrays(images / "truth.npz")) if (images / "truth.npz").exists() else None
+    known = images / "truth.npz"
+    truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
     return Inputs(config, mesh, fixed, moving, tissue, skull, truth)
 
 
@@ -202,23 +203,32 @@ def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
     return [np.asarray(data[name], float) for name in names]
 
 
-def read_displacement(path: Path, mesh: TetMesh) -> Float[np.ndarray, "nodes 3"]:
+def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarray, "nodes 3"]:
     """A displacement of every node: array "u" of an .npz file, or "u" or "u_mean" of a .vtu mesh, mm.
+
+    Parameters
+    ----------
+    path : path
+    mesh : TetMesh, optional
+        Whose nodes the displacement must fit; None where there is no mesh yet.
 
     Raises
     ------
     InputError
         If the file holds none, or one for another mesh.
     """
-    data = load_arrays(path) if path.suffix == ".npz" else _point_data(path)
+    data = load_arrays(path, "give another file") if path.suffix == ".npz" else _point_data(path)
     found = [data[name] for name in ("u", "u_mean") if name in data]
     if not found:
         raise InputError(f"{path} holds no displacement: expected an array named 'u', got {', '.join(data) or 'none'}")
-    if np.shape(found[0]) != mesh.points.shape or not np.isfinite(found[0]).all():
+    shape = np.shape(found[0])
+    if shape[1:] != (3,) or (mesh is not None and len(mesh.points) != shape[0]):
+        rows = "n" if mesh is None else len(mesh.points)
         raise InputError(
-            f"the displacement in {path} has shape {np.shape(found[0])} or is not finite; "
-            f"expected {mesh.points.shape}, one finite row per node of the run's mesh"
+            f"the displacement in {path} has shape {shape}; expected ({rows}, 3), one row per node of the run's mesh"
         )
+    if found[0].dtype.kind not in "fiu" or not np.isfinite(found[0]).all():
+        raise InputError(f"the displacement in {path} must consist of finite numbers")
     return np.asarray(found[0], float)
 
 
@@ -239,8 +249,12 @@ def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -
 
 def load_blocks(folder: str | Path, count: int) -> Iterator[dict[str, np.ndarray]]:
     """The first `count` blocks of draws, in order, one in memory at a time; InputError where one is missing."""
+    advice = "delete state.npz in that run's folder, and it resumes from its first step"
     for index in range(count):
-        yield load_arrays(_require(Path(folder), f"draws/block_{index:05d}.npz"))
+        path = Path(folder) / "draws" / f"block_{index:05d}.npz"
+        if not path.exists():
+            raise InputError(f"{path} is missing; {advice}")
+        yield load_arrays(path, advice)
 
 
 def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
@@ -251,7 +265,7 @@ def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
 def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
     """The content of state.npz; None where there is none."""
     path = Path(folder) / "state.npz"
-    return load_arrays(path) if path.exists() else None
+    return load_arrays(path, "delete it, and the run resumes from its first step") if path.exists() else None
 
 
 def remove_checkpoints(folder: str | Path) -> None:

@@ -174,5 +174,20 @@ def test_a_gap_among_the_blocks_is_an_error(tmp_path):
         list(store.load_blocks(tmp_path, 3))
 
 
+@pytest.mark.parametrize("name", ["state.npz", "draws/block_00000.npz", "inputs/truth.npz"])
+def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
+    write(tmp_path, run)
+    store.save_block(tmp_path, 0, {"u": np.zeros(3)})
+    store.save_state(tmp_path, {"step": np.array(1)})
+    (tmp_path / name).write_bytes(b"PK half a file")
+    read = {
+        "state.npz": (store.load_state, r"delete it, and the run resumes from its first step"),
+        "draws/block_00000.npz": (lambda f: list(store.load_blocks(f, 1)), r"delete state\.npz"),
+        "inputs/truth.npz": (store.read_inputs, r"run anew, into another folder"),
+    }
+    with pytest.raises(ValueError, match=f"{name} is damaged or no .npz file .*; {read[name][1]}"):
+        read[name][0](tmp_path)
+
+
 def test_without_a_checkpoint_there_is_no_state(tmp_path):
     assert store.load_state(tmp_path) is None
