@@ -129,6 +129,13 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
     np.testing.assert_array_equal(resumed.u_sd, finished.u_sd)
 
 
+def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):
+    monkeypatch.setattr(preparation, "make_pair", None)
+    np.savez(folder / "other.npz", u=np.zeros((9, 3)))
+    with pytest.raises(br.InputError, match=r"other\.npz has shape \(9, 3\); expected \(\d\d+, 3\)"):
+        pipeline.check(synthetic("paper", "start.field=other.npz"))
+
+
 def test_nothing_is_written_where_a_chain_cannot_start(folder):
     far = np.full((len(br.load_mesh(folder / "mesh.vtu").points), 3), np.nan)
     np.savez(folder / "far.npz", u=far)
