@@ -46,7 +46,7 @@ def manifest(
     provenance : dict
         "timings" (s) of the preparation, and what is known of a synthetic "pair".
     began : float
-        `time.perf_counter()` when the run began.
+        `time.perf_counter()` when the run began, put back by what processes that were cut off have spent.
     """
     tally = samples.tally
     steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())

@@ -136,6 +136,9 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
         reached = _reached(config, inputs, posterior, out)
+        sampled = float(reached[0].seconds)
+        began -= provenance["unsampled"] + sampled
+        store.write_json(out / PROVENANCE, _timed(provenance, began + sampled))
     else:
         # A run that was cut off before its configuration was written has nothing yet that is worth keeping.
         if not (resume and (out / PROVENANCE).exists()):
@@ -146,7 +149,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         posterior = posterior_of(config, inputs)
         reached = _first(config, inputs, posterior)
         inputs = _with_initial(inputs, config)
-        _store(out, inputs, provenance)
+        _store(out, inputs, _timed(provenance, began))
     say(_described(inputs))
     samples = _sample(config, posterior, reached, out, progress)
     say("writing the results")
@@ -218,9 +221,10 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
     config = config if isinstance(config, Config) else load_config(config)
     if config.simulate is None:
         raise InputError("the configuration has no section 'simulate': its pair comes from files")
+    began = time.perf_counter()
     store.require_fresh(out)
     inputs, provenance = _prepared_inputs(config)
-    _store(Path(out), inputs, provenance)
+    _store(Path(out), inputs, _timed(provenance, began))
     return Path(out)
 
 
@@ -264,6 +268,11 @@ def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "
 def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
     prepared = prepare(config)
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
+
+
+def _timed(provenance: dict[str, Any], began: float) -> dict[str, Any]:
+    """With the seconds spent on all but sampling, which a resumed run adds to its own."""
+    return provenance | {"unsampled": time.perf_counter() - began}
 
 
 def _require_same_config(out: Path, config: Config) -> None:

@@ -124,7 +124,14 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
     monkeypatch.undo()
     with pytest.raises(br.InputError, match="another configuration"):
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "cut", resume=True, progress=False)
+    provenance = store.read_json(folder / "cut" / pipeline.PROVENANCE)
+    assert 0 < provenance["unsampled"] < 600
+    store.write_json(folder / "cut" / pipeline.PROVENANCE, provenance | {"unsampled": 3600})
     resumed = br.run(folder / "run.yaml", folder / "cut", resume=True, progress=False)
+    timings = resumed.run.manifest["timings"]
+    assert 3600 + timings["sampling"] < timings["total"] < 3600 + timings["sampling"] + 600
+    # What the resumed run spent on getting ready counts, should it be cut off itself.
+    assert store.read_json(folder / "cut" / pipeline.PROVENANCE)["unsampled"] > 3600
     np.testing.assert_array_equal(resumed.idata.posterior.u_boundary, finished.idata.posterior.u_boundary)
     np.testing.assert_array_equal(resumed.u_sd, finished.u_sd)
 
