@@ -2,7 +2,9 @@
 
 import errno
 import json
+import re
 import shutil
+from pathlib import Path
 
 import meshio
 import nibabel as nib
@@ -19,6 +21,7 @@ from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
 from tests.phantoms import ball_mesh
 
+ROOT = Path(__file__).parent.parent
 CENTRE = np.array([5.0, -3.0, 8.0])
 STOP = {"rhat": 1.2, "max_steps": 36}
 SAMPLER = {"chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
@@ -222,6 +225,25 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
     half = np.linalg.norm(0.5 * truth.u[result.mesh.boundary], axis=1)
     assert metrics["initial"]["median"] == pytest.approx(np.median(half))
     assert metrics["posterior_mean"]["median"] < 2 * metrics["initial"]["median"]
+
+
+@pytest.mark.slow
+def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeypatch, capsys):
+    """On a phantom in place of MNI152, from a quickstart made small."""
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
+    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38))
+    monkeypatch.chdir(tmp_path)
+    small = {"simulate": {"displacement": 3, "patch_nodes": 4}, "sampler": {"thin": 3}, "stop": {"max_steps": 36}}
+    (tmp_path / "configs").mkdir()
+    extended = {"extends": str(ROOT / "configs" / "quickstart.yaml"), **small}
+    YAML(typ="safe").dump(extended, tmp_path / "configs" / "quickstart.yaml")
+    exec(compile(code, "README.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "converged: False" in said
+    assert [line.split()[0] for line in said.splitlines() if re.match(r"(csf|gm|wm) +\d", line)] == ["csf", "gm", "wm"]
+    assert len(said.splitlines()[-1].strip("[]").split()) == 3
+    assert (tmp_path / "runs" / "example" / "report.html").exists()
 
 
 def test_simulate_writes_the_pair(synthetic, folder):
