@@ -16,7 +16,8 @@ from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.distance import signed_distance
 from bayesreg.inference.diagnostics import Convergence
-from bayesreg.inference.run import Samples, greatest_rhat
+from bayesreg.inference.moments import greatest_rhat
+from bayesreg.inference.run import Samples
 from bayesreg.io.store import Inputs
 from bayesreg.model.posterior import Posterior
 
@@ -45,7 +46,7 @@ def manifest(
     provenance : dict
         "timings" (s) of the preparation, and what is known of a synthetic "pair".
     began : float
-        `time.perf_counter()` when the run began.
+        `time.perf_counter()` when the run began, put back by what processes that were cut off have spent.
     """
     tally = samples.tally
     steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())

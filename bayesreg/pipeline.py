@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
@@ -30,7 +31,9 @@ from bayesreg.io import store
 from bayesreg.io.store import Inputs, Run
 from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
+from bayesreg.model.options import Lame
 from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.problem import cell_entries, lame_parameter
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
 from bayesreg.preparation import prepare
 from bayesreg.report.compare import write_comparison
@@ -133,6 +136,9 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
         reached = _reached(config, inputs, posterior, out)
+        sampled = float(reached[0].seconds)
+        began -= provenance["unsampled"] + sampled
+        store.write_json(out / PROVENANCE, _timed(provenance, began + sampled))
     else:
         # A run that was cut off before its configuration was written has nothing yet that is worth keeping.
         if not (resume and (out / PROVENANCE).exists()):
@@ -143,7 +149,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         posterior = posterior_of(config, inputs)
         reached = _first(config, inputs, posterior)
         inputs = _with_initial(inputs, config)
-        _store(out, inputs, provenance)
+        _store(out, inputs, _timed(provenance, began))
     say(_described(inputs))
     samples = _sample(config, posterior, reached, out, progress)
     say("writing the results")
@@ -215,9 +221,10 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
     config = config if isinstance(config, Config) else load_config(config)
     if config.simulate is None:
         raise InputError("the configuration has no section 'simulate': its pair comes from files")
+    began = time.perf_counter()
     store.require_fresh(out)
     inputs, provenance = _prepared_inputs(config)
-    _store(Path(out), inputs, provenance)
+    _store(Path(out), inputs, _timed(provenance, began))
     return Path(out)
 
 
@@ -244,20 +251,28 @@ def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
 
 def posterior_of(config: Config, inputs: Inputs) -> Posterior:
     """The posterior of a run, its solver preconditioned at the start parameters."""
-    posterior = build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull)
-    given = {name: config.start.entries(name, posterior.entry_names) for name in ("lam", "mu")}
-    if not any(given.values()):
-        return posterior
-    values = {name: np.array(posterior.reference()[name]) for name in given}
-    for name, entries in given.items():
-        for entry, value in (entries or {}).items():
-            values[name][posterior.entry_names.index(entry)] = value
-    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull, reference=values)
+    reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
+    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull, reference)
+
+
+def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
+    """All entries of λ or μ at the start: as the configuration gives them, else as the model chooses."""
+    values = np.array(lame_parameter(name, mesh, config.model, None).reference)
+    given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
+    for index, tissue in enumerate(mesh.names):
+        if tissue in given:
+            values[entry[mesh.tissue == index]] = given[tissue]
+    return values
 
 
 def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
     prepared = prepare(config)
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
+
+
+def _timed(provenance: dict[str, Any], began: float) -> dict[str, Any]:
+    """With the seconds spent on all but sampling, which a resumed run adds to its own."""
+    return provenance | {"unsampled": time.perf_counter() - began}
 
 
 def _require_same_config(out: Path, config: Config) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
-from bayesreg.io.store import Inputs, Truth
+from bayesreg.io.store import Inputs, Truth, read_displacement
 from bayesreg.io.volumes import load_image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.simulation import SyntheticPair, make_pair
@@ -45,12 +46,14 @@ def prepare(config: Config) -> Prepared:
         If a file, a label, the mesh or the pair is not what the configuration promises.
     """
     clock = _Clock()
+    _require_start(config)
     anatomy, moving = _anatomy(config)
     clock.lap("anatomy")
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain))
     mesh = _mesh(anatomy, domain, config.mesh)
     clock.lap("mesh")
+    _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(_forbidden(anatomy.intracranial))
     scale = robust_scale(anatomy.image, domain.voxels != 0)
     fixed = scale(anatomy.image)
@@ -67,6 +70,12 @@ def prepare(config: Config) -> Prepared:
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth)
     return Prepared(inputs, clock.laps, _described(config, pair))
+
+
+def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
+    """Raise InputError where the chains are to start from a file that cannot serve, as far as can be told by now."""
+    if isinstance(config.start.field, Path):
+        read_displacement(config.start.field, mesh)
 
 
 class _Clock:

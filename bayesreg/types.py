@@ -1,4 +1,4 @@
-"""Array aliases and the small containers that two floors share."""
+"""Array aliases, and the small containers and names that two floors share."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     AnyArray = Any
 else:
     AnyArray = jax.Array | np.ndarray
+
+# The environment variable that names a folder in which files are looked for.
+DATA_FOLDER = "BAYESREG_DATA"
 
 Scalar = Float[AnyArray, ""]
 Points = Float[AnyArray, "nodes 3"]

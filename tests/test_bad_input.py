@@ -32,8 +32,8 @@ def pair(tmp_path, monkeypatch):
     for name, voxels in contents.items():
         data[name] = str(save(tmp_path / f"{name}.nii.gz", voxels))
 
-    def check(*command: str, **changed):
-        YAML(typ="safe").dump({"data": data | changed}, tmp_path / "run.yaml")
+    def check(*command: str, start=None, **changed):
+        YAML(typ="safe").dump({"data": data | changed, "start": start or {}}, tmp_path / "run.yaml")
         command = command or ("check",)
         return CliRunner().invoke(app, [command[0], str(tmp_path / "run.yaml"), *command[1:]])
 
@@ -86,6 +86,37 @@ def test_a_bad_file_is_named(pair, tmp_path, key, make, part):
     assert result.exit_code == 2, result
     assert part in result.stderr
     assert result.stderr.startswith("bayesreg: ")
+
+
+def lone_array(folder):
+    with (folder / "start.npz").open("wb") as file:
+        np.save(file, np.zeros((9, 3)))
+
+
+@pytest.mark.parametrize(
+    ("write", "part"),
+    [
+        (lambda f: (f / "start.npz").write_bytes(b"PK half"), "is damaged or no .npz file"),
+        (lone_array, "is damaged or no .npz file"),
+        (lambda f: np.savez(f / "start.npz", v=np.zeros((9, 3))), "expected an array named 'u', got v"),
+        (lambda f: np.savez(f / "start.npz", u=np.zeros((3, 9))), "has shape (3, 9); expected (n, 3)"),
+        (lambda f: np.savez(f / "start.npz", u=np.zeros(())), "has shape (); expected (n, 3)"),
+        (lambda f: np.savez(f / "start.npz", u=np.full((9, 3), np.nan)), "finite numbers"),
+        (lambda f: np.savez(f / "start.npz", u=np.full((9, 3), "far")), "finite numbers"),
+    ],
+)
+def test_a_bad_start_field_is_told_before_meshing(pair, tmp_path, write, part):
+    write(tmp_path)
+    result = pair(start={"field": str(tmp_path / "start.npz")})
+    assert result.exit_code == 2, result
+    assert part in result.stderr
+    assert "start.npz" in result.stderr
+    assert "delete" not in result.stderr
+
+
+def test_a_start_field_that_may_serve_waits_for_the_mesh(pair, tmp_path):
+    np.savez(tmp_path / "start.npz", u=np.zeros((9, 3)))
+    assert isinstance(pair(start={"field": str(tmp_path / "start.npz")}).exception, LongWorkError)
 
 
 def test_a_sound_pair_reaches_the_long_work(pair):

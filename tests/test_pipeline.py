@@ -2,7 +2,9 @@
 
 import errno
 import json
+import re
 import shutil
+from pathlib import Path
 
 import meshio
 import nibabel as nib
@@ -13,10 +15,13 @@ from ruamel.yaml import YAML
 
 import bayesreg as br
 from bayesreg import pipeline, preparation
+from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy
+from bayesreg.model import problem
 from tests.phantoms import ball_mesh
 
+ROOT = Path(__file__).parent.parent
 CENTRE = np.array([5.0, -3.0, 8.0])
 STOP = {"rhat": 1.2, "max_steps": 36}
 SAMPLER = {"chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
@@ -122,9 +127,23 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
     monkeypatch.undo()
     with pytest.raises(br.InputError, match="another configuration"):
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "cut", resume=True, progress=False)
+    provenance = store.read_json(folder / "cut" / pipeline.PROVENANCE)
+    assert 0 < provenance["unsampled"] < 600
+    store.write_json(folder / "cut" / pipeline.PROVENANCE, provenance | {"unsampled": 3600})
     resumed = br.run(folder / "run.yaml", folder / "cut", resume=True, progress=False)
+    timings = resumed.run.manifest["timings"]
+    assert 3600 + timings["sampling"] < timings["total"] < 3600 + timings["sampling"] + 600
+    # What the resumed run spent on getting ready counts, should it be cut off itself.
+    assert store.read_json(folder / "cut" / pipeline.PROVENANCE)["unsampled"] > 3600
     np.testing.assert_array_equal(resumed.idata.posterior.u_boundary, finished.idata.posterior.u_boundary)
     np.testing.assert_array_equal(resumed.u_sd, finished.u_sd)
+
+
+def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):
+    monkeypatch.setattr(preparation, "make_pair", None)
+    np.savez(folder / "other.npz", u=np.zeros((9, 3)))
+    with pytest.raises(br.InputError, match=r"other\.npz has shape \(9, 3\); expected \(\d\d+, 3\)"):
+        pipeline.check(synthetic("paper", "start.field=other.npz"))
 
 
 def test_nothing_is_written_where_a_chain_cannot_start(folder):
@@ -134,6 +153,24 @@ def test_nothing_is_written_where_a_chain_cannot_start(folder):
     with pytest.raises(br.InputError, match=r"far\.npz"):
         br.run(config, folder / "never", progress=False)
     assert not (folder / "never").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "lam", "mu"),
+    [
+        ([], [0.01, 10, 10], [0.01, 1, 1]),
+        (["start.lam=7"], [7, 7, 7], [0.01, 1, 1]),
+        (["start.mu={csf: 0.2, gm: 3, wm: 4}"], [0.01, 10, 10], [0.2, 1, 4]),  # μ of GM is known to be 1.
+        (["start.lam=7", "model.elasticity=uniform"], [7], [1]),
+    ],
+)
+def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, monkeypatch, overrides, lam, mu):
+    built = []
+    monkeypatch.setattr(problem, "elastic_system", lambda *args: built.append(args) or elastic_system(*args))
+    posterior = pipeline.posterior_of(br.load_config(folder / "run.yaml", overrides), store.read_inputs(folder / "out"))
+    assert len(built) == 1
+    np.testing.assert_allclose(posterior.reference()["lam"], lam)
+    np.testing.assert_allclose(posterior.reference()["mu"], mu)
 
 
 def test_check_estimates_without_writing(folder):
@@ -188,6 +225,25 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
     half = np.linalg.norm(0.5 * truth.u[result.mesh.boundary], axis=1)
     assert metrics["initial"]["median"] == pytest.approx(np.median(half))
     assert metrics["posterior_mean"]["median"] < 2 * metrics["initial"]["median"]
+
+
+@pytest.mark.slow
+def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeypatch, capsys):
+    """On a phantom in place of MNI152, from a quickstart made small."""
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
+    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38))
+    monkeypatch.chdir(tmp_path)
+    small = {"simulate": {"displacement": 3, "patch_nodes": 4}, "sampler": {"thin": 3}, "stop": {"max_steps": 36}}
+    (tmp_path / "configs").mkdir()
+    extended = {"extends": str(ROOT / "configs" / "quickstart.yaml"), **small}
+    YAML(typ="safe").dump(extended, tmp_path / "configs" / "quickstart.yaml")
+    exec(compile(code, "README.md", "exec"), {})
+    said = capsys.readouterr().out
+    assert "converged: False" in said
+    assert [line.split()[0] for line in said.splitlines() if re.match(r"(csf|gm|wm) +\d", line)] == ["csf", "gm", "wm"]
+    assert len(said.splitlines()[-1].strip("[]").split()) == 3
+    assert (tmp_path / "runs" / "example" / "report.html").exists()
 
 
 def test_simulate_writes_the_pair(synthetic, folder):

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 
-DATA_FOLDER = "BAYESREG_DATA"
+from bayesreg.types import DATA_FOLDER
 
 
 def _find_file(value: object, info: ValidationInfo) -> Path:

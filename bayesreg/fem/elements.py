@@ -69,7 +69,8 @@ class Quadrature(NamedTuple):
     barycentric : (q, 4) array
         Its barycentric coordinates there.
     weights : (q,) array
-        mm³; they sum to the volume of Ω.
+        mm³; those of a Gauss rule sum to the volume of Ω, those of voxels to the volume of the voxels whose centres
+        lie inside.
     """
 
     cells: Int[AnyArray, "points"]

@@ -114,7 +114,7 @@ def _plain(result: Any) -> xr.Dataset:
 
 def dataset(idata: Any, group: str) -> xr.Dataset:
     """One group of the draws as an xarray Dataset, whichever ArviZ made them."""
-    found = idata[group]
+    found = getattr(idata, group)
     return found if isinstance(found, xr.Dataset) else found.to_dataset()
 
 

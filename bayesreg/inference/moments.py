@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -65,3 +66,8 @@ def scale_reduction(moments: Moments) -> Any:
             return np.where(pooled_variance == 0, 1.0, np.sqrt(pooled_variance / within))
 
     return jax.tree.map(ratio, moments.mean, moments.squares)
+
+
+def greatest_rhat(rhat: Mapping[str, AnyArray]) -> float:
+    """The worst of all estimands; NaN where it cannot be told."""
+    return float(max((np.max(value, initial=0.0) for value in rhat.values()), default=np.nan))

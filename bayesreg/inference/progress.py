@@ -8,6 +8,8 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichProgress
 
+from bayesreg.inference.moments import greatest_rhat
+
 
 @runtime_checkable
 class Progress(Protocol):
@@ -66,8 +68,8 @@ class SamplingProgress(NoProgress):
         steps = float(np.sum(tally.steps))
         inside = max(steps - float(np.sum(tally.outside_support)), 1.0)
         accepted = float(np.sum(tally.acceptance))
-        worst = max((np.max(value, initial=0.0) for value in rhat["estimands"].values()), default=np.nan)
         target = "" if self._threshold is None else f"/{self._threshold:g}"
+        worst = greatest_rhat(rhat["estimands"])
         # The first block holds the compilation: rates are taken from its end.
         self._first = self._first or (draws, seconds)
         figures = f"accepted {accepted / steps:.0%} (in support {accepted / inside:.0%})  R̂ {worst:.2f}{target}"

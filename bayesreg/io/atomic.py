@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,13 +35,14 @@ def save_arrays(path: str | Path, arrays: Mapping[str, AnyArray]) -> None:
         np.savez(file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
-def load_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """Read an .npz file; InputError where it is damaged."""
+def load_arrays(path: str | Path, advice: str) -> dict[str, np.ndarray]:
+    """Read an .npz file; InputError, with advice on what to do then, where it is none or damaged."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return dict(archive)
-    except (zipfile.BadZipFile, EOFError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); delete it to continue from what stands before it") from error
+    except (zipfile.BadZipFile, zlib.error, EOFError, TypeError, ValueError) as error:
+        # A TypeError: NumPy opens a lone array (.npy) under this name, too.
+        raise InputError(f"{path} is damaged or no .npz file ({error}); {advice}") from error
 
 
 def write_json(path: str | Path, value: Any) -> None:

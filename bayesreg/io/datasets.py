@@ -14,11 +14,10 @@ from scipy import ndimage
 from bayesreg.image import Image
 from bayesreg.io.domain import TISSUES, main_part
 from bayesreg.io.volumes import LabelTable, check_same_grid, check_same_space, load_image, load_labels
-from bayesreg.types import InputError
+from bayesreg.types import DATA_FOLDER, InputError
 
 __all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152"]
 
-DATA_VARIABLE = "BAYESREG_DATA"
 BRAINWEB_TABLE: dict[str, tuple[int, ...]] = {"csf": (1,), "gm": (2, 8), "wm": (3,)}
 BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
 # How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
@@ -144,7 +143,7 @@ def _from_nibabel(source: nib.Nifti1Image) -> Image:
 def _data_file(path: str | Path | None, name: str) -> Path:
     if path is not None:
         return Path(path)
-    folder = os.environ.get(DATA_VARIABLE)
+    folder = os.environ.get(DATA_FOLDER)
     if not folder:
-        raise InputError(f"give the path of {name}, or let the environment variable {DATA_VARIABLE} name its folder")
+        raise InputError(f"give the path of {name}, or let the environment variable {DATA_FOLDER} name its folder")
     return Path(folder) / name

@@ -100,11 +100,6 @@ class Run:
     truth: Truth | None = None
     metrics: dict[str, Any] | None = None
 
-    @property
-    def inputs(self) -> Inputs:
-        """What the run started from."""
-        return Inputs(self.config, self.mesh, self.fixed, self.moving, self.tissue, self.skull, self.truth)
-
 
 def require_fresh(folder: str | Path) -> None:
     """Raise InputError where a folder (or a file in its place) already holds a run, or cannot be written."""
@@ -148,26 +143,16 @@ def read_inputs(folder: str | Path) -> Inputs:
         load_image(_require(folder, f"inputs/{name}.nii.gz")) for name in ("fixed", "moving", "tissue")
     )
     skull = load_image(images / "skull.nii.gz") if (images / "skull.nii.gz").exists() else None
-    truth = Truth(**load_arrays(images / "truth.npz")) if (images / "truth.npz").exists() else None
+    known = images / "truth.npz"
+    truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
     return Inputs(config, mesh, fixed, moving, tissue, skull, truth)
-
-
-def write_run(
-    folder: str | Path,
-    run: Run,
-    displacement_mean: Float[np.ndarray, "X Y Z 3"] | None = None,
-    displacement_sd: Float[np.ndarray, "X Y Z 3"] | None = None,
-) -> None:
-    """Write everything of a run folder except the draws and the report: `write_inputs`, then `write_results`."""
-    write_inputs(folder, run.inputs)
-    write_results(folder, run, displacement_mean, displacement_sd)
 
 
 def write_results(
     folder: str | Path,
     run: Run,
-    displacement_mean: Float[np.ndarray, "X Y Z 3"] | None = None,
-    displacement_sd: Float[np.ndarray, "X Y Z 3"] | None = None,
+    displacement_mean: Float[np.ndarray, "X Y Z 3"],
+    displacement_sd: Float[np.ndarray, "X Y Z 3"],
 ) -> None:
     """Write what a finished run adds to its inputs, run.json last.
 
@@ -176,26 +161,24 @@ def write_results(
     folder : path
         Where `write_inputs` has written; files of the same names are replaced, each in one step.
     run : Run
-    displacement_mean, displacement_sd : (X, Y, Z, 3) arrays, optional
+    displacement_mean, displacement_sd : (X, Y, Z, 3) arrays
         Posterior mean and standard deviation of u on the fixed grid, world RAS, mm. The mean is written as a
         resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
     """
     folder = Path(folder)
     save_mesh(run.mesh, folder / "mesh.vtu", point_data={"u_mean": run.u_mean, "u_sd": run.u_sd})
     save_image(run.warped, folder / "warped_mean.nii.gz")
-    if displacement_mean is not None:
-        save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, run.fixed.affine)
-    if displacement_sd is not None:
-        # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
-        unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
-        save_displacement(folder / "displacement_sd.nii.gz", unsigned, run.fixed.affine)
+    save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, run.fixed.affine)
+    # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
+    unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
+    save_displacement(folder / "displacement_sd.nii.gz", unsigned, run.fixed.affine)
     if run.metrics is not None:
         write_json(folder / "metrics.json", run.metrics)
     write_json(folder / "run.json", run.manifest)
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read what `write_run` wrote.
+    """Read what `write_inputs` and `write_results` wrote.
 
     Raises
     ------
@@ -220,23 +203,32 @@ def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
     return [np.asarray(data[name], float) for name in names]
 
 
-def read_displacement(path: Path, mesh: TetMesh) -> Float[np.ndarray, "nodes 3"]:
+def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarray, "nodes 3"]:
     """A displacement of every node: array "u" of an .npz file, or "u" or "u_mean" of a .vtu mesh, mm.
+
+    Parameters
+    ----------
+    path : path
+    mesh : TetMesh, optional
+        Whose nodes the displacement must fit; None where there is no mesh yet.
 
     Raises
     ------
     InputError
         If the file holds none, or one for another mesh.
     """
-    data = load_arrays(path) if path.suffix == ".npz" else _point_data(path)
+    data = load_arrays(path, "give another file") if path.suffix == ".npz" else _point_data(path)
     found = [data[name] for name in ("u", "u_mean") if name in data]
     if not found:
         raise InputError(f"{path} holds no displacement: expected an array named 'u', got {', '.join(data) or 'none'}")
-    if np.shape(found[0]) != mesh.points.shape or not np.isfinite(found[0]).all():
+    shape = np.shape(found[0])
+    if shape[1:] != (3,) or (mesh is not None and len(mesh.points) != shape[0]):
+        rows = "n" if mesh is None else len(mesh.points)
         raise InputError(
-            f"the displacement in {path} has shape {np.shape(found[0])} or is not finite; "
-            f"expected {mesh.points.shape}, one finite row per node of the run's mesh"
+            f"the displacement in {path} has shape {shape}; expected ({rows}, 3), one row per node of the run's mesh"
         )
+    if found[0].dtype.kind not in "fiu" or not np.isfinite(found[0]).all():
+        raise InputError(f"the displacement in {path} must consist of finite numbers")
     return np.asarray(found[0], float)
 
 
@@ -255,20 +247,14 @@ def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -
     save_arrays(draws / f"block_{index:05d}.npz", arrays)
 
 
-def count_blocks(folder: str | Path) -> int:
-    """Number of blocks of draws; InputError where one in the middle is missing."""
-    names = sorted(path.name for path in (Path(folder) / "draws").glob("block_*.npz"))
-    expected = [f"block_{index:05d}.npz" for index in range(len(names))]
-    gaps = sorted(set(expected) - set(names))
-    if gaps:
-        raise InputError(f"{Path(folder) / 'draws'} holds {len(names)} blocks, but {gaps[0]} is missing")
-    return len(names)
-
-
-def load_blocks(folder: str | Path, count: int | None = None) -> Iterator[dict[str, np.ndarray]]:
-    """The first `count` blocks of draws (all, by default), in order, one in memory at a time."""
-    for index in range(count_blocks(folder) if count is None else count):
-        yield load_arrays(_require(Path(folder), f"draws/block_{index:05d}.npz"))
+def load_blocks(folder: str | Path, count: int) -> Iterator[dict[str, np.ndarray]]:
+    """The first `count` blocks of draws, in order, one in memory at a time; InputError where one is missing."""
+    advice = "delete state.npz in that run's folder, and it resumes from its first step"
+    for index in range(count):
+        path = Path(folder) / "draws" / f"block_{index:05d}.npz"
+        if not path.exists():
+            raise InputError(f"{path} is missing; {advice}")
+        yield load_arrays(path, advice)
 
 
 def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
@@ -279,7 +265,7 @@ def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
 def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
     """The content of state.npz; None where there is none."""
     path = Path(folder) / "state.npz"
-    return load_arrays(path) if path.exists() else None
+    return load_arrays(path, "delete it, and the run resumes from its first step") if path.exists() else None
 
 
 def remove_checkpoints(folder: str | Path) -> None:

@@ -10,12 +10,13 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from bayesreg.inference.diagnostics import dataset
 from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Run
 from bayesreg.report import panels, style, tables
 from bayesreg.report.convergence import plain_log_axis
 from bayesreg.report.estimands import Diagnosed, Estimand, estimands, parameter_groups
-from bayesreg.report.html import dataset, elasticity_of, error_tables, metrics_of, name_of, render
+from bayesreg.report.html import elasticity_of, error_tables, metrics_of, name_of, render
 from bayesreg.report.marginals import ratio_panel
 from bayesreg.report.metrics import divergence
 from bayesreg.report.panels import View
@@ -46,7 +47,7 @@ class Study(NamedTuple):
     @property
     def posterior(self) -> xr.Dataset:
         """Its draws."""
-        return dataset(self.idata.posterior)
+        return dataset(self.idata, "posterior")
 
     @property
     def diagnosed(self) -> Diagnosed:

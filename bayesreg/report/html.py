@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bayesreg import __version__
+from bayesreg.inference.diagnostics import dataset
 from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Run
 from bayesreg.report import anatomy, convergence, marginals, tables
@@ -57,7 +58,7 @@ def write_report(
     path : path
         The HTML file; replaced in one step.
     """
-    posterior, sample_stats = dataset(idata.posterior), dataset(idata.sample_stats)
+    posterior, sample_stats = dataset(idata, "posterior"), dataset(idata, "sample_stats")
     diagnosed = Diagnosed(rhat, ess_bulk, ess_tail)
     entries = estimands(run.mesh, diagnosed, posterior)
     metrics = {"This run": known} if (known := metrics_of(run, posterior)) else {}
@@ -100,11 +101,6 @@ def render(template: str, content: Mapping[str, Any]) -> str:
 def _indexed(text: str) -> Markup:
     """Escaped text in which u_x, T_s and the like get a subscript."""
     return Markup(re.sub(r"\b([uTE])_([xyzrs])\b", r"\1<sub>\2</sub>", str(escape(text))))
-
-
-def dataset(group: Any) -> xr.Dataset:
-    """A group of an InferenceData (a Dataset already) or of a DataTree as a Dataset."""
-    return group if isinstance(group, xr.Dataset) else group.to_dataset()
 
 
 def name_of(run: Run) -> str:

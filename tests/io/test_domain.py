@@ -9,11 +9,6 @@ from bayesreg.io.domain import MeshError, domain_labels, mesh_domain
 from tests.io.balls import balls, grid, offset_from_centre
 
 
-@pytest.fixture(scope="module")
-def phantom():
-    return balls(grid())
-
-
 class TestDomain:
     def test_is_the_hull_with_its_inner_csf(self, phantom):
         np.testing.assert_array_equal(mesh_domain(*phantom).voxels, phantom[0].voxels > 0)

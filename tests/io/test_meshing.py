@@ -15,7 +15,6 @@ from bayesreg.io.meshing import (
     MeshOptions,
     build_mesh,
     check_mesh,
-    domain_labels,
     load_mesh,
     mesh_domain,
     save_mesh,
@@ -27,16 +26,6 @@ from tests.io.test_datasets import needs_brainweb
 from tests.phantoms import ball_mesh, box_mesh
 
 OPTIONS = MeshOptions(edge_length=16.0, envelope=4.0)
-
-
-@pytest.fixture(scope="module")
-def phantom():
-    return balls(grid())
-
-
-@pytest.fixture(scope="module")
-def labels(phantom):
-    return domain_labels(phantom[0], mesh_domain(*phantom))
 
 
 @pytest.fixture(scope="module")

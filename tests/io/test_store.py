@@ -6,7 +6,7 @@ import pytest
 
 from bayesreg.image import Image
 from bayesreg.io import store
-from bayesreg.io.store import Run, Truth
+from bayesreg.io.store import Inputs, Run, Truth
 from tests.phantoms import ball_mesh, rotated_affine
 
 
@@ -31,6 +31,17 @@ def run():
     )
 
 
+def inputs_of(run: Run) -> Inputs:
+    return Inputs(**{name: getattr(run, name) for name in Inputs._fields})
+
+
+def write(folder, run: Run, mean=None, sd=None) -> None:
+    """All of a run, as the program writes it; displacements are zero where none are given."""
+    zero = np.zeros((*run.fixed.shape, 3))
+    store.write_inputs(folder, inputs_of(run))
+    store.write_results(folder, run, zero if mean is None else mean, zero if sd is None else sd)
+
+
 def assert_same(a: Run, b: Run) -> None:
     assert (a.config, a.manifest, a.metrics) == (b.config, b.manifest, b.metrics)
     assert a.mesh.digest == b.mesh.digest
@@ -45,7 +56,7 @@ def assert_same(a: Run, b: Run) -> None:
 
 def test_a_run_comes_back_as_it_was_written(run, tmp_path):
     folder = tmp_path / "new" / "run"
-    store.write_run(folder, run)
+    write(folder, run)
     back = store.read_run(folder)
     assert_same(run, back)
     for one, other in zip(run.truth, back.truth, strict=True):
@@ -54,7 +65,7 @@ def test_a_run_comes_back_as_it_was_written(run, tmp_path):
 
 def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
     run = replace(run, truth=None, skull=None, metrics=None)
-    store.write_run(tmp_path, run)
+    write(tmp_path, run)
     back = store.read_run(tmp_path)
     assert_same(run, back)
     assert back.truth is None
@@ -63,14 +74,14 @@ def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
 
 
 def test_a_truth_without_a_start_comes_back_without(run, tmp_path):
-    store.write_run(tmp_path, replace(run, truth=run.truth._replace(initial=None)))
+    write(tmp_path, replace(run, truth=run.truth._replace(initial=None)))
     assert store.read_run(tmp_path).truth.initial is None
 
 
 def test_displacements_are_written_as_lps_transform_and_the_sd_stays_positive(run, tmp_path):
     mean = np.zeros((*run.fixed.shape, 3))
     mean[2, 3, 1] = (1.0, 2.0, 3.0)
-    store.write_run(tmp_path, run, mean, np.abs(mean))
+    write(tmp_path, run, mean, np.abs(mean))
     for name, expected in (("displacement_mean", (-1.0, -2.0, 3.0)), ("displacement_sd", (1.0, 2.0, 3.0))):
         file = nib.load(tmp_path / f"{name}.nii.gz")
         assert file.shape == (*run.fixed.shape, 1, 3)
@@ -80,7 +91,7 @@ def test_displacements_are_written_as_lps_transform_and_the_sd_stays_positive(ru
 
 
 def test_inputs_can_be_read_before_the_run_has_finished(run, tmp_path):
-    store.write_inputs(tmp_path, run.inputs)
+    store.write_inputs(tmp_path, inputs_of(run))
     inputs = store.read_inputs(tmp_path)
     assert inputs.config == run.config
     assert inputs.mesh.digest == run.mesh.digest
@@ -93,14 +104,14 @@ def test_inputs_can_be_read_before_the_run_has_finished(run, tmp_path):
     "name", ["run.json", "config.yaml", "mesh.vtu", "inputs/fixed.nii.gz", "inputs/tissue.nii.gz", "warped_mean.nii.gz"]
 )
 def test_each_missing_part_is_named(run, tmp_path, name):
-    store.write_run(tmp_path, run)
+    write(tmp_path, run)
     (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=f"holds no finished run: {name} is missing"):
         store.read_run(tmp_path)
 
 
 def test_a_mesh_without_results_is_no_finished_run(run, tmp_path):
-    store.write_run(tmp_path, run)
+    write(tmp_path, run)
     store.save_mesh(run.mesh, tmp_path / "mesh.vtu")
     with pytest.raises(ValueError, match="holds no u_mean and no u_sd"):
         store.read_run(tmp_path)
@@ -129,16 +140,14 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
 
 
 def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
-    assert store.count_blocks(tmp_path) == 0
-    assert list(store.load_blocks(tmp_path)) == []
+    assert list(store.load_blocks(tmp_path, 0)) == []
     for k in range(12):
         store.save_block(tmp_path, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
     store.save_block(tmp_path, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
-    assert store.count_blocks(tmp_path) == 12
-    blocks = list(store.load_blocks(tmp_path))
+    blocks = list(store.load_blocks(tmp_path, 12))
     assert [int(block["step"]) for block in blocks] == list(range(12))
     assert (blocks[11]["u"] == -1).all()
-    assert len(list(store.load_blocks(tmp_path, count=5))) == 5
+    assert len(list(store.load_blocks(tmp_path, 5))) == 5
 
 
 def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, monkeypatch):
@@ -154,7 +163,7 @@ def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, 
         store.save_block(tmp_path, 1, {"u": np.ones(3)})
     with pytest.raises(KeyboardInterrupt):
         store.save_state(tmp_path, {"step": np.array(2)})
-    assert store.count_blocks(tmp_path) == 1
+    assert [path.name for path in (tmp_path / "draws").iterdir()] == ["block_00000.npz"]
     assert int(store.load_state(tmp_path)["step"]) == 1
 
 
@@ -162,7 +171,22 @@ def test_a_gap_among_the_blocks_is_an_error(tmp_path):
     for k in (0, 2):
         store.save_block(tmp_path, k, {"u": np.zeros(1)})
     with pytest.raises(ValueError, match=r"block_00001\.npz is missing"):
-        store.count_blocks(tmp_path)
+        list(store.load_blocks(tmp_path, 3))
+
+
+@pytest.mark.parametrize("name", ["state.npz", "draws/block_00000.npz", "inputs/truth.npz"])
+def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
+    write(tmp_path, run)
+    store.save_block(tmp_path, 0, {"u": np.zeros(3)})
+    store.save_state(tmp_path, {"step": np.array(1)})
+    (tmp_path / name).write_bytes(b"PK half a file")
+    read = {
+        "state.npz": (store.load_state, r"delete it, and the run resumes from its first step"),
+        "draws/block_00000.npz": (lambda f: list(store.load_blocks(f, 1)), r"delete state\.npz"),
+        "inputs/truth.npz": (store.read_inputs, r"run anew, into another folder"),
+    }
+    with pytest.raises(ValueError, match=f"{name} is damaged or no .npz file .*; {read[name][1]}"):
+        read[name][0](tmp_path)
 
 
 def test_without_a_checkpoint_there_is_no_state(tmp_path):

@@ -3,21 +3,9 @@
 import numpy as np
 import pytest
 
-from bayesreg.io.domain import domain_labels, mesh_domain
 from bayesreg.io.surfaces import depth_sizing, tissue_surfaces
 from bayesreg.mesh import TetMesh
 from tests.io.balls import CENTRE, RADII, balls, grid, volume_of
-
-
-@pytest.fixture(scope="module")
-def phantom():
-    return balls(grid())
-
-
-@pytest.fixture(scope="module")
-def labels(phantom):
-    return domain_labels(phantom[0], mesh_domain(*phantom))
-
 
 GRIDS = {
     "upright": {},
