@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from bayesreg.fem.location import locate
 from bayesreg.inference.predictive import push_forward, summarise, thinned
@@ -133,7 +134,7 @@ def default_landmarks(
 
     A tissue's middle is the centre of the one of its tetrahedra that lies nearest to its centroid.
     """
-    depth = np.linalg.norm(mesh.points[:, None] - mesh.points[mesh.boundary], axis=-1).min(axis=1)
+    depth, _ = cKDTree(mesh.points[mesh.boundary]).query(mesh.points)
     centres = mesh.points[mesh.cells].mean(axis=1)
     found = {
         "largest shift": mesh.points[np.linalg.norm(u_mean, axis=1).argmax()],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,20 @@ from bayesreg.report import (
     tables,
     uncertainty,
 )
-from bayesreg.report.estimands import Diagnosed, estimands
+from bayesreg.report.estimands import Diagnosed, Estimand, estimands
 from bayesreg.report.metrics import compute_metrics
-from bayesreg.report.modes import grouping
+from bayesreg.report.modes import Grouping, grouping
 from bayesreg.report.panels import View
-from bayesreg.report.verdict import approximation, duration, key_facts, part, threshold_of, verdict, warnings_of
+from bayesreg.report.verdict import (
+    Verdict,
+    approximation,
+    duration,
+    key_facts,
+    part,
+    threshold_of,
+    verdict,
+    warnings_of,
+)
 
 SECTIONS = (
     ("accuracy", "Registration"),
@@ -95,7 +104,7 @@ def write_report(
         "subtitle": _subtitle(run, posterior),
         "sections": [(key, name) for key, name in SECTIONS if key not in left_out],
         "approximation": approximation(run.manifest),
-        "verdict": verdict(run.manifest, entries),
+        "verdict": _judged(run.manifest, entries, groups),
         "facts": key_facts(run.manifest, entries, posterior),
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
@@ -113,6 +122,15 @@ def write_report(
         "config": run.config,
     }
     write_text(path, render("template.html", content))
+
+
+def _judged(manifest: Mapping[str, Any], entries: Sequence[Estimand], groups: Grouping) -> Verdict:
+    """The verdict, with a word on chains that lie apart."""
+    judged = verdict(manifest, entries)
+    if groups.groups == 1:
+        return judged
+    apart = f" The chains lie in {groups.groups} groups, each shown by itself under “Chains that disagree”."
+    return judged._replace(detail=(judged.detail + apart).strip())
 
 
 def render(template: str, content: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from bayesreg.mesh import TetMesh
 from bayesreg.report import panels, style
-from bayesreg.report.estimands import AXES, DISPLACEMENT
+from bayesreg.report.estimands import AXES, DISPLACEMENT, MOST_VALUES
 from bayesreg.report.panels import View
 from bayesreg.report.places import regions
 from bayesreg.report.slices import main_plane, planes_through
@@ -69,9 +69,16 @@ def _renumbered(label: np.ndarray) -> np.ndarray:
 
 def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"]:
     """All estimands side by side."""
+    posterior = _fewer(posterior)
     found = [posterior[name] for name in (DISPLACEMENT, "lam", "mu") if name in posterior]
     flat = [one.transpose("chain", "draw", ...).to_numpy().reshape(*_shape(one), -1) for one in found]
     return np.concatenate(flat, axis=-1).astype(float)
+
+
+def _fewer(posterior: xr.Dataset) -> xr.Dataset:
+    """Evenly thinned, where the draws would take much memory."""
+    numbers = sum(posterior[name].size for name in (DISPLACEMENT, "lam", "mu") if name in posterior)
+    return posterior.isel(draw=slice(None, None, max(1, numbers // MOST_VALUES)))
 
 
 def _shape(draws: xr.DataArray) -> tuple[int, int]:
@@ -128,7 +135,7 @@ def _chain_list(chains: np.ndarray) -> str:
 
 def difference_table(mesh: TetMesh, posterior: xr.Dataset, found: Grouping) -> Table:
     """The displacements that set groups of chains apart most, one per node, with their places."""
-    draws = posterior[DISPLACEMENT].transpose("chain", "draw", "node", "axis")
+    draws = _fewer(posterior)[DISPLACEMENT].transpose("chain", "draw", "node", "axis")
     values = draws.to_numpy().astype(float)
     nodes, means = draws["node"].to_numpy().astype(int), group_means(values.mean(axis=1), found)
     within = np.sqrt(values.var(axis=1).mean(axis=0))

@@ -212,5 +212,6 @@ def test_separate_chains_and_an_approximate_sampler_are_told_first(tmp_path, stu
     found = page(tmp_path, study._replace(run=run, idata=study.idata._replace(posterior=posterior)))
     assert "group 1: chains 1, 2; group 2: chain 3" in found.text
     assert "several modes" in found.text
+    assert "The chains lie in 2 groups, each shown by itself" in found.text
     assert set(found.figures) == FIGURES | FORWARD | {"modes"}
     assert found.text.index("Approximate: a quick look") < found.text.index("Converged")

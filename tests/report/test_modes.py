@@ -1,6 +1,7 @@
 import numpy as np
 import xarray as xr
 
+from bayesreg.report import modes
 from bayesreg.report.modes import difference_table, explanation, group_means, grouping
 from tests.phantoms import box_mesh
 
@@ -62,3 +63,10 @@ def test_the_differences_are_named_with_place_and_group_means():
     means = posterior["u_boundary"].sel(node=int(rows[0][0].split()[-1])).isel(axis=2).mean("draw").to_numpy()
     assert rows[0][3:5] == [f"{means[[0, 2]].mean():.2f}", f"{means[1]:.2f}".replace("-", "−")]
     assert 8 < float(rows[0][5]) < 12
+
+
+def test_many_draws_are_thinned_and_grouped_the_same(monkeypatch):
+    posterior = posterior_of([2.0, 0.0, 2.1, 0.0])
+    monkeypatch.setattr(modes, "MOST_VALUES", posterior["u_boundary"].size // 4)
+    np.testing.assert_array_equal(grouping(posterior).label, [0, 1, 0, 1])
+    assert modes._values(posterior).shape[1] == 20
