@@ -80,6 +80,14 @@ class TetMesh:
         return faces[first[count == 1]]
 
     @cached_property
+    def neighbours(self) -> Int[np.ndarray, "pairs 2"]:
+        """Pairs of tetrahedra that share a face."""
+        faces = np.sort(self.cells[:, FACES].reshape(-1, 3), axis=1)
+        order = np.lexsort(faces.T)
+        shared = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
+        return np.stack([order[shared], order[shared + 1]], axis=1) // 4
+
+    @cached_property
     def boundary(self) -> Int[np.ndarray, "boundary"]:
         """Sorted indices of the nodes on the boundary."""
         return np.unique(self.boundary_faces)

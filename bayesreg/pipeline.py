@@ -35,6 +35,7 @@ from bayesreg.model.options import Lame
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.problem import cell_entries, lame_parameter
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
+from bayesreg.prediction import predict, require_inside
 from bayesreg.preparation import prepare
 from bayesreg.report.compare import write_comparison
 from bayesreg.report.html import write_report
@@ -267,6 +268,7 @@ def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "
 
 def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
     prepared = prepare(config)
+    require_inside(prepared.inputs.mesh, config.report.landmarks)
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
 
 
@@ -392,12 +394,21 @@ def _finish(
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, dataset(samples.idata, "posterior"))
+    predicted = predict(
+        posterior,
+        dataset(samples.idata, "posterior"),
+        samples.u_mean,
+        samples.u_sd,
+        config.report.landmarks,
+        config.seed,
+    )
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, judged, provenance, began),
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
         warped=warp_image(inputs.moving, mean_field, inputs.fixed),
         metrics=metrics,
+        predicted=predicted,
         **inputs._asdict(),
     )
     store.write_results(out, finished, mean_field, sd_field)

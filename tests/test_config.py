@@ -95,8 +95,10 @@ model:
   priors: {lam: {gm: {alpha: 2, beta: 3, low: 0, high: 60}}, mu: {high: .inf}}
 start: {field: truth, fraction: 0.5, lam: {csf: 1, gm: 10, wm: 20}}
 stop: {rhat: null, max_minutes: 1}
+report: {landmarks: {left ventricle: [-12, 3.5, 20]}}
 """
     config = load_config(write(text))
+    assert config.report.landmarks == {"left ventricle": (-12.0, 3.5, 20.0)}
     assert load_config(write(resolved_yaml(config), "resolved.yaml")) == config
     assert config.start.fraction == (0.5, 0.5)
     assert config.model.priors["mu"].high == math.inf

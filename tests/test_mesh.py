@@ -16,6 +16,15 @@ def two_tets() -> TetMesh:
     return TetMesh.from_arrays(POINTS, CELLS, np.array([0, 2]))
 
 
+def test_neighbours_share_a_face():
+    np.testing.assert_array_equal(np.sort(two_tets().neighbours, axis=1), [[0, 1]])
+    mesh = ball_mesh(spacing=24)
+    pairs = {frozenset(pair) for pair in mesh.neighbours.tolist()}
+    shared = (mesh.cells[:, None, :, None] == mesh.cells[None, :, None, :]).sum(axis=(2, 3))
+    assert pairs == {frozenset(pair) for pair in np.argwhere(shared == 3).tolist()}
+    assert len(pairs) == len(mesh.neighbours)
+
+
 class TestFromArrays:
     def test_keeps_what_it_is_given(self):
         mesh = two_tets()

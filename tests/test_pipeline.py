@@ -92,6 +92,9 @@ def test_the_run_folder_is_that_of_the_contract(finished, folder):
     assert "Not converged" in (out / "report.html").read_text()
     assert not (out / "draws").exists()
     assert not (out / "metrics.json").exists()
+    read = store.read_run(out).predicted
+    np.testing.assert_allclose(read.chain_mean.mean(axis=0), finished.u_mean, atol=1e-6)
+    assert "Posterior predictive checks" in (out / "report.html").read_text()
     assert not finished.converged
 
 

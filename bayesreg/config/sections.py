@@ -10,7 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, 
 from pydantic_core import PydanticCustomError
 
 from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_field
-from bayesreg.model.options import ModelConfig
+from bayesreg.model.options import ModelConfig, Vector
 
 
 class Section(BaseModel):
@@ -181,6 +181,13 @@ class StopConfig(Section):
     """Minutes of sampling."""
 
 
+class ReportConfig(Section):
+    """What the report is to show."""
+
+    landmarks: dict[str, Vector] = {}
+    """Places (x, y, z) in the fixed image, world RAS mm, by name; empty lets the program choose some."""
+
+
 class Config(Section):
     """Everything that a run needs to know."""
 
@@ -197,6 +204,7 @@ class Config(Section):
     sampler: SamplerConfig = SamplerConfig()
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
+    report: ReportConfig = ReportConfig()
 
     # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
 

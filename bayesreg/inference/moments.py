@@ -34,6 +34,35 @@ def updated(moments: Moments, draw: Any) -> Moments:
     return Moments(count, mean, squares)
 
 
+def extended(moments: Moments, block: Any) -> Moments:
+    """Moments of several chains with a block of draws more (Chan et al.), on the host.
+
+    Parameters
+    ----------
+    moments : Moments
+        Chains leading.
+    block : pytree
+        NumPy arrays (chain, draw, …).
+    """
+    before, more = np.asarray(moments.count), jax.tree.leaves(block)[0].shape[1]
+    total = before + more
+
+    def mean(old: AnyArray, x: np.ndarray) -> np.ndarray:
+        share = (more / total).reshape(-1, *(1,) * (x.ndim - 2))
+        return old + share * (x.mean(axis=1) - old)
+
+    def squares(old: AnyArray, x: np.ndarray, old_mean: AnyArray) -> np.ndarray:
+        between = (before * more / total).reshape(-1, *(1,) * (x.ndim - 2))
+        own = x.mean(axis=1)
+        return old + ((x - own[:, None]) ** 2).sum(axis=1) + between * (own - old_mean) ** 2
+
+    return Moments(
+        total,
+        jax.tree.map(mean, moments.mean, block),
+        jax.tree.map(squares, moments.squares, block, moments.mean),
+    )
+
+
 def pooled(moments: Moments) -> tuple[Any, Any]:
     """Mean and standard deviation over all draws of all chains (leading axis), each chain of equal length."""
     count = np.asarray(moments.count)[0]
@@ -41,7 +70,7 @@ def pooled(moments: Moments) -> tuple[Any, Any]:
     def total(mean: AnyArray, squares: AnyArray) -> np.ndarray:
         mean, squares = np.asarray(mean), np.asarray(squares)
         between = count * ((mean - mean.mean(axis=0)) ** 2).sum(axis=0)
-        return np.sqrt((squares.sum(axis=0) + between) / max(count * len(mean) - 1, 1))
+        return np.asarray(np.sqrt((squares.sum(axis=0) + between) / max(count * len(mean) - 1, 1)))
 
     return jax.tree.map(lambda m: np.asarray(m).mean(axis=0), moments.mean), jax.tree.map(
         total, moments.mean, moments.squares

@@ -43,6 +43,46 @@ class Truth(NamedTuple):
     initial: AnyArray | None = None
 
 
+class Predicted(NamedTuple):
+    """What was computed of thinned draws at the end of a run, since it needs the posterior itself.
+
+    Attributes
+    ----------
+    chain_mean : (chains, n, 3) array
+        Mean displacement of every node, mm, chain by chain.
+    far_mm : scalar
+    far : (n,) array
+        P(|u − ū| > far_mm) at every node, ū the posterior mean.
+    reach : (n,) array
+        |u − ū|, mm, that 95 % of the draws do not exceed.
+    landmark_names : (L,) array of str
+    landmark_points : (L, 3) array
+        World mm, in the fixed image.
+    landmark_draws : (chains, draws, L, 3) array
+        Displacement of the landmarks, mm.
+    residual : (q,) array
+        f − m(x + ū) at the quadrature points over the noise sd that T_s implies there.
+    residual_tissue : (q,) int array
+        Index into the mesh's tissue names.
+    discrepancies : (D,) array of str
+    observed, replicated : (chains, draws, D) arrays
+        Discrepancies of the standardised residuals of each draw, and of noise that follows the model.
+    """
+
+    chain_mean: AnyArray
+    far_mm: AnyArray
+    far: AnyArray
+    reach: AnyArray
+    landmark_names: np.ndarray
+    landmark_points: AnyArray
+    landmark_draws: AnyArray
+    residual: AnyArray
+    residual_tissue: AnyArray
+    discrepancies: np.ndarray
+    observed: AnyArray
+    replicated: AnyArray
+
+
 class Inputs(NamedTuple):
     """What a run starts from, and what a resumed run must find unchanged.
 
@@ -85,6 +125,8 @@ class Run:
         Moving image resampled on the fixed grid by the posterior mean.
     metrics : dict or None
         The content of metrics.json, where the truth is known.
+    predicted : Predicted or None
+        The content of predicted.npz; None for runs of versions that wrote none.
     """
 
     config: str
@@ -99,6 +141,7 @@ class Run:
     skull: Image | None = None
     truth: Truth | None = None
     metrics: dict[str, Any] | None = None
+    predicted: Predicted | None = None
 
 
 def require_fresh(folder: str | Path) -> None:
@@ -174,6 +217,8 @@ def write_results(
     save_displacement(folder / "displacement_sd.nii.gz", unsigned, run.fixed.affine)
     if run.metrics is not None:
         write_json(folder / "metrics.json", run.metrics)
+    if run.predicted is not None:
+        save_arrays(folder / "predicted.npz", run.predicted._asdict())
     write_json(folder / "run.json", run.manifest)
 
 
@@ -191,7 +236,16 @@ def read_run(folder: str | Path) -> Run:
     u_mean, u_sd = read_point_data(folder / "mesh.vtu", "u_mean", "u_sd")
     warped = load_image(_require(folder, "warped_mean.nii.gz"))
     metrics = read_json(folder / "metrics.json") if (folder / "metrics.json").exists() else None
-    return Run(manifest=manifest, u_mean=u_mean, u_sd=u_sd, warped=warped, metrics=metrics, **inputs._asdict())
+    predicted = Predicted(**load_arrays(folder / "predicted.npz")) if (folder / "predicted.npz").exists() else None
+    return Run(
+        manifest=manifest,
+        u_mean=u_mean,
+        u_sd=u_sd,
+        warped=warped,
+        metrics=metrics,
+        predicted=predicted,
+        **inputs._asdict(),
+    )
 
 
 def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:

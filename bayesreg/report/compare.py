@@ -22,7 +22,7 @@ from bayesreg.report.metrics import divergence
 from bayesreg.report.panels import View
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import Verdict, key_facts, verdict
+from bayesreg.report.verdict import Verdict, approximation, key_facts, verdict
 from bayesreg.types import InputError
 
 RUN_COLOURS = ("#2b5c8a", "#b3560f", "#4f9d86", "#7d6aa8", "#a84a63", "#8aa34f")
@@ -123,6 +123,9 @@ def _notes(named: dict[str, Study]) -> list[str]:
         found.append("These runs are not of one pair of images: their errors and maps cannot be compared directly.")
     if len({run.mesh.digest for run in runs}) > 1:
         found.append("These runs are on different meshes.")
+    found += [
+        f"{name} is approximate. {text}" for name, study in named.items() if (text := approximation(study.run.manifest))
+    ]
     return found
 
 

@@ -9,9 +9,11 @@ import numpy as np
 import xarray as xr
 
 from bayesreg.mesh import TetMesh
+from bayesreg.report.places import regions
 
 SYMBOLS = {"lam": "λ", "mu": "μ", "ratio": "λ/μ", "t_similarity": "T_s", "t_elastic": "T_r"}
 DISPLACEMENT = "u_boundary"
+TEMPERATURES = ("t_similarity", "t_elastic")
 AXES = ("x", "y", "z")
 MOST_VALUES = 10_000_000
 
@@ -31,6 +33,8 @@ class Estimand(NamedTuple):
         World position of its node, mm.
     rhat, ess_bulk, ess_tail : float
         NaN where undefined (chains that never moved, say).
+    region : str
+        Its place in words; empty where it has none.
     """
 
     variable: str
@@ -40,6 +44,7 @@ class Estimand(NamedTuple):
     rhat: float
     ess_bulk: float
     ess_tail: float
+    region: str = ""
 
     @property
     def badness(self) -> float:
@@ -78,10 +83,16 @@ def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[E
         spread = draws.max(("chain", "draw")) - draws.min(("chain", "draw"))
         sampled |= spread.transpose(*dims).to_numpy() > 0
     naming = _Naming(name, mesh, *_coordinates(draws, dims))
-    return [
-        Estimand(name, index, naming.name(index), naming.place(index), *(float(value) for value in figures[index]))
-        for index in map(tuple, np.argwhere(sampled).tolist())
-    ]
+    indices = [tuple(index) for index in np.argwhere(sampled).tolist()]
+    places = [naming.place(index) for index in indices]
+    known = [place for place in places if place is not None]
+    words = iter(regions(mesh, np.array(known).reshape(-1, 3)))
+    where = ["" if place is None else next(words) for place in places]
+    found = []
+    for index, place, region in zip(indices, places, where, strict=True):
+        rhat, bulk, tail = (float(value) for value in figures[index])
+        found.append(Estimand(name, index, naming.name(index), place, rhat, bulk, tail, region))
+    return found
 
 
 def _coordinates(draws: xr.DataArray, dims: list) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -136,6 +147,11 @@ def draws_of(posterior: xr.Dataset, entry: Estimand, max_draws: int) -> np.ndarr
     stride = max(1, draws.sizes["draw"] // max_draws)
     chosen = draws.isel({"draw": slice(None, None, stride), **dict(zip(dims, entry.position, strict=True))})
     return np.asarray(chosen.transpose("chain", "draw").to_numpy(), float)
+
+
+def sampled_temperatures(posterior: xr.Dataset) -> list[str]:
+    """Names of the temperatures that vary over the draws."""
+    return [name for name in TEMPERATURES if name in posterior and np.ptp(posterior[name].to_numpy()) > 0]
 
 
 class Group(NamedTuple):

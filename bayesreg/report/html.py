@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,37 @@ from bayesreg import __version__
 from bayesreg.inference.diagnostics import dataset
 from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Run
-from bayesreg.report import anatomy, convergence, marginals, tables
-from bayesreg.report.estimands import Diagnosed, estimands
+from bayesreg.report import (
+    adequacy,
+    anatomy,
+    convergence,
+    identifiability,
+    marginals,
+    modes,
+    tables,
+    uncertainty,
+)
+from bayesreg.report.estimands import Diagnosed, Estimand, estimands
 from bayesreg.report.metrics import compute_metrics
+from bayesreg.report.modes import Grouping, grouping
 from bayesreg.report.panels import View
-from bayesreg.report.verdict import duration, key_facts, part, threshold_of, verdict, warnings_of
+from bayesreg.report.verdict import (
+    Verdict,
+    approximation,
+    duration,
+    key_facts,
+    part,
+    threshold_of,
+    verdict,
+    warnings_of,
+)
 
 SECTIONS = (
     ("accuracy", "Registration"),
+    ("trust", "Uncertainty"),
+    ("groups", "Chains that disagree"),
     ("stiffnesses", "Stiffness"),
+    ("fit", "Fit"),
     ("one-node", "One node"),
     ("convergence", "Convergence"),
     ("model", "Model"),
@@ -62,11 +84,18 @@ def write_report(
     diagnosed = Diagnosed(rhat, ess_bulk, ess_tail)
     entries = estimands(run.mesh, diagnosed, posterior)
     metrics = {"This run": known} if (known := metrics_of(run, posterior)) else {}
-    view = View.of(run)
+    view, predicted, groups = View.of(run), run.predicted, grouping(posterior)
+    apart = groups.groups > 1
+    left_out = {key for key, shown in (("groups", apart), ("trust", predicted), ("fit", predicted)) if not shown}
     drawings = [
         *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
+        uncertainty.maps(view, predicted) if predicted else None,
+        uncertainty.landmarks(view, predicted) if predicted else None,
+        modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
         anatomy.element_stiffness(view, posterior),
+        marginals.temperatures(run, posterior),
+        adequacy.residual(view),
         marginals.skull_node(run, posterior),
         convergence.traces(posterior, sample_stats, entries),
         convergence.distributions(run.mesh, entries, posterior["node"].to_numpy(), threshold_of(run.manifest)),
@@ -74,18 +103,35 @@ def write_report(
     content = {
         "title": name_of(run),
         "subtitle": _subtitle(run, posterior),
-        "sections": SECTIONS,
-        "verdict": verdict(run.manifest, entries),
+        "sections": [(key, name) for key, name in SECTIONS if key not in left_out],
+        "approximation": approximation(run.manifest),
+        "verdict": _judged(run.manifest, entries, groups),
         "facts": key_facts(run.manifest, entries, posterior),
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
         "error_tables": error_tables(metrics, run.mesh.names),
+        "landmarks": uncertainty.landmark_table(view, predicted) if predicted else None,
+        "groups": modes.explanation(groups) if apart else "",
+        "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
+        "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),
+        "ratios": identifiability.ratio_table(run.mesh, posterior),
+        "widths": identifiability.width_table(run.mesh, posterior, diagnosed, run.manifest),
         "parameters": tables.parameter_table(run, posterior, diagnosed),
+        "checks": adequacy.check_table(predicted) if predicted else None,
         "worst": tables.worst_table(entries),
         "provenance": provenance(run.manifest),
         "config": run.config,
     }
     write_text(path, render("template.html", content))
+
+
+def _judged(manifest: Mapping[str, Any], entries: Sequence[Estimand], groups: Grouping) -> Verdict:
+    """The verdict, with a word on chains that lie apart."""
+    judged = verdict(manifest, entries)
+    if groups.groups == 1:
+        return judged
+    apart = f" The chains lie in {groups.groups} groups, each shown by itself under “Chains that disagree”."
+    return judged._replace(detail=(judged.detail + apart).strip())
 
 
 def render(template: str, content: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,15 +10,16 @@ import xarray as xr
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
+from scipy import stats
 
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
 from bayesreg.io.store import Run, Truth
 from bayesreg.report import panels, style
-from bayesreg.report.estimands import Group, parameter_groups
+from bayesreg.report.estimands import SYMBOLS, Group, parameter_groups, sampled_temperatures
 from bayesreg.report.slices import COORDINATES, IN_PLANE, Plane, sample
 from bayesreg.report.style import Drawing
-from bayesreg.report.verdict import number, place_text
+from bayesreg.report.verdict import number, part, place_text
 
 BINS = 32
 REACH = 6.0
@@ -92,9 +93,9 @@ def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: Sequence[Mark],
     logarithmic = bool(ratio and low > 0 and high > LOG_SPAN * low)
     edges = _edges(finite, logarithmic)
     axes.set_xscale("log" if logarithmic else "linear")
-    axes.stairs(_density(finite, edges), edges, fill=True, color=colour, alpha=0.45, lw=0)
+    axes.stairs(_density(finite, edges, logarithmic), edges, fill=True, color=colour, alpha=0.45, lw=0)
     for chain, line in zip(draws, style.chain_colours(len(draws)), strict=True):
-        axes.stairs(_density(chain[np.isfinite(chain)], edges), edges, color=line, lw=0.7, alpha=0.85)
+        axes.stairs(_density(chain[np.isfinite(chain)], edges, logarithmic), edges, color=line, lw=0.7, alpha=0.85)
     base = -0.05 * axes.get_ylim()[1]
     axes.plot([low, high], [base, base], color=colour, lw=3, solid_capstyle="butt")
     axes.plot([median], [base], "o", mfc="white", mec=colour, ms=5)
@@ -122,8 +123,9 @@ def _point_out(axes: Axes, edges: np.ndarray, marks: Sequence[Mark], logarithmic
             axes.text(0.0 if below else 1.0, 0.98 - 0.09 * index, text, **place)
 
 
-def _density(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    return np.histogram(values, edges)[0] / max(1, values.size) / np.diff(edges)
+def _density(values: np.ndarray, edges: np.ndarray, logarithmic: bool) -> np.ndarray:
+    """Per unit of the axis that is drawn, so that areas are probabilities to the eye."""
+    return np.histogram(values, edges)[0] / max(1, values.size) / np.diff(np.log(edges) if logarithmic else edges)
 
 
 def _edges(values: np.ndarray, logarithmic: bool) -> np.ndarray:
@@ -144,6 +146,42 @@ def _true_ratios(run: Run, name: str) -> dict[str, float]:
         return {}
     ratios = dict(zip(run.mesh.names, np.asarray(run.truth.lam) / np.asarray(run.truth.mu), strict=True))
     return {key: float(ratio) for key, ratio in ratios.items() if name in (key, "uniform")}
+
+
+def temperatures(run: Run, posterior: xr.Dataset) -> Drawing | None:
+    """Trace and marginal of every sampled temperature with its prior; None where none is sampled."""
+    sampled = sampled_temperatures(posterior)
+    if not sampled:
+        return None
+    with style.look():
+        figure = style.new_figure(1.9 * len(sampled) + 0.2)
+        axes = figure.subplots(len(sampled), 2, width_ratios=[2, 1], squeeze=False)
+        for (left, right), name in zip(axes, sampled, strict=True):
+            draws = np.asarray(posterior[name].transpose("chain", "draw").to_numpy(), float)
+            for chain, colour in zip(draws, style.chain_colours(len(draws)), strict=True):
+                left.plot(chain, color=colour, lw=0.6, alpha=0.85)
+            left.set(xlim=(0, max(1, draws.shape[1] - 1)), xlabel="draw", ylabel=f"${SYMBOLS[name]}$")
+            histogram(right, draws, style.UNIFORM, [])
+            _prior_line(right, part(run.manifest, "model", name))
+            right.set_xlabel(f"${SYMBOLS[name]}$")
+        uri = style.data_uri(figure)
+    caption = (
+        "Temperatures that were sampled with the rest. Left: every chain over its kept draws. Right: all chains "
+        "together (filled) and each by itself, with median and 95 % interval; dashed: the log-normal prior."
+    )
+    alt = "Traces and histograms of " + " and ".join(SYMBOLS[name] for name in sampled) + "."
+    return Drawing("temperatures", "Temperatures", caption, alt, uri)
+
+
+def _prior_line(axes: Axes, prior: Any) -> None:
+    """Density of a log-normal prior over the range that is shown."""
+    if not isinstance(prior, Mapping):
+        return
+    low, high = axes.get_xlim()
+    x = np.linspace(max(low, 1e-9 * high), high, 300)
+    density = stats.lognorm.pdf(x, float(prior["log_sd"]), scale=float(prior["median"]))
+    axes.plot(x, density, color=style.ACCENT, ls=(0, (4, 2)), lw=1.1)
+    axes.set_xlim(low, high)
 
 
 class SkullNode(NamedTuple):

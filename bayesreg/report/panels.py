@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize, to_rgb
-from matplotlib.figure import Figure
+from matplotlib.figure import FigureBase
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from scipy import ndimage
 
 from bayesreg.image import Image
@@ -173,7 +173,7 @@ def grey_limits(run: Run) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-9))
 
 
-def colourbar(figure: Figure, drawn: ScalarMappable, axes: Axes | Sequence[Axes], label: str, **place: Any) -> None:
+def colourbar(figure: FigureBase, drawn: ScalarMappable, axes: Axes | Sequence[Axes], label: str, **place: Any) -> None:
     """A slim colour bar with its unit."""
     settings: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "aspect": 28, "shrink": 0.94} | place
     bar = figure.colorbar(drawn, ax=axes, **settings)
@@ -183,7 +183,7 @@ def colourbar(figure: Figure, drawn: ScalarMappable, axes: Axes | Sequence[Axes]
         bar.locator, bar.minorlocator = LogLocator(subs=(1, 2, 5)), NullLocator()
         bar.formatter = FuncFormatter(lambda value, _: f"{value:.3g}")
     else:
-        bar.locator = MaxNLocator(5)
+        bar.locator = FixedLocator(place["ticks"]) if "ticks" in place else MaxNLocator(5)
     bar.update_ticks()
     bar.set_label(label, fontsize=8)
 

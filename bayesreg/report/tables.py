@@ -144,11 +144,12 @@ def _truth(run: Run, name: str) -> dict[str, float]:
 
 
 def worst_table(entries: Sequence[Estimand]) -> Table:
-    """The estimands of the greatest R-hat, with their places."""
+    """The estimands of the greatest R-hat, with their places in numbers and in words."""
     rows = [
         [
             entry.name,
             place_text(entry.place) if entry.place else NONE,
+            entry.region or NONE,
             rhat_text(entry.rhat),
             number(entry.ess_bulk),
             number(entry.ess_tail),
@@ -156,4 +157,5 @@ def worst_table(entries: Sequence[Estimand]) -> Table:
         for entry in worst(entries, WORST_SHOWN)
     ]
     caption = f"The {len(rows)} of {len(entries):,} estimands whose chains agree least."
-    return Table("Worst estimands", caption, ["", "Place (x, y, z)", "R̂", "ESS bulk", "ESS tail"], [("", rows)])
+    header = ["", "Place (x, y, z)", "Where", "R̂", "ESS bulk", "ESS tail"]
+    return Table("Worst estimands", caption, header, [("", rows)])

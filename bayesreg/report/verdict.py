@@ -134,7 +134,7 @@ def rhat_text(rhat: float) -> str:
 
 
 def _at(entry: Estimand) -> str:
-    return f" at {place_text(entry.place)}" if entry.place else ""
+    return f" at {place_text(entry.place)}" + (f", {entry.region}" if entry.region else "") if entry.place else ""
 
 
 def place_text(place: tuple[float, float, float]) -> str:
@@ -197,26 +197,33 @@ def _count(value: float | int | None) -> str:
     return NONE if value is None else f"{int(value):,}"
 
 
+def approximation(manifest: Mapping[str, Any]) -> str:
+    """What a reader of an approximate run must know first; empty where the sampler is exact."""
+    if part(manifest, "exact") is not False:
+        return ""
+    sampler = part(manifest, "sampler", "name")
+    return (
+        f"The draws come from {sampler or 'an approximate sampler'}, which stands in for the posterior of the model: "
+        "even with endless draws it would not give exactly that posterior. Intervals may be too narrow or too wide, "
+        "and other modes may be missed. Chains that agree, below, show that the draws are many enough, not that they "
+        "are right. Sample with an exact sampler before anything is decided by these figures."
+    )
+
+
 def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
     """What to beware of, beyond convergence: the manifest's own warnings, then those that its numbers call for.
 
     Parameters
     ----------
     manifest : mapping
-        Of which `warnings`, `exact`, `solver`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
+        Of which `warnings`, `solver`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
     mesh : TetMesh
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.
     """
     found = list(part(manifest, "warnings") or [])
-    found += _approximate(manifest) + _solver(manifest) + _noise(manifest) + _locking(mesh, posterior)
+    found += _solver(manifest) + _noise(manifest) + _locking(mesh, posterior)
     return list(dict.fromkeys(found))
-
-
-def _approximate(manifest: Mapping[str, Any]) -> list[str]:
-    if part(manifest, "exact") is not False:
-        return []
-    return ["The sampler is approximate: even with endless draws it would not give exactly the posterior of the model."]
 
 
 def _solver(manifest: Mapping[str, Any]) -> list[str]:

@@ -6,7 +6,7 @@ import pytest
 
 from bayesreg.image import Image
 from bayesreg.io import store
-from bayesreg.io.store import Inputs, Run, Truth
+from bayesreg.io.store import Inputs, Predicted, Run, Truth
 from tests.phantoms import ball_mesh, rotated_affine
 
 
@@ -63,6 +63,15 @@ def test_a_run_comes_back_as_it_was_written(run, tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
+def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
+    arrays = {name: np.arange(k + 2.0) for k, name in enumerate(Predicted._fields)}
+    names = {"landmark_names": np.array(["third ventricle", "λ"]), "discrepancies": np.array(["sd"])}
+    write(tmp_path, replace(run, predicted=Predicted(**arrays | names)))
+    back = store.read_run(tmp_path).predicted
+    assert list(back.landmark_names) == ["third ventricle", "λ"]
+    np.testing.assert_array_equal(back.reach, arrays["reach"])
+
+
 def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
     run = replace(run, truth=None, skull=None, metrics=None)
     write(tmp_path, run)
@@ -71,6 +80,7 @@ def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
     assert back.truth is None
     assert back.skull is None
     assert back.metrics is None
+    assert back.predicted is None
 
 
 def test_a_truth_without_a_start_comes_back_without(run, tmp_path):

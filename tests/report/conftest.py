@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.io.store import Run, Truth
+from bayesreg.io.store import Predicted, Run, Truth
 from bayesreg.mesh import TetMesh
 from bayesreg.report.metrics import compute_metrics
 from tests.phantoms import ball_mesh, rotated_affine
@@ -140,6 +140,7 @@ def make_study(
         u_sd=spread * (0.5, 0.6, 0.4),
         truth=truth,
         metrics=compute_metrics(mesh, u_mean, truth, posterior),
+        predicted=make_predicted(rng, mesh, u_mean, chains),
         **phantom_images(mesh, shape, rng),
     )
     stats = sample_stats(rng, chains, draws, memory)
@@ -163,6 +164,27 @@ def make_posterior(rng: np.random.Generator, mesh: TetMesh, u: np.ndarray, memor
             "ratio": (dims, lam / mu),
         },
         coords={"node": mesh.boundary, "axis": list("xyz"), "tissue": ["uniform"] if uniform else list(NAMES)},
+    )
+
+
+def make_predicted(rng: np.random.Generator, mesh: TetMesh, u_mean: np.ndarray, chains: int) -> Predicted:
+    """Two landmarks with a covariance of known axes; P(> 2 mm) that rises with x; residuals of sd 1.3."""
+    nodes = [int(np.linalg.norm(u_mean, axis=1).argmax()), int(mesh.interior[0])]
+    spread = rng.normal(size=(chains, 100, 2, 3)) * (0.9, 0.3, 0.1)
+    observed = rng.normal((1.3, 4.0, 0.0), (0.01, 0.2, 0.05), (chains, 100, 3))
+    return Predicted(
+        chain_mean=np.stack([u_mean] * chains),
+        far_mm=np.array(2.0),
+        far=np.clip((mesh.points[:, 0] - CENTRE[0]) / RADII[0], 0, 1),
+        reach=np.full(len(u_mean), 1.25),
+        landmark_names=np.array(["ventricle", "tip <b>"]),
+        landmark_points=mesh.points[nodes],
+        landmark_draws=u_mean[nodes] + spread,
+        residual=1.3 * rng.normal(size=4 * len(mesh.cells)),
+        residual_tissue=np.repeat(mesh.tissue, 4),
+        discrepancies=np.array(["sd", "greatest", "neighbours"]),
+        observed=observed,
+        replicated=rng.normal((1.0, 4.0, 0.0), (0.01, 0.2, 0.05), (chains, 100, 3)),
     )
 
 

@@ -62,3 +62,10 @@ def test_unequal_pairs_and_meshes_are_told(tmp_path, study):
 def test_one_run_is_no_comparison(tmp_path, study):
     with pytest.raises(ValueError, match="two or more runs, got 1"):
         write_comparison([study], tmp_path / "compare.html")
+
+
+def test_an_approximate_run_is_told_by_name(tmp_path, study, other):
+    run = replace(other.run, manifest=other.run.manifest | {"exact": False, "sampler": {"name": "laplace"}})
+    found = compare(tmp_path, [study, other._replace(run=run)])
+    assert "Uniform is approximate. The draws come from laplace" in found.text
+    assert "By tissue is approximate" not in found.text

@@ -1,5 +1,6 @@
 import base64
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -136,3 +137,30 @@ def test_many_chains_have_many_colours():
     assert len(set(style.chain_colours(16))) == 16
     assert len(set(style.tissue_colours(["csf", "gm", "wm", "tumour", "oedema"]))) == 5
     assert style.tissue_colours(["WM", "tumour"])[0] == style.tissue_colours(["csf", "gm", "wm"])[2]
+
+
+def test_areas_on_a_logarithmic_axis_are_shares_of_the_draws():
+    draws = np.random.default_rng(0).lognormal(1.0, 2.0, size=(3, 4000))
+    axes = Figure().subplots()
+    marginals.histogram(axes, draws, "grey", [], ratio=True)
+    values, edges, _ = axes.patches[0].get_data()
+    assert (values * np.diff(np.log(edges))).sum() == pytest.approx(1, abs=0.01)
+    # Log-normal draws are Normal to the eye: the peak stands over the median.
+    peak = edges[values.argmax() : values.argmax() + 2].mean()
+    assert abs(np.log(peak) - 1.0) < 1.0
+
+
+def test_sampled_temperatures_are_drawn_with_their_prior(study):
+    posterior = study.idata.posterior
+    assert marginals.temperatures(study.run, posterior) is None
+    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    hot = np.random.default_rng(0).lognormal(np.log(0.05), 0.1, size=(chains, draws))
+    fixed = posterior.assign(t_similarity=(("chain", "draw"), np.full((chains, draws), 0.05)))
+    assert marginals.temperatures(study.run, fixed) is None
+    sampled = posterior.assign(t_similarity=(("chain", "draw"), hot))
+    plain = marginals.temperatures(study.run, sampled)
+    model = study.run.manifest["model"] | {"t_similarity": {"median": 0.05, "log_sd": 0.3}}
+    run = replace(study.run, manifest=study.run.manifest | {"model": model})
+    assert np.abs(pixels(marginals.temperatures(run, sampled)) - pixels(plain)).max() > 0.2
+    assert "T_s" in plain.alt
+    assert "T_r" not in plain.alt

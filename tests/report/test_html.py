@@ -10,8 +10,10 @@ from matplotlib import image
 
 from bayesreg.report import style
 from bayesreg.report.html import write_report
+from bayesreg.report.places import regions
 
 FIGURES = {"registration", "data", "result", "displacement", "stiffness", "node", "traces", "distributions"}
+FORWARD = {"uncertainty", "landmarks", "residual"}
 
 
 class Page(HTMLParser):
@@ -66,15 +68,16 @@ def full(tmp_path_factory, study):
 
 @pytest.fixture(scope="module")
 def clinical(tmp_path_factory, uniform_study):
-    """Uniform parameters, not converged, no truth, no skull, and a name that is no markup."""
+    """Uniform parameters, not converged, no truth, no skull, nothing predicted, and a name that is no markup."""
     run = uniform_study.run
     manifest = run.manifest | {"name": '<script>alert("x")</script> & Ω', "warnings": ["beware of <i>this</i>"]}
     run = replace(run, manifest=manifest, config="a: </pre><b>bold</b>\n", truth=None, skull=None, metrics=None)
+    run = replace(run, predicted=None)
     return page(tmp_path_factory.mktemp("clinical"), uniform_study._replace(run=run))
 
 
 def test_every_figure_is_drawn_and_embedded(full):
-    assert set(full.figures) == FIGURES
+    assert set(full.figures) == FIGURES | FORWARD
     for key, uri in full.figures.items():
         kind, content = re.fullmatch(r"data:image/(png|svg\+xml);base64,(.+)", uri).groups()
         content = base64.b64decode(content)
@@ -128,7 +131,7 @@ def test_parameters_with_intervals_truth_and_what_is_fixed(full, study):
     wm = full.named("λ/μ")[2]
     assert wm[1] == f"{float(ratio.median()):.1f}"
     assert wm[3] == "30.0"
-    assert full.named("μ")[1][2] == "fixed"
+    assert full.named("μ")[-2][2] == "fixed"
 
 
 def test_the_worst_estimands_are_named_with_their_place(full, study):
@@ -137,7 +140,8 @@ def test_the_worst_estimands_are_named_with_their_place(full, study):
     x, y, z = study.run.mesh.points[int(rhat["node"][node])].round().astype(int)
     row = full.row(f"u{'xyz'[axis]} of node {int(rhat['node'][node])}")
     assert row[0] == f"({x}, {y}, {z}) mm".replace("-", "−")
-    assert row[1] == f"{float(rhat.max()):.3f}"
+    assert row[1] == regions(study.run.mesh, study.run.mesh.points[[int(rhat["node"][node])]])[0]
+    assert row[2] == f"{float(rhat.max()):.3f}"
 
 
 def test_verdict_warnings_settings_and_convention_are_told(full):
@@ -167,3 +171,47 @@ def test_chains_that_did_not_converge_are_called_so(clinical):
     assert "Not converged: R̂ is 1.01 or more for" in clinical.text
     assert "It stopped because the budget of 5 min was spent." in clinical.text
     assert "parameters uniform" in clinical.text
+
+
+def test_landmarks_are_listed_with_their_region_and_name_as_text(full, study):
+    predicted = study.run.predicted
+    row = full.row("tip <b>")
+    draws = predicted.landmark_draws[:, :, 1].reshape(-1, 3)
+    assert row[2] == ", ".join(f"{x:.1f}" for x in draws.mean(axis=0)).replace("-", "−")
+    # The draws are Normal with these sds: the radius of 95 % is the root of a chi-square quantile.
+    expected = np.sqrt(7.815) * np.array([0.9, 0.3, 0.1])
+    np.testing.assert_allclose([float(x) for x in row[4].split(" × ")], expected, rtol=0.15)
+
+
+def test_the_checks_name_what_the_model_does_not_explain(full):
+    sd = full.row("sd of the residual")
+    assert sd[0].startswith("1.30 (")
+    assert sd[2:] == ["p < 0.0033", "too much"]
+    assert full.row("greatest |residual|")[3] == "as the model has it"
+
+
+def test_a_page_without_predictions_and_with_one_group_of_chains_lacks_those_sections(full, clinical):
+    assert "Does the model fit" not in clinical.text
+    assert "Landmarks" not in clinical.text
+    assert "Chains that disagree" not in full.text
+    assert "#groups" not in full.links
+    assert "#fit" in full.links
+    assert "#fit" not in clinical.links
+
+
+def test_separate_chains_and_an_approximate_sampler_are_told_first(tmp_path, study):
+    """Chain 3 five standard deviations apart in all of one side, and draws of an approximation."""
+    posterior = study.idata.posterior.copy(deep=True)
+    right = study.run.mesh.points[posterior["node"].to_numpy()][:, 0] > 20
+    posterior["u_boundary"][2, :, right, 1] += 5.0
+    shifted = np.zeros((3, *study.run.u_mean.shape))
+    shifted[2, study.run.mesh.points[:, 0] > 20, 1] = 5.0
+    predicted = study.run.predicted._replace(chain_mean=study.run.u_mean + shifted)
+    manifest = study.run.manifest | {"exact": False, "sampler": {"name": "laplace"}}
+    run = replace(study.run, predicted=predicted, manifest=manifest)
+    found = page(tmp_path, study._replace(run=run, idata=study.idata._replace(posterior=posterior)))
+    assert "group 1: chains 1, 2; group 2: chain 3" in found.text
+    assert "several modes" in found.text
+    assert "The chains lie in 2 groups, each shown by itself" in found.text
+    assert set(found.figures) == FIGURES | FORWARD | {"modes"}
+    assert found.text.index("Approximate: a quick look") < found.text.index("Converged")

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from bayesreg.report.estimands import Estimand
-from bayesreg.report.verdict import duration, fixed, key_facts, number, percent, verdict, warnings_of
+from bayesreg.report.verdict import approximation, duration, fixed, key_facts, number, percent, verdict, warnings_of
 from tests.phantoms import box_mesh
 
 
@@ -119,14 +119,25 @@ def test_locking_names_the_tissue_and_poissons_ratio():
     assert warnings_of({}, box_mesh(), elastic([30.0], [1.0]))[0].startswith("Poisson’s ratio of uniform")
 
 
-def test_failed_solves_and_approximation_are_warned_of_and_nothing_is_said_twice():
-    manifest = {"solver": {"failed": 3}, "exact": False, "warnings": ["The mesh is coarse."]}
+def test_failed_solves_are_warned_of_and_nothing_is_said_twice():
+    manifest = {"solver": {"failed": 3}, "warnings": ["The mesh is coarse."]}
     quiet = elastic([1.0] * 3, [1.0] * 3)
     first = warnings_of(manifest, box_mesh(), quiet)
     assert first[0] == "The mesh is coarse."
     assert any(text.startswith("3 elastic solves failed") for text in first)
-    assert any("approximate" in text for text in first)
     assert warnings_of(manifest | {"warnings": first}, box_mesh(), quiet) == first
+
+
+def test_only_an_approximate_sampler_is_called_so():
+    text = approximation({"exact": False, "sampler": {"name": "laplace"}})
+    assert "laplace" in text
+    assert "too narrow or too wide" in text
+    assert approximation({"exact": True}) == approximation({}) == ""
+
+
+def test_the_worst_estimand_is_named_with_its_region():
+    found = verdict(stopped(), [entry(1.3)._replace(region="left posterior, GM")])
+    assert "u_x of node 7 at (1, −20, 3) mm, left posterior, GM" in found.headline
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,72 @@
+import numpy as np
+import xarray as xr
+
+from bayesreg.report import modes
+from bayesreg.report.modes import difference_table, explanation, group_means, grouping
+from tests.phantoms import box_mesh
+
+MESH = box_mesh(2)
+NODES = MESH.boundary
+
+
+def posterior_of(offsets: list[float], drift: float = 0.0, seed: int = 0) -> xr.Dataset:
+    """Independent draws of sd 0.2 about 0; in five nodes along z about an offset for each chain, in mm."""
+    rng = np.random.default_rng(seed)
+    u = 0.2 * rng.normal(size=(len(offsets), 80, len(NODES), 3))
+    u[:, :, 3:8, 2] += np.asarray(offsets)[:, None, None]
+    u += drift * np.linspace(-0.5, 0.5, 80)[:, None, None]
+    lam = 5 + rng.normal(size=(len(offsets), 80, 3))
+    dims = ("chain", "draw", "node", "axis")
+    return xr.Dataset({"u_boundary": (dims, u), "lam": (("chain", "draw", "tissue"), lam)}, coords={"node": NODES})
+
+
+def test_chains_about_one_place_are_one_group():
+    found = grouping(posterior_of([0.0, 0.1, -0.1, 0.0]))
+    assert found.groups == 1
+    assert not found.drifting.any()
+
+
+def test_chains_apart_are_groups_in_the_order_of_their_first():
+    found = grouping(posterior_of([2.0, 0.0, 2.1, 0.0]))
+    np.testing.assert_array_equal(found.label, [0, 1, 0, 1])
+    text = explanation(found)
+    assert "group 1: chains 1, 3; group 2: chains 2, 4" in text
+    assert "several modes" in text
+    np.testing.assert_array_equal(group_means(np.array([1.0, 2.0, 3.0, 4.0]), found), [2, 3])
+
+
+def test_one_estimand_alone_does_not_part_chains():
+    posterior = posterior_of([0.0, 0.0])
+    posterior["lam"][1, :, 0] += 50
+    assert grouping(posterior).groups == 1
+
+
+def test_chains_on_their_way_are_not_called_modes():
+    found = grouping(posterior_of([0.0, 9.0], drift=4.0))
+    assert found.drifting.all()
+    assert "have not arrived yet" in explanation(found)
+    assert "several modes" not in explanation(found)
+
+
+def test_chains_that_stand_still_are_apart_only_where_they_differ():
+    posterior = posterior_of([0.0, 0.0])
+    still = posterior.isel(draw=[0] * 10).isel(chain=[0, 0])
+    assert grouping(still).groups == 1
+    still["u_boundary"][1] += 1e-6
+    assert grouping(still).groups == 2
+
+
+def test_the_differences_are_named_with_place_and_group_means():
+    posterior = posterior_of([2.0, 0.0, 2.0])
+    ((_, rows),) = difference_table(MESH, posterior, grouping(posterior)).groups
+    assert {row[0] for row in rows[:5]} == {f"u_z of node {node}" for node in NODES[3:8]}
+    means = posterior["u_boundary"].sel(node=int(rows[0][0].split()[-1])).isel(axis=2).mean("draw").to_numpy()
+    assert rows[0][3:5] == [f"{means[[0, 2]].mean():.2f}", f"{means[1]:.2f}".replace("-", "−")]
+    assert 8 < float(rows[0][5]) < 12
+
+
+def test_many_draws_are_thinned_and_grouped_the_same(monkeypatch):
+    posterior = posterior_of([2.0, 0.0, 2.1, 0.0])
+    monkeypatch.setattr(modes, "MOST_VALUES", posterior["u_boundary"].size // 4)
+    np.testing.assert_array_equal(grouping(posterior).label, [0, 1, 0, 1])
+    assert modes._values(posterior).shape[1] == 20

@@ -1,0 +1,170 @@
+"""What is computed of the draws at the end of a run, against plain loops over them."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import bayesreg as br
+from bayesreg.inference.predictive import predictive_p
+from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
+from bayesreg.prediction import default_landmarks, predict, require_inside
+from tests.phantoms import box_mesh, smooth_image
+
+MESH = box_mesh(3)
+LANDMARKS = {"corner": tuple(MESH.points[0]), "within": (9.0, 11.0, 8.0)}
+
+
+@cache
+def problem() -> tuple[br.Posterior, xr.Dataset, np.ndarray]:
+    """A posterior whose fixed image is the moving one, moved and with the noise of the model; draws near the truth."""
+    rng = np.random.default_rng(0)
+    moving = smooth_image(MESH.points, seed=2, blur=3.0)
+    posterior = br.build_posterior(moving, moving, MESH, br.ModelConfig(t_similarity=0.05))
+    truth = {name: np.array(value) for name, value in posterior.reference().items()}
+    truth["u_boundary"] += 0.5 * np.sin(MESH.points[posterior.sampled] / 6)
+    u = np.asarray(posterior.evaluate(truth).u)
+    weights = np.asarray(posterior.data.quadrature.weights)
+    noise = np.sqrt(0.05 / (2 * weights)) * rng.normal(size=len(weights))
+    shown = posterior.data.fixed_values - posterior.residuals(u) + noise
+    posterior = replace(posterior, data=posterior.data._replace(fixed_values=shown))
+    draws = {name: np.broadcast_to(value, (3, 12, *value.shape)) for name, value in truth.items()}
+    draws["u_boundary"] = draws["u_boundary"] + 0.02 * rng.normal(size=draws["u_boundary"].shape)
+    draws["u_boundary"][2, :6] += 2.5
+    dims = {"u_boundary": ["node", "axis"], "lam": ["tissue"], "mu": ["tissue"]}
+    dataset = xr.Dataset({name: (["chain", "draw", *dims[name]], values) for name, values in draws.items()})
+    return posterior, dataset, u
+
+
+@cache
+def everywhere() -> np.ndarray:
+    """u of every node, (chain, draw, n, 3), one draw at a time."""
+    posterior, draws, _ = problem()
+    one = [[draws.isel(chain=c, draw=d) for d in range(12)] for c in range(3)]
+    return np.array([[posterior.evaluate({n: x[n].to_numpy() for n in x}).u for x in chain] for chain in one])
+
+
+@cache
+def predicted():
+    posterior, draws, _ = problem()
+    mean, sd = everywhere().mean(axis=(0, 1)), everywhere().std(axis=(0, 1))
+    return predict(posterior, draws, mean, sd, LANDMARKS, seed=1)
+
+
+def test_maps_are_those_of_all_draws():
+    u, found = everywhere(), predicted()
+    distance = np.linalg.norm(u - u.mean(axis=(0, 1)), axis=-1)
+    np.testing.assert_allclose(found.chain_mean, u.mean(axis=1), atol=1e-6)
+    np.testing.assert_allclose(found.far, (distance > 2).mean(axis=(0, 1)))
+    np.testing.assert_allclose(found.reach, np.quantile(distance, 0.95, axis=(0, 1)), atol=1e-6)
+    assert found.far.min() > 0.1
+
+
+def test_landmarks_move_as_the_mesh_does():
+    found = predicted()
+    np.testing.assert_allclose(found.landmark_draws[:, :, 0], everywhere()[:, :, 0], atol=1e-6)
+    # The mesh as a function: any other way to interpolate on tetrahedra, here by volumes.
+    place = np.array(LANDMARKS["within"])
+    shares = np.array([_shares(MESH.points[cell], place) for cell in MESH.cells])
+    holding = int(np.argmax(shares.min(axis=1)))
+    expected = np.einsum("a,cdai->cdi", shares[holding], everywhere()[:, :, MESH.cells[holding]])
+    np.testing.assert_allclose(found.landmark_draws[:, :, 1], expected, atol=1e-6)
+    assert list(found.landmark_names) == ["corner", "within"]
+
+
+def _shares(corners: np.ndarray, place: np.ndarray) -> np.ndarray:
+    whole = np.linalg.det(corners[1:] - corners[0])
+    parts = []
+    for k in range(4):
+        moved = corners.copy()
+        moved[k] = place
+        parts.append(np.linalg.det(moved[1:] - moved[0]) / whole)
+    return np.array(parts)
+
+
+def test_noise_of_the_model_passes_the_checks():
+    found = predicted()
+    near = found.observed[:2], found.replicated[:2]
+    for k in range(len(DISCREPANCIES)):
+        assert 0.02 < predictive_p(near[0][..., k], near[1][..., k]) < 0.98, DISCREPANCIES[k]
+
+
+def test_a_wrong_displacement_fails_them():
+    found = predicted()
+    wrong = found.observed[2, :6], found.replicated[2, :6]
+    assert [predictive_p(wrong[0][..., k], wrong[1][..., k]) for k in (0, 2)] == [0.0, 0.0]
+
+
+def test_replications_differ_between_draws_and_follow_the_seed():
+    posterior, draws, _ = problem()
+    found = predicted()
+    assert len(np.unique(found.replicated[..., 0])) == 36
+    again = predict(posterior, draws, everywhere().mean(axis=(0, 1)), np.zeros((len(MESH.points), 3)), {}, seed=1)
+    np.testing.assert_array_equal(again.replicated, found.replicated)
+
+
+def test_the_residual_at_the_truth_is_standard_normal():
+    posterior, _, u = problem()
+    z = np.asarray(standardised_residual(posterior, u, 0.05))
+    assert z.std() == pytest.approx(1, abs=4 / np.sqrt(2 * len(z)))
+    np.testing.assert_allclose(standardised_residual(posterior, u, 0.2), z / 2, rtol=1e-12)
+
+
+def test_a_sampled_temperature_sets_the_unit_of_its_draw():
+    posterior, draws, _ = problem()
+    posterior = _Heated(**vars(posterior))
+    heated = draws.assign(t_similarity=(("chain", "draw"), np.full((3, 12), 0.2)))
+    mean = everywhere().mean(axis=(0, 1))
+    found = predict(posterior, heated, mean, mean, LANDMARKS, seed=1)
+    np.testing.assert_allclose(found.observed[..., :2], predicted().observed[..., :2] / 2, rtol=1e-6)
+    np.testing.assert_allclose(found.residual, predicted().residual / 2, rtol=1e-5)
+
+
+class _Heated(br.Posterior):
+    """A posterior in which T_s is sampled too, as far as `predict` can see."""
+
+    def reference(self):
+        return {**super().reference(), "t_similarity": np.array(0.05)}
+
+    def evaluate(self, values):
+        return super().evaluate({name: value for name, value in values.items() if name != "t_similarity"})
+
+
+def test_discrepancies_are_those_of_a_plain_loop():
+    rng = np.random.default_rng(3)
+    cells = np.sort(rng.integers(0, len(MESH.cells), 3 * len(MESH.cells)))
+    z = rng.normal(size=len(cells)) + 0.5 * np.sin(MESH.points[MESH.cells].mean(axis=1)[cells, 0])
+    sums = {c: z[cells == c].sum() / np.sqrt((cells == c).sum()) for c in np.unique(cells)}
+    pairs = [
+        (sums[a], sums[b])
+        for a in range(len(MESH.cells))
+        for b in range(a)
+        if len(set(MESH.cells[a]) & set(MESH.cells[b])) == 3 and a in sums and b in sums
+    ]
+    one, other = np.array(pairs).T
+    expected = [np.sqrt(np.mean(z**2)), max(abs(z)), (one * other).sum() / ((one**2 + other**2) / 2).sum()]
+    np.testing.assert_allclose(discrepancies(z, cells, MESH.neighbours, len(MESH.cells)), expected, rtol=1e-10)
+
+
+def test_a_landmark_outside_the_mesh_is_refused():
+    with pytest.raises(br.InputError, match=r"landmark 'far' at \[99.0, 0.0, 0.0\] mm lies outside the mesh"):
+        require_inside(MESH, LANDMARKS | {"far": (99.0, 0.0, 0.0)})
+    require_inside(MESH, LANDMARKS)
+    require_inside(MESH, {})
+
+
+def test_chosen_landmarks_are_where_their_names_say():
+    rng = np.random.default_rng(4)
+    u_mean, u_sd = rng.normal(size=(2, len(MESH.points), 3))
+    u_mean[7], u_sd[9] = 50, 50
+    found = default_landmarks(MESH, u_mean, u_sd)
+    assert found["largest shift"] == tuple(MESH.points[7])
+    assert found["largest sd"] == tuple(MESH.points[9])
+    low, high = MESH.points.min(axis=0), MESH.points.max(axis=0)
+    depth = np.minimum(MESH.points - low, high - MESH.points).min(axis=1)
+    place = np.array(found["deepest point"])
+    assert np.minimum(place - low, high - place).min() > 0.7 * depth.max()
+    require_inside(MESH, found)
+    assert [name for name in found if name.startswith("middle")] == ["middle of CSF", "middle of GM", "middle of WM"]
