@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.distance import signed_distance
+from bayesreg.fem.elasticity import rigid_modes
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import locate
@@ -223,13 +224,3 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
         raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
     weights = np.full(inside.sum(), fixed.voxel_volume)
     return Quadrature(jnp.asarray(cells[inside]), jnp.asarray(barycentric[inside]), jnp.asarray(weights))
-
-
-def rigid_modes(points: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "rows 6"]:
-    """Orthonormal basis of the translations and infinitesimal rotations of some points about their centroid."""
-    centred = points - points.mean(axis=0)
-    translations = np.tile(np.eye(3), (len(points), 1))
-    rotations = np.stack([np.cross(axis, centred).ravel() for axis in np.eye(3)], axis=1)
-    basis, triangle = np.linalg.qr(np.concatenate([translations, rotations], axis=1))
-    independent = np.abs(np.diag(triangle)) > 1e-9 * np.abs(triangle).max()
-    return basis * independent
