@@ -11,6 +11,7 @@ from bayesreg.types import InputError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SMALL = "data: {source: mni152}\nsimulate: {kind: paper}\n"
+PROPER = "model: {normalised: true, priors: {lam: {csf: {high: 9}, gm: {high: 9}, wm: {high: 9}}, mu: {high: 9}}"
 FILES = """
 data:
   source: files
@@ -107,6 +108,15 @@ report: {landmarks: {left ventricle: [-12, 3.5, 20]}}
     assert "rhat: null" in resolved_yaml(config)
 
 
+@pytest.mark.parametrize(
+    "more", ["", ", t_elastic: {median: 200}", ", fixed: {}", ", held: {3: [0, 0, 0]}", ", similarity: student_t"]
+)
+def test_the_proper_density(write, more):
+    config = load_config(write(SMALL + PROPER + ", t_similarity: {median: 0.05, log_sd: 0.5}" + more + "}"))
+    assert (config.model.t_similarity.median, config.model.t_similarity.log_sd) == (0.05, 0.5)
+    assert load_config(write(resolved_yaml(config), "resolved.yaml")) == config
+
+
 def test_numbers_and_words_are_read_as_in_yaml_1_2(write):
     config = load_config(write(SMALL + "mesh: {edge_length: 2e1, envelope: 1e-3}\ndescription: no\n"))
     assert (config.mesh.edge_length, config.mesh.envelope, config.description) == (20.0, 0.001, "no")
@@ -189,6 +199,26 @@ start: {field: truth}
         (SMALL.replace("paper", "paper, direction: [0, 0, 0]"), "simulate.direction = [0, 0, 0]: expected a direction"),
         (SMALL.replace("paper", "paper, making_edge_length: 9"), "simulate.making_edge_length = 9: unknown key"),
         (SMALL.replace("paper", "calibrated, making_edge_length: 20"), "expected less than mesh.edge_length, 15.5 mm"),
+        (SMALL + "model: {t_similarity: hot}", 'model.t_similarity = "hot": expected a number or keys with values'),
+        (SMALL + "model: {t_similarity: {median: 0}}", "model.t_similarity.median = 0: expected greater than 0"),
+        (SMALL + "model: {t_elastic: {log_sd: 1}}", "model.t_elastic.median: missing"),
+        (SMALL + "model: {degrees_of_freedom: 2}", "model.degrees_of_freedom = 2: expected greater than 2"),
+        (
+            SMALL + "model: {t_elastic: {median: 9}}",
+            'model.t_elastic = {"median": 9}: a T_r with a prior needs normalis',
+        ),
+        (
+            SMALL + "model: {t_elastic: {median: 9}, normalised: true, fixed: {}}",
+            "model.fixed = {}: t_elastic has a pri",
+        ),
+        (SMALL + "model: {normalised: true}", "model.priors.lam: normalised: true needs a prior with a finite high"),
+        (SMALL + "model: {normalised: true, priors: {lam: {high: 9}}}", "model.priors.mu: normalised: true needs"),
+        (SMALL + PROPER.replace("csf: {high: 9}, ", "") + "}", "every free parameter, and lam of csf has none"),
+        (SMALL + PROPER + ", held: {3: [0, 0, 1]}}", "with normalised: true a node is held where it is"),
+        (
+            SMALL + PROPER + ", held: {3: [0, 0, 0]}, rigid_sd: 2}",
+            "model.rigid_sd = 2: with normalised: true",
+        ),
         ("extends: 3", "extends = 3: expected the path of a file"),
         ("extends: base.yaml", "base.yaml does not exist"),
         ("extends: run.yaml", "extends itself"),
@@ -265,4 +295,6 @@ def test_schema_describes_every_section_and_forbids_unknown_keys():
     found = schema()
     assert set(found["properties"]) == {*Config.model_fields, "extends"}
     assert found["additionalProperties"] is False
+    temperature = found["$defs"]["ModelConfig"]["properties"]["t_elastic"]["anyOf"]
+    assert {"$ref": "#/$defs/TemperaturePrior"} in temperature
     assert found["$defs"]["SamplerConfig"]["properties"]["sigma_u"]["description"].endswith("mm.")

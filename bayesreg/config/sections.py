@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationInfo, field_validator
-from pydantic_core import PydanticCustomError
 
 from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_field
 from bayesreg.model.options import ModelConfig, Vector
+from bayesreg.model.options import wrong as _wrong
 
 
 class Section(BaseModel):
@@ -241,6 +241,7 @@ class Config(Section):
                     raise _wrong(f"{key}.{parameter}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
         if not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
             raise _wrong("sampled", "expected at least three nodes, held ones included; fewer do not hold the mesh")
+        model.require_proper_priors(names)
         return model
 
     @field_validator("start")
@@ -263,8 +264,3 @@ class Config(Section):
         if sampler and stop.max_steps < 2 * sampler.thin:
             raise _wrong("max_steps", f"expected at least two kept draws, {2 * sampler.thin} steps")
         return stop
-
-
-def _wrong(key: str, message: str) -> PydanticCustomError:
-    """An error that belongs to one key of the section that the validator sees."""
-    return PydanticCustomError("wrong", "{message}", {"message": message, "key": key})

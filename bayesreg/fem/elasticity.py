@@ -81,6 +81,17 @@ def internal_force(
     return jnp.zeros_like(u).at[elements.cells].add(jnp.stack(force, axis=-1))
 
 
+def element_stiffness(
+    elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
+) -> Float[AnyArray, "4 3 4 3 cells"]:
+    """K_e = V BᵀCB of eq. (6), block (a, b): V (λ g_a g_bᵀ + μ (g_b g_aᵀ + (g_a · g_b) I))."""
+    gradients = elements.gradients
+    outer = gradients[:, :, None, None] * gradients
+    inner = (gradients[:, None] * gradients[None]).sum(axis=2)
+    shear = jnp.swapaxes(outer, 1, 3) + inner[:, None, :, None] * jnp.eye(3)[None, :, None, :, None]
+    return elements.volumes * (lam * outer + mu * shear)
+
+
 def stiffness_diagonal(elements: Elements, lam: AnyArray, mu: AnyArray, nodes: int) -> Float[AnyArray, "nodes 3"]:
     """diag K(λ, μ), one entry for each node and axis."""
     squares = elements.gradients**2
@@ -143,3 +154,13 @@ def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_ma
     rows, columns = np.repeat(degrees, 12, axis=1), np.tile(degrees, (1, 12))
     size = 3 * len(mesh.points)
     return scipy.sparse.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size))
+
+
+def rigid_modes(points: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "rows 6"]:
+    """Orthonormal basis of the translations and infinitesimal rotations of some points about their centroid."""
+    centred = points - points.mean(axis=0)
+    translations = np.tile(np.eye(3), (len(points), 1))
+    rotations = np.stack([np.cross(axis, centred).ravel() for axis in np.eye(3)], axis=1)
+    basis, triangle = np.linalg.qr(np.concatenate([translations, rotations], axis=1))
+    independent = np.abs(np.diag(triangle)) > 1e-9 * np.abs(triangle).max()
+    return basis * independent

@@ -22,6 +22,7 @@ STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
     "outside_support", "diverging",
 )  # fmt: skip
+TEMPERATURES = ("t_similarity", "t_elastic")
 _DIMS = {
     "u_boundary": ["node", "axis"],
     "lam": ["tissue"],
@@ -48,13 +49,15 @@ def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> An
     -------
     arviz.InferenceData or xarray.DataTree
         posterior: u_boundary (chain, draw, node, axis) in mm, lam, mu and ratio = λ/μ (chain, draw, tissue),
-        known entries included; sample_stats; constant_data.
+        known entries included, t_similarity and t_elastic (chain, draw) where they were sampled; sample_stats;
+        constant_data.
     """
     draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in blocks[0]}
     estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
     values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
     with np.errstate(divide="ignore", invalid="ignore"):
         values["ratio"] = values["lam"] / values["mu"]
+    values |= {name: estimands[name] for name in TEMPERATURES if name in estimands}
     groups: dict[str, Any] = {
         "posterior": values,
         "sample_stats": {name: draws[name] for name in STATISTICS},
@@ -96,8 +99,9 @@ class Convergence(NamedTuple):
 
 
 def convergence(idata: Any) -> Convergence:
-    """R̂ and effective sample sizes of every displacement, λ and μ; of few draws (below 4) all NaN."""
-    posterior = dataset(idata, "posterior")[["u_boundary", "lam", "mu"]]
+    """R̂ and effective sample sizes of every displacement, λ, μ and temperature; of few draws (below 4) all NaN."""
+    draws = dataset(idata, "posterior")
+    posterior = draws[["u_boundary", "lam", "mu", *(name for name in TEMPERATURES if name in draws)]]
     if posterior.sizes["draw"] < 4:
         nothing = xr.full_like(posterior.isel(chain=0, draw=0, drop=True), np.nan)
         return Convergence(nothing, nothing, nothing)

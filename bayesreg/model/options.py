@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
+from pydantic_core import PydanticCustomError
 
 Lame = Literal["lam", "mu"]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
+
+USUAL_TISSUES = ("csf", "gm", "wm")
 
 
 class PriorConfig(BaseModel):
@@ -43,6 +48,23 @@ class PriorConfig(BaseModel):
         return self
 
 
+class TemperaturePrior(BaseModel):
+    """Log-normal prior of a Boltzmann temperature.
+
+    Attributes
+    ----------
+    median : float
+        In the unit of the temperature, positive.
+    log_sd : float
+        Standard deviation of its natural logarithm, positive; 1 spans a factor of 50 with 95 %.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    median: Positive
+    log_sd: Positive = 1.0
+
+
 class ModelConfig(BaseModel):
     """The posterior to sample; the defaults are the paper's.
 
@@ -57,12 +79,18 @@ class ModelConfig(BaseModel):
     priors : mapping
         A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"gm": PriorConfig(high=60)}}``;
         what is not named has the flat prior on [0, ∞).
-    similarity : {"ssd"}
-        Sum of squared differences, eq. (1).
-    t_similarity, t_elastic : float
-        Boltzmann temperatures T_s (mm³ times squared intensity) and T_r (energy).
+    similarity : {"ssd", "student_t"}
+        Sum of squared differences, eq. (1): Gaussian noise; or Student's t noise, which forgives outliers.
+    degrees_of_freedom : float
+        ν of "student_t", above 2: the fewer, the heavier the tails; many are Gaussian.
+    independent_points : float, optional
+        Effective number of independent quadrature points (see `bayesreg.independent_points`): the log likelihood
+        is tempered by its share of all of them. None: all are independent.
+    t_similarity, t_elastic : float or TemperaturePrior
+        Boltzmann temperatures T_s (mm³ times squared intensity) and T_r (energy), known or inferred.
     normalised : bool
-        False: the paper's density, without the normaliser of the elastic prior in λ, μ. True is refused.
+        False: the paper's density, without the normaliser of the elastic prior in λ, μ. True: with it; then
+        every free λ, μ needs a prior with a finite `high`, and `fixed: {}` lets all be free if T_r is known.
     interpolation : {"linear", "cubic"}
         Of the moving image; cubic where gradients are used.
     quadrature : {"gauss4", "gauss32", "gauss256", "voxels"}
@@ -82,9 +110,11 @@ class ModelConfig(BaseModel):
     elasticity: Literal["tissue", "uniform", "element"] = "tissue"
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
     priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = {}
-    similarity: Literal["ssd"] = "ssd"
-    t_similarity: Positive = 0.05
-    t_elastic: Positive = 1e4
+    similarity: Literal["ssd", "student_t"] = "ssd"
+    degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
+    independent_points: Positive | None = None
+    t_similarity: Positive | TemperaturePrior = 0.05
+    t_elastic: Positive | TemperaturePrior = 1e4
     normalised: StrictBool = False
     interpolation: Literal["linear", "cubic"] = "linear"
     quadrature: Literal["gauss4", "gauss32", "gauss256", "voxels"] = "gauss4"
@@ -92,11 +122,72 @@ class ModelConfig(BaseModel):
     held: dict[Annotated[int, Field(ge=0)], Vector] = {}
     rigid_sd: Positive | None = None
 
-    @field_validator("normalised")
-    @classmethod
-    def _only_the_paper(cls, value: bool) -> bool:
-        if value:
-            raise ValueError(
-                "the density with the elastic prior's normaliser is not part of this version; use normalised: false"
+    @model_validator(mode="after")
+    def _is_proper(self) -> ModelConfig:
+        if isinstance(self.t_elastic, TemperaturePrior) and not self.normalised:
+            raise wrong("t_elastic", "a T_r with a prior needs normalised: true; without it T_r has no likelihood")
+        if isinstance(self.t_elastic, TemperaturePrior) and self.fixed is not None and not any(self.fixed.values()):
+            raise wrong(
+                "fixed",
+                "t_elastic has a prior and no λ or μ is known: their common scale and T_r cannot be told apart; "
+                "fix one parameter or t_elastic",
             )
-        return value
+        if self.normalised:
+            self._require_rest()
+            self.require_proper_priors(self._named_tissues or USUAL_TISSUES)
+        return self
+
+    def _require_rest(self) -> None:
+        for node, displacement in self.held.items():
+            if any(displacement):
+                raise wrong(
+                    f"held.{node}",
+                    "with normalised: true a node is held where it is, (0, 0, 0), only: the energy of a prescribed "
+                    "displacement is part of the normaliser, which leaves it out",
+                )
+        if self.held and self.rigid_sd is not None:
+            raise wrong(
+                "rigid_sd",
+                "with normalised: true expected null where nodes are held: these couple the rigid motions of the "
+                "sampled nodes with their strain, and the normaliser knows the elastic prior alone",
+            )
+
+    def require_proper_priors(self, tissues: Sequence[str]) -> None:
+        """Refuse flat priors on [low, ∞) of free parameters where the density is normalised.
+
+        Raises
+        ------
+        ValueError
+        """
+        known = self.known(tissues)
+        for name, tissue in product(get_args(Lame), tissues if self.normalised else ()):
+            prior = of_tissue(self, self.priors.get(name), tissue) or PriorConfig()
+            if math.isinf(prior.high) and of_tissue(self, known.get(name), tissue) is None:
+                raise wrong(
+                    f"priors.{name}",
+                    f"normalised: true needs a prior with a finite high (r2) for every free parameter, and {name} of "
+                    f"{tissue} has none: the posterior would be improper",
+                )
+
+    def known(self, tissues: Sequence[str]) -> Mapping[Lame, Any]:
+        """`fixed`, or its default for these tissues."""
+        if self.fixed is not None:
+            return self.fixed
+        return {"mu": 1.0 if self.elasticity == "uniform" else {"gm" if "gm" in tissues else tissues[0]: 1.0}}
+
+    @property
+    def _named_tissues(self) -> list[str]:
+        sections = (*(self.fixed or {}).values(), *self.priors.values())
+        return sorted({tissue for section in sections if isinstance(section, Mapping) for tissue in section})
+
+
+def of_tissue(model: ModelConfig, given: Any, tissue: str) -> Any:
+    """The option of one tissue, given for all or in a mapping by tissue; None where it is not given."""
+    if not isinstance(given, Mapping):
+        return given
+    return next(iter(given.values()), None) if model.elasticity == "uniform" else given.get(tissue)
+
+
+def wrong(key: str, message: str) -> PydanticCustomError:
+    """An error that belongs to one key, given by its dotted path, of the section whose validator raises it."""
+    return PydanticCustomError("wrong", "{message}", {"message": message, "key": key})

@@ -20,7 +20,8 @@ from bayesreg.model.curvature import displacement_precision
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
-from bayesreg.model.program import LameParameter, RegistrationData, in_support, registration
+from bayesreg.model.program import LameParameter, RegistrationData, in_support, log_elastic_normaliser, registration
+from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -39,7 +40,7 @@ class Evaluation(NamedTuple):
     u : (n, 3) array
         Displacement of every node, mm.
     similarity_energy, strain_energy : scalars
-        E_s and E_r.
+        E_s and E_r; with "student_t" E_s is −T_s times the log of the likelihood without its normaliser.
     solver_iterations : scalar integer
     solver_failed, outside_support : scalar bools
         Whether the elastic solve failed; whether a sampled node lies in Ω_SK or a parameter outside the
@@ -61,7 +62,8 @@ class Posterior:
 
     Three sets of coordinates name the same state:
 
-    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries}``, known entries included;
+    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries}``, known entries included, and
+      the scalars "t_similarity", "t_elastic" where they have a prior;
     - *estimands*: the same with the sampled entries of λ and μ only;
     - *position*: estimands mapped to the real line (log, or logit where a prior is bounded).
 
@@ -115,13 +117,26 @@ class Posterior:
         return _evaluate(self.data, dict(values), self.options.similarity)
 
     def evaluate_estimands(
-        self, data: RegistrationData, estimands: Values, guess: Float[AnyArray, "nodes 3"] | None = None
+        self,
+        data: RegistrationData,
+        estimands: Values,
+        guess: Float[AnyArray, "nodes 3"] | None = None,
+        normaliser: bool = True,
     ) -> Evaluation:
         """`evaluate` as a pure function of the data, for samplers of the constrained space.
 
         With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
+        Without `normaliser`, `log_normaliser` is left out of the density, and its cost with it.
         """
-        return _evaluate(data, _complete(data, estimands, self.free), self.options.similarity, guess)
+        values = _complete(data, estimands, self.free)
+        return _evaluate(data, values, self.options.similarity, guess, normaliser)
+
+    def log_normaliser(self, data: RegistrationData, estimands: Values) -> Scalar:
+        """½ log pdet S(λ, μ) − r/2 log(2π T_r), the elastic prior's normaliser; zero if not `normalised`.
+
+        The same for all displacements: what moves these alone does not need it.
+        """
+        return _log_normaliser(data, _complete(data, estimands, self.free))
 
     def supports(self, data: RegistrationData, estimands: Values) -> Bool[AnyArray, ""]:
         """Whether estimands lie where the density may be positive; costs no elastic solve."""
@@ -131,10 +146,10 @@ class Posterior:
         """Log density of the unconstrained position, the Jacobian of `constrain` included."""
         return self.logdensity_of(self.data, position)
 
-    def logdensity_of(self, data: RegistrationData, position: Values) -> Scalar:
-        """`logdensity` as a pure function of the data, for samplers."""
+    def logdensity_of(self, data: RegistrationData, position: Values, normaliser: bool = True) -> Scalar:
+        """`logdensity` as a pure function of the data, for samplers; without `normaliser` less `log_normaliser`."""
         estimands, log_jacobian = _to_estimands(data, position, self.free)
-        return self.evaluate_estimands(data, estimands).logdensity + log_jacobian
+        return self.evaluate_estimands(data, estimands, normaliser=normaliser).logdensity + log_jacobian
 
     def clearance(
         self, data: RegistrationData, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
@@ -171,20 +186,22 @@ class Posterior:
         for name, free in self.free.items():
             if len(free):
                 position[name] = _transform(getattr(self.data, name), free).inv(jnp.asarray(values[name])[free])
-        return position
+        return position | {name: jnp.log(values[name]) for name in self.data.temperature_log_sd}
 
     def estimands(self, values: Values) -> dict[str, AnyArray]:
         """The sampled entries of values."""
         self._require_shapes(values)
         free = {name: jnp.asarray(values[name], float)[free] for name, free in self.free.items() if len(free)}
-        return {"u_boundary": jnp.asarray(values["u_boundary"], float), **free}
+        warm = {name: jnp.asarray(values[name], float) for name in self.data.temperature_log_sd}
+        return {"u_boundary": jnp.asarray(values["u_boundary"], float), **free, **warm}
 
     def reference(self) -> dict[str, AnyArray]:
-        """Values at rest: no displacement, λ and μ at their known or reference values."""
+        """Values at rest: no displacement, λ and μ at their known or reference values, T_s and T_r at their medians."""
         return {
             "u_boundary": jnp.zeros((len(self.sampled), 3)),
             "lam": jnp.asarray(self.data.lam.reference),
             "mu": jnp.asarray(self.data.mu.reference),
+            **{name: jnp.asarray(getattr(self.data, name)) for name in self.data.temperature_log_sd},
         }
 
     def allowed(self, u_boundary: Float[AnyArray, "sampled 3"]) -> Bool[np.ndarray, "sampled"]:
@@ -198,10 +215,16 @@ class Posterior:
         """f(x_q) − m(x_q + u(x_q)) at the quadrature points."""
         return _residuals(self.data, jnp.asarray(u))
 
+    def noise_sd(self, t_similarity: float) -> float:
+        """The noise that a temperature T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
+        noise = Noise(jnp.asarray(t_similarity), self.data.degrees_of_freedom)
+        variance = SIMILARITIES[self.options.similarity].variance(noise) * t_similarity
+        return float(np.sqrt(variance / (2 * np.mean(self.data.quadrature.weights))))
+
     @property
     def implied_noise_sd(self) -> float:
-        """√(T_s / 2w): the noise that the temperature stands for at a point of average weight w."""
-        return float(np.sqrt(self.options.t_similarity / (2 * np.mean(self.data.quadrature.weights))))
+        """`noise_sd` at the known T_s, or at the median of its prior."""
+        return self.noise_sd(float(self.data.t_similarity))
 
     def constant_data(self) -> dict[str, AnyArray]:
         """Points (mm), cells, tissue of every cell and the sampled nodes."""
@@ -209,12 +232,11 @@ class Posterior:
         return {"points": mesh.points, "cells": mesh.cells, "tissue": mesh.tissue, "boundary": self.sampled}
 
     def initial(self, key: AnyArray) -> dict[str, AnyArray]:
-        """A random position near `reference`: displacements of 0.01 mm, parameters within about 10 %."""
+        """A random position near `reference`: displacements of 0.01 mm, the rest within about 10 %."""
         position = self.unconstrain(self.reference())
         keys = jax.random.split(key, len(position))
-        scales = {"u_boundary": 0.01, "lam": 0.1, "mu": 0.1}
         return {
-            name: value + scales[name] * jax.random.normal(subkey, value.shape)
+            name: value + (0.01 if name == "u_boundary" else 0.1) * jax.random.normal(subkey, value.shape)
             for (name, value), subkey in zip(position.items(), keys, strict=True)
         }
 
@@ -226,13 +248,15 @@ class Posterior:
         dict
             "similarity_energy" (E_s), "strain_energy" (E_r), and the terms that sum to the log density:
             "log_similarity", "log_elastic", "log_rigid", "log_prior_lam", "log_prior_mu", "log_support",
-            "log_solved".
+            "log_solved"; where T_s is inferred "log_similarity_normaliser", where the density is normalised
+            "log_normaliser", and "log_prior_t_similarity", "log_prior_t_elastic" of those inferred.
         """
         self._require_shapes(values)
         return _terms(self.data, dict(values), self.options.similarity)
 
     def _require_shapes(self, values: Values) -> None:
         expected = {"u_boundary": (len(self.sampled), 3), **{n: getattr(self.data, n).low.shape for n in LAME}}
+        expected |= dict.fromkeys(self.data.temperature_log_sd, ())
         for name, shape in expected.items():
             if name not in values:
                 raise InputError(f"values lack {name!r}; expected {', '.join(expected)}")
@@ -284,7 +308,7 @@ def _complete(data: RegistrationData, estimands: Values, free: Mapping[str, np.n
     for name in LAME:
         known = jnp.asarray(getattr(data, name).reference)
         values[name] = known.at[free[name]].set(estimands[name]) if len(free[name]) else known
-    return values
+    return values | {name: estimands[name] for name in data.temperature_log_sd}
 
 
 def _transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
@@ -300,17 +324,21 @@ def _to_estimands(
             transform = _transform(getattr(data, name), free[name])
             estimands[name] = transform(position[name])
             log_jacobian += transform.log_abs_det_jacobian(position[name], estimands[name]).sum()
+    for name in data.temperature_log_sd:
+        estimands[name] = jnp.exp(position[name])
+        log_jacobian += position[name]
     return estimands, log_jacobian
 
 
-@partial(jax.jit, static_argnames="similarity")
+@partial(jax.jit, static_argnames=("similarity", "normaliser"))
 def _evaluate(
     data: RegistrationData,
     values: dict[str, AnyArray],
     similarity: str,
     guess: Float[AnyArray, "nodes 3"] | None = None,
+    normaliser: bool = True,
 ) -> Evaluation:
-    total, trace = log_density(registration, (data, similarity, guess), {}, values)
+    total, trace = log_density(registration, (data, similarity, guess, normaliser), {}, values)
     found = {name: trace[name]["value"] for name in Evaluation._fields if name != "logdensity"}
     # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
     return Evaluation(logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), **found)
@@ -320,11 +348,16 @@ def _evaluate(
 def _terms(data: RegistrationData, values: dict[str, AnyArray], similarity: str) -> dict[str, Scalar]:
     _, trace = log_density(registration, (data, similarity), {}, values)
     terms = {name: trace[name]["value"] for name in ("similarity_energy", "strain_energy")}
-    for name in ("log_similarity", "log_elastic", "log_rigid", "log_support", "log_solved"):
+    for name in (name for name in trace if name.startswith("log_")):
         terms[name] = trace[name]["fn"].log_prob(trace[name]["value"])
-    for name in LAME:
-        terms[f"log_prior_{name}"] = getattr(data, name).prior().log_prob(values[name])
+    for name in (*LAME, *data.temperature_log_sd):
+        terms[f"log_prior_{name}"] = trace[name]["fn"].log_prob(values[name])
     return terms
+
+
+@jax.jit
+def _log_normaliser(data: RegistrationData, values: dict[str, AnyArray]) -> Scalar:
+    return log_elastic_normaliser(data, values["lam"], values["mu"], values.get("t_elastic", data.t_elastic))
 
 
 @jax.jit

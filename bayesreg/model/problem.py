@@ -9,13 +9,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.distance import signed_distance
+from bayesreg.fem.determinant import schur_determinant
+from bayesreg.fem.elasticity import rigid_modes
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import locate
 from bayesreg.image import Image, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
-from bayesreg.model.options import Lame, ModelConfig, PriorConfig
+from bayesreg.model.options import Lame, ModelConfig, PriorConfig, TemperaturePrior, of_tissue
 from bayesreg.model.program import LameParameter, RegistrationData
 from bayesreg.types import AnyArray, InputError
 
@@ -32,6 +34,7 @@ def registration_data(
     require_overlap(mesh, fixed, "fixed image")
     require_overlap(mesh, moving, "moving image")
     sampled, held = sampled_nodes(mesh, model)
+    require_proper(mesh, model)
     prescribed = np.union1d(sampled, list(held)).astype(int)
     lam, mu = (lame_parameter(name, mesh, model, reference) for name in ("lam", "mu"))
     entry = cell_entries(mesh, model)
@@ -55,10 +58,48 @@ def registration_data(
         held=jnp.asarray(displacement),
         rigid_modes=jnp.asarray(rigid_modes(mesh.points[sampled])),
         rigid_sd=jnp.asarray(np.inf if model.rigid_sd is None else model.rigid_sd),
-        t_similarity=jnp.asarray(model.t_similarity),
-        t_elastic=jnp.asarray(model.t_elastic),
+        t_similarity=jnp.asarray(_centre(model.t_similarity)),
+        t_elastic=jnp.asarray(_centre(model.t_elastic)),
+        temperature_log_sd={
+            name: jnp.asarray(prior.log_sd)
+            for name, prior in (("t_similarity", model.t_similarity), ("t_elastic", model.t_elastic))
+            if isinstance(prior, TemperaturePrior)
+        },
+        degrees_of_freedom=jnp.asarray(model.degrees_of_freedom),
+        independent_share=jnp.asarray(independent_share(model, len(positions))),
+        determinant=schur_determinant(mesh, sampled, np.array(list(held), int)) if model.normalised else None,
     )
     return data, sampled
+
+
+def _centre(temperature: float | TemperaturePrior) -> float:
+    return temperature.median if isinstance(temperature, TemperaturePrior) else temperature
+
+
+def require_proper(mesh: TetMesh, model: ModelConfig) -> None:
+    """Raise InputError if the density is normalised and a free parameter of a tissue of the mesh has a flat prior."""
+    try:
+        model.require_proper_priors(mesh.names)
+    except ValueError as error:
+        raise InputError(f"model.priors: {error}") from None
+
+
+def independent_share(model: ModelConfig, points: int) -> float:
+    """Effective number of independent quadrature points over the number of all.
+
+    Raises
+    ------
+    InputError
+        If there are fewer points than are said to be independent.
+    """
+    if model.independent_points is None:
+        return 1.0
+    if model.independent_points > points:
+        raise InputError(
+            f"model.independent_points is {model.independent_points:g}, but the quadrature has {points} points; "
+            "give at most as many, or null for all"
+        )
+    return model.independent_points / points
 
 
 def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
@@ -150,7 +191,7 @@ def lame_parameter(
     """
     entries = int(cell_entries(mesh, model).max()) + 1 if model.elasticity != "tissue" else len(mesh.names)
     prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
-    fixed = _default_fixed(mesh, model) if model.fixed is None else model.fixed
+    fixed = model.known(mesh.names)
     known = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
     if reference is None:
         start = _within(prior, _default_reference(name, mesh, model, entries))
@@ -167,12 +208,6 @@ def lame_parameter(
         is_free=jnp.array([k is None for k in known]),
         reference=jnp.asarray(values),
     )
-
-
-def _default_fixed(mesh: TetMesh, model: ModelConfig) -> dict[str, object]:
-    if model.elasticity == "uniform":
-        return {"mu": 1.0}
-    return {"mu": {"gm" if "gm" in mesh.names else mesh.names[0]: 1.0}}
 
 
 def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: int) -> Float[np.ndarray, "entries"]:
@@ -196,13 +231,11 @@ def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: 
     unknown = set(given) - set(mesh.names)
     if unknown:
         raise InputError(f"model.{where} names {sorted(unknown)}, but the mesh's tissues are {list(mesh.names)}")
-    if model.elasticity == "tissue":
-        return [given.get(tissue, default) for tissue in mesh.names]
-    if model.elasticity == "element":
-        return [given.get(mesh.names[tissue], default) for tissue in mesh.tissue]
-    if len(set(given.values())) > 1:
+    if model.elasticity == "uniform" and len(set(given.values())) > 1:
         raise InputError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
-    return [next(iter(given.values()), default)]
+    tissues = {"tissue": mesh.names, "uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
+    found = (of_tissue(model, given, tissue) for tissue in tissues[model.elasticity])
+    return [default if value is None else value for value in found]
 
 
 def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature:
@@ -223,13 +256,3 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
         raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
     weights = np.full(inside.sum(), fixed.voxel_volume)
     return Quadrature(jnp.asarray(cells[inside]), jnp.asarray(barycentric[inside]), jnp.asarray(weights))
-
-
-def rigid_modes(points: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "rows 6"]:
-    """Orthonormal basis of the translations and infinitesimal rotations of some points about their centroid."""
-    centred = points - points.mean(axis=0)
-    translations = np.tile(np.eye(3), (len(points), 1))
-    rotations = np.stack([np.cross(axis, centred).ravel() for axis in np.eye(3)], axis=1)
-    basis, triangle = np.linalg.qr(np.concatenate([translations, rotations], axis=1))
-    independent = np.abs(np.diag(triangle)) > 1e-9 * np.abs(triangle).max()
-    return basis * independent

@@ -11,13 +11,14 @@ import numpyro.distributions as dist
 from jaxtyping import Bool, Float, Int
 from numpyro.distributions import constraints
 
+from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.elements import Quadrature
 from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
 from bayesreg.image import Interpolator
 from bayesreg.model.constraint import is_allowed
 from bayesreg.model.priors import ScaledBeta
-from bayesreg.model.similarity import SIMILARITIES
+from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, Scalar
 
@@ -75,8 +76,18 @@ class RegistrationData(NamedTuple):
         Known displacements, zero in the rows of sampled nodes, mm.
     rigid_modes : (3b, 6) array
         Orthonormal basis of the sampled nodes' infinitesimal rigid motions.
-    rigid_sd, t_similarity, t_elastic : scalars
-        `rigid_sd` is infinite for the flat prior.
+    rigid_sd : scalar
+        Infinite for the flat prior.
+    t_similarity, t_elastic : scalars
+        The known temperatures T_s and T_r, or the medians of their priors.
+    temperature_log_sd : mapping of name to scalar
+        Of the log-normal priors of those temperatures that are inferred.
+    degrees_of_freedom : scalar
+        ν of Student's t noise.
+    independent_share : scalar
+        Effective number of independent quadrature points over that of all: tempers the likelihood.
+    determinant : SchurDeterminant or None
+        Of the elastic prior; None leaves its normaliser out.
     """
 
     system: ElasticSystem
@@ -95,40 +106,52 @@ class RegistrationData(NamedTuple):
     rigid_sd: Scalar
     t_similarity: Scalar
     t_elastic: Scalar
+    temperature_log_sd: dict[str, Scalar]
+    degrees_of_freedom: Scalar
+    independent_share: Scalar
+    determinant: SchurDeterminant | None
 
 
 def registration(
-    data: RegistrationData, similarity: str = "ssd", guess: Float[AnyArray, "nodes 3"] | None = None
+    data: RegistrationData,
+    similarity: str = "ssd",
+    guess: Float[AnyArray, "nodes 3"] | None = None,
+    normaliser: bool = True,
 ) -> None:
     """p(m, u, λ, μ) of eq. (8): the program whose log joint density is the posterior's up to a constant.
 
     The displacements have a flat base measure, on which the Boltzmann elastic prior (12), the rigid prior
     and the Boltzmann likelihood (11) are factors. The skull belongs to the likelihood: a configuration with
     a sampled node in Ω_SK cannot have produced the image. So does an elastic solve that failed. A `guess` of
-    the displacement of all nodes speeds up the solve (see `equilibrium`).
+    the displacement of all nodes speeds up the solve (see `equilibrium`). Without `normaliser` that of the
+    elastic prior is left out, where there is one.
     """
     flat = dist.ImproperUniform(constraints.real_matrix, (), event_shape=data.points_sampled.shape)
     u_boundary = numpyro.sample("u_boundary", flat)
     lam = numpyro.sample("lam", data.lam.prior())
     mu = numpyro.sample("mu", data.mu.prior())
+    t_similarity, t_elastic = (_temperature(data, name) for name in ("t_similarity", "t_elastic"))
 
-    # Where K may be indefinite the density is −∞; the solve is given the reference, to end soon.
-    physical = _physical(lam, mu)
-    lam_cells = jnp.where(physical, lam, data.lam.reference)[data.cell_entry]
-    mu_cells = jnp.where(physical, mu, data.mu.reference)[data.cell_entry]
+    lam_cells, mu_cells = _by_cell(data, lam, mu)
     u_prescribed = data.held.at[data.slots].set(u_boundary)
     state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, SOLVER_TOLERANCE, guess)
 
     elements, quadrature = data.system.elements, data.quadrature
     moved = data.positions + displacement_at(elements, quadrature, state.u)
-    similarity_energy = SIMILARITIES[similarity](data.fixed_values, data.moving(moved), quadrature.weights)
+    likelihood, noise = SIMILARITIES[similarity], Noise(t_similarity, data.degrees_of_freedom)
+    similarity_energy = likelihood.energy(data.fixed_values, data.moving(moved), quadrature.weights, noise)
     strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)
     # Without the barrier XLA computes both energies twice, for the density and for the record.
     similarity_energy, strain_energy = jax.lax.optimization_barrier((similarity_energy, strain_energy))
-    inside = in_support(data, u_boundary, lam, mu)
+    inside = in_support(data, u_boundary, lam, mu, t_similarity, t_elastic)
 
-    numpyro.factor("log_similarity", -similarity_energy / data.t_similarity)
-    numpyro.factor("log_elastic", -strain_energy / data.t_elastic)
+    numpyro.factor("log_similarity", -data.independent_share * similarity_energy / t_similarity)
+    if "t_similarity" in data.temperature_log_sd:
+        log_normaliser = likelihood.log_normaliser(quadrature.weights, noise)
+        numpyro.factor("log_similarity_normaliser", data.independent_share * log_normaliser)
+    numpyro.factor("log_elastic", -strain_energy / t_elastic)
+    if data.determinant is not None and normaliser:
+        numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic))
     numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
     numpyro.factor("log_support", jnp.where(inside, 0.0, -jnp.inf))
     numpyro.factor("log_solved", jnp.where(state.converged, 0.0, -jnp.inf))
@@ -141,10 +164,44 @@ def registration(
     numpyro.deterministic("outside_support", ~inside)
 
 
-def in_support(data: RegistrationData, u_boundary: AnyArray, lam: AnyArray, mu: AnyArray) -> Bool[AnyArray, ""]:
+def log_elastic_normaliser(data: RegistrationData, lam: AnyArray, mu: AnyArray, t_elastic: AnyArray) -> Scalar:
+    """½ log pdet S(λ, μ) − r/2 log(2π T_r), r the rank of S: makes exp(−E_r / T_r) a density of u_B."""
+    if data.determinant is None:
+        return jnp.zeros(())
+    log_pdet = log_pseudo_determinant(data.determinant, data.system.elements, *_by_cell(data, lam, mu))
+    return 0.5 * (log_pdet - data.determinant.rank * jnp.log(2 * jnp.pi * t_elastic))
+
+
+def _temperature(data: RegistrationData, name: str) -> Scalar:
+    """T_s or T_r, sampled where it has a prior."""
+    known = getattr(data, name)
+    if name not in data.temperature_log_sd:
+        return known
+    return numpyro.sample(name, dist.LogNormal(jnp.log(known), data.temperature_log_sd[name]))
+
+
+def _by_cell(
+    data: RegistrationData, lam: AnyArray, mu: AnyArray
+) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
+    """λ and μ of every cell. Where K may be indefinite the density is −∞; the reference then lets a solve end soon."""
+    physical = _physical(lam, mu)
+    safe = (jnp.where(physical, values, known.reference) for values, known in ((lam, data.lam), (mu, data.mu)))
+    lam_entries, mu_entries = safe
+    return lam_entries[data.cell_entry], mu_entries[data.cell_entry]
+
+
+def in_support(
+    data: RegistrationData,
+    u_boundary: AnyArray,
+    lam: AnyArray,
+    mu: AnyArray,
+    t_similarity: AnyArray | float = 1.0,
+    t_elastic: AnyArray | float = 1.0,
+) -> Bool[AnyArray, ""]:
     """Whether no sampled node lies in Ω_SK and every parameter is physical and in the range of its prior."""
     in_range = _in_range(lam, data.lam) & _in_range(mu, data.mu)
-    return _physical(lam, mu) & in_range & _clear_of_skull(data, u_boundary)
+    warm = jnp.isfinite(t_similarity) & (t_similarity > 0) & jnp.isfinite(t_elastic) & (t_elastic > 0)
+    return _physical(lam, mu) & in_range & warm & _clear_of_skull(data, u_boundary)
 
 
 def _physical(lam: AnyArray, mu: AnyArray) -> Bool[AnyArray, ""]:

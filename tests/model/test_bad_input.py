@@ -129,6 +129,22 @@ def test_options_are_validated(options, where):
         build(**options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, r"finite high \(r2\).* lam of csf has none"),
+        ({"priors": {"lam": {"high": 9.0}}}, "mu of csf has none"),
+        ({"priors": {"lam": {"high": 9.0}, "mu": {"gm": {"high": 9.0}}}, "fixed": {}}, "mu of csf has none"),
+        ({"elasticity": "uniform"}, "lam of csf has none"),
+        ({"priors": {"lam": {"high": 9.0}}, "fixed": {"mu": 1.0}, "held": {3: (0.0, 0.0, 1.0)}}, "held where it is"),
+    ],
+)
+def test_the_proper_density_needs_proper_priors_and_nodes_at_rest(options, message):
+    with pytest.raises(ValueError, match=message):
+        build(normalised=True, **options)
+    build(normalised=False, **options)
+
+
 def test_a_skull_that_forbids_everything():
     skull = flat_skull(MESH.points, axis=0, wall=-1000.0, voxel=4.0)
     assert skull.voxels.all()

@@ -1,0 +1,78 @@
+"""How many independent points a correlated residual is worth."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.types import InputError
+
+
+def independent_points(residual: Image, mask: Image) -> float:
+    """Effective number of independent points of a residual inside a mask: its volume over ∫ρ(h) dh.
+
+    ρ is the autocorrelation at lag h, over all pairs of voxels inside the mask. Its integral runs over the ball up
+    to the lag at which the mean of ρ over directions first is not positive: beyond it lies noise alone.
+
+    Parameters
+    ----------
+    residual : Image
+        f(x) − m(x + u(x)) on a grid.
+    mask : Image
+        Nonzero = inside, on the same grid; where the likelihood looks.
+
+    Returns
+    -------
+    float
+        Between one and the number of voxels inside; for `ModelConfig.independent_points`, which may be no more
+        than the number of quadrature points.
+
+    Raises
+    ------
+    InputError
+        If the grids differ, or the residual inside the mask is constant.
+    """
+    if residual.shape != mask.shape or not np.allclose(residual.affine, mask.affine):
+        raise InputError(f"residual and mask must share one grid; got {residual.shape} and {mask.shape}")
+    inside = np.asarray(mask.voxels) != 0
+    values = np.asarray(residual.voxels, float)[inside]
+    if len(values) < 2 or np.ptp(values) == 0:
+        raise InputError("the residual is constant inside the mask, or the mask is empty: no autocorrelation")
+    centred = np.zeros(inside.shape)
+    centred[inside] = values - values.mean()
+    box = ndimage.find_objects(inside.astype(int))[0]
+    correlation, pairs = _autocorrelation(centred[box], inside[box])
+    lags = _lag_lengths(correlation.shape, residual)
+    near = (pairs > 0) & (lags < _first_gap(correlation, pairs, lags, residual.voxel_sizes.max()))
+    return float(np.clip(inside.sum() / correlation[near].sum(), 1, inside.sum()))
+
+
+def _autocorrelation(
+    centred: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
+) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
+    """ρ(h) and the number of pairs at every lag, zero lag first, negative lags last."""
+    shape = [scipy.fft.next_fast_len(2 * n) for n in inside.shape]
+
+    def products(field: np.ndarray) -> np.ndarray:
+        return scipy.fft.irfftn(np.abs(scipy.fft.rfftn(field, shape)) ** 2, shape)
+
+    pairs = np.rint(products(inside.astype(float)))
+    covariance = products(centred) / np.maximum(pairs, 1)
+    return covariance / covariance[0, 0, 0], pairs
+
+
+def _lag_lengths(shape: tuple[int, ...], grid: Image) -> Float[np.ndarray, "U V W"]:
+    """|h| of every lag, mm."""
+    steps = np.stack(np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in shape), indexing="ij"), axis=-1)
+    return np.linalg.norm(steps @ np.asarray(grid.affine)[:3, :3].T, axis=-1)
+
+
+def _first_gap(correlation: np.ndarray, pairs: np.ndarray, lags: np.ndarray, width: float) -> float:
+    """Where the mean of ρ over the directions first is not positive, in shells of a given width, mm."""
+    shell = np.rint(lags / width).astype(int).ravel()
+    total, weight = (np.bincount(shell, weights=w.ravel()) for w in (pairs * correlation, pairs))
+    gaps = np.flatnonzero((total <= 0) & (weight > 0))
+    return (gaps[0] - 0.5) * width if len(gaps) else np.inf
