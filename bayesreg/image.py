@@ -105,6 +105,11 @@ class Image:
         indices = self.world_to_voxel(points)
         return ((indices >= -0.5) & (indices <= np.array(self.shape) - 0.5)).all(axis=-1)
 
+    def smoothed(self, sd: float) -> Image:
+        """The image smoothed by a Gaussian of some standard deviation, mm."""
+        voxels = ndimage.gaussian_filter(np.asarray(self.voxels, float), sd / self.voxel_sizes, mode="nearest")
+        return self.with_voxels(voxels)
+
     def interpolator(self, method: Interpolation = "linear") -> Interpolator:
         """The image as a differentiable function of world position; see `Interpolator`."""
         voxels = np.asarray(self.voxels, float)

@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesreg import __version__
 from bayesreg.config import Config
+from bayesreg.config.sections import StopConfig
 from bayesreg.distance import signed_distance
 from bayesreg.inference.diagnostics import Convergence
 from bayesreg.inference.moments import greatest_rhat
@@ -71,8 +72,9 @@ def manifest(
         "exact": samples.exact,
         "stopped": {
             "reason": samples.reason,
-            "converged": _converged(samples, config.stop.rhat, greatest),
+            "converged": _converged(samples, config.stop, judged),
             "rhat_threshold": config.stop.rhat,
+            "ess_threshold": config.stop.ess,
         },
         "convergence": {
             "rhat_max": greatest,
@@ -87,17 +89,21 @@ def manifest(
             "iterations_mean": float(tally.solver_iterations.sum()) / steps,
         },
         "steps_per_chain": int(tally.steps[0]),
+        "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
         "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
         "implied_noise_sd": posterior.implied_noise_sd,
     }
 
 
-def _converged(samples: Samples, threshold: float | None, greatest: float | None) -> bool | None:
-    """The stop rule's R̂ and the stricter one of the report, rank-normalised and split, must both agree."""
-    if threshold is None:
+def _converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:
+    """The stop rule and the figures of the report, rank-normalised and split, must both agree."""
+    if stop.rhat is None:
         return None
-    return bool(samples.converged) and greatest is not None and greatest < threshold
+    greatest = _extreme(judged.rhat, np.nanmax)
+    least = [_extreme(ess, np.nanmin) for ess in (judged.ess_bulk, judged.ess_tail)]
+    enough = stop.ess is None or all(ess is not None and ess > stop.ess for ess in least)
+    return bool(samples.converged) and greatest is not None and greatest < stop.rhat and enough
 
 
 def _versions() -> dict[str, str]:

@@ -42,7 +42,7 @@ from bayesreg.report.html import write_report
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 
-BLOCK = 50
+BLOCK = 100
 PROVENANCE = Path("inputs") / "provenance.json"
 
 
@@ -136,7 +136,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
-        reached = _reached(config, inputs, posterior, out)
+        reached = _reached(config, inputs, posterior, out, progress)
         sampled = float(reached[0].seconds)
         began -= provenance["unsampled"] + sampled
         store.write_json(out / PROVENANCE, _timed(provenance, began + sampled))
@@ -148,7 +148,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         inputs, provenance = _prepared_inputs(config)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs)
-        reached = _first(config, inputs, posterior)
+        reached = _first(config, inputs, posterior, progress)
         inputs = _with_initial(inputs, config)
         _store(out, inputs, _timed(provenance, began))
     say(_described(inputs))
@@ -172,7 +172,7 @@ def check(config: str | Path | Config) -> Check:
 
     # Two blocks: the first holds the compilation.
     sample(posterior, options.name, options.chains, 2 * trial, config.seed, block=trial, start=start,
-           progress=False, on_block=keep, **_sampler_settings(config))  # fmt: skip
+           progress=False, on_block=keep, **options.settings)  # fmt: skip
     seconds_per_step = (reached[1] - reached[0]) / trial
     device = sum(leaf.nbytes for leaf in jax.tree.leaves(posterior.data))
     draws = config.stop.max_steps // options.thin
@@ -331,28 +331,26 @@ def _store(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
     store.write_inputs(out, inputs)
 
 
-def _sampler_settings(config: Config) -> dict[str, Any]:
-    return config.sampler.model_dump(include={"sigma_u", "sigma_lam", "sigma_mu"})
-
-
 Reached = tuple[Checkpoint, list[Block]]
 
 
-def _first(config: Config, inputs: Inputs, posterior: Posterior) -> Reached:
+def _first(config: Config, inputs: Inputs, posterior: Posterior, progress: bool) -> Reached:
     """The chains before their first step; InputError where one cannot start."""
     options, start = config.sampler, _start(config, inputs, posterior)
-    settings = _sampler_settings(config)
-    return first_checkpoint(posterior, options.name, options.chains, config.seed, start, **settings), []
+    found = first_checkpoint(
+        posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
+    )
+    return found, []
 
 
-def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path) -> Reached:
+def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
     """The chains as the run that was cut off stored them last."""
     state = store.load_state(out)
     if state is None:
-        return _first(config, inputs, posterior)
+        return _first(config, inputs, posterior, progress)
     blocks = list(store.load_blocks(out, int(state.pop("blocks"))))
-    options, settings = config.sampler, _sampler_settings(config)
-    return checkpoint_from_arrays(state, posterior, options.name, options.chains, **settings), blocks
+    options = config.sampler
+    return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
 
 
 def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
@@ -369,11 +367,11 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
         config.seed,
         thin=options.thin,
         block=options.block or BLOCK,
-        stop=StopRule(config.stop.rhat, config.stop.max_minutes and 60 * config.stop.max_minutes),
+        stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
         resume=reached,
         on_block=keep,
-        **_sampler_settings(config),
+        **options.settings,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationInfo, field_validator
 
@@ -132,11 +132,40 @@ class MeshConfig(Section):
     """A mesh (.vtu) made earlier; the other entries are then left alone."""
 
 
-class SamplerConfig(Section):
-    """Which sampler, and its settings."""
+class _Sampler(Section):
+    chains: Count = 4
+    thin: Count = 1
+    """Every how many transitions a draw is kept."""
+    block: Count | None = None
+    """Kept draws between two looks at the stop rule; null lets the program choose."""
 
-    name: Literal["rwmh"] = "rwmh"
-    """rwmh: random-walk Metropolis with the three Normal kernels of the paper."""
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What is the sampler's own."""
+        return self.model_dump(exclude={"name", *_Sampler.model_fields})
+
+
+class Hamiltonian(_Sampler):
+    """Gradients, in coordinates whitened at the mode, trajectories reflected by the skull; see docs/model.md."""
+
+    name: Literal["hmc", "nuts"] = "hmc"
+    """hmc: Hamiltonian Monte Carlo with trajectories of a quarter turn; nuts: the No-U-Turn sampler."""
+    warm_up: Count = 60
+    """Transitions that tune the step size and are not kept."""
+    target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.75
+    """Acceptance towards which the step size is tuned."""
+
+
+class Laplace(_Sampler):
+    """Draws from the Gaussian about the mode, cut off by the skull: a quick look, approximate."""
+
+    name: Literal["laplace"]
+
+
+class RandomWalk(_Sampler):
+    """Random-walk Metropolis with the three Normal kernels of the paper."""
+
+    name: Literal["rwmh"]
     chains: Count = 3
     thin: Count = 10
     """Every how many steps a draw is kept."""
@@ -146,8 +175,6 @@ class SamplerConfig(Section):
     """Sd of a step of each λ."""
     sigma_mu: Positive = 0.003
     """Sd of a step of each μ."""
-    block: Count | None = None
-    """Kept draws between two looks at the stop rule; null lets the program choose."""
 
 
 class StartConfig(Section):
@@ -173,10 +200,13 @@ class StartConfig(Section):
 class StopConfig(Section):
     """When to stop: as soon as every estimand's R-hat is low enough, or when a budget is spent."""
 
-    rhat: Annotated[float, Field(strict=True, gt=1)] | None = 1.2
+    rhat: Annotated[float, Field(strict=True, gt=1)] | None = 1.01
     """Largest R-hat of all estimands; null runs until a budget is spent."""
-    max_steps: Count = 250_000
-    """Steps per chain, thinned ones included."""
+    ess: Positive | None = 400.0
+    """Least effective sample size, bulk and tail, of all estimands, R-hat then being rank-normalised and split;
+    null leaves it out, and R-hat is the unsplit one of the paper."""
+    max_steps: Count = 10_000
+    """Transitions per chain, thinned ones included."""
     max_minutes: Positive | None = None
     """Minutes of sampling."""
 
@@ -201,7 +231,7 @@ class Config(Section):
     ] = None
     """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
     model: ModelConfig = ModelConfig()
-    sampler: SamplerConfig = SamplerConfig()
+    sampler: Annotated[Hamiltonian | Laplace | RandomWalk, Field(discriminator="name")] = Hamiltonian()
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()

@@ -20,7 +20,7 @@ _OLD = int(az.__version__.split(".")[0]) < 1
 
 STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
-    "outside_support", "diverging",
+    "outside_support", "diverging", "gradients",
 )  # fmt: skip
 TEMPERATURES = ("t_similarity", "t_elastic")
 _DIMS = {
@@ -110,6 +110,30 @@ def convergence(idata: Any) -> Convergence:
     with np.errstate(invalid="ignore"):
         found = (az.rhat(posterior), az.ess(posterior, method="bulk"), az.ess(posterior, method="tail"))
     return Convergence(*(_plain(result).where(~constant) for result in found))
+
+
+class Worst(NamedTuple):
+    """The greatest rank-normalised split R̂ and the least effective sample sizes of all estimands."""
+
+    rhat: float
+    ess_bulk: float
+    ess_tail: float
+
+
+def worst(blocks: list[dict[str, np.ndarray]]) -> Worst:
+    """The worst figures of blocks of draws (see `to_inference_data`); R̂ infinite where there are too few draws."""
+    names = [name for name in blocks[0] if name not in STATISTICS] if blocks else []
+    draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in names}
+    if not draws or next(iter(draws.values())).shape[1] < 4:
+        return Worst(np.inf, 0.0, 0.0)
+    data = xr.Dataset(
+        {name: (["chain", "draw", *(f"{name}_{k}" for k in range(x.ndim - 2))], x) for name, x in draws.items()}
+    )
+    rhat, bulk, tail = (_plain(found) for found in (az.rhat(data), az.ess(data), az.ess(data, method="tail")))
+    return Worst(
+        max(float(rhat[name].max()) for name in draws),
+        *(min(float(ess[name].min()) for name in draws) for ess in (bulk, tail)),
+    )
 
 
 def _plain(result: Any) -> xr.Dataset:

@@ -58,6 +58,9 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
         if name in centre:
             noise = jax.random.normal(subkey, (chains, *centre[name].shape))
             points[name] = centre[name] * jnp.exp(start.spread * noise)
+    for index, name in enumerate(sorted(set(centre) - set(points))):
+        noise = jax.random.normal(jax.random.fold_in(key, index), (chains,))
+        points[name] = centre[name] * jnp.exp(start.spread * noise)
     return points
 
 

@@ -8,8 +8,9 @@ whose flow is a kick. Their Strang composition is exact where the posterior is G
 The support has hard walls: the signed distance d of every sampled node to the forbidden region is at least zero. A
 rotation that meets a wall is reflected there: with n the gradient of that node's distance in ξ, the momentum p becomes
 p − 2 (p·n) n / |n|². This keeps volume, energy and reversibility (Pakman and Paninski 2014; Mohasel Afshar and Domke
-2015), so that the Metropolis test of Hamiltonian Monte Carlo stays what it is. A reflection inside a leapfrog step would
-cost an error of first order in the step times the force at the wall; here only the force beyond the reference's.
+2015), so that the Metropolis test of Hamiltonian Monte Carlo stays what it is. A reflection inside a leapfrog step
+would cost an error of first order in the step times the force at the wall; here only the force beyond the reference's
+counts.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 from blackjax.mcmc.integrators import IntegratorState
 from jaxtyping import Float, Int
 
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.types import AnyArray
 
 # Looks at every wall along a stretch, secant steps to a hit, and the most reflections of one drift.
 _LOOKS, _SECANTS, _MOST = 8, 4, 400
@@ -65,7 +66,7 @@ def reflective_rotation(walls: Walls | None, clearance: Clearance | None) -> Cal
     def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
         density = jax.value_and_grad(logdensity_fn)
 
-        def one_step(state: IntegratorState, step_size: Scalar) -> IntegratorState:
+        def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
             momentum = state.momentum + step_size / 2 * (state.logdensity_grad + state.position)
             position, momentum = rotated(walls, clearance, state.position, momentum, step_size)
             logdensity, gradient = density(position)
@@ -87,7 +88,7 @@ class _Flight(NamedTuple):
 
 
 def rotated(
-    walls: Walls | None, clearance: Clearance | None, position: AnyArray, momentum: AnyArray, time: Scalar
+    walls: Walls | None, clearance: Clearance | None, position: AnyArray, momentum: AnyArray, time: AnyArray | float
 ) -> tuple[AnyArray, AnyArray]:
     """Position and momentum after the reference's own motion for some time (either sign), reflected at the walls.
 
@@ -133,7 +134,7 @@ def rotated(
     return jnp.where(last.left > 0, jnp.nan, last.position), sign * last.momentum
 
 
-def _turn(position: AnyArray, momentum: AnyArray, angle: Scalar) -> tuple[AnyArray, AnyArray]:
+def _turn(position: AnyArray, momentum: AnyArray, angle: AnyArray | float) -> tuple[AnyArray, AnyArray]:
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     return cosine * position + sine * momentum, cosine * momentum - sine * position
 
@@ -152,7 +153,7 @@ def _first_hit(walls: Walls, clearance: Clearance, flight: _Flight) -> tuple[Any
     low, high = times[step, rows], times[step + 1, rows]
     above, below = jnp.maximum(found[step, rows], 0.0), found[step + 1, rows]
 
-    def secant(_: int, bracket: tuple[AnyArray, ...]) -> tuple[AnyArray, ...]:
+    def secant(_: AnyArray | int, bracket: tuple[AnyArray, ...]) -> tuple[AnyArray, ...]:
         low, high, above, below = bracket
         middle = low + (high - low) * above / jnp.maximum(above - below, 1e-300)
         value = clear(middle)

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.diagnostics import to_inference_data
+from bayesreg.inference.diagnostics import Worst, to_inference_data, worst
 from bayesreg.inference.initialise import Start, require_density, starting_points
-from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
+from bayesreg.inference.moments import Moments, greatest_rhat, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
-from bayesreg.inference.samplers import SAMPLERS, Info, Sampler, State
+from bayesreg.inference.samplers import SAMPLERS, Draw, Info, Sampler
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
 
@@ -26,14 +26,18 @@ class StopRule(NamedTuple):
     Attributes
     ----------
     rhat : float, optional
-        Stop when R̂ = √(var⁺/W), unsplit, is below this for every estimand; None never stops early.
+        Stop when R̂ is below this for every estimand; None never stops early. Without `ess` it is the paper's,
+        √(var⁺/W), unsplit; with it the rank-normalised, split one of Vehtari et al. (2021).
+    ess : float, optional
+        And when every estimand's bulk and tail effective sample sizes exceed this.
     max_seconds : float, optional
-        Of sampling, compilation included.
+        Of sampling, compilation, search for the mode and warm-up included.
     min_draws : int
         Kept draws per chain before R̂ is believed.
     """
 
     rhat: float | None = None
+    ess: float | None = None
     max_seconds: float | None = None
     min_draws: int = 100
 
@@ -47,6 +51,7 @@ class Tally(NamedTuple):
     solver_failed: AnyArray
     solver_iterations: AnyArray
     diverging: AnyArray
+    gradients: AnyArray
 
 
 class Checkpoint(NamedTuple):
@@ -56,7 +61,9 @@ class Checkpoint(NamedTuple):
     ----------
     draws : int
         Kept draws per chain so far.
-    state : State
+    setup : pytree
+        What the sampler found before its first step.
+    state : pytree
     moments : Moments
         Of the estimands and of u at every node.
     tally : Tally
@@ -66,7 +73,8 @@ class Checkpoint(NamedTuple):
     """
 
     draws: AnyArray
-    state: State
+    setup: Any
+    state: Any
     moments: Moments
     tally: Tally
     seconds: AnyArray
@@ -110,7 +118,7 @@ Block = dict[str, np.ndarray]
 
 def sample(
     posterior: Target,
-    sampler: str = "rwmh",
+    sampler: str = "hmc",
     chains: int = 4,
     draws: int = 1000,
     seed: int = 0,
@@ -122,7 +130,7 @@ def sample(
     progress: bool = True,
     resume: tuple[Checkpoint, list[Block]] | None = None,
     on_block: Callable[[int, Block, Checkpoint], None] | None = None,
-    **settings: float,
+    **settings: Any,
 ) -> Samples:
     """Draw from a posterior with parallel chains.
 
@@ -151,7 +159,7 @@ def sample(
     on_block : callable, optional
         Called with the block's number, its draws and the checkpoint after it.
     **settings
-        Of the sampler: for "rwmh" sigma_u, sigma_lam, sigma_mu.
+        Of the sampler: for "hmc" and "nuts" warm_up and target_acceptance; for "rwmh" sigma_u, sigma_lam, sigma_mu.
 
     Returns
     -------
@@ -173,12 +181,13 @@ def sample(
     _, key_chains = jax.random.split(jax.random.key(seed))
     if resume is None:
         checkpoint, blocks = first_checkpoint(posterior, sampler, chains, seed, start, **settings), []
+        began = time.perf_counter()
     else:
         checkpoint, blocks = resume[0], list(resume[1])
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(kernel, posterior, chain_keys, thin, block, draws, checkpoint, began)
-        for found, reached in _until(stop, advance, checkpoint, bar):
+        for found, reached in _until(stop, advance, checkpoint, blocks, bar):
             blocks.append(found)
             checkpoint = reached
             if on_block is not None:
@@ -187,20 +196,31 @@ def sample(
 
 
 def first_checkpoint(
-    posterior: Target, sampler: str, chains: int, seed: int, start: Start | None = None, **settings: float
+    posterior: Target,
+    sampler: str,
+    chains: int,
+    seed: int,
+    start: Start | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    **settings: Any,
 ) -> Checkpoint:
     """The checkpoint before any draw: where `sample` starts its chains, unless it resumes.
+
+    `say` is told of the search for the mode and of the warm-up, where the sampler has them.
 
     Raises
     ------
     InputError
         If a chain cannot start there.
     """
+    began = time.perf_counter()
     key_start, _ = jax.random.split(jax.random.key(seed))
     points = starting_points(posterior, start or Start(), chains, key_start)
-    checkpoint = _first(SAMPLERS[sampler](posterior, **settings), posterior, points)
-    require_density(checkpoint.state.evaluation)
-    return checkpoint
+    kernel = SAMPLERS[sampler](posterior, **settings)
+    setup, points = kernel.prepare(points, jax.random.fold_in(key_start, 1), say)
+    checkpoint = _first(kernel, posterior, setup, points)
+    require_density(_observed(kernel, posterior, checkpoint).evaluation)
+    return checkpoint._replace(seconds=np.array(time.perf_counter() - began))
 
 
 def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
@@ -209,7 +229,7 @@ def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
 
 
 def checkpoint_from_arrays(
-    arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: float
+    arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: Any
 ) -> Checkpoint:
     """The inverse of `checkpoint_to_arrays`, for the same posterior, sampler and number of chains.
 
@@ -220,7 +240,7 @@ def checkpoint_from_arrays(
     """
     kernel = SAMPLERS[sampler](posterior, **settings)
     points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.estimands(posterior.reference()))
-    expected = jax.eval_shape(lambda p: _first(kernel, posterior, p), points)
+    expected = jax.eval_shape(lambda setup, p: _first(kernel, posterior, setup, p), kernel.blank(), points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
     if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
@@ -228,16 +248,22 @@ def checkpoint_from_arrays(
     return jax.tree.unflatten(structure, leaves)
 
 
-def _first(kernel: Sampler, posterior: Target, points: Any) -> Checkpoint:
-    state = jax.jit(jax.vmap(kernel.init, in_axes=(None, 0)))(posterior.data, points)
-    chains = len(state.evaluation.logdensity)
-    moments = jax.vmap(lambda s: zero_moments(_watched(s)))(state)
+def _first(kernel: Sampler, posterior: Target, setup: Any, points: Any) -> Checkpoint:
+    state = jax.jit(jax.vmap(kernel.init, in_axes=(None, None, 0)))(posterior.data, setup, points)
+    chains = len(next(iter(points.values())))
+    shapes = jax.eval_shape(jax.vmap(partial(kernel.observe, posterior.data, setup)), state)
+    moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), _watched(shapes)))
     zeros = jnp.zeros(chains)
-    return Checkpoint(np.array(0), state, moments, Tally(*(zeros,) * len(Tally._fields)), np.array(0.0))
+    return Checkpoint(np.array(0), setup, state, moments, Tally(*(zeros,) * len(Tally._fields)), np.array(0.0))
 
 
-def _watched(state: State) -> dict[str, Any]:
-    return {"estimands": state.kernel.position, "u": state.evaluation.u}
+def _observed(kernel: Sampler, posterior: Target, checkpoint: Checkpoint) -> Draw:
+    observe = jax.jit(jax.vmap(kernel.observe, in_axes=(None, None, 0)))
+    return observe(posterior.data, checkpoint.setup, checkpoint.state)
+
+
+def _watched(draw: Draw) -> dict[str, Any]:
+    return {"estimands": draw.estimands, "u": draw.evaluation.u}
 
 
 def _advance(
@@ -255,39 +281,42 @@ def _advance(
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
         state, moments, tally, found = _run_block(
-            kernel.step, length, thin, posterior.data, chain_keys, int(checkpoint.draws), *checkpoint[1:4]
+            kernel, length, thin, posterior.data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
         )
         found = {name: np.asarray(value) for name, value in found.items()}
         seconds = np.array(spent + time.perf_counter() - began)
-        checkpoint = Checkpoint(np.array(int(checkpoint.draws) + length), state, moments, tally, seconds)
+        drawn = np.array(int(checkpoint.draws) + length)
+        checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
         yield found, checkpoint
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _run_block(  # type: ignore[no-untyped-def]
-    step,
+    kernel: Sampler,
     length: int,
     thin: int,
     data: Any,
     chain_keys: AnyArray,
     first: AnyArray | int,
-    state: State,
+    setup: Any,
+    state: Any,
     moments: Moments,
     tally: Tally,
 ):
-    def chain(key: AnyArray, state: State, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
+    def chain(key: AnyArray, state: Any, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
         def one_draw(carry, draw):  # type: ignore[no-untyped-def]
             state, moments, tally = carry
 
             def one_step(i, carry):  # type: ignore[no-untyped-def]
                 state, window = carry
-                state, info = step(data, jax.random.fold_in(key, draw * thin + i), state)
+                state, info = kernel.step(data, setup, jax.random.fold_in(key, draw * thin + i), state)
                 return state, _counted(window, info)
 
             nothing = Tally(*(jnp.zeros(()),) * len(Tally._fields))
             state, window = jax.lax.fori_loop(0, thin, one_step, (state, nothing))
-            moments = updated(moments, _watched(state))
-            return (state, moments, jax.tree.map(jnp.add, tally, window)), _kept(state, window)
+            drawn = kernel.observe(data, setup, state)
+            moments = updated(moments, _watched(drawn))
+            return (state, moments, jax.tree.map(jnp.add, tally, window)), _kept(drawn, window)
 
         carry, kept = jax.lax.scan(one_draw, (state, moments, tally), first + jnp.arange(length))
         return *carry, kept
@@ -303,14 +332,15 @@ def _counted(window: Tally, info: Info) -> Tally:
         solver_failed=window.solver_failed + info.solver_failed,
         solver_iterations=window.solver_iterations + info.solver_iterations,
         diverging=window.diverging + info.diverging,
+        gradients=window.gradients + info.gradients,
     )
 
 
-def _kept(state: State, window: Tally) -> dict[str, AnyArray]:
+def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:
     """One kept draw; rates and counts are over the steps since the draw before it."""
-    evaluation = state.evaluation
+    evaluation = draw.evaluation
     return {
-        **state.kernel.position,
+        **draw.estimands,
         "lp": evaluation.logdensity,
         "similarity_energy": evaluation.similarity_energy,
         "strain_energy": evaluation.strain_energy,
@@ -319,15 +349,20 @@ def _kept(state: State, window: Tally) -> dict[str, AnyArray]:
         "solver_failed": window.solver_failed.astype(int),
         "outside_support": window.outside_support.astype(int),
         "diverging": window.diverging.astype(int),
+        "gradients": window.gradients.astype(int),
     }
 
 
 def _until(
-    stop: StopRule, advance: Iterator[tuple[Block, Checkpoint]], checkpoint: Checkpoint, bar: Progress
+    stop: StopRule,
+    advance: Iterator[tuple[Block, Checkpoint]],
+    checkpoint: Checkpoint,
+    blocks: list[Block],
+    bar: Progress,
 ) -> Iterator[tuple[Block, Checkpoint]]:
-    """The blocks up to the one at which the stop rule holds."""
+    """The blocks up to the one at which the stop rule holds; `blocks` are those before, which the caller extends."""
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    while not (_converged(stop, checkpoint) or _out_of_time(stop, checkpoint)):
+    while not (_converged(stop, checkpoint, blocks) or _out_of_time(stop, checkpoint)):
         found = next(advance, None)
         if found is None:
             return
@@ -336,15 +371,20 @@ def _until(
         yield found
 
 
-def greatest_rhat(rhat: dict[str, np.ndarray]) -> float:
-    """The worst of all estimands; NaN where it cannot be told."""
-    return float(max((np.max(value, initial=0.0) for value in rhat.values()), default=np.nan))
-
-
-def _converged(stop: StopRule, checkpoint: Checkpoint) -> bool:
+def _converged(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block]) -> bool:
     if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
         return False
-    return greatest_rhat(scale_reduction(checkpoint.moments)["estimands"]) < stop.rhat
+    running = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
+    if stop.ess is None:
+        return running < stop.rhat
+    # The running R̂ is cheap and close to the strict one: where it is far off, that need not be worked out.
+    return running < 1 + 1.5 * (stop.rhat - 1) and _meets(worst(blocks), stop)
+
+
+def _meets(found: Worst, stop: StopRule) -> bool:
+    assert stop.rhat is not None
+    assert stop.ess is not None
+    return found.rhat < stop.rhat and min(found.ess_bulk, found.ess_tail) > stop.ess
 
 
 def _out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
@@ -356,7 +396,7 @@ def _samples(
 ) -> Samples:
     mean, sd = pooled(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
-    converged = None if stop.rhat is None else _converged(stop, checkpoint)
+    converged = None if stop.rhat is None else _converged(stop, checkpoint, blocks)
     return Samples(
         idata=to_inference_data(posterior, blocks),
         u_mean=mean["u"],
@@ -364,22 +404,25 @@ def _samples(
         rhat=rhat,
         tally=jax.tree.map(np.asarray, checkpoint.tally),
         converged=converged,
-        reason=_reason(stop, checkpoint, rhat, draws),
+        reason=_reason(stop, checkpoint, blocks, converged, draws),
         seconds=float(checkpoint.seconds),
         exact=kernel.exact,
     )
 
 
-def _reason(stop: StopRule, checkpoint: Checkpoint, rhat: dict[str, np.ndarray], draws: int) -> str:
-    worst = greatest_rhat(rhat)
-    if _converged(stop, checkpoint):
-        return f"R̂ (unsplit) is below {stop.rhat:g} for every estimand; the greatest is {worst:.3f}"
+def _reason(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block], converged: bool | None, draws: int) -> str:
+    if stop.ess is None:
+        greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
+        state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"below {stop.rhat}"
+    else:
+        found = worst(blocks)
+        state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"
+        rule = f"R̂ below {stop.rhat:g} and both ESS above {stop.ess:g}"
+    if converged:
+        return f"every estimand has converged: {state}"
     limit = f"{draws} draws per chain"
     if _out_of_time(stop, checkpoint):
         limit = f"{stop.max_seconds:g} s of sampling"
     if stop.rhat is None:
-        return f"the budget of {limit} is spent; no convergence rule was set (greatest unsplit R̂ {worst:.3f})"
-    return (
-        f"the budget of {limit} is spent before convergence: the greatest unsplit R̂ is {worst:.3f}, "
-        f"not below {stop.rhat:g}"
-    )
+        return f"the budget of {limit} is spent; no convergence rule was set ({state})"
+    return f"the budget of {limit} is spent before convergence: {state}; the rule asks for {rule}"

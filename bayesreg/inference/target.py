@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from bayesreg.types import AnyArray
@@ -29,6 +29,9 @@ class Target(Protocol):
 
     `data` is a pytree and an argument of every density, so that no array is baked into compiled code.
     """
+
+    def __hash__(self) -> int:
+        """One object, one hash: what is compiled for a target is kept for it."""
 
     @property
     def data(self) -> Any:
@@ -63,3 +66,35 @@ class Target(Protocol):
 
     def constant_data(self) -> dict[str, AnyArray]:
         """What a reader of the draws needs to know of the mesh."""
+
+
+@runtime_checkable
+class SmoothTarget(Target, Protocol):
+    """What samplers that follow gradients know besides.
+
+    A *position* holds the estimands mapped to the real line; "u_boundary" stays as it is and is its last entry.
+    """
+
+    def logdensity_of(self, data: Any, position: Estimands) -> AnyArray:
+        """Log density of a position, the Jacobian included."""
+
+    def constrain_of(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
+        """Estimands of a position."""
+
+    def unconstrain_of(self, data: Any, estimands: Estimands) -> dict[str, AnyArray]:
+        """Position of estimands."""
+
+    def unconstrain(self, values: Estimands) -> dict[str, AnyArray]:
+        """Position of values."""
+
+    def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
+        """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
+
+    def without_walls(self, data: Any) -> Any:
+        """The data of the same problem in which a node may be anywhere."""
+
+    def continuation(self) -> Iterable[tuple[Any, bool]]:
+        """Data of ever harder problems that end with this one, and whether each moves more than displacements."""
+
+    def displacement_precision(self, data: Any, estimands: Estimands) -> AnyArray:
+        """Positive semidefinite curvature (3b, 3b) of minus the log density in "u_boundary"."""

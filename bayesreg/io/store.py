@@ -236,7 +236,8 @@ def read_run(folder: str | Path) -> Run:
     u_mean, u_sd = read_point_data(folder / "mesh.vtu", "u_mean", "u_sd")
     warped = load_image(_require(folder, "warped_mean.nii.gz"))
     metrics = read_json(folder / "metrics.json") if (folder / "metrics.json").exists() else None
-    predicted = Predicted(**load_arrays(folder / "predicted.npz")) if (folder / "predicted.npz").exists() else None
+    known = folder / "predicted.npz"
+    predicted = Predicted(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
     return Run(
         manifest=manifest,
         u_mean=u_mean,

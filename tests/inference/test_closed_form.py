@@ -1,4 +1,4 @@
-"""The sampler against posteriors that are known exactly.
+"""The samplers against posteriors that are known exactly.
 
 Where the moving image is linear in x, E_s is quadratic in u_B, and the posterior of u_B at fixed λ, μ is a Gaussian
 whose mean and precision the oracle computes. With a flat skull it is that Gaussian, cut off: rejection samples it.
@@ -57,17 +57,10 @@ def walled() -> br.Posterior:
     return br.build_posterior(*images, MESH, model=found.posterior.options, skull=found.skull)
 
 
-def run(posterior, sigma_u, seed):
+def run(posterior, sampler, seed, **settings):
+    thin = STEPS_PER_DRAW if sampler == "rwmh" else 1
     return br.sample(
-        posterior,
-        sampler="rwmh",
-        chains=CHAINS,
-        draws=DRAWS,
-        seed=seed,
-        thin=STEPS_PER_DRAW,
-        block=DRAWS,
-        sigma_u=sigma_u,
-        progress=False,
+        posterior, sampler, chains=CHAINS, draws=DRAWS, seed=seed, thin=thin, block=DRAWS, progress=False, **settings
     )
 
 
@@ -126,9 +119,10 @@ def test_density_is_the_gaussian():
             assert found == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.fixture(scope="module")
-def result():
-    return run(problem().posterior, sigma_u=0.25, seed=0)
+@pytest.fixture(scope="module", params=["rwmh", "hmc", "nuts", "laplace"])
+def result(request):
+    """Laplace's approximation of a Gaussian is the Gaussian."""
+    return run(problem().posterior, request.param, seed=0, **({"sigma_u": 0.25} if request.param == "rwmh" else {}))
 
 
 @pytest.mark.slow
@@ -145,7 +139,7 @@ class TestGaussianPosterior:
 
     def test_acceptance_and_known_parameters(self, result):
         stats, posterior = result.idata.sample_stats, result.idata.posterior
-        assert 0.1 < float(stats["acceptance_rate"].mean()) < 0.5
+        assert float(stats["acceptance_rate"].mean()) > 0.1
         assert not stats["solver_failed"].any()
         assert not stats["outside_support"].any()
         np.testing.assert_allclose(posterior["lam"], np.broadcast_to(LAM, posterior["lam"].shape), rtol=1e-12)
@@ -180,9 +174,9 @@ def reference():
     return np.concatenate(kept)
 
 
-@pytest.fixture(scope="module")
-def draws():
-    return draws_of(run(walled(), sigma_u=0.22, seed=1))
+@pytest.fixture(scope="module", params=["rwmh", "hmc", "nuts", "laplace"])
+def draws(request):
+    return draws_of(run(walled(), request.param, seed=1, **({"sigma_u": 0.22} if request.param == "rwmh" else {})))
 
 
 @pytest.mark.slow

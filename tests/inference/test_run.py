@@ -13,7 +13,7 @@ from bayesreg.inference.run import checkpoint_from_arrays, checkpoint_to_arrays
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)
-OPTIONS = {"chains": 3, "thin": 3, "seed": 5, "progress": False, "sigma_u": 0.05}
+OPTIONS = {"sampler": "rwmh", "chains": 3, "thin": 3, "seed": 5, "progress": False, "sigma_u": 0.05}
 
 
 @cache
@@ -112,7 +112,7 @@ def test_stop_rules():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; there are rwmh"),
+        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; there are rwmh, hmc, nuts, laplace"),
         ({"chains": 0}, "chains must be at least 1, got 0"),
         ({"thin": 0}, "thin must be at least 1"),
         ({"sigma_u": -1.0}, "step of u_boundary must be positive"),

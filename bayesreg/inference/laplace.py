@@ -1,0 +1,202 @@
+"""The mode of a posterior, and the Gaussian reference that its curvature defines there (Laplace's approximation)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+from bayesreg.inference.target import SmoothTarget
+from bayesreg.types import AnyArray, InputError
+
+# The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
+SOFTNESS, GAP = 0.05, 0.02
+# The logarithm z of a parameter that only its flat prior and the elastic energy see has the density exp(z − e^z): its
+# variance π²/6 is more than the inverse of its curvature, one, at the mode.
+LEAST_CURVATURE, UNSEEN, INFLATION = 1.0, 4.0, np.pi**2 / 6
+
+
+class Reference(NamedTuple):
+    """The Gaussian N(centre, factor · factorᵀ) of a flat position, whose last 3b entries are "u_boundary" (a pytree).
+
+    Attributes
+    ----------
+    centre : (d,) array
+    factor : (d, d) array
+        Upper triangular; the whitened coordinates are ξ = factor⁻¹ (x − centre).
+    """
+
+    centre: Float[AnyArray, "dimension"]
+    factor: Float[AnyArray, "dimension dimension"]
+
+
+@lru_cache(maxsize=8)
+def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
+    """The map from flat positions to positions."""
+    return ravel_pytree(target.unconstrain(target.reference()))[1]
+
+
+def find_mode(
+    target: SmoothTarget,
+    start: Float[np.ndarray, "dimension"],
+    say: Callable[[str], None] = lambda text: None,
+    iterations: int = 40,
+) -> Float[np.ndarray, "dimension"]:
+    """A mode of the log density of the position, in its support, by L-BFGS along the target's continuation.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    start : (d,) array
+        Flat position to start from; it need not lie in the support.
+    say : callable
+        Told of each stage.
+    iterations : int
+        Most iterations of a stage; the last is repeated up to five times, whitened anew.
+
+    Returns
+    -------
+    (d,) array
+        Flat position. Nodes that the soft skull let in are moved to its surface.
+
+    Raises
+    ------
+    InputError
+        If the density is not finite at the start.
+    """
+    flat = np.asarray(start)
+    *way, last = target.continuation()
+    for data, moves in way:
+        flat = _improved(target, data, flat, moves, iterations, say)
+    for _ in range(5):
+        before = flat
+        flat = _improved(target, last[0], flat, last[1], iterations, say)
+        if np.abs(flat - before).max() < 1e-3:
+            break
+    return _admissible(target, flat)
+
+
+def _improved(
+    target: SmoothTarget,
+    data: Any,
+    flat: Float[np.ndarray, "dimension"],
+    moves: bool,
+    iterations: int,
+    say: Callable[[str], None],
+) -> Float[np.ndarray, "dimension"]:
+    """L-BFGS in the coordinates whitened where it starts, the skull softened."""
+    reference = laplace(target, flat, data, moves)
+    moving = np.ones(len(flat))
+    if not moves:
+        moving[: len(flat) - 3 * len(target.sampled)] = 0.0
+    best: list[tuple[Any, float, Any]] = []
+
+    def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = _softened(target, data, reference, moving * xi)
+        value, gradient = float(value), moving * np.asarray(gradient)
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            if not best:
+                raise InputError("the mode cannot be looked for: the density is not finite at the start field")
+            # A wall for the line search: uphill from the best place so far, sloping back to it.
+            place, least, slope = best[-1]
+            return least + 2 * abs(slope @ (xi - place)), -slope
+        if not best or value < best[-1][1]:
+            best[:] = [(xi.copy(), value, gradient)]
+        return value, gradient
+
+    options = {"maxiter": iterations, "maxcor": 20, "ftol": 1e-10, "gtol": 1e-2}
+    minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
+    say(f"mode: log density {-best[-1][1]:.1f}")
+    return flat + np.asarray(reference.factor) @ (moving * best[-1][0])
+
+
+def _softened_of(target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray) -> AnyArray:
+    """Minus the log density with the hard skull replaced by a penalty."""
+    position = unravel(target)(reference.centre + reference.factor @ xi)
+    gap = target.clearance(data, position["u_boundary"], jnp.arange(len(target.sampled)))
+    penalty = 0.5 * (jnp.minimum(gap - GAP, 0.0) ** 2).sum() / SOFTNESS**2
+    return penalty - target.logdensity_of(target.without_walls(data), position)
+
+
+_softened = jax.jit(jax.value_and_grad(_softened_of, argnums=3), static_argnums=0)
+
+
+def laplace(
+    target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
+) -> Reference:
+    """The Gaussian reference about a flat position.
+
+    The curvature in the displacements is Gauss–Newton's, the rows of the other coordinates are exact; directions
+    in which the latter are not convex are given the least curvature of a logarithmic parameter.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    flat : (d,) array
+    data : pytree, optional
+        Of a problem other than the target's own.
+    joint : bool
+        Whether the other coordinates are given curvature; else they are left uncorrelated.
+    """
+    data = target.data if data is None else data
+    count = len(flat) - 3 * len(target.sampled)
+    precision = np.zeros((len(flat), len(flat)))
+    estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
+    curvature = np.asarray(target.displacement_precision(data, estimands))
+    # A trace of the identity keeps directions finite that neither images nor elasticity see.
+    precision[count:, count:] = curvature + 1e-9 * np.trace(curvature) * np.eye(len(curvature))
+    if joint and count:
+        rows = -np.asarray(_hessian_rows(target, count, target.without_walls(data), jnp.asarray(flat)))
+        precision[:count] = rows
+        precision[count:, :count] = rows[:, count:].T
+        cross = rows[:, count:]
+        inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[count:, count:]), cross.T)
+        schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
+        values, vectors = np.linalg.eigh(schur)
+        values = np.maximum(np.abs(values), LEAST_CURVATURE)
+        convex = (vectors * np.where(values < UNSEEN, values / INFLATION, values)) @ vectors.T
+        precision[:count, :count] = convex + cross @ inner
+    else:
+        precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
+    lower = np.linalg.cholesky((precision + precision.T) / 2)
+    factor = scipy.linalg.solve_triangular(lower, np.eye(len(flat)), lower=True).T
+    return Reference(jnp.asarray(flat), jnp.asarray(factor))
+
+
+def _hessian_rows_of(target: SmoothTarget, count: int, data: Any, flat: AnyArray) -> AnyArray:
+    """The first rows of the Hessian of the log density of a flat position."""
+    gradient = jax.grad(lambda x: target.logdensity_of(data, unravel(target)(x)))
+    directions = jnp.eye(count, len(flat))
+    return jax.lax.map(lambda direction: jax.jvp(gradient, (flat,), (direction,))[1], directions)
+
+
+_hessian_rows = jax.jit(_hessian_rows_of, static_argnums=(0, 1))
+
+
+def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
+    count = 3 * len(target.sampled)
+    u = np.array(flat[-count:].reshape(-1, 3))
+    nodes = jnp.arange(len(u))
+
+    @jax.jit
+    def distance(u: AnyArray) -> tuple[AnyArray, AnyArray]:
+        gap, pullback = jax.vjp(lambda u: target.clearance(target.data, u, nodes), u)
+        return gap, pullback(jnp.ones_like(gap))[0]
+
+    for _ in range(100):
+        gap, slope = (np.asarray(found) for found in distance(jnp.asarray(u)))
+        inside = gap < GAP / 2
+        if not inside.any():
+            return np.concatenate([flat[:-count], u.ravel()])
+        steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
+        u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
+    raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")

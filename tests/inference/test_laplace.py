@@ -1,0 +1,52 @@
+"""The mode and its curvature where both are known in closed form, and from far away."""
+
+import jax
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import bayesreg as br
+from bayesreg.inference.laplace import find_mode, laplace, unravel
+from tests.inference.test_closed_form import LAM, MESH, MU, problem, walled
+from tests.phantoms import smooth_image
+
+
+def test_a_gaussian_posterior_is_its_own_approximation():
+    posterior, _, exact, _ = problem()
+    start = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
+    mode = find_mode(posterior, np.asarray(start) + 0.5)
+    reference = laplace(posterior, mode)
+    sd = np.sqrt(np.diag(np.linalg.inv(exact.precision)))
+    assert (abs(mode - exact.mean) / sd).max() < 0.02
+    covariance = np.asarray(reference.factor @ reference.factor.T)
+    np.testing.assert_allclose(covariance @ exact.precision, np.eye(len(mode)), atol=1e-6)
+
+
+def test_the_mode_is_in_the_support():
+    """The Gaussian's mean has nodes beyond the wall."""
+    posterior = walled()
+    values = {"lam": LAM, "mu": MU}
+    exact = problem().exact
+    assert not posterior.allowed(exact.mean.reshape(-1, 3) + np.array([3.0, 0, 0])).all()
+    start = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
+    mode = find_mode(posterior, start + np.tile([3.0, 0, 0], len(start) // 3))
+    assert posterior.allowed(mode.reshape(-1, 3)).all()
+    assert np.isfinite(posterior.logdensity_constrained({"u_boundary": mode.reshape(-1, 3), **values}))
+
+
+@pytest.mark.slow
+def test_curvature_of_parameters_is_the_hessian():
+    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    prior = br.PriorConfig(alpha=2.0, beta=2.0, low=0.1, high=5.0)
+    model = br.ModelConfig(priors={"lam": prior, "mu": prior}, interpolation="cubic", t_elastic=30.0, rigid_sd=1.0)
+    posterior = br.build_posterior(*images, MESH, model=model)
+    flat = np.asarray(ravel_pytree(posterior.initial(jax.random.key(0)))[0])
+    reference = laplace(posterior, flat)
+    precision = np.linalg.inv(np.asarray(reference.factor @ reference.factor.T))
+
+    gradient = jax.jit(jax.grad(lambda x: -posterior.logdensity_of(posterior.data, unravel(posterior)(x))))
+    count = len(flat) - 3 * len(posterior.sampled)
+    for k in range(count):
+        step = 1e-5 * np.eye(len(flat))[k]
+        row = np.asarray(gradient(flat + step) - gradient(flat - step)) / 2e-5
+        np.testing.assert_allclose(precision[k, count:], row[count:], rtol=1e-4, atol=1e-4 * abs(row).max())
