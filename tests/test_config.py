@@ -73,7 +73,12 @@ def test_paper_tissues_is_section_4_2_to_the_letter(paper_data):
     assert (config.model.fixed, config.model.priors) == ({"mu": {"gm": 1.0}}, {})
     assert (config.sampler.name, config.sampler.sigma_u) == ("rwmh", 0.008)
     assert (config.sampler.chains, config.sampler.thin) == (3, 10)
-    assert (config.stop.rhat, config.stop.max_steps, config.stop.max_minutes) == (1.2, 250_000, None)
+    assert (config.stop.rhat, config.stop.ess, config.stop.max_steps, config.stop.max_minutes) == (
+        1.2,
+        None,
+        250_000,
+        None,
+    )
 
 
 def test_paper_uniform_differs_in_the_elasticity_alone(paper_data):
@@ -191,7 +196,10 @@ start: {field: truth}
         (SMALL + "start: {lam: {csf: 1, gm: 2}}", "start.lam.wm: missing"),
         (SMALL + "start: {lam: soft}", 'start.lam = "soft": expected a number or keys with values'),
         (SMALL + "sampler: {chains: 1}", "stop.rhat: R-hat needs sampler.chains of at least 2"),
-        (SMALL + "stop: {max_steps: 15}", "stop.max_steps = 15: expected at least two kept draws, 20 steps"),
+        (
+            SMALL + "sampler: {thin: 10}\nstop: {max_steps: 15}",
+            "stop.max_steps = 15: expected at least two kept draws, 20",
+        ),
         (SMALL + "model: {elasticity: uniform}\nstart: {mu: {csf: 1, gm: 1, wm: 1}}", "start.mu"),
         (SMALL + "model: {sampled: [4, 4, 7]}", "model.sampled = [4, 4, 7]: expected at least three nodes"),
         (SMALL + "model: {fixed: {mu: {grey: 1}}}", "model.fixed.mu.grey = 1: unknown tissue; expected csf, gm, wm"),
@@ -297,4 +305,4 @@ def test_schema_describes_every_section_and_forbids_unknown_keys():
     assert found["additionalProperties"] is False
     temperature = found["$defs"]["ModelConfig"]["properties"]["t_elastic"]["anyOf"]
     assert {"$ref": "#/$defs/TemperaturePrior"} in temperature
-    assert found["$defs"]["SamplerConfig"]["properties"]["sigma_u"]["description"].endswith("mm.")
+    assert found["$defs"]["RandomWalk"]["properties"]["sigma_u"]["description"].endswith("mm.")

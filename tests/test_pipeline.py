@@ -23,8 +23,8 @@ from tests.phantoms import ball_mesh
 
 ROOT = Path(__file__).parent.parent
 CENTRE = np.array([5.0, -3.0, 8.0])
-STOP = {"rhat": 1.2, "max_steps": 36}
-SAMPLER = {"chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
+STOP = {"rhat": 1.2, "ess": None, "max_steps": 36}
+SAMPLER = {"name": "rwmh", "chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +237,11 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
     monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38))
     monkeypatch.chdir(tmp_path)
-    small = {"simulate": {"displacement": 3, "patch_nodes": 4}, "sampler": {"thin": 3}, "stop": {"max_steps": 36}}
+    small = {
+        "simulate": {"displacement": 3, "patch_nodes": 4},
+        "sampler": {"warm_up": 5, "block": 10},
+        "stop": {"max_steps": 20},
+    }
     (tmp_path / "configs").mkdir()
     extended = {"extends": str(ROOT / "configs" / "quickstart.yaml"), **small}
     YAML(typ="safe").dump(extended, tmp_path / "configs" / "quickstart.yaml")

@@ -177,6 +177,10 @@ class RandomWalk(_Sampler):
     """Sd of a step of each μ."""
 
 
+def _hamiltonian_if_unnamed(value: object) -> object:
+    return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value
+
+
 class StartConfig(Section):
     """Where the chains start."""
 
@@ -231,7 +235,9 @@ class Config(Section):
     ] = None
     """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
     model: ModelConfig = ModelConfig()
-    sampler: Annotated[Hamiltonian | Laplace | RandomWalk, Field(discriminator="name")] = Hamiltonian()
+    sampler: Annotated[
+        Hamiltonian | Laplace | RandomWalk, Field(discriminator="name"), BeforeValidator(_hamiltonian_if_unnamed)
+    ] = Hamiltonian()
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()

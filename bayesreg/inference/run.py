@@ -388,7 +388,9 @@ def _meets(found: Worst, stop: StopRule) -> bool:
 
 
 def _out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
-    return stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
+    # A first block is drawn however long the search for the mode took: a run ends with draws.
+    begun = int(checkpoint.draws) > 0
+    return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
 
 
 def _samples(
@@ -413,7 +415,7 @@ def _samples(
 def _reason(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block], converged: bool | None, draws: int) -> str:
     if stop.ess is None:
         greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
-        state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"below {stop.rhat}"
+        state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"it below {stop.rhat}"
     else:
         found = worst(blocks)
         state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"

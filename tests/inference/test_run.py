@@ -106,7 +106,7 @@ def test_stop_rules():
     assert loose.converged is True
     strict = br.sample(posterior(), draws=20, block=10, stop=br.StopRule(rhat=1.0001, min_draws=20), **OPTIONS)
     assert strict.converged is False
-    assert "not below 1.0001" in strict.reason
+    assert "below 1.0001" in strict.reason
 
 
 @pytest.mark.parametrize(
