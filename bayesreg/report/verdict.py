@@ -110,8 +110,8 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
     named = f"{rhat_text(first.rhat)} ({first.name}{_at(first)})"
     if not failing and part(manifest, "stopped", "converged") is False:
         headline = (
-            f"Not converged by the rule of this run: its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, "
-            f"asked for {threshold:g}, though the rank-normalised R̂ is below it; the greatest is {named}."
+            f"Not converged by the rule of this run: {_missed(manifest, threshold)}, though the rank-normalised R̂ is "
+            f"below {threshold:g}; the greatest is {named}."
         )
         return Verdict(False, headline, stopped + UNCONVERGED)
     if not failing:
@@ -122,6 +122,15 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
         f"the greatest is {named}."
     )
     return Verdict(False, headline, stopped + UNCONVERGED)
+
+
+def _missed(manifest: Mapping[str, Any], threshold: float) -> str:
+    """What the stop rule asked for besides the rank-normalised R-hat, and what was found."""
+    wanted = part(manifest, "stopped", "ess_threshold")
+    if wanted is None:
+        return f"its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, asked for {threshold:g}"
+    bulk, tail = (part(manifest, "convergence", f"ess_{name}_min") for name in ("bulk", "tail"))
+    return f"the least ESS is {fixed(bulk, 0)} (bulk) and {fixed(tail, 0)} (tail), asked for more than {wanted:g}"
 
 
 def _unsplit(manifest: Mapping[str, Any]) -> str:

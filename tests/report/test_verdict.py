@@ -159,3 +159,13 @@ def test_other_formats():
         "1 h 02 min",
         "–",
     ]
+
+
+def test_too_few_effective_draws_are_named():
+    manifest = {
+        "stopped": {"converged": False, "rhat_threshold": 1.01, "ess_threshold": 400.0},
+        "convergence": {"ess_bulk_min": 512.3, "ess_tail_min": 380.2},
+    }
+    found = verdict(manifest, [entry(1.004)])
+    assert not found.converged
+    assert "the least ESS is 512 (bulk) and 380 (tail), asked for more than 400" in found.headline
