@@ -92,7 +92,7 @@ class Result:
 
     @property
     def converged(self) -> bool | None:
-        """Whether both R̂, unsplit and rank-normalised, met the stop rule's threshold; None where there is none."""
+        """Whether the stop rule held and the report's rank-normalised R̂ agrees; None where no rule was set."""
         return self.run.manifest["stopped"]["converged"]
 
     @property

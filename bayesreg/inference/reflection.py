@@ -60,7 +60,7 @@ def walls(centre: Float[AnyArray, "nodes 3"], rows: Float[AnyArray, "nodes 3 dim
     return Walls(centre[near], rows, jnp.einsum("aid,bjd->aibj", rows, rows), jnp.asarray(near))
 
 
-def reflective_rotation(walls: Walls | None, clearance: Clearance | None) -> Callable:
+def reflective_rotation(walls: Walls, clearance: Clearance) -> Callable:
     """An integrator for BlackJAX: half a kick, a rotation reflected at the walls, half a kick; unit mass."""
 
     def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
@@ -88,14 +88,12 @@ class _Flight(NamedTuple):
 
 
 def rotated(
-    walls: Walls | None, clearance: Clearance | None, position: AnyArray, momentum: AnyArray, time: AnyArray | float
+    walls: Walls, clearance: Clearance, position: AnyArray, momentum: AnyArray, time: AnyArray | float
 ) -> tuple[AnyArray, AnyArray]:
     """Position and momentum after the reference's own motion for some time (either sign), reflected at the walls.
 
     A flight that is not over after many reflections ends outside the support of any density: at NaN.
     """
-    if walls is None or clearance is None:
-        return _turn(position, momentum, time)
     # Backward in time is forward with the momentum reversed.
     sign = jnp.sign(time)
     first = _Flight(

@@ -76,10 +76,12 @@ def test_volume_is_kept(made):
     assert checked > 2
 
 
-def test_without_walls_it_is_a_rotation():
-    position, momentum = rotated(None, None, jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0]), jnp.pi / 2)
-    np.testing.assert_allclose(position, [0.0, 2.0], atol=1e-12)
-    np.testing.assert_allclose(momentum, [-1.0, 0.0], atol=1e-12)
+def test_where_no_wall_is_near_it_is_a_rotation(made):
+    """As where there is no skull: the clearance is infinite."""
+    start, momentum = np.random.default_rng(5).normal(size=(2, DIMENSION))
+    found = rotated(made, lambda u: jnp.full(u.shape[:-1], jnp.inf), start, momentum, jnp.pi / 2)
+    np.testing.assert_allclose(found[0], momentum, atol=1e-12)
+    np.testing.assert_allclose(found[1], -start, atol=1e-12)
 
 
 def test_a_flight_that_does_not_end_is_no_place(made, monkeypatch):
