@@ -201,31 +201,35 @@ def _cubic(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
 
 @_cubic.defjvp
 def _cubic_jvp(primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
-    # Value and gradient from one gather of the taps: they are what costs.
+    # Value and gradient from one look at the taps: they are what costs.
     value, gradient = _cubic_and_gradient(*primals)
     return value, (gradient * tangents[1]).sum(axis=-1)
 
 
 def _cubic_and_gradient(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Value, and its gradient in the indices (last axis); sums one axis after the other."""
-    first, offset, strides = _first_tap(coefficients, indices)
-    steps = np.array([np.dot(tap, strides) for tap in product(range(4), repeat=3)])
-    steps = steps.reshape(64, *(1,) * first.ndim)
-    taps = coefficients.reshape(-1).at[first + steps].get(mode="clip").reshape(4, 4, 4, *first.shape)
-    weights = [_cubic_weights(offset[..., axis]) for axis in range(3)]
-    slopes = [_cubic_slopes(offset[..., axis]) for axis in range(3)]
+    """Value, and its gradient in the indices (last axis)."""
+    # The 64 taps of so many points stay in the cache; those of all points at once do not, which costs three times as
+    # much.
+    found = jax.lax.map(partial(_cubic_at, coefficients), indices.reshape(-1, 3), batch_size=1024)
+    value, gradient = jax.lax.optimization_barrier(found)
+    return value.reshape(indices.shape[:-1]), gradient.reshape(indices.shape)
+
+
+def _cubic_at(coefficients: AnyArray, index: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Value and gradient at one point: sums over its taps, one axis after the other."""
+    corner = jax.lax.stop_gradient(jnp.floor(index))
+    taps = jax.lax.dynamic_slice(coefficients, tuple(corner.astype(int)), (4, 4, 4))
+    weights = [_cubic_weights(t) for t in index - corner]
+    slopes = [_cubic_slopes(t) for t in index - corner]
     # Without the barriers XLA fuses the stages and gathers every tap anew for each of the four results.
     taps, weights, slopes = jax.lax.optimization_barrier((taps, weights, slopes))
 
     def along(axis: int, taps: AnyArray, weights: list[tuple[AnyArray, ...]]) -> AnyArray:
-        return sum(taps[..., k, :] * weights[axis][k] for k in range(4))
+        return sum(taps[..., k] * weights[axis][k] for k in range(4))
 
-    taps = taps.reshape(4, 4, 4, -1)
-    weights, slopes = ([tuple(w.reshape(-1) for w in axis) for axis in both] for both in (weights, slopes))
     z, dz = jax.lax.optimization_barrier((along(2, taps, weights), along(2, taps, slopes)))
     y, dy, y_dz = jax.lax.optimization_barrier((along(1, z, weights), along(1, z, slopes), along(1, dz, weights)))
-    gradient = jnp.stack([along(0, y, slopes), along(0, dy, weights), along(0, y_dz, weights)], axis=-1)
-    return along(0, y, weights).reshape(first.shape), gradient.reshape(indices.shape)
+    return along(0, y, weights), jnp.stack([along(0, y, slopes), along(0, dy, weights), along(0, y_dz, weights)])
 
 
 def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:

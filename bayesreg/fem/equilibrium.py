@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.fem.elasticity import internal_force, lame_by_cell, stiffness, stiffness_diagonal
+from bayesreg.fem.elasticity import internal_force, lame_by_cell, stiffness, stiffness_diagonal, strain_products
 from bayesreg.fem.elements import Elements, elements_of
 from bayesreg.fem.preconditioners import ReferenceInverse, reference_inverse
 from bayesreg.mesh import TetMesh
@@ -83,12 +84,32 @@ def equilibrium(
     million times softer than their neighbours. A `guess` (mm, the equilibrium of a state near by) saves
     iterations, and costs the derivative: reverse-mode differentiation then raises.
     """
-    elements, prescribed, free, reference = system
-    nodes = len(prescribed) + len(free)
-    u_given = jnp.zeros((nodes, 3)).at[prescribed].set(u_prescribed)
-    if len(free) == 0:
+    if guess is None:
+        return _differentiable(system, lam, mu, u_prescribed, tolerance)
+    return _settled(system, lam, mu, u_prescribed, tolerance, guess)
+
+
+def _settled(
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, tolerance: float, guess: AnyArray | None
+) -> Equilibrium:
+    nodes = len(system.prescribed) + len(system.free)
+    u_given = jnp.zeros((nodes, 3)).at[system.prescribed].set(u_prescribed)
+    if len(system.free) == 0:
         fine = jnp.isfinite(u_given).all()
         return Equilibrium(u_given, jnp.zeros(()), jnp.zeros((), int), fine)
+    load = -internal_force(system.elements, lam, mu, u_given)[system.free]
+    u_free, info = _response(system, lam, mu, load, tolerance, guess)
+    u = u_given.at[system.free].set(u_free)
+    # A node whose cells have no free node never enters the solve, but must be finite all the same.
+    return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
+
+
+def _response(
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, load: AnyArray, tolerance: float, guess: AnyArray | None = None
+) -> tuple[AnyArray, SolverInfo]:
+    """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
+    elements, prescribed, free, reference = system
+    nodes = len(prescribed) + len(free)
 
     def apply(u_free: AnyArray) -> AnyArray:
         u = jnp.zeros((nodes, 3)).at[free].set(u_free)
@@ -103,14 +124,45 @@ def equilibrium(
         first = jnp.zeros_like(load) if guess is None else guess[free]
         return _conjugate_gradients(apply, load, first, precondition, inverse_diagonal, tolerance)
 
-    load = -internal_force(elements, lam, mu, u_given)[free]
     if guess is None:
-        u_free, info = jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
-    else:
-        u_free, info = solve(apply, load)
-    u = u_given.at[free].set(u_free)
-    # A node whose cells have no free node never enters the solve, but must be finite all the same.
-    return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
+        return jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
+    return solve(apply, load)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(4,))
+def _differentiable(
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, tolerance: float
+) -> Equilibrium:
+    return _settled(system, lam, mu, u_prescribed, tolerance, None)
+
+
+def _forward(
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, tolerance: float
+) -> tuple[Equilibrium, tuple[ElasticSystem, AnyArray, AnyArray, AnyArray]]:
+    state = _settled(system, lam, mu, u_prescribed, tolerance, None)
+    return state, (system, lam, mu, state.u)
+
+
+def _backward(
+    tolerance: float, kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
+) -> tuple[None, AnyArray, AnyArray, AnyArray]:
+    """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
+
+    Written out, for what is derived from the solve by transposing its gathers runs several times slower on the CPU.
+    """
+    system, lam, mu, u = kept
+    bar = cotangent.u
+    if len(system.free) == 0:
+        return None, jnp.zeros_like(lam), jnp.zeros_like(mu), bar[system.prescribed]
+    w_free, _ = _response(system, lam, mu, bar[system.free], tolerance)
+    w = jnp.zeros_like(u).at[system.free].set(w_free)
+    dilatation, distortion = strain_products(system.elements, u, w)
+    reaction = internal_force(system.elements, lam, mu, w)
+    volumes = system.elements.volumes
+    return None, -volumes * dilatation, -volumes * distortion, (bar - reaction)[system.prescribed]
+
+
+_differentiable.defvjp(_forward, _backward)
 
 
 def _conjugate_gradients(

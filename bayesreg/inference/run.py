@@ -186,7 +186,7 @@ def sample(
         checkpoint, blocks = resume[0], list(resume[1])
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
-        advance = _advance(kernel, posterior, chain_keys, thin, block, draws, checkpoint, began)
+        advance = _advance(kernel, chain_keys, thin, block, draws, checkpoint, began)
         for found, reached in _until(stop, advance, checkpoint, blocks, bar):
             blocks.append(found)
             checkpoint = reached
@@ -218,8 +218,8 @@ def first_checkpoint(
     points = starting_points(posterior, start or Start(), chains, key_start)
     kernel = SAMPLERS[sampler](posterior, **settings)
     setup, points = kernel.prepare(points, jax.random.fold_in(key_start, 1), say)
-    checkpoint = _first(kernel, posterior, setup, points)
-    require_density(_observed(kernel, posterior, checkpoint).evaluation)
+    checkpoint = _first(kernel, kernel.data(setup), setup, points)
+    require_density(_observed(kernel, checkpoint).evaluation)
     return checkpoint._replace(seconds=np.array(time.perf_counter() - began))
 
 
@@ -240,7 +240,7 @@ def checkpoint_from_arrays(
     """
     kernel = SAMPLERS[sampler](posterior, **settings)
     points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.estimands(posterior.reference()))
-    expected = jax.eval_shape(lambda setup, p: _first(kernel, posterior, setup, p), kernel.blank(), points)
+    expected = jax.eval_shape(partial(_first, kernel, posterior.data), kernel.blank(), points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
     if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
@@ -248,18 +248,18 @@ def checkpoint_from_arrays(
     return jax.tree.unflatten(structure, leaves)
 
 
-def _first(kernel: Sampler, posterior: Target, setup: Any, points: Any) -> Checkpoint:
-    state = jax.jit(jax.vmap(kernel.init, in_axes=(None, None, 0)))(posterior.data, setup, points)
+def _first(kernel: Sampler, data: Any, setup: Any, points: Any) -> Checkpoint:
+    state = jax.jit(jax.vmap(kernel.init, in_axes=(None, None, 0)))(data, setup, points)
     chains = len(next(iter(points.values())))
-    shapes = jax.eval_shape(jax.vmap(partial(kernel.observe, posterior.data, setup)), state)
+    shapes = jax.eval_shape(jax.vmap(partial(kernel.observe, data, setup)), state)
     moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), _watched(shapes)))
     zeros = jnp.zeros(chains)
     return Checkpoint(np.array(0), setup, state, moments, Tally(*(zeros,) * len(Tally._fields)), np.array(0.0))
 
 
-def _observed(kernel: Sampler, posterior: Target, checkpoint: Checkpoint) -> Draw:
+def _observed(kernel: Sampler, checkpoint: Checkpoint) -> Draw:
     observe = jax.jit(jax.vmap(kernel.observe, in_axes=(None, None, 0)))
-    return observe(posterior.data, checkpoint.setup, checkpoint.state)
+    return observe(kernel.data(checkpoint.setup), checkpoint.setup, checkpoint.state)
 
 
 def _watched(draw: Draw) -> dict[str, Any]:
@@ -268,7 +268,6 @@ def _watched(draw: Draw) -> dict[str, Any]:
 
 def _advance(
     kernel: Sampler,
-    posterior: Target,
     chain_keys: AnyArray,
     thin: int,
     block: int,
@@ -278,10 +277,11 @@ def _advance(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """Blocks of draws, until there are `draws` of them."""
     spent = float(checkpoint.seconds)
+    data = kernel.data(checkpoint.setup)
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
         state, moments, tally, found = _run_block(
-            kernel, length, thin, posterior.data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
+            kernel, length, thin, data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
         )
         found = {name: np.asarray(value) for name, value in found.items()}
         seconds = np.array(spent + time.perf_counter() - began)

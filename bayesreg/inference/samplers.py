@@ -65,6 +65,8 @@ class Sampler(NamedTuple):
     prepare : callable
         (points, key, say) → (setup, points): start points (chains as the leading axis) to what the kernel needs
         besides the data, a pytree that is found once, and the points from which chains then start.
+    data : callable
+        (setup) → the target's data as the functions below take them.
     blank : callable
         () → a setup of the same structure, for reading one back.
     init : callable
@@ -78,6 +80,7 @@ class Sampler(NamedTuple):
     """
 
     prepare: Callable[[Any, AnyArray, Say], tuple[Any, Any]]
+    data: Callable[[Any], Any]
     blank: Callable[[], Any]
     init: Callable[[Any, Any, Estimands], Any]
     step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Info]]
@@ -139,6 +142,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
 
     return Sampler(
         prepare=lambda points, _key, _say: (None, points),
+        data=lambda _: target.data,
         blank=lambda: None,
         init=init,
         step=step,
@@ -258,7 +262,10 @@ def _about_reference(target: SmoothTarget, transition: Callable, warm_up: int, a
         starts = _overdispersed(target, target.data, setup, jax.random.split(key_start, chains))
         if not warm_up:
             return setup, starts
-        return _tuned(target, init, step, setup, starts, key_tune, warm_up, acceptance, say)
+        return _tuned(target, conditioned(setup), init, step, setup, starts, key_tune, warm_up, acceptance, say)
+
+    def conditioned(setup: Setup) -> Any:
+        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.reference.centre)))
 
     def blank() -> Setup:
         flat = ravel_pytree(target.unconstrain(target.reference()))[0]
@@ -266,11 +273,12 @@ def _about_reference(target: SmoothTarget, transition: Callable, warm_up: int, a
         reference = Reference(jnp.zeros(d), jnp.zeros((d, d)))
         return Setup(reference, _walls(target, reference), jnp.zeros(()), jnp.zeros((), int))
 
-    return Sampler(prepare, blank, init, step, observe, exact=True)
+    return Sampler(prepare, conditioned, blank, init, step, observe, exact=True)
 
 
 def _tuned(
     target: SmoothTarget,
+    data: Any,
     init: Callable,
     step: Callable,
     setup: Setup,
@@ -309,7 +317,7 @@ def _tuned(
             rates,
         )
 
-    points, size, rates = run(target.data, setup, starts, key)
+    points, size, rates = run(data, setup, starts, key)
     tuned = sized(size)
     late = float(rates[warm_up // 2 :].mean())
     say(f"warm-up: step {float(tuned.step_size):.2f}, {int(tuned.steps)} steps a trajectory, acceptance {late:.0%}")
@@ -317,16 +325,29 @@ def _tuned(
 
 
 def _overdispersed(target: SmoothTarget, data: Any, setup: Setup, keys: AnyArray) -> Any:
-    """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support."""
+    """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support.
+
+    Raises
+    ------
+    InputError
+        If a chain finds no place in the support.
+    """
 
     @jax.jit
-    def start(data: Any, setup: Setup, key: AnyArray) -> Any:
+    def start(data: Any, setup: Setup, key: AnyArray, width: AnyArray) -> Any:
         d = len(setup.reference.centre)
-        momentum = OVERDISPERSION * jax.random.normal(key, (d,))
+        momentum = width * jax.random.normal(key, (d,))
         xi, _ = rotated(setup.walls, _clearance(target, data, setup), jnp.zeros(d), momentum, jnp.pi / 2)
-        return target.constrain_of(data, _whitened_position(target, setup.reference, xi))
+        return target.constrain_of(data, _whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()
 
-    return jax.vmap(partial(start, data, setup))(keys)
+    width = np.full(len(keys), OVERDISPERSION)
+    for _ in range(10):
+        points, done = jax.vmap(partial(start, data, setup))(keys, jnp.asarray(width))
+        if done.all():
+            return points
+        # A flight that is caught in a corner of the skull does not end; a shorter one may.
+        width = np.where(done, width, width / 2)
+    raise InputError(f"{int((~done).sum())} of {len(keys)} chains find no start near the mode outside the skull")
 
 
 def _walls(target: SmoothTarget, reference: Reference) -> Walls:

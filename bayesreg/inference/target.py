@@ -90,6 +90,9 @@ class SmoothTarget(Target, Protocol):
     def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
         """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
 
+    def conditioned(self, estimands: Estimands) -> Any:
+        """The data of the same problem, prepared for fast densities near these estimands."""
+
     def without_walls(self, data: Any) -> Any:
         """The data of the same problem in which a node may be anywhere."""
 

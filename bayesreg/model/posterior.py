@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpyro.infer.util import log_density
 
+from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
@@ -197,6 +198,12 @@ class Posterior:
         yield self.data, False
         yield self.data, True
 
+    def conditioned(self, estimands: Values) -> RegistrationData:
+        """The data of the same problem, the interior solves preconditioned at these λ and μ: faster near them."""
+        values = _complete(self.data, estimands, self.free)
+        lam, mu = (tuple(np.asarray(values[name]).tolist()) for name in LAME)
+        return self.data._replace(system=_conditioned_system(self, lam, mu))
+
     def displacement_precision(self, data: RegistrationData, estimands: Values) -> Float[np.ndarray, "rows rows"]:
         """Curvature of −log p(u, λ, μ | m) in "u_boundary": Gauss–Newton, positive semidefinite.
 
@@ -347,6 +354,13 @@ def build_posterior(
     model = model or ModelConfig()
     data, sampled = registration_data(fixed, moving, mesh, model, skull, reference)
     return Posterior(data, mesh, model, sampled, fixed, moving)
+
+
+@lru_cache(maxsize=2)
+def _conditioned_system(posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...]) -> ElasticSystem:
+    entry = np.asarray(posterior.data.cell_entry)
+    prescribed = np.asarray(posterior.data.system.prescribed)
+    return elastic_system(posterior.mesh, prescribed, np.array(lam)[entry], np.array(mu)[entry])
 
 
 def _complete(data: RegistrationData, estimands: Values, free: Mapping[str, np.ndarray]) -> dict[str, AnyArray]:
