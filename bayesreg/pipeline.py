@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
-from bayesreg.inference.diagnostics import Convergence, convergence, dataset, open_posterior, save_posterior
+from bayesreg.inference.diagnostics import Convergence, convergence, dataset, open_posterior, save_posterior, to_block
 from bayesreg.inference.initialise import Start
 from bayesreg.inference.run import (
     Block,
@@ -28,6 +28,7 @@ from bayesreg.inference.run import (
     sample,
 )
 from bayesreg.io import store
+from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Inputs, Run
 from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
@@ -108,9 +109,10 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     ----------
     config : path or Config
     out : path
-        The run folder, new or empty; with `resume`, that of a run that was cut off.
+        The run folder, new or empty; with `resume`, that of a run that was cut off, or of a finished one.
     resume : bool
-        Continue after the last block that was stored.
+        Continue after the last draws that were stored. Where the section `stop` differs from the one that the run was
+        begun with, the new one holds: a finished run is given more draws so.
     progress : bool
         Say what is being done, and show a progress bar.
 
@@ -128,14 +130,18 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     began = time.perf_counter()
     say = _narrator(progress)
     if resume and (out / "config.yaml").exists():
-        _require_same_config(out, config)
-        if (out / "run.json").exists():
-            say(f"{out} holds a finished run already")
+        known = _resumed_config(out, config)
+        if (out / "run.json").exists() and known.stop == config.stop:
+            say(f"{out} holds a finished run already; another budget (stop) would continue it")
             if not (out / "report.html").exists():
                 report(out)
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
+        if (out / "run.json").exists():
+            store.reopen(out, to_block(posterior, load_result(out).idata))
+        inputs = inputs._replace(config=resolved_yaml(config))
+        write_text(out / "config.yaml", inputs.config)
         reached = _reached(config, inputs, posterior, out, progress)
         sampled = float(reached[0].seconds)
         began -= provenance["unsampled"] + sampled
@@ -277,12 +283,15 @@ def _timed(provenance: dict[str, Any], began: float) -> dict[str, Any]:
     return provenance | {"unsampled": time.perf_counter() - began}
 
 
-def _require_same_config(out: Path, config: Config) -> None:
-    if (out / "config.yaml").read_text(encoding="utf-8") != resolved_yaml(config):
+def _resumed_config(out: Path, config: Config) -> Config:
+    """The configuration that a run was begun with; InputError if it differs in more than its budget."""
+    known = load_config(out / "config.yaml")
+    if resolved_yaml(known.model_copy(update={"stop": config.stop})) != resolved_yaml(config):
         raise InputError(
-            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), "
-            "or name another folder"
+            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which only "
+            "the section stop may change, or name another folder"
         )
+    return known
 
 
 def _narrator(progress: bool) -> Callable[[str], None]:
@@ -410,7 +419,7 @@ def _finish(
         **inputs._asdict(),
     )
     store.write_results(out, finished, mean_field, sd_field)
-    store.remove_checkpoints(out)
+    store.remove_blocks(out)
     result = Result(out, finished)
     write_report(finished, samples.idata, *judged, result.report)
     return result

@@ -142,6 +142,25 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
     np.testing.assert_array_equal(resumed.u_sd, finished.u_sd)
 
 
+def test_a_finished_run_is_continued_with_more_draws(finished, folder):
+    """The draws are those of a run that had the greater budget from the start."""
+    more = br.load_config(folder / "run.yaml", [f"stop.max_steps={2 * STOP['max_steps']}"])
+    whole = br.run(more, folder / "whole", progress=False)
+    shutil.copytree(folder / "out", folder / "continued")
+    continued = br.run(more, folder / "continued", resume=True, progress=False)
+    assert continued.idata.posterior.sizes["draw"] == 2 * finished.idata.posterior.sizes["draw"]
+    for group in ("posterior", "sample_stats"):
+        found, expected = (getattr(run.idata, group) for run in (continued, whole))
+        for name in expected:
+            np.testing.assert_array_equal(found[name], expected[name])
+    np.testing.assert_allclose(continued.u_sd, whole.u_sd, rtol=1e-12)
+    assert "max_steps: %d" % (2 * STOP["max_steps"]) in (folder / "continued" / "config.yaml").read_text()
+    (folder / "continued" / "state.npz").unlink()
+    with pytest.raises(br.InputError, match=r"cannot be continued: state\.npz"):
+        br.run(folder / "run.yaml", folder / "continued", resume=True, progress=False)
+    assert (folder / "continued" / "run.json").exists()
+
+
 def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):
     monkeypatch.setattr(preparation, "make_pair", None)
     np.savez(folder / "other.npz", u=np.zeros((9, 3)))

@@ -69,6 +69,16 @@ def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> An
     )
 
 
+def to_block(target: Target, idata: Any) -> dict[str, np.ndarray]:
+    """All draws as one block: the inverse of `to_inference_data`."""
+    posterior, statistics = dataset(idata, "posterior"), dataset(idata, "sample_stats")
+    block = {}
+    for name in target.estimands(target.reference()):
+        values = np.asarray(posterior[name].values, float)
+        block[name] = values[..., np.asarray(target.free[name])] if name in target.free else values
+    return block | {name: statistics[name].values for name in STATISTICS}
+
+
 def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """λ and μ with their known entries, on the host: there may be many draws."""
     reference = target.reference()

@@ -323,11 +323,28 @@ def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
     return load_arrays(path, "delete it, and the run resumes from its first step") if path.exists() else None
 
 
-def remove_checkpoints(folder: str | Path) -> None:
-    """Remove draws/ and state.npz of a run whose results are complete."""
+def remove_blocks(folder: str | Path) -> None:
+    """Remove draws/ of a run whose results are complete; state.npz stays, from which it can be continued."""
+    shutil.rmtree(Path(folder) / "draws", ignore_errors=True)
+
+
+def reopen(folder: str | Path, draws: Mapping[str, AnyArray]) -> None:
+    """Make of a finished run one that was cut off after one block, which holds all its draws.
+
+    Killed between any two of its steps, it leaves a finished run, or what it is to leave.
+
+    Raises
+    ------
+    InputError
+        If the run's last state was not kept.
+    """
     folder = Path(folder)
-    shutil.rmtree(folder / "draws", ignore_errors=True)
-    (folder / "state.npz").unlink(missing_ok=True)
+    state = load_state(folder)
+    if state is None:
+        raise InputError(f"{folder} cannot be continued: state.npz, where its chains stood last, is missing")
+    save_block(folder, 0, draws)
+    save_state(folder, state | {"blocks": np.array(1)})
+    (folder / "run.json").unlink()
 
 
 def _require(folder: Path, name: str) -> Path:
