@@ -38,6 +38,10 @@ SMOOTHING = (
 )  # fmt: skip
 
 
+# Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
+NEAR = 1e3
+
+
 class Evaluation(NamedTuple):
     """The log density at one place, and what was found on the way.
 
@@ -201,8 +205,10 @@ class Posterior:
     def conditioned(self, estimands: Values) -> RegistrationData:
         """The data of the same problem, the interior solves preconditioned at these λ and μ: faster near them."""
         values = _complete(self.data, estimands, self.free)
-        lam, mu = (tuple(np.asarray(values[name]).tolist()) for name in LAME)
-        return self.data._replace(system=_conditioned_system(self, lam, mu))
+        # A tissue that is next to nothing leaves K_II without a factor.
+        reference = {name: np.asarray(getattr(self.data, name).reference) for name in LAME}
+        near = (np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items())
+        return self.data._replace(system=_conditioned_system(self, *(tuple(x.tolist()) for x in near)))
 
     def displacement_precision(self, data: RegistrationData, estimands: Values) -> Float[np.ndarray, "rows rows"]:
         """Curvature of −log p(u, λ, μ | m) in "u_boundary": Gauss–Newton, positive semidefinite.
