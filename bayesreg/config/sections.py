@@ -6,7 +6,16 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    TypeAdapter,
+    ValidationInfo,
+    field_validator,
+)
 
 from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_field
 from bayesreg.model.options import ModelConfig, Vector
@@ -212,6 +221,14 @@ class RandomWalk(_Sampler):
     """Sd of a step of each μ."""
 
 
+SamplerConfig = Hamiltonian | Local | Tempered | Approximation | RandomWalk
+
+
+def sampler_section(name: str) -> SamplerConfig:
+    """The section of a sampler by its name, with default settings."""
+    return TypeAdapter(Annotated[SamplerConfig, Field(discriminator="name")]).validate_python({"name": name})
+
+
 def _hamiltonian_if_unnamed(value: object) -> object:
     return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value
 
@@ -271,7 +288,7 @@ class Config(Section):
     """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
     model: ModelConfig = ModelConfig()
     sampler: Annotated[
-        Hamiltonian | Local | Tempered | Approximation | RandomWalk,
+        SamplerConfig,
         Field(discriminator="name"),
         BeforeValidator(_hamiltonian_if_unnamed),
     ] = Hamiltonian()

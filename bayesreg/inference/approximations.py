@@ -17,7 +17,6 @@ from bayesreg.inference.laplace import Reference, softened
 from bayesreg.inference.reflection import rotated
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.whitened import (
-    ModeSearch,
     Moved,
     Setup,
     about_reference,
@@ -31,7 +30,7 @@ from bayesreg.types import AnyArray, InputError
 ITERATIONS, JUDGES = 30, 8
 
 
-def laplace_sampler(target: SmoothTarget, mode_search: ModeSearch = "once") -> Sampler:
+def laplace_sampler(target: SmoothTarget, mode_search: str = "once") -> Sampler:
     """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
 
     def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -46,7 +45,7 @@ def laplace_sampler(target: SmoothTarget, mode_search: ModeSearch = "once") -> S
     return about_reference(target, transition, mode_search=mode_search, exact=False)
 
 
-def pathfinder(target: SmoothTarget, mode_search: ModeSearch = "once") -> Sampler:
+def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
     """As `laplace`, from Pathfinder's Gaussian (Zhang et al. 2022): that of the greatest evidence bound on a path.
 
     The path is that of L-BFGS in the coordinates that Laplace's approximation whitens, from an overdispersed start; the

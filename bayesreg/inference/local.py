@@ -15,7 +15,7 @@ from bayesreg.inference.laplace import Reference
 from bayesreg.inference.reflection import reflective_leapfrog, rotated, shifted
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.warm_up import Tuning
-from bayesreg.inference.whitened import ModeSearch, Moved, Setup, about_reference, clearance_of, whitened_density
+from bayesreg.inference.whitened import Moved, Setup, about_reference, clearance_of, whitened_density
 from bayesreg.types import AnyArray
 
 # Steps of a random walk shrink with the square root of the dimension, and with what refuses them.
@@ -23,7 +23,7 @@ LEAST = 1e-4
 
 
 def mala(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.574, mode_search: ModeSearch = "once"
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.574, mode_search: str = "once"
 ) -> Sampler:
     """The Metropolis-adjusted Langevin algorithm: Hamiltonian Monte Carlo of a single leapfrog step (Neal 2011).
 
@@ -50,7 +50,7 @@ def mala(
 
 
 def barker(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.4, mode_search: ModeSearch = "once"
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.4, mode_search: str = "once"
 ) -> Sampler:
     """Barker's proposal, whose gradient decides on signs alone (Livingstone and Zanella 2022); settings of `mala`.
 
@@ -69,7 +69,7 @@ def barker(
 
 
 def rwmh_adaptive(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: ModeSearch = "once"
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
 ) -> Sampler:
     """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned; settings of `mala`.
 
@@ -90,7 +90,7 @@ def rwmh_adaptive(
 
 
 def pcn(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: ModeSearch = "once"
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
 ) -> Sampler:
     """Preconditioned Crank–Nicolson on the Gaussian reference (Cotter et al. 2013); its settings are those of `mala`.
 

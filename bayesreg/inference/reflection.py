@@ -68,17 +68,20 @@ def walls(centre: Float[AnyArray, "nodes 3"], rows: Float[AnyArray, "nodes 3 dim
     return Walls(centre[near], rows, jnp.einsum("aid,bjd->aibj", rows, rows), jnp.asarray(near))
 
 
-def reflective_rotation(walls: Walls, clearance: Clearance) -> Callable:
-    """An integrator for BlackJAX: half a kick, a rotation reflected at the walls, half a kick; unit mass."""
+def reflective_rotation(walls: Walls, clearance: Clearance, precision: AnyArray | float = 1.0) -> Callable:
+    """An integrator for BlackJAX: half a kick, a rotation reflected at the walls, half a kick.
+
+    The reference is N(0, I / precision) and the mass the precision, of which BlackJAX takes the inverse.
+    """
 
     def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
         density = jax.value_and_grad(logdensity_fn)
 
         def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
-            momentum = state.momentum + step_size / 2 * (state.logdensity_grad + state.position)
-            position, momentum = rotated(walls, clearance, state.position, momentum, step_size)
+            momentum = state.momentum + step_size / 2 * (state.logdensity_grad + precision * state.position)
+            position, velocity = rotated(walls, clearance, state.position, momentum / precision, step_size)
             logdensity, gradient = density(position)
-            momentum = momentum + step_size / 2 * (gradient + position)
+            momentum = precision * velocity + step_size / 2 * (gradient + precision * position)
             return IntegratorState(position, momentum, logdensity, gradient)
 
         return one_step

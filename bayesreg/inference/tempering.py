@@ -16,7 +16,6 @@ from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.reflection import reflective_rotation, rotated
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.whitened import (
-    ModeSearch,
     Setup,
     clearance_of,
     whitened_density,
@@ -35,7 +34,7 @@ def smc(
     spread: float = 2.0,
     warm_up: int = 60,
     target_acceptance: float = 0.75,
-    mode_search: ModeSearch = "once",
+    mode_search: str = "once",
 ) -> Sampler:
     """Adaptive tempered sequential Monte Carlo, whose particles are where chains of `hmc` start.
 
@@ -65,7 +64,7 @@ def smc(
         setup, _ = chains_of.prepare(points, key, say)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         first = _broad(target, target.data, setup, spread, jax.random.split(key_first, particles))
-        found, weights = _tempered(target, setup, spread, first, key_temper, say)
+        found, weights = _tempered(target, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
         return setup, jax.vmap(partial(target.constrain_of, target.data))(positions)
@@ -74,7 +73,7 @@ def smc(
 
 
 @partial(jax.jit, static_argnums=0)
-def _broad(target: SmoothTarget, data: Any, setup: Setup, spread: float, keys: AnyArray) -> AnyArray:
+def _broad(target: SmoothTarget, data: Any, setup: Setup, spread: AnyArray | float, keys: AnyArray) -> AnyArray:
     """Draws of N(0, spread² I) cut off by the skull: from the mode, by quarter turns about it."""
     clearance = clearance_of(target, data, setup)
 
@@ -90,44 +89,55 @@ def _broad(target: SmoothTarget, data: Any, setup: Setup, spread: float, keys: A
 
 
 def _tempered(
-    target: SmoothTarget, setup: Setup, spread: float, particles: AnyArray, key: AnyArray, say: Say
+    target: SmoothTarget, setup: Setup, spread: float, particles: AnyArray, acceptance: float, key: AnyArray, say: Say
 ) -> tuple[AnyArray, AnyArray]:
-    """Particles and weights at β = 1."""
-    state = adaptive_tempered.init(particles)
+    """Particles and weights at β = 1; from one temperature to the next the step size follows the acceptance."""
+    state, size = adaptive_tempered.init(particles), setup.step_size
     for number in range(_MOST):
-        state, acceptance = _rise(target, target.data, setup, spread, state, jax.random.fold_in(key, number))
+        state, rate = _rise(target, target.data, setup, spread, state, size, jax.random.fold_in(key, number))
         power = float(state.tempering_param)
         if not np.isfinite(power):
             break
         if power >= 1:
             effective = 1 / float((state.weights**2).sum())
-            say(f"tempering: {number + 1} temperatures, acceptance {float(acceptance):.0%}, {effective:.0f} particles")
+            say(f"tempering: {number + 1} temperatures, acceptance {float(rate):.0%}, {effective:.0f} particles")
             return state.particles, state.weights
+        size = jnp.clip(size * jnp.exp(rate - acceptance), 0.01, jnp.pi / 2)
     raise InputError("the tempering came to a halt before the posterior; give smc more particles or less spread")
 
 
 @partial(jax.jit, static_argnums=0)
-def _rise(target: SmoothTarget, data: Any, setup: Setup, spread: float, state: Any, key: AnyArray) -> tuple[Any, Any]:
-    """Resample, move, and reweight for the next β."""
+def _rise(
+    target: SmoothTarget,
+    data: Any,
+    setup: Setup,
+    spread: AnyArray | float,
+    state: Any,
+    size: AnyArray,
+    key: AnyArray,
+) -> tuple[Any, AnyArray]:
+    """Resample, move, and reweight for the next β; and the acceptance of the moves."""
     density = whitened_density(target, data, setup.reference)
+    clearance = clearance_of(target, data, setup)
 
     def broad(xi: AnyArray) -> AnyArray:
         return -0.5 * (xi @ xi) / spread**2
 
+    # That of the tempered reference, about which trajectories rotate.
+    precision = (1 - state.tempering_param) / spread**2 + state.tempering_param
     kernel = adaptive_tempered.build_kernel(
         broad,
-        # Minus infinity in the skull, so that no power but zero lets a particle in; there the walls keep it out.
         lambda xi: density(xi) - broad(xi),
-        blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup))),
+        blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance, precision)),
         blackjax.mcmc.hmc.init,
         resampling.systematic,
         _SHARE,
         batch_size=_BATCH,
     )
     settings = {
-        "step_size": setup.step_size,
-        "inverse_mass_matrix": jnp.ones_like(setup.reference.centre),
-        "num_integration_steps": setup.steps,
+        "step_size": size,
+        "inverse_mass_matrix": jnp.ones_like(setup.reference.centre) / precision,
+        "num_integration_steps": jnp.maximum(jnp.round(jnp.pi / 2 / size), 1).astype(int),
     }
     state, info = kernel(key, state, _MOVES, jax.tree.map(lambda x: x[None], settings))
     return state, info.update_info.acceptance_rate.mean()

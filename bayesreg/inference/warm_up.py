@@ -36,6 +36,14 @@ class Tuning(NamedTuple):
     greatest: float = float(jnp.pi / 2)
 
 
+def require_sound(tuning: Tuning) -> None:
+    """Raise InputError where an option is out of range."""
+    if not 0 < tuning.acceptance < 1:
+        raise InputError(f"target_acceptance must lie between 0 and 1, got {tuning.acceptance}")
+    if tuning.warm_up < 1:
+        raise InputError(f"warm_up must be at least 1, got {tuning.warm_up}")
+
+
 def tuned(
     data: Any, kernel: tuple[Callable, Callable, Callable], setup: Any, starts: Any, key: AnyArray, tuning: Tuning,
     say: Say,
@@ -55,10 +63,6 @@ def tuned(
     say : callable
         Told of what was found.
     """
-    if not 0 < tuning.acceptance < 1:
-        raise InputError(f"target_acceptance must lie between 0 and 1, got {tuning.acceptance}")
-    if tuning.warm_up < 1:
-        raise InputError(f"warm_up must be at least 1, got {tuning.warm_up}")
     init, step, estimands_of = kernel
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import blackjax
 import jax
@@ -21,13 +21,13 @@ from bayesreg.inference.laplace import Reference, unravel
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
 from bayesreg.inference.target import Estimands, SmoothTarget
-from bayesreg.inference.warm_up import FIRST_STEP, Tuning, tuned
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.inference.warm_up import FIRST_STEP, Tuning, require_sound, tuned
+from bayesreg.types import AnyArray, InputError, Scalar
 
 # Chains start that much wider than Laplace's approximation.
 OVERDISPERSION = 1.5
 
-ModeSearch = Literal["once", "per_chain"]
+MODE_SEARCHES = ("once", "per_chain")
 
 
 class Setup(NamedTuple):
@@ -100,7 +100,7 @@ def about_reference(
     tuning: Tuning | None = None,
     begin: Callable[[AnyArray, Callable], Any] = blackjax.mcmc.hmc.init,
     density: Density = whitened_density,
-    mode_search: ModeSearch = "once",
+    mode_search: str = "once",
     exact: bool = True,
 ) -> Sampler:
     """A sampler of the whitened coordinates.
@@ -119,7 +119,16 @@ def about_reference(
     mode_search : str
         "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
     exact : bool
+
+    Raises
+    ------
+    InputError
+        If an option is out of range.
     """
+    if mode_search not in MODE_SEARCHES:
+        raise InputError(f"mode_search must be {' or '.join(MODE_SEARCHES)}, got {mode_search!r}")
+    if tuning is not None:
+        require_sound(tuning)
 
     def init(data: Any, setup: Setup, estimands: Estimands) -> Any:
         flat = ravel_pytree(target.unconstrain_of(data, estimands))[0]
