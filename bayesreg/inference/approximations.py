@@ -57,7 +57,9 @@ def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
         setup, starts = about_mode.prepare(points, key, say)
         first = target.unconstrain_of(target.data, jax.tree.map(lambda x: x[0], starts))
         flat = ravel_pytree(first)[0]
-        path = _path(target, target.data, setup.reference, whitened(setup.reference, flat), jax.random.fold_in(key, 0))
+        path = _path(
+            target, about_mode.data(setup), setup.reference, whitened(setup.reference, flat), jax.random.fold_in(key, 0)
+        )
         elbo, mean, covariance = (np.asarray(found) for found in path)
         if not np.isfinite(elbo):
             raise InputError("pathfinder found no Gaussian with a finite evidence bound; use the sampler laplace")

@@ -62,9 +62,10 @@ def smc(
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
         setup, _ = chains_of.prepare(points, key, say)
+        data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
-        first = _broad(target, target.data, setup, spread, jax.random.split(key_first, particles))
-        found, weights = _tempered(target, setup, spread, first, target_acceptance, key_temper, say)
+        first = _broad(target, data, setup, spread, jax.random.split(key_first, particles))
+        found, weights = _tempered(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
         return setup, jax.vmap(partial(target.constrain_of, target.data))(positions)
@@ -89,12 +90,19 @@ def _broad(target: SmoothTarget, data: Any, setup: Setup, spread: AnyArray | flo
 
 
 def _tempered(
-    target: SmoothTarget, setup: Setup, spread: float, particles: AnyArray, acceptance: float, key: AnyArray, say: Say
+    target: SmoothTarget,
+    data: Any,
+    setup: Setup,
+    spread: float,
+    particles: AnyArray,
+    acceptance: float,
+    key: AnyArray,
+    say: Say,
 ) -> tuple[AnyArray, AnyArray]:
     """Particles and weights at β = 1; from one temperature to the next the step size follows the acceptance."""
     state, size = adaptive_tempered.init(particles), setup.step_size
     for number in range(_MOST):
-        state, rate = _rise(target, target.data, setup, spread, state, size, jax.random.fold_in(key, number))
+        state, rate = _rise(target, data, setup, spread, state, size, jax.random.fold_in(key, number))
         power = float(state.tempering_param)
         if not np.isfinite(power):
             break

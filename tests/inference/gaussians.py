@@ -81,6 +81,9 @@ class GaussianTarget:
     def constant_data(self):
         return {}
 
+    def conditioned(self, estimands):
+        return self.data
+
     def without_walls(self, data):
         return data._replace(wall=jnp.asarray(jnp.inf))
 
