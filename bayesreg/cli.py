@@ -50,8 +50,12 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override an entry, e.g. sampler.chains=4; may be repeated."),
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run that DIR holds; a finished one needs a larger budget.")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with the run that DIR holds; a finished one needs a larger budget.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+Samplers = Annotated[str | None, typer.Option(metavar="NAME,NAME...", help="Which ones; all of them if left out.")]
+Minutes = Annotated[float, typer.Option(help="Budget of each sampler.")]
 Page = Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="HTML file to write.")]
 
 
@@ -127,6 +131,26 @@ def compare(folders: RunFolders, out: Page = Path("compare.html")) -> None:
     from bayesreg import pipeline
 
     typer.echo(f"Comparison: {pipeline.compare(folders, out)}")
+
+
+@app.command()
+def compare_samplers(
+    config: ConfigFile,
+    out: OutFolder = Path("samplers"),
+    samplers: Samplers = None,
+    minutes: Minutes = 5.0,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Draw from one posterior with several samplers; tell what effective draws cost with each."""
+    from bayesreg.config import load_config
+
+    settings = load_config(config, overrides or ())
+    from bayesreg import comparison
+
+    chosen = {} if samplers is None else {"samplers": [name.strip() for name in samplers.split(",")]}
+    comparison.compare_samplers(settings, out, minutes=minutes, progress=not quiet, **chosen)
+    typer.echo(f"Comparison: {out / 'samplers.html'}")
 
 
 @app.command()

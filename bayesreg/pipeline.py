@@ -151,7 +151,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         if not (resume and (out / PROVENANCE).exists()):
             store.require_fresh(out)
         say("reading the images, meshing")
-        inputs, provenance = _prepared_inputs(config)
+        inputs, provenance = prepared_inputs(config)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs)
         reached = _first(config, inputs, posterior, progress)
@@ -168,9 +168,9 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
 def check(config: str | Path | Config) -> Check:
     """Everything but sampling, with an estimate of time and memory."""
     config = config if isinstance(config, Config) else load_config(config)
-    inputs, provenance = _prepared_inputs(config)
+    inputs, provenance = prepared_inputs(config)
     posterior = posterior_of(config, inputs)
-    start = _start(config, inputs, posterior)
+    start = start_of(config, inputs, posterior)
     options, trial, reached = config.sampler, 10, []
 
     def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
@@ -230,7 +230,7 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
         raise InputError("the configuration has no section 'simulate': its pair comes from files")
     began = time.perf_counter()
     store.require_fresh(out)
-    inputs, provenance = _prepared_inputs(config)
+    inputs, provenance = prepared_inputs(config)
     _store(Path(out), inputs, _timed(provenance, began))
     return Path(out)
 
@@ -272,7 +272,8 @@ def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "
     return values
 
 
-def _prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
+def prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
+    """The images, mesh and truth of a configuration, and where they come from."""
     prepared = prepare(config)
     require_inside(prepared.inputs.mesh, config.report.landmarks)
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
@@ -304,7 +305,8 @@ def _described(inputs: Inputs) -> str:
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
 
-def _start(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
+def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
+    """Where a configuration's chains begin."""
     field = _start_field(config, inputs)
     return Start(
         field=None if field is None else field[posterior.sampled],
@@ -345,7 +347,7 @@ Reached = tuple[Checkpoint, list[Block]]
 
 def _first(config: Config, inputs: Inputs, posterior: Posterior, progress: bool) -> Reached:
     """The chains before their first step; InputError where one cannot start."""
-    options, start = config.sampler, _start(config, inputs, posterior)
+    options, start = config.sampler, start_of(config, inputs, posterior)
     found = first_checkpoint(
         posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
     )

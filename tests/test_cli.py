@@ -80,6 +80,18 @@ def test_other_commands_call_the_pipeline(pipeline):
     assert pipeline.calls["compare"] == ([Path("a"), Path("b"), Path("c")], Path("page.html"))
 
 
+def test_samplers_to_compare_are_named_or_all(monkeypatch):
+    calls = []
+    stub = SimpleNamespace(compare_samplers=lambda *given, **options: calls.append((given, options)))
+    monkeypatch.setattr(bayesreg, "comparison", stub, raising=False)
+    done = invoke("compare-samplers", QUICK, "--samplers", "hmc, nuts", "--minutes", "2", "--set", "seed=4", "-q")
+    assert done.exit_code == 0
+    (config, out), options = calls[0]
+    assert (config.seed, out) == (4, Path("samplers"))
+    assert options == {"minutes": 2.0, "progress": False, "samplers": ["hmc", "nuts"]}
+    assert "samplers" not in (invoke("compare-samplers", QUICK), calls[1])[1][1]
+
+
 def test_the_real_pipeline_takes_what_the_commands_give():
     from bayesreg import pipeline
 

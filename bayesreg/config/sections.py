@@ -6,7 +6,16 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StrictBool, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    TypeAdapter,
+    ValidationInfo,
+    field_validator,
+)
 
 from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_field
 from bayesreg.model.options import ModelConfig, Vector
@@ -141,25 +150,60 @@ class _Sampler(Section):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What is the sampler's own."""
-        return self.model_dump(exclude={"name", *_Sampler.model_fields})
+        """What is the sampler's own, where it is given."""
+        return self.model_dump(exclude={"name", *_Sampler.model_fields}, exclude_none=True)
 
 
-class Hamiltonian(_Sampler):
-    """Gradients, in coordinates whitened at the mode, trajectories reflected by the skull; see docs/model.md."""
+class _AboutMode(_Sampler):
+    mode_search: Literal["once", "per_chain"] = "once"
+    """once: one mode, from the mean of the chains' starts; per_chain: one from the start of each, at as many times the
+    cost, and where they differ chains start about their own."""
 
-    name: Literal["hmc", "nuts"] = "hmc"
-    """hmc: Hamiltonian Monte Carlo with trajectories of a quarter turn; nuts: the No-U-Turn sampler."""
+
+class _Tuned(_AboutMode):
     warm_up: Count = 60
     """Transitions that tune the step size and are not kept."""
     target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.75
     """Acceptance towards which the step size is tuned."""
 
 
-class Laplace(_Sampler):
-    """Draws from the Gaussian about the mode, cut off by the skull: a quick look, approximate."""
+class Hamiltonian(_Tuned):
+    """Gradients, in coordinates whitened at the mode, trajectories reflected by the skull; see docs/samplers.md."""
 
-    name: Literal["laplace"]
+    name: Literal["hmc", "nuts", "mclmc"] = "hmc"
+    """hmc: Hamiltonian Monte Carlo with trajectories of a quarter turn; nuts: the No-U-Turn sampler; mclmc: adjusted
+    microcanonical trajectories."""
+
+
+class Local(_AboutMode):
+    """One evaluation a transition, in coordinates whitened at the mode; see docs/samplers.md."""
+
+    name: Literal["mala", "barker", "rwmh_adaptive", "pcn"]
+    """With gradients mala (Langevin) and barker, without rwmh_adaptive (random walk) and pcn (Crank–Nicolson)."""
+    thin: Count = 10
+    """Every how many transitions a draw is kept."""
+    warm_up: Count = 500
+    """Transitions that tune the step size and are not kept."""
+    target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
+    """Acceptance towards which the step size is tuned; null takes what is best for the kernel in many dimensions: 0.574
+    for mala, 0.4 for barker, 0.234 for the others."""
+
+
+class Tempered(_Tuned):
+    """Particles tempered from a broad Gaussian into the posterior; chains start there and go on as with hmc."""
+
+    name: Literal["smc"]
+    particles: Count = 128
+    """Many: they are what finds several modes and weighs them."""
+    spread: Annotated[float, Field(strict=True, ge=1)] = 2.0
+    """How much wider than Laplace's approximation the first distribution is."""
+
+
+class Approximation(_AboutMode):
+    """Draws from a Gaussian about the mode, cut off by the skull: a quick look, approximate."""
+
+    name: Literal["laplace", "pathfinder"]
+    """laplace: the curvature at the mode; pathfinder: the Gaussian of the greatest evidence bound on the way there."""
 
 
 class RandomWalk(_Sampler):
@@ -175,6 +219,14 @@ class RandomWalk(_Sampler):
     """Sd of a step of each λ."""
     sigma_mu: Positive = 0.003
     """Sd of a step of each μ."""
+
+
+SamplerConfig = Hamiltonian | Local | Tempered | Approximation | RandomWalk
+
+
+def sampler_section(name: str) -> SamplerConfig:
+    """The section of a sampler by its name, with default settings."""
+    return TypeAdapter(Annotated[SamplerConfig, Field(discriminator="name")]).validate_python({"name": name})
 
 
 def _hamiltonian_if_unnamed(value: object) -> object:
@@ -236,7 +288,9 @@ class Config(Section):
     """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
     model: ModelConfig = ModelConfig()
     sampler: Annotated[
-        Hamiltonian | Laplace | RandomWalk, Field(discriminator="name"), BeforeValidator(_hamiltonian_if_unnamed)
+        SamplerConfig,
+        Field(discriminator="name"),
+        BeforeValidator(_hamiltonian_if_unnamed),
     ] = Hamiltonian()
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()

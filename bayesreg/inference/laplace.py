@@ -100,7 +100,7 @@ def _improved(
     best: list[tuple[Any, float, Any]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _softened(target, data, reference, moving * xi)
+        value, gradient = _softened_with_slope(target, data, reference, moving * xi)
         value, gradient = float(value), moving * np.asarray(gradient)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
@@ -118,15 +118,15 @@ def _improved(
     return flat + np.asarray(reference.factor) @ (moving * best[-1][0])
 
 
-def _softened_of(target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray) -> AnyArray:
-    """Minus the log density with the hard skull replaced by a penalty."""
+def softened(target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray) -> AnyArray:
+    """Minus the log density of whitened coordinates, the hard skull replaced by a penalty."""
     position = unravel(target)(reference.centre + reference.factor @ xi)
     gap = target.clearance(data, position["u_boundary"], jnp.arange(len(target.sampled)))
     penalty = 0.5 * (jnp.minimum(gap - GAP, 0.0) ** 2).sum() / SOFTNESS**2
     return penalty - target.logdensity_of(target.without_walls(data), position)
 
 
-_softened = jax.jit(jax.value_and_grad(_softened_of, argnums=3), static_argnums=0)
+_softened_with_slope = jax.jit(jax.value_and_grad(softened, argnums=3), static_argnums=0)
 
 
 def laplace(

@@ -11,6 +11,8 @@ p − 2 (p·n) n / |n|². This keeps volume, energy and reversibility (Pakman an
 2015), so that the Metropolis test of Hamiltonian Monte Carlo stays what it is. A reflection inside a leapfrog step
 would cost an error of first order in the step times the force at the wall; here only the force beyond the reference's
 counts.
+
+Samplers that know no reference move in straight lines instead, reflected in the same way.
 """
 
 from __future__ import annotations
@@ -20,7 +22,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from blackjax.mcmc.integrators import IntegratorState
+from blackjax.mcmc.integrators import (
+    IntegratorState,
+    esh_dynamics_momentum_update_one_step,
+    mclachlan_coefficients,
+)
 from jaxtyping import Float, Int
 
 from bayesreg.types import AnyArray
@@ -52,6 +58,8 @@ class Walls(NamedTuple):
 
 # Signed distance, mm, of the walls' nodes at some displacements (…, k, 3).
 Clearance = Callable[[AnyArray], AnyArray]
+# (position, momentum, time) → (position, momentum), where no wall is met.
+Motion = Callable[[AnyArray, AnyArray, AnyArray | float], tuple[AnyArray, AnyArray]]
 
 
 def walls(centre: Float[AnyArray, "nodes 3"], rows: Float[AnyArray, "nodes 3 dimension"], near: AnyArray) -> Walls:
@@ -60,18 +68,64 @@ def walls(centre: Float[AnyArray, "nodes 3"], rows: Float[AnyArray, "nodes 3 dim
     return Walls(centre[near], rows, jnp.einsum("aid,bjd->aibj", rows, rows), jnp.asarray(near))
 
 
-def reflective_rotation(walls: Walls, clearance: Clearance) -> Callable:
-    """An integrator for BlackJAX: half a kick, a rotation reflected at the walls, half a kick; unit mass."""
+def reflective_rotation(walls: Walls, clearance: Clearance, precision: AnyArray | float = 1.0) -> Callable:
+    """An integrator for BlackJAX: half a kick, a rotation reflected at the walls, half a kick.
+
+    The reference is N(0, I / precision) and the mass the precision, of which BlackJAX takes the inverse.
+    """
 
     def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
         density = jax.value_and_grad(logdensity_fn)
 
         def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
-            momentum = state.momentum + step_size / 2 * (state.logdensity_grad + state.position)
-            position, momentum = rotated(walls, clearance, state.position, momentum, step_size)
+            momentum = state.momentum + step_size / 2 * (state.logdensity_grad + precision * state.position)
+            position, velocity = rotated(walls, clearance, state.position, momentum / precision, step_size)
             logdensity, gradient = density(position)
-            momentum = momentum + step_size / 2 * (gradient + position)
+            momentum = precision * velocity + step_size / 2 * (gradient + precision * position)
             return IntegratorState(position, momentum, logdensity, gradient)
+
+        return one_step
+
+    return integrator
+
+
+def reflective_leapfrog(walls: Walls, clearance: Clearance) -> Callable:
+    """An integrator for BlackJAX: half a kick, a straight flight reflected at the walls, half a kick; unit mass."""
+
+    def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
+        density = jax.value_and_grad(logdensity_fn)
+
+        def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
+            momentum = state.momentum + step_size / 2 * state.logdensity_grad
+            position, momentum = shifted(walls, clearance, state.position, momentum, step_size)
+            logdensity, gradient = density(position)
+            return IntegratorState(position, momentum + step_size / 2 * gradient, logdensity, gradient)
+
+        return one_step
+
+    return integrator
+
+
+def reflective_microcanonical(walls: Walls, clearance: Clearance) -> Callable:
+    """BlackJAX's isokinetic integrator of McLachlan's with flights reflected at the walls.
+
+    A reflection keeps the speed, which is one, and so the energy that the kicks are corrected for.
+    """
+
+    def integrator(logdensity_fn: Callable, inverse_mass_matrix: Any) -> Callable:
+        density = jax.value_and_grad(logdensity_fn)
+        kick = esh_dynamics_momentum_update_one_step(inverse_mass_matrix)
+        *way, last = mclachlan_coefficients
+
+        def one_step(state: IntegratorState, step_size: AnyArray | float) -> tuple[IntegratorState, AnyArray]:
+            position, momentum, logdensity, gradient = state
+            change = None
+            for push, flight in zip(way[::2], way[1::2], strict=True):
+                momentum, _, change = kick(momentum, gradient, step_size, push, change)
+                position, momentum = shifted(walls, clearance, position, momentum, flight * step_size)
+                logdensity, gradient = density(position)
+            momentum, _, change = kick(momentum, gradient, step_size, last, change)
+            return IntegratorState(position, momentum, logdensity, gradient), change
 
         return one_step
 
@@ -94,6 +148,24 @@ def rotated(
 
     A flight that is not over after many reflections ends outside the support of any density: at NaN.
     """
+    return _reflected(_turn, walls, clearance, position, momentum, time)
+
+
+def shifted(
+    walls: Walls, clearance: Clearance, position: AnyArray, momentum: AnyArray, time: AnyArray | float
+) -> tuple[AnyArray, AnyArray]:
+    """As `rotated`, in a straight line."""
+    return _reflected(_shift, walls, clearance, position, momentum, time)
+
+
+def _reflected(
+    motion: Motion,
+    walls: Walls,
+    clearance: Clearance,
+    position: AnyArray,
+    momentum: AnyArray,
+    time: AnyArray | float,
+) -> tuple[AnyArray, AnyArray]:
     # Backward in time is forward with the momentum reversed.
     sign = jnp.sign(time)
     first = _Flight(
@@ -109,10 +181,10 @@ def rotated(
         return (flight.left > 0) & (flight.reflections < _MOST)
 
     def stretch(flight: _Flight) -> _Flight:
-        hit, node = _first_hit(walls, clearance, flight)
+        hit, node = _first_hit(motion, walls, clearance, flight)
         time = jnp.minimum(hit, flight.left)
-        position, momentum = _turn(flight.position, flight.momentum, time)
-        u, velocity = _turn(flight.u, flight.velocity, time)
+        position, momentum = motion(flight.position, flight.momentum, time)
+        u, velocity = motion(flight.u, flight.velocity, time)
         place = walls.centre + u
         normal = jax.grad(lambda at: clearance(place.at[node].set(at))[node])(place[node])
         speed = normal @ velocity[node]
@@ -137,11 +209,15 @@ def _turn(position: AnyArray, momentum: AnyArray, angle: AnyArray | float) -> tu
     return cosine * position + sine * momentum, cosine * momentum - sine * position
 
 
-def _first_hit(walls: Walls, clearance: Clearance, flight: _Flight) -> tuple[AnyArray, AnyArray]:
+def _shift(position: AnyArray, momentum: AnyArray, time: AnyArray | float) -> tuple[AnyArray, AnyArray]:
+    return position + time * momentum, momentum
+
+
+def _first_hit(motion: Motion, walls: Walls, clearance: Clearance, flight: _Flight) -> tuple[AnyArray, AnyArray]:
     """Time and row of the first node to meet its wall; infinite where none does in the time left."""
 
     def clear(times: AnyArray) -> AnyArray:
-        return clearance(walls.centre + _turn(flight.u, flight.velocity, times[..., None])[0])
+        return clearance(walls.centre + motion(flight.u, flight.velocity, times[..., None])[0])
 
     times = jnp.linspace(0, 1, _LOOKS + 1)[:, None] * flight.left * jnp.ones(len(walls.nodes))
     found = clear(times)

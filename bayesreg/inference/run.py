@@ -13,9 +13,10 @@ import numpy as np
 
 from bayesreg.inference.diagnostics import Worst, to_inference_data, worst
 from bayesreg.inference.initialise import Start, require_density, starting_points
+from bayesreg.inference.kernel import Draw, Info, Sampler
 from bayesreg.inference.moments import Moments, greatest_rhat, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
-from bayesreg.inference.samplers import SAMPLERS, Draw, Info, Sampler
+from bayesreg.inference.samplers import SAMPLERS
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
 
@@ -52,6 +53,7 @@ class Tally(NamedTuple):
     solver_iterations: AnyArray
     diverging: AnyArray
     gradients: AnyArray
+    densities: AnyArray
 
 
 class Checkpoint(NamedTuple):
@@ -159,7 +161,7 @@ def sample(
     on_block : callable, optional
         Called with the block's number, its draws and the checkpoint after it.
     **settings
-        Of the sampler: for "hmc" and "nuts" warm_up and target_acceptance; for "rwmh" sigma_u, sigma_lam, sigma_mu.
+        Of the sampler, see `bayesreg.inference.samplers`.
 
     Returns
     -------
@@ -333,6 +335,7 @@ def _counted(window: Tally, info: Info) -> Tally:
         solver_iterations=window.solver_iterations + info.solver_iterations,
         diverging=window.diverging + info.diverging,
         gradients=window.gradients + info.gradients,
+        densities=window.densities + info.densities,
     )
 
 

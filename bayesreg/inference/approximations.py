@@ -1,0 +1,91 @@
+"""Independent draws from a Gaussian that stands in for the posterior: a quick look, approximate."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from blackjax.optimizers.lbfgs import lbfgs_inverse_hessian_formula_1
+from blackjax.vi.pathfinder import approximate
+from jax.flatten_util import ravel_pytree
+
+from bayesreg.inference.kernel import Sampler, Say
+from bayesreg.inference.laplace import Reference, softened
+from bayesreg.inference.reflection import rotated
+from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.whitened import (
+    Moved,
+    Setup,
+    about_reference,
+    clearance_of,
+    setup_about,
+    whitened,
+)
+from bayesreg.types import AnyArray, InputError
+
+# Pathfinder: L-BFGS iterations, and draws by which the approximations along its path are judged.
+ITERATIONS, JUDGES = 30, 8
+
+
+def laplace_sampler(target: SmoothTarget, mode_search: str = "once") -> Sampler:
+    """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
+
+    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+        momentum = jax.random.normal(key, state.position.shape)
+        clearance = clearance_of(target, data, setup)
+        position, _ = rotated(setup.walls, clearance, state.position, momentum, jnp.pi / 2)
+        # A turn that was not over in time is refused, as everywhere.
+        done = jnp.isfinite(position).all()
+        moved = state._replace(position=jnp.where(done, position, state.position))
+        return moved, Moved(done.astype(float), diverging=~done)
+
+    return about_reference(target, transition, mode_search=mode_search, exact=False)
+
+
+def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
+    """As `laplace`, from Pathfinder's Gaussian (Zhang et al. 2022): that of the greatest evidence bound on a path.
+
+    The path is that of L-BFGS in the coordinates that Laplace's approximation whitens, from an overdispersed start; the
+    skull is soft there, and cuts off the draws.
+    """
+    about_mode = laplace_sampler(target, mode_search)
+
+    def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
+        setup, starts = about_mode.prepare(points, key, say)
+        first = target.unconstrain_of(target.data, jax.tree.map(lambda x: x[0], starts))
+        flat = ravel_pytree(first)[0]
+        path = _path(
+            target, about_mode.data(setup), setup.reference, whitened(setup.reference, flat), jax.random.fold_in(key, 0)
+        )
+        elbo, mean, covariance = (np.asarray(found) for found in path)
+        if not np.isfinite(elbo):
+            raise InputError("pathfinder found no Gaussian with a finite evidence bound; use the sampler laplace")
+        say(f"pathfinder: evidence bound {elbo:.1f}, mean {np.sqrt((mean**2).mean()):.2f} sd from the mode")
+        return setup_about(target, _pushed(setup.reference, mean, covariance)), starts
+
+    return about_mode._replace(prepare=prepare)
+
+
+@partial(jax.jit, static_argnums=0)
+def _path(target: SmoothTarget, data: Any, reference: Reference, start: AnyArray, key: AnyArray) -> Any:
+    """Evidence bound, mean and covariance in whitened coordinates."""
+
+    def density(xi: AnyArray) -> AnyArray:
+        return -softened(target, data, reference, xi)
+
+    best, _ = approximate(key, density, start, JUDGES, maxiter=ITERATIONS)
+    covariance = lbfgs_inverse_hessian_formula_1(best.alpha, best.beta, best.gamma)
+    # The gradient is that of minus the log density.
+    return best.elbo, best.position - covariance @ best.grad_position, covariance
+
+
+def _pushed(reference: Reference, mean: np.ndarray, covariance: np.ndarray) -> Reference:
+    """The Gaussian of the whitened coordinates as one of flat positions."""
+    factor = np.asarray(reference.factor)
+    spread = factor @ covariance @ factor.T
+    # Cholesky's factor from the last row up is the upper triangular one.
+    upper = np.linalg.cholesky(spread[::-1, ::-1])[::-1, ::-1]
+    return Reference(reference.centre + reference.factor @ mean, jnp.asarray(upper))

@@ -1,0 +1,70 @@
+"""What a sampler is: a handful of pure functions behind one small adapter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from bayesreg.inference.target import Estimands
+from bayesreg.types import AnyArray
+
+Say = Callable[[str], None]
+
+
+class Info(NamedTuple):
+    """One transition: what the proposal met, the probability with which it was accepted, and what it cost.
+
+    Attributes
+    ----------
+    acceptance_rate : scalar
+    outside_support, solver_failed, diverging : scalar bool
+    solver_iterations : scalar
+    gradients, densities : scalar integer
+        Evaluations of the density with its gradient, and without.
+    """
+
+    acceptance_rate: AnyArray
+    outside_support: AnyArray
+    solver_failed: AnyArray
+    solver_iterations: AnyArray
+    diverging: AnyArray
+    gradients: AnyArray
+    densities: AnyArray
+
+
+class Draw(NamedTuple):
+    """Where a chain stands: estimands, and the `Evaluation` there."""
+
+    estimands: dict[str, AnyArray]
+    evaluation: Any
+
+
+class Sampler(NamedTuple):
+    """A transition kernel.
+
+    Attributes
+    ----------
+    prepare : callable
+        (points, key, say) → (setup, points): start points (chains as the leading axis) to what the kernel needs
+        besides the data, a pytree that is found once, and the points from which chains then start.
+    data : callable
+        (setup) → the target's data as the functions below take them.
+    blank : callable
+        () → a setup of the same structure, for reading one back.
+    init : callable
+        (data, setup, estimands) → state.
+    step : callable
+        (data, setup, key, state) → (state, Info).
+    observe : callable
+        (data, setup, state) → Draw.
+    exact : bool
+        Whether the posterior is its stationary distribution.
+    """
+
+    prepare: Callable[[Any, AnyArray, Say], tuple[Any, Any]]
+    data: Callable[[Any], Any]
+    blank: Callable[[], Any]
+    init: Callable[[Any, Any, Estimands], Any]
+    step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Info]]
+    observe: Callable[[Any, Any, Any], Draw]
+    exact: bool

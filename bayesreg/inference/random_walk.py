@@ -1,0 +1,90 @@
+"""The paper's kernel: random-walk Metropolis in the constrained space of the estimands."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import blackjax
+import jax
+import jax.numpy as jnp
+
+from bayesreg.inference.kernel import Draw, Info, Sampler
+from bayesreg.inference.target import Estimands, Target
+from bayesreg.types import AnyArray, InputError
+
+
+class State(NamedTuple):
+    """One chain of the paper's kernel: BlackJAX's state, and the evaluation of the density at its position."""
+
+    kernel: Any
+    evaluation: Any
+
+
+def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_mu: float = 0.003) -> Sampler:
+    """Random-walk Metropolis with the paper's three Normal kernels (eqs. 13 and 14), all proposed at once.
+
+    Parameters
+    ----------
+    target : Target
+    sigma_u, sigma_lam, sigma_mu : float
+        Standard deviations of the steps, positive: mm, and the unit of λ and μ.
+
+    Raises
+    ------
+    InputError
+        If a standard deviation is not positive, or a temperature is to be sampled: the paper has no step for it.
+    """
+    sigma = {"u_boundary": sigma_u, "lam": sigma_lam, "mu": sigma_mu}
+    for name, value in sigma.items():
+        if not value > 0:
+            raise InputError(f"the step of {name} must be positive, got {value}")
+    warm = [name for name in target.estimands(target.reference()) if name not in sigma]
+    if warm:
+        raise InputError(f"rwmh has no step for {', '.join(warm)}; use the sampler hmc where a temperature has a prior")
+
+    def init(data: Any, _: None, estimands: Estimands) -> State:
+        evaluation = target.evaluate_estimands(data, estimands)
+        kernel = blackjax.additive_step_random_walk(lambda _: evaluation.logdensity, lambda *_: estimands)
+        return State(kernel.init(estimands), evaluation)
+
+    def step(data: Any, _: None, key: AnyArray, state: State) -> tuple[State, Info]:
+        # The proposal is drawn and evaluated here, once, so that its energies and its solve are seen;
+        # BlackJAX is handed both and decides.
+        key_proposal, key_accept = jax.random.split(key)
+        position, current = state.kernel.position, state.evaluation
+        move = _normal_step(key_proposal, position, sigma)
+        proposal = jax.tree.map(jnp.add, position, move)
+        # A proposal outside the support needs no solve: the chain evaluates where it stands, at no iteration.
+        inside = target.supports(data, proposal)
+        place = jax.tree.map(lambda new, old: jnp.where(inside, new, old), proposal, position)
+        evaluation = target.evaluate_estimands(data, place, guess=current.u)
+        logdensity = jnp.where(inside, evaluation.logdensity, -jnp.inf)
+        kernel = blackjax.additive_step_random_walk(lambda _: logdensity, lambda *_: move)
+        kernel_state, kernel_info = kernel.step(key_accept, state.kernel)
+        kept = jax.tree.map(lambda new, old: jnp.where(kernel_info.is_accepted, new, old), evaluation, state.evaluation)
+        info = Info(
+            acceptance_rate=kernel_info.acceptance_rate,
+            outside_support=~inside,
+            solver_failed=inside & evaluation.solver_failed,
+            solver_iterations=evaluation.solver_iterations,
+            diverging=jnp.zeros((), bool),
+            gradients=jnp.zeros((), int),
+            densities=jnp.ones((), int),
+        )
+        return State(kernel_state, kept), info
+
+    return Sampler(
+        prepare=lambda points, _key, _say: (None, points),
+        data=lambda _: target.data,
+        blank=lambda: None,
+        init=init,
+        step=step,
+        observe=lambda _data, _setup, state: Draw(state.kernel.position, state.evaluation),
+        exact=True,
+    )
+
+
+def _normal_step(key: AnyArray, position: Estimands, sigma: dict[str, float]) -> dict[str, AnyArray]:
+    keys = jax.random.split(key, len(sigma))
+    draws = {name: subkey for name, subkey in zip(sigma, keys, strict=True) if name in position}
+    return {name: sigma[name] * jax.random.normal(subkey, position[name].shape) for name, subkey in draws.items()}

@@ -1,0 +1,203 @@
+"""Samplers about a Gaussian reference: the coordinates in which Laplace's approximation is N(0, I).
+
+A transition there is all that such a sampler needs to bring; the search for the mode, the starts, the warm-up and the
+way back to the estimands are the same for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from bayesreg.inference.kernel import Draw, Info, Sampler, Say
+from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.modes import search_modes
+from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
+from bayesreg.inference.target import Estimands, SmoothTarget
+from bayesreg.inference.warm_up import FIRST_STEP, Tuning, require_sound, tuned
+from bayesreg.types import AnyArray, InputError, Scalar
+
+# Chains start that much wider than Laplace's approximation.
+OVERDISPERSION = 1.5
+
+MODE_SEARCHES = ("once", "per_chain")
+
+
+class Setup(NamedTuple):
+    """What the samplers about a Gaussian reference find once (a pytree).
+
+    Attributes
+    ----------
+    reference : Reference
+    walls : Walls
+        Of every sampled node.
+    step_size : scalar
+        In whitened coordinates; π/2 is a quarter turn of the reference's motion.
+    steps : scalar integer
+        Steps of a trajectory of fixed length: those of a quarter turn.
+    """
+
+    reference: Reference
+    walls: Walls
+    step_size: Scalar
+    steps: AnyArray
+
+
+class Moved(NamedTuple):
+    """What a transition tells: see `Info`."""
+
+    acceptance_rate: AnyArray
+    diverging: AnyArray | bool = False
+    outside_support: AnyArray | bool = False
+    gradients: AnyArray | int = 0
+    densities: AnyArray | int = 0
+
+
+# (data, setup, key, state) → (state, Moved)
+Transition = Callable[[Any, Setup, AnyArray, Any], tuple[Any, Moved]]
+# (target, data, reference) → the log density of the whitened coordinates that the transition works with
+Density = Callable[[SmoothTarget, Any, Reference], Callable[[AnyArray], AnyArray]]
+
+
+def setup_about(target: SmoothTarget, reference: Reference) -> Setup:
+    """A setup before its tuning."""
+    nodes = len(target.sampled)
+    centre = reference.centre[-3 * nodes :].reshape(nodes, 3)
+    rows = reference.factor[-3 * nodes :].reshape(nodes, 3, -1)
+    return Setup(reference, walls(centre, rows, jnp.arange(nodes)), jnp.asarray(FIRST_STEP), jnp.asarray(1))
+
+
+def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
+    """The whitened coordinates ξ of a flat position."""
+    return jax.scipy.linalg.solve_triangular(reference.factor, flat - reference.centre, lower=False)
+
+
+def whitened_position(target: SmoothTarget, reference: Reference, xi: AnyArray) -> dict[str, AnyArray]:
+    """The position at ξ."""
+    return unravel(target)(reference.centre + reference.factor @ xi)
+
+
+def whitened_density(target: SmoothTarget, data: Any, reference: Reference) -> Callable[[AnyArray], AnyArray]:
+    """log π(ξ), up to a constant."""
+    return lambda xi: target.logdensity_of(data, whitened_position(target, reference, xi))
+
+
+def clearance_of(target: SmoothTarget, data: Any, setup: Setup) -> Clearance:
+    """Signed distances of the walls' nodes."""
+    return lambda u: target.clearance(data, u, setup.walls.nodes)
+
+
+def about_reference(
+    target: SmoothTarget,
+    transition: Transition,
+    tuning: Tuning | None = None,
+    begin: Callable[[AnyArray, Callable], Any] = blackjax.mcmc.hmc.init,
+    density: Density = whitened_density,
+    mode_search: str = "once",
+    exact: bool = True,
+) -> Sampler:
+    """A sampler of the whitened coordinates.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    transition : callable
+        (data, setup, key, state) → (state, Moved).
+    tuning : Tuning, optional
+        Of the step size; without it there is no warm-up.
+    begin : callable
+        (position, log density) → the state that the transition takes, with fields `position` and `logdensity`.
+    density : callable
+        (target, data, reference) → the log density of a whitened position that `begin` is given.
+    mode_search : str
+        "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
+    exact : bool
+
+    Raises
+    ------
+    InputError
+        If an option is out of range.
+    """
+    if mode_search not in MODE_SEARCHES:
+        raise InputError(f"mode_search must be {' or '.join(MODE_SEARCHES)}, got {mode_search!r}")
+    if tuning is not None:
+        require_sound(tuning)
+
+    def init(data: Any, setup: Setup, estimands: Estimands) -> Any:
+        flat = ravel_pytree(target.unconstrain_of(data, estimands))[0]
+        return begin(whitened(setup.reference, flat), density(target, data, setup.reference))
+
+    def step(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
+        state, moved = transition(data, setup, key, state)
+        info = Info(
+            acceptance_rate=moved.acceptance_rate,
+            outside_support=jnp.asarray(moved.outside_support),
+            solver_failed=jnp.zeros((), bool),
+            solver_iterations=jnp.zeros((), int),
+            diverging=jnp.asarray(moved.diverging),
+            gradients=jnp.asarray(moved.gradients),
+            densities=jnp.asarray(moved.densities),
+        )
+        return state, info
+
+    def estimands_of(data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
+        return target.constrain_of(data, whitened_position(target, setup.reference, state.position))
+
+    def observe(data: Any, setup: Setup, state: Any) -> Draw:
+        estimands = estimands_of(data, setup, state)
+        return Draw(estimands, target.evaluate_estimands(data, estimands))
+
+    def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
+        found = search_modes(target, points, mode_search == "per_chain", say)
+        key_start, key_tune = jax.random.split(key)
+        keys = jax.random.split(key_start, len(found.chains))
+        setups = [setup_about(target, reference) for reference in found.references]
+        starts = [_overdispersed(target, setup, keys) for setup in setups]
+        own = jnp.asarray(found.chains), jnp.arange(len(keys))
+        points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
+        if tuning is None:
+            return setups[0], points
+        return tuned(conditioned(setups[0]), (init, step, estimands_of), setups[0], points, key_tune, tuning, say)
+
+    def conditioned(setup: Setup) -> Any:
+        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.reference.centre)))
+
+    def blank() -> Setup:
+        d = len(ravel_pytree(target.unconstrain(target.reference()))[0])
+        return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))))
+
+    return Sampler(prepare, conditioned, blank, init, step, observe, exact)
+
+
+def _overdispersed(target: SmoothTarget, setup: Setup, keys: AnyArray) -> Any:
+    """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support.
+
+    Raises
+    ------
+    InputError
+        If a chain finds no place in the support.
+    """
+    width = np.full(len(keys), OVERDISPERSION)
+    for _ in range(10):
+        points, done = jax.vmap(partial(_start, target, target.data, setup))(keys, jnp.asarray(width))
+        if done.all():
+            return points
+        # A flight that is caught in a corner of the skull does not end; a shorter one may.
+        width = np.where(done, width, width / 2)
+    raise InputError(f"{int((~done).sum())} of {len(keys)} chains find no start near the mode outside the skull")
+
+
+@partial(jax.jit, static_argnums=0)
+def _start(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, width: AnyArray) -> tuple[Any, AnyArray]:
+    """Estimands, and whether the flight there was over in time."""
+    d = len(setup.reference.centre)
+    momentum = width * jax.random.normal(key, (d,))
+    xi, _ = rotated(setup.walls, clearance_of(target, data, setup), jnp.zeros(d), momentum, jnp.pi / 2)
+    return target.constrain_of(data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()

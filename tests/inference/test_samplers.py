@@ -1,0 +1,228 @@
+"""Every sampler of the registry on a small Gaussian behind a wall; `test_closed_form` has them on a real posterior."""
+
+from functools import cache
+
+import blackjax.mcmc.proposal
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesreg as br
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.modes import distance, search_modes
+from bayesreg.inference.run import checkpoint_from_arrays, checkpoint_to_arrays
+from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.whitened import setup_about
+from tests.inference.gaussians import DIMENSION, GaussianTarget
+
+# Steps at which a good part of the proposals is refused: only then does the test of acceptance matter.
+STEPS = {
+    "rwmh": (0.5, 1), "hmc": (1.0, 2), "nuts": (1.0, 1), "mclmc": (2.0, 2), "mala": (0.9, 1), "barker": (0.9, 1),
+    "rwmh_adaptive": (0.8, 1), "pcn": (0.9, 1),
+}  # fmt: skip
+CHAINS, TRANSITIONS = 2500, 6
+
+
+@cache
+def target() -> GaussianTarget:
+    return GaussianTarget()
+
+
+@cache
+def exact() -> np.ndarray:
+    return target().exact_draws(np.random.default_rng(0), 5 * CHAINS)
+
+
+def poor_reference() -> Reference:
+    """Neither the mean nor the covariance of the target."""
+    covariance = target().covariance
+    factor = np.linalg.cholesky(covariance[::-1, ::-1])[::-1, ::-1]
+    stretch = 1.2 * np.eye(DIMENSION) + np.triu(0.25 * np.cos(np.arange(DIMENSION**2)).reshape(DIMENSION, -1), 1)
+    return Reference(jnp.full(DIMENSION, -0.2), jnp.asarray(factor @ stretch))
+
+
+def after_steps(name: str) -> np.ndarray:
+    """Where chains from exact draws are after some transitions."""
+    size, steps = STEPS[name]
+    if name == "rwmh":
+        kernel, setup = SAMPLERS[name](target(), sigma_u=size), None
+    else:
+        setup = setup_about(target(), poor_reference())._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps))
+        kernel = SAMPLERS[name](target())
+
+    @jax.jit
+    def run(data, setup, points, keys):
+        def chain(point, key):
+            def one(state, key):
+                return kernel.step(data, setup, key, state)[0], None
+
+            first = kernel.init(data, setup, {"u_boundary": point})
+            last, _ = jax.lax.scan(one, first, jax.random.split(key, TRANSITIONS))
+            return kernel.observe(data, setup, last).estimands["u_boundary"]
+
+        return jax.vmap(chain)(points, keys)
+
+    points = jnp.asarray(exact()[:CHAINS])
+    return np.asarray(run(target().data, setup, points, jax.random.split(jax.random.key(0), CHAINS)))
+
+
+def statistics(u: np.ndarray) -> np.ndarray:
+    """(statistic, draw): coordinates, their distance from the mean, that from the wall, and a product."""
+    flat = u.reshape(len(u), -1)
+    radius = np.einsum("ni,ij,nj->n", flat, np.linalg.inv(target().covariance), flat)
+    gap = np.asarray(target().clearance(target().data, jnp.asarray(u), target().sampled)).min(axis=1)
+    return np.stack([*flat.T, radius, gap, flat[:, 0] * flat[:, 4]])
+
+
+def least_p(u: np.ndarray) -> float:
+    """Of Kolmogorov and Smirnov's tests of every statistic against fresh exact draws, after Bonferroni."""
+    pairs = list(zip(statistics(u), statistics(exact()[CHAINS:]), strict=True))
+    return len(pairs) * min(stats.ks_2samp(*pair).pvalue for pair in pairs)
+
+
+def test_the_statistics_tell_a_slightly_different_distribution():
+    assert least_p(exact()[:CHAINS]) > 0.01
+    assert least_p(1.06 * exact()[:CHAINS]) < 1e-4
+
+
+def test_every_exact_sampler_is_looked_at():
+    """All but smc, which moves by hmc's kernel."""
+    assert {name for name, make in SAMPLERS.items() if make(target()).exact} == {*STEPS, "smc"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STEPS)
+def test_exact_draws_stay_exact(name):
+    moved = after_steps(name)
+    assert target().allowed(moved).all()
+    assert np.corrcoef(moved.ravel(), exact()[:CHAINS].ravel())[0, 1] < 0.8
+    assert least_p(moved) > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STEPS)
+def test_a_wrong_sign_in_the_acceptance_is_found(name, monkeypatch):
+    """exp(−Δ) for exp(Δ) where BlackJAX accepts."""
+
+    class Wrong:
+        def __getattr__(self, name):
+            return getattr(jnp, name)
+
+        def exp(self, x):
+            return jnp.exp(-x)
+
+    monkeypatch.setattr(blackjax.mcmc.proposal, "jnp", Wrong())
+    assert least_p(after_steps(name)) < 1e-6
+
+
+THIN = {"rwmh": 60, "rwmh_adaptive": 30, "pcn": 5, "mala": 8, "barker": 15}
+SETTINGS = {"rwmh": {"sigma_u": 0.5}, "smc": {"particles": 64}}
+LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "pathfinder"])
+def test_truncated_gaussian_from_start_to_end(name):
+    """Search for the mode, warm-up and chains: means, and the probabilities below exact quantiles.
+
+    Laplace's approximation, cut off by the wall, is this posterior; Pathfinder's has another covariance.
+    """
+    chains = 32
+    found = br.sample(
+        target(), name, chains, 220, seed=1, thin=THIN.get(name, 1), block=220, progress=False, **SETTINGS.get(name, {})
+    )
+    draws = found.idata.posterior["u_boundary"].values[:, 20:].reshape(chains, 200, -1)
+    wanted = exact().reshape(-1, DIMENSION)
+    below = (draws[..., None] < np.quantile(wanted, LEVELS, axis=0).T).mean(axis=1)
+    for each, expected in ((draws.mean(axis=1), wanted.mean(axis=0)), (below, LEVELS)):
+        error = np.sqrt(each.var(axis=0, ddof=1) / chains + 0.25 / len(wanted))
+        assert error.max() < 0.05
+        assert abs((each.mean(axis=0) - expected) / error).max() < 4.5
+
+
+@pytest.mark.slow
+def test_pathfinder_is_near_a_gaussian_and_called_approximate():
+    found = br.sample(GaussianTarget(wall=50.0), "pathfinder", 4, 500, seed=2, progress=False)
+    assert not found.exact
+    draws = found.idata.posterior["u_boundary"].values.reshape(-1, DIMENSION)
+    sd = np.sqrt(np.diag(target().covariance))
+    assert abs(draws.mean(axis=0) / sd).max() < 0.3
+    assert (abs(np.log(draws.std(axis=0) / sd)) < 0.4).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mala", "mclmc", "smc", "pathfinder"])
+def test_a_resumed_run_is_the_run_that_was_not_cut_off(name):
+    blocks = []
+    settings = SETTINGS.get(name, {})
+    options = {"chains": 3, "draws": 6, "seed": 5, "block": 3, "progress": False} | settings
+    whole = br.sample(target(), name, on_block=lambda *found: blocks.append(found), **options)
+    checkpoint = checkpoint_from_arrays(checkpoint_to_arrays(blocks[0][2]), target(), name, 3, **settings)
+    resumed = br.sample(target(), name, resume=(checkpoint, [blocks[0][1]]), **options)
+    np.testing.assert_array_equal(whole.idata.posterior["u_boundary"], resumed.idata.posterior["u_boundary"])
+
+
+def two_modes() -> GaussianTarget:
+    return GaussianTarget(wall=50.0, apart=9.0)
+
+
+def starts_at(*y: float) -> dict[str, np.ndarray]:
+    points = np.zeros((len(y), 2, 3))
+    points[:, 0, 1] = y
+    return {"u_boundary": points}
+
+
+def test_every_chain_finds_its_own_mode():
+    said = []
+    found = search_modes(two_modes(), starts_at(-3.0, 4.0, 2.0, -4.0), True, said.append)
+    assert len(found.references) == 2
+    assert found.chains[0] == found.chains[3] != found.chains[1] == found.chains[2]
+    centres = np.array([np.asarray(reference.centre)[1] for reference in found.references])
+    assert sorted(centres) == pytest.approx([-4.5, 4.5], abs=0.1)
+    sd = np.sqrt(two_modes().covariance[1, 1])
+    assert distance(found.references[0], np.asarray(found.references[1].centre)) == pytest.approx(9 / sd, rel=0.02)
+    assert any("2, about which" in text for text in said)
+    assert any("chains 0, 3" in text for text in said)
+
+
+def test_searches_that_end_in_one_place_are_one_mode():
+    found = search_modes(two_modes(), starts_at(3.0, 4.0), True, lambda text: None)
+    assert (len(found.references), found.chains) == (1, [0, 0])
+
+
+@pytest.mark.slow
+def test_chains_start_about_their_own_modes():
+    """With one search all start about one of the two, and the other is missed."""
+    start = br.Start(field=np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), fraction=(-0.7, 1.0))
+    means = {}
+    for search in ("once", "per_chain"):
+        found = br.sample(two_modes(), "hmc", 4, 40, seed=3, start=start, progress=False, mode_search=search)
+        means[search] = found.idata.posterior["u_boundary"].values[:, :, 0, 1].mean(axis=1)
+    assert np.ptp(np.sign(means["once"])) == 0
+    assert (np.sign(means["per_chain"]) == [-1, -1, 1, 1]).all()
+
+
+@pytest.mark.slow
+def test_tempered_particles_find_both_modes():
+    """In proportion to their mass, from a search for the mode that knows only one."""
+    start = br.Start(field=np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), fraction=(1.0, 1.0))
+    found = br.sample(two_modes(), "smc", 64, 2, seed=4, start=start, progress=False, particles=256, spread=6.0)
+    share = (found.idata.posterior["u_boundary"].values[:, -1, 0, 1] > 0).mean()
+    assert 0.3 < share < 0.7
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        ("smc", {"particles": 2}, "particles must be at least as many as the 3 chains, got 2"),
+        ("smc", {"spread": 0.5}, "spread must be at least 1, got 0.5"),
+        ("mala", {"target_acceptance": 1.2}, "target_acceptance must lie between 0 and 1, got 1.2"),
+        ("pcn", {"warm_up": 0}, "warm_up must be at least 1, got 0"),
+        ("hmc", {"mode_search": "twice"}, "mode_search must be once or per_chain, got 'twice'"),
+    ],
+)
+def test_wrong_settings_are_told(name, wrong, message):
+    with pytest.raises(br.InputError, match=message):
+        br.sample(target(), name, 3, 2, progress=False, **wrong)

@@ -1,0 +1,44 @@
+"""The comparison of samplers, written."""
+
+import base64
+import csv
+import json
+
+from bayesreg.inference.efficiency import Efficiency
+from bayesreg.report.efficiency import HEADER, Setting, efficiency_table, write_efficiencies
+
+SETTING = Setting("a phantom", 4, 5.0, "R̂ below 1.01 and ESS above 400")
+FOUND = [
+    Efficiency("slow", True, "", 100, 1.8, 4.0, 6.0, 0.01, 0.008, 1e-5, 0, 400_000, 0.2, 1.0, 400.0, 500.0, None),
+    Efficiency("fast", True, "", 900, 1.004, 500.0, 450.0, 9.0, 3.0, 0.05, 9000, 0, 0.8, 90.0, 50.0, 150.0, 150.0),
+    Efficiency("rough", False, "", 900, 1.0, 900.0, 880.0, 88.0, 8.0, None, 0, 0, 1.0, 90.0, 10.0, 110.0, 110.0),
+    Efficiency("other", note="it has no step for t_similarity"),
+]
+
+
+def test_rows_are_ranked_and_approximate_ones_apart():
+    (_, exact), (title, approximate) = efficiency_table(FOUND, SETTING).groups
+    assert [row[0] for row in exact] == ["fast", "slow", "other"]
+    assert (title, approximate[0][0]) == ("Approximate", "rough")
+    assert all(len(row) == len(HEADER) for row in exact + approximate)
+    assert exact[0][HEADER.index("Rule met, s")] == "150"
+    assert exact[1][HEADER.index("Rule met, s")] == "–"
+    assert exact[1][HEADER.index("Worst R̂")] == "1.800"
+
+
+def test_files_hold_the_figures(tmp_path):
+    page = write_efficiencies(FOUND, SETTING, tmp_path / "out").read_text()
+    assert "other did not run: it has no step for t_similarity" in page
+    assert "5 minutes for each sampler" in page
+    svg = base64.b64decode(page.split("data:image/svg+xml;base64,")[1].split('"')[0]).decode()
+    assert svg.count("<path") > 10
+    rows = list(csv.DictReader((tmp_path / "out" / "samplers.csv").open()))
+    assert [row["sampler"] for row in rows] == ["slow", "fast", "rough", "other"]
+    assert (rows[0]["seconds_to_rule"], rows[1]["seconds_to_rule"]) == ("", "150.0")
+    stored = json.loads((tmp_path / "out" / "samplers.json").read_text())
+    assert stored["samplers"][1]["ess_per_second"] == 9.0
+    assert stored["minutes"] == 5.0
+
+
+def test_nothing_that_ran_leaves_no_figure(tmp_path):
+    assert "<img" not in write_efficiencies(FOUND[3:], SETTING, tmp_path).read_text()
