@@ -32,7 +32,7 @@ from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Inputs, Run
 from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
-from bayesreg.model.options import Lame
+from bayesreg.model.options import Lame, ModelConfig
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.problem import cell_entries, lame_parameter
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
@@ -259,7 +259,16 @@ def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
 def posterior_of(config: Config, inputs: Inputs) -> Posterior:
     """The posterior of a run, its solver preconditioned at the start parameters."""
     reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
-    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, config.model, inputs.skull, reference)
+    model = _model(config.model, inputs)
+    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, model, inputs.skull, reference)
+
+
+def _model(model: ModelConfig, inputs: Inputs) -> ModelConfig:
+    """The model of a configuration, its boundary held where that is known."""
+    if inputs.boundary is None:
+        return model
+    held = dict(zip(inputs.mesh.boundary.tolist(), map(tuple, np.asarray(inputs.boundary).tolist()), strict=True))
+    return ModelConfig(**{**dict(model), "sampled": [], "held": held})
 
 
 def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.sections import BrainWebData, CalibratedPair, FilesData, MeshConfig
@@ -14,7 +15,7 @@ from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
-from bayesreg.io.store import Inputs, Truth, read_displacement
+from bayesreg.io.store import Inputs, Truth, read_boundary, read_displacement, require_displacement
 from bayesreg.io.volumes import load_image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.simulation import SyntheticPair, make_pair
@@ -61,21 +62,34 @@ def prepare(config: Config) -> Prepared:
         assert moving is not None
         own_scale = scale if config.data.same_contrast else robust_scale(moving, _within(domain, moving))
         images = _as_stored(fixed), _as_stored(own_scale(moving))
-        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull)
+        boundary = _known_boundary(config, mesh, None)
+        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary)
         return Prepared(inputs, clock.laps, {})
     pair = _pair(config, fixed, anatomy, domain, skull, mesh)
     clock.lap("pair")
     u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
-    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth)
+    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, _known_boundary(config, mesh, truth))
     return Prepared(inputs, clock.laps, _described(config, pair))
 
 
 def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
-    """Raise InputError where the chains are to start from a file that cannot serve, as far as can be told by now."""
+    """Raise InputError where a file with displacements cannot serve, as far as can be told by now."""
     if isinstance(config.start.field, Path):
         read_displacement(config.start.field, mesh)
+    if isinstance(config.known_boundary, Path) and mesh is None:
+        require_displacement(config.known_boundary)
+
+
+def _known_boundary(config: Config, mesh: TetMesh, truth: Truth | None) -> Float[np.ndarray, "boundary 3"] | None:
+    """u_B where the configuration gives it, mm."""
+    if config.known_boundary is None:
+        return None
+    if config.known_boundary == "truth":
+        assert truth is not None
+        return np.asarray(truth.u)[mesh.boundary]
+    return read_boundary(Path(config.known_boundary), mesh)
 
 
 class _Clock:

@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
+from bayesreg.fem.location import locate
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh, signed_volumes
 
@@ -91,6 +92,29 @@ def smooth_image(
     values = ndimage.gaussian_filter(noise, blur)
     values = (values - values.min()) / np.ptp(values)
     return Image(values, rotated_affine(points, shape, **kwargs))
+
+
+def pair_from_model(
+    mesh: TetMesh, u: np.ndarray, noise_sd: float, voxel: float = 3.0, blur: float = 4.0, seed: int = 0
+) -> tuple[Image, Image, float]:
+    """A pair drawn from the model with quadrature "voxels": f(x_q) = m(x_q + u(x_q)) + N(0, sd²), m textured.
+
+    Cubic interpolation of m; a voxel of f outside the mesh is zero. Also the T_s = 2 w_q sd² of that noise.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = mesh.points.min(axis=0) - 12, mesh.points.max(axis=0) + 12
+    affine = np.diag([voxel, voxel, voxel, 1.0])
+    affine[:3, 3] = low
+    texture = ndimage.gaussian_filter(rng.normal(size=np.ceil((high - low) / voxel).astype(int)), blur / voxel)
+    moving = Image((texture - texture.min()) / np.ptp(texture), affine)
+    cells, barycentric = locate(mesh.points, mesh.cells, moving.grid_points().reshape(-1, 3))
+    inside = cells >= 0
+    displacement = np.einsum("qa,qai->qi", barycentric[inside], np.asarray(u)[mesh.cells[cells[inside]]])
+    values = np.zeros(len(cells))
+    points = moving.grid_points().reshape(-1, 3)[inside] + displacement
+    values[inside] = moving.interpolate(points, "cubic")
+    values[inside] += noise_sd * rng.normal(size=inside.sum())
+    return moving.with_voxels(values.reshape(moving.shape)), moving, 2 * voxel**3 * noise_sd**2
 
 
 def linear_image(

@@ -250,6 +250,29 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
 
 
 @pytest.mark.slow
+def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
+    """From the truth, and from the mesh of the run with the truth: the same draws."""
+    out = folder / "elastography"
+    overrides = ["known_boundary=truth", "sampler.sigma_lam=0.5", "sampler.sigma_mu=0.05", "start.field=identity"]
+    result = br.run(synthetic("paper", *overrides), out, progress=False)
+    posterior, truth = result.idata.posterior, result.run.truth
+    assert posterior.u_boundary.shape == (2, 12, 0, 3)
+    assert posterior["lam"].values.std(axis=(0, 1)).min() > 0
+    boundary = result.mesh.boundary
+    np.testing.assert_allclose(result.u_mean[boundary], truth.u[boundary], rtol=1e-12)
+    assert result.metrics["boundary_error"]["posterior_mean"]["max"] < 1e-9
+    assert result.metrics["coverage"] == {}
+    page = result.report.read_text()
+    assert "Elastography: posterior of the elastic parameters" in page
+    assert 'id="one-node"' not in page
+    br.save_mesh(result.mesh, folder / "known.vtu", {"u_mean": truth.u})
+    overrides[0] = f"known_boundary={folder / 'known.vtu'}"
+    again = br.run(synthetic("paper", *overrides), folder / "from a file", progress=False)
+    np.testing.assert_array_equal(again.idata.posterior["lam"], posterior["lam"])
+    np.testing.assert_array_equal(store.read_inputs(out).boundary, truth.u[boundary])
+
+
+@pytest.mark.slow
 def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeypatch, capsys):
     """On a phantom in place of MNI152, from a quickstart made small."""
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)

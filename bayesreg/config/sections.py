@@ -17,7 +17,7 @@ from pydantic import (
     field_validator,
 )
 
-from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_field
+from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_boundary, find_field
 from bayesreg.model.options import ModelConfig, Vector
 from bayesreg.model.options import wrong as _wrong
 
@@ -274,6 +274,15 @@ class ReportConfig(Section):
     """Places (x, y, z) in the fixed image, world RAS mm, by name; empty lets the program choose some."""
 
 
+def _require_nothing_else(model: ModelConfig) -> None:
+    """Refuse what known_boundary leaves no room for."""
+    if model.sampled != "boundary" or model.held:
+        key = "held" if model.held else "sampled"
+        raise _wrong(key, "expected the default: known_boundary holds the nodes of the boundary and no other is sampled")
+    if model.normalised:
+        raise _wrong("normalised", "expected false with known_boundary: a given u_B has no prior to be normalised")
+
+
 class Config(Section):
     """Everything that a run needs to know."""
 
@@ -286,6 +295,9 @@ class Config(Section):
         Annotated[PaperPair | CalibratedPair, Field(discriminator="kind")] | None, Field(validate_default=True)
     ] = None
     """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
+    known_boundary: Annotated[Literal["truth"] | Path | None, BeforeValidator(find_boundary)] = None
+    """Elastography: the displacement of the boundary is known, truth (of a synthetic pair) or a file (.vtu or .npz of
+    this mesh, or a displacement field .nii, .nii.gz), and λ, μ alone are sampled; null samples both."""
     model: ModelConfig = ModelConfig()
     sampler: Annotated[
         SamplerConfig,
@@ -319,9 +331,16 @@ class Config(Section):
             raise _wrong("making_edge_length", f"expected less than mesh.edge_length, {mesh.edge_length:g} mm")
         return simulate
 
+    @field_validator("known_boundary")
+    @classmethod
+    def _is_known(cls, boundary: Path | str | None, info: ValidationInfo) -> Path | str | None:
+        if boundary == "truth" and "simulate" in info.data and info.data["simulate"] is None:
+            raise ValueError("the truth of this pair is not known; expected a file or null")
+        return boundary
+
     @field_validator("model")
     @classmethod
-    def _names_tissues_and_nodes(cls, model: ModelConfig) -> ModelConfig:
+    def _names_tissues_and_nodes(cls, model: ModelConfig, info: ValidationInfo) -> ModelConfig:
         names = tuple(Tissues.model_fields)
         for key, section in (("fixed", model.fixed or {}), ("priors", model.priors)):
             for parameter, given in section.items():
@@ -329,7 +348,9 @@ class Config(Section):
                 if unknown:
                     tissue = min(unknown)
                     raise _wrong(f"{key}.{parameter}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
-        if not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
+        if info.data.get("known_boundary") is not None:
+            _require_nothing_else(model)
+        elif not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
             raise _wrong("sampled", "expected at least three nodes, held ones included; fewer do not hold the mesh")
         model.require_proper_priors(names)
         return model

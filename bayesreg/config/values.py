@@ -35,6 +35,11 @@ def find_field(value: object, info: ValidationInfo) -> object:
     return value if value in ("identity", "truth") else _find_file(value, info)
 
 
+def find_boundary(value: object, info: ValidationInfo) -> object:
+    """"truth" and null as they are, anything else as a file."""
+    return value if value in (None, "truth") else _find_file(value, info)
+
+
 def _as_pair(value: object) -> object:
     return (value, value) if isinstance(value, int | float) else value
 

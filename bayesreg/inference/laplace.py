@@ -184,7 +184,7 @@ _hessian_rows = jax.jit(_hessian_rows_of, static_argnums=(0, 1))
 def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
     count = 3 * len(target.sampled)
-    u = np.array(flat[-count:].reshape(-1, 3))
+    u = np.array(flat[len(flat) - count :].reshape(-1, 3))
     nodes = jnp.arange(len(u))
 
     @jax.jit
@@ -196,7 +196,7 @@ def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> F
         gap, slope = (np.asarray(found) for found in distance(jnp.asarray(u)))
         inside = gap < GAP / 2
         if not inside.any():
-            return np.concatenate([flat[:-count], u.ravel()])
+            return np.concatenate([flat[: len(flat) - count], u.ravel()])
         steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
         u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
     raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")

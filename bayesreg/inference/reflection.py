@@ -166,6 +166,8 @@ def _reflected(
     momentum: AnyArray,
     time: AnyArray | float,
 ) -> tuple[AnyArray, AnyArray]:
+    if not len(walls.nodes):
+        return motion(position, momentum, time)
     # Backward in time is forward with the momentum reversed.
     sign = jnp.sign(time)
     first = _Flight(

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from bayesreg.image import Image
 from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
 from bayesreg.io.meshing import load_mesh, save_mesh
-from bayesreg.io.volumes import load_image, save_displacement, save_image
+from bayesreg.io.volumes import load_displacement, load_image, save_displacement, save_image
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError
 
@@ -98,6 +98,8 @@ class Inputs(NamedTuple):
     skull : Image or None
         Nonzero where no sampled node may go.
     truth : Truth or None
+    boundary : (b, 3) array or None
+        Displacement of the boundary nodes, mm, where it is known and not sampled.
     """
 
     config: str
@@ -107,6 +109,7 @@ class Inputs(NamedTuple):
     tissue: Image
     skull: Image | None = None
     truth: Truth | None = None
+    boundary: AnyArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ class Run:
 
     Attributes
     ----------
-    config, mesh, fixed, moving, tissue, skull, truth
+    config, mesh, fixed, moving, tissue, skull, truth, boundary
         As in `Inputs`.
     manifest : dict
         The content of run.json.
@@ -140,6 +143,7 @@ class Run:
     warped: Image
     skull: Image | None = None
     truth: Truth | None = None
+    boundary: AnyArray | None = None
     metrics: dict[str, Any] | None = None
     predicted: Predicted | None = None
 
@@ -172,6 +176,8 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
         save_arrays(images / "truth.npz", known)
+    if inputs.boundary is not None:
+        save_arrays(images / "boundary.npz", {"u_boundary": inputs.boundary})
     save_mesh(inputs.mesh, folder / "mesh.vtu")
     write_text(folder / "config.yaml", inputs.config)
 
@@ -186,9 +192,10 @@ def read_inputs(folder: str | Path) -> Inputs:
         load_image(_require(folder, f"inputs/{name}.nii.gz")) for name in ("fixed", "moving", "tissue")
     )
     skull = load_image(images / "skull.nii.gz") if (images / "skull.nii.gz").exists() else None
-    known = images / "truth.npz"
+    known, given = images / "truth.npz", images / "boundary.npz"
     truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
-    return Inputs(config, mesh, fixed, moving, tissue, skull, truth)
+    boundary = load_arrays(given, "run anew, into another folder")["u_boundary"] if given.exists() else None
+    return Inputs(config, mesh, fixed, moving, tissue, skull, truth, boundary)
 
 
 def write_results(
@@ -285,6 +292,52 @@ def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarr
     if found[0].dtype.kind not in "fiu" or not np.isfinite(found[0]).all():
         raise InputError(f"the displacement in {path} must consist of finite numbers")
     return np.asarray(found[0], float)
+
+
+def require_displacement(path: Path) -> None:
+    """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid (.nii, .nii.gz)."""
+    load_displacement(path) if _is_volume(path) else read_displacement(path)
+
+
+def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
+    """Displacement of the boundary nodes from a file of all nodes (.npz, .vtu) or a displacement field on a grid.
+
+    Parameters
+    ----------
+    path : path
+        A field (.nii, .nii.gz) as `bayesreg.io.volumes.save_displacement` and ITK write it is interpolated linearly.
+    mesh : TetMesh
+
+    Raises
+    ------
+    InputError
+        If the file holds no displacement or one for another mesh, the field's grid does not reach the boundary,
+        or the field ends there: it is zero on one side.
+    """
+    if not _is_volume(path):
+        return read_displacement(path, mesh)[mesh.boundary]
+    components = load_displacement(path)
+    places = mesh.points[mesh.boundary]
+    off_grid = ~components[0].contains(places)
+    if off_grid.any():
+        raise InputError(
+            f"the displacement field {path} does not reach {int(off_grid.sum())} of the {len(places)} boundary nodes: "
+            f"they lie off its grid, the first at {places[off_grid][0].round(1).tolist()} mm"
+        )
+    defined = components[0].with_voxels(np.any([np.asarray(one.voxels) != 0 for one in components], axis=0) * 1.0)
+    share = np.asarray(defined.interpolate(places))
+    ends = (share > 1e-9) & (share < 1 - 1e-9)
+    if ends.any():
+        raise InputError(
+            f"the displacement field {path} ends at {int(ends.sum())} of the {len(places)} boundary nodes: it is zero "
+            f"in voxels beside them, first at {places[ends][0].round(1).tolist()} mm, as where it is known inside the "
+            "organ alone; give one that goes on beyond the boundary, or a run's mesh.vtu"
+        )
+    return np.stack([np.asarray(one.interpolate(places)) for one in components], axis=1)
+
+
+def _is_volume(path: Path) -> bool:
+    return path.name.endswith((".nii", ".nii.gz"))
 
 
 def _point_data(path: Path) -> dict[str, np.ndarray]:

@@ -118,6 +118,34 @@ def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affin
     _write(lps[:, :, :, None], affine, Path(path), intent=VECTOR_INTENT)
 
 
+def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
+    """Read a displacement field as `save_displacement` and ITK write it; the inverse of `save_displacement`.
+
+    Returns
+    -------
+    three Images
+        Components along x, y and z, mm, world RAS.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is no image or damaged, or has another shape than (X, Y, Z, 1, 3).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"displacement field {path}: there is no such file")
+    source = _open(path)
+    if source.shape[3:] != (1, 3):
+        raise InputError(
+            f"{path} is no displacement field: expected the shape (X, Y, Z, 1, 3), LPS vectors in mm, got {source.shape}"
+        )
+    try:
+        lps = np.asarray(source.dataobj, float)[:, :, :, 0]
+        return tuple(Image(lps[..., k] * sign, source.affine) for k, sign in enumerate((-1, -1, 1)))  # type: ignore[return-value]
+    except (OSError, EOFError, zlib.error, ValueError) as error:
+        raise InputError(f"displacement field {path}: {error}") from error
+
+
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
     """Raise InputError unless two images share their grid (corners within a hundredth of a voxel)."""
     if a.shape != b.shape:

@@ -99,7 +99,8 @@ class ModelConfig(BaseModel):
     sampled : "boundary", "all" or list of int
         Nodes whose displacements are sampled; the others follow by the elastic solve.
     held : mapping of int to (x, y, z)
-        Nodes with a known displacement, mm; they are not sampled.
+        Nodes with a known displacement, mm; they are not sampled. Elastography: all boundary nodes held and
+        ``sampled=[]``; only λ, μ are then sampled, and E_r, the prior of u_B, is no part of the density.
     rigid_sd : float, optional
         Standard deviation, mm, of the root-mean-square displacement of each of the six rigid motions of
         the sampled nodes under a Gaussian prior; None is flat.
@@ -133,6 +134,8 @@ class ModelConfig(BaseModel):
                 "fix one parameter or t_elastic",
             )
         if self.normalised:
+            if not isinstance(self.sampled, str) and not set(self.sampled) - set(self.held):
+                raise wrong("normalised", "expected false where no node is sampled: a given u_B has no prior")
             self._require_rest()
             self.require_proper_priors(self._named_tissues or USUAL_TISSUES)
         return self

@@ -185,9 +185,9 @@ class Posterior:
 
         Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement
         of many times its posterior standard deviation is found step by step. The last two are the
-        posterior itself, first in the displacements alone.
+        posterior itself, first in the displacements alone. Where no node is sampled, the last is all there is.
         """
-        for sigma, similarity, elastic in SMOOTHING:
+        for sigma, similarity, elastic in SMOOTHING if len(self.sampled) else ():
             fixed, moving = (image.smoothed(sigma) for image in (self.fixed, self.moving))
             data = self.data
             yield (
@@ -199,7 +199,8 @@ class Posterior:
                 ),
                 False,
             )
-        yield self.data, False
+        if len(self.sampled):
+            yield self.data, False
         yield self.data, True
 
     def conditioned(self, estimands: Values) -> RegistrationData:
@@ -223,6 +224,8 @@ class Posterior:
         u = self.evaluate_estimands(data, estimands, normaliser=False).u
         data = data._replace(**{name: values[name] for name in data.temperature_log_sd})
         precision = displacement_precision(self.mesh, data, lam, mu, u)
+        if not len(self.sampled):
+            return precision
         weight = 1 / (len(self.sampled) * float(data.rigid_sd) ** 2)
         return precision + weight * np.asarray(data.rigid_modes @ data.rigid_modes.T)
 
@@ -307,7 +310,7 @@ class Posterior:
         dict
             "similarity_energy" (E_s), "strain_energy" (E_r), and the terms that sum to the log density:
             "log_similarity", "log_elastic", "log_rigid", "log_prior_lam", "log_prior_mu", "log_support",
-            "log_solved"; where T_s is inferred "log_similarity_normaliser", where the density is normalised
+            "log_solved" ("log_elastic" and "log_rigid" where nodes are sampled); where T_s is inferred "log_similarity_normaliser", where the density is normalised
             "log_normaliser", and "log_prior_t_similarity", "log_prior_t_elastic" of those inferred.
         """
         self._require_shapes(values)

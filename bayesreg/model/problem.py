@@ -42,7 +42,7 @@ def registration_data(
     positions = quadrature.positions(mesh)
     displacement = np.zeros((len(prescribed), 3))
     displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
-    distance = None if skull is None else skull_distance(skull, mesh, sampled)
+    distance = None if skull is None or not len(sampled) else skull_distance(skull, mesh, sampled)
     data = RegistrationData(
         system=elastic_system(mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry]),
         cell_entry=jnp.asarray(entry),
@@ -56,7 +56,7 @@ def registration_data(
         points_sampled=jnp.asarray(mesh.points[sampled]),
         slots=jnp.asarray(np.searchsorted(prescribed, sampled)),
         held=jnp.asarray(displacement),
-        rigid_modes=jnp.asarray(rigid_modes(mesh.points[sampled])),
+        rigid_modes=jnp.asarray(rigid_modes(mesh.points[sampled]) if len(sampled) else np.zeros((0, 6))),
         rigid_sd=jnp.asarray(np.inf if model.rigid_sd is None else model.rigid_sd),
         t_similarity=jnp.asarray(_centre(model.t_similarity)),
         t_elastic=jnp.asarray(_centre(model.t_elastic)),
@@ -141,7 +141,8 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
     Raises
     ------
     InputError
-        If a node does not exist, or sampled and held nodes together are fewer than three or on one line.
+        If a node does not exist, none is sampled and not all of the boundary is held, or sampled and held nodes
+        together are fewer than three or on one line.
     """
     count = len(mesh.points)
     if model.sampled == "boundary":
@@ -158,8 +159,13 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
             )
     sampled = np.setdiff1d(wanted, list(held)).astype(int)
     prescribed = mesh.points[np.union1d(sampled, list(held)).astype(int)]
-    if len(sampled) == 0:
-        raise InputError("no node is sampled: model.sampled names none that is not held")
+    unknown = np.setdiff1d(mesh.boundary, list(held))
+    if len(sampled) == 0 and len(unknown):
+        raise InputError(
+            "no node is sampled: model.sampled names none that is not held. Elastography, λ and μ alone, needs every "
+            f"boundary node held (model.held); {len(unknown)} of {len(mesh.boundary)} are not, the first is node "
+            f"{unknown[0]}"
+        )
     spread = np.linalg.svd(prescribed - prescribed.mean(axis=0), compute_uv=False)
     if len(prescribed) < 3 or spread[1] < 1e-6 * spread[0]:
         raise InputError(

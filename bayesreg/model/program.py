@@ -149,10 +149,12 @@ def registration(
     if "t_similarity" in data.temperature_log_sd:
         log_normaliser = likelihood.log_normaliser(quadrature.weights, noise)
         numpyro.factor("log_similarity_normaliser", data.independent_share * log_normaliser)
-    numpyro.factor("log_elastic", -strain_energy / t_elastic)
+    # E_r / T_r is minus the log prior of u_B. Where u_B is given there is none: u_I follows from it and θ.
+    if len(data.slots):
+        numpyro.factor("log_elastic", -strain_energy / t_elastic)
     if data.determinant is not None and normaliser:
         numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic))
-    numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
+        numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
     numpyro.factor("log_support", jnp.where(inside, 0.0, -jnp.inf))
     numpyro.factor("log_solved", jnp.where(state.converged, 0.0, -jnp.inf))
 

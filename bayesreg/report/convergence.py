@@ -128,19 +128,25 @@ def _ranks(axes: Axes, draws: np.ndarray) -> None:
 def distributions(mesh: TetMesh, entries: Sequence[Estimand], nodes: np.ndarray, threshold: float) -> Drawing:
     """Histograms of R-hat and ESS over all estimands, and where on the brain R-hat is worst."""
     with style.look():
-        figure = style.new_figure(5.6)
-        axes = figure.subplots(2, 3, height_ratios=[1, 1.25])
+        rows = 2 if len(nodes) else 1
+        figure = style.new_figure(5.6 if len(nodes) else 2.5)
+        axes = figure.subplots(rows, 3, height_ratios=[1, 1.25][:rows], squeeze=False)
         _histogram(axes[0, 0], entries, "rhat", "R̂", threshold)
         _histogram(axes[0, 1], entries, "ess_bulk", "effective sample size, bulk", None)
         _histogram(axes[0, 2], entries, "ess_tail", "effective sample size, tail", None)
         axes[0, 0].set_ylabel("displacements")
-        _map(figure, list(axes[1]), mesh, entries, nodes)
+        if len(nodes):
+            _map(figure, list(axes[1]), mesh, entries, nodes)
         uri = style.data_uri(figure)
     caption = (
-        f"Top: R̂ and effective sample size over all {len(entries):,} estimands: bars for the displacements, ticks "
-        f"below for the elastic parameters; dashed, the R̂ of {threshold:g} that was asked for. Bottom: the greatest R̂ "
-        "of the three components at every sampled node, seen along z, y and x; the worst lie on top."
+        f"R̂ and effective sample size over all {len(entries):,} estimands: bars for the displacements, ticks "
+        f"below for the elastic parameters; dashed, the R̂ of {threshold:g} that was asked for."
     )
+    if len(nodes):
+        caption = "Top: " + caption + (
+            " Bottom: the greatest R̂ of the three components at every sampled node, seen along z, y and x; the worst "
+            "lie on top."
+        )
     return Drawing("distributions", "Convergence of all estimands", caption, "Distributions of R-hat and ESS.", uri)
 
 

@@ -86,7 +86,9 @@ def write_report(
     metrics = {"This run": known} if (known := metrics_of(run, posterior)) else {}
     view, predicted, groups = View.of(run), run.predicted, grouping(posterior)
     apart = groups.groups > 1
-    left_out = {key for key, shown in (("groups", apart), ("trust", predicted), ("fit", predicted)) if not shown}
+    nodes = posterior.sizes["node"]
+    shown = {"groups": apart, "trust": predicted, "fit": predicted, "one-node": nodes}
+    left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
         *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
         uncertainty.maps(view, predicted) if predicted else None,
@@ -96,7 +98,7 @@ def write_report(
         anatomy.element_stiffness(view, posterior),
         marginals.temperatures(run, posterior),
         adequacy.residual(view),
-        marginals.skull_node(run, posterior),
+        marginals.skull_node(run, posterior) if nodes else None,
         convergence.traces(posterior, sample_stats, entries),
         convergence.distributions(run.mesh, entries, posterior["node"].to_numpy(), threshold_of(run.manifest)),
     ]
@@ -121,6 +123,7 @@ def write_report(
         "worst": tables.worst_table(entries),
         "provenance": provenance(run.manifest),
         "config": run.config,
+        "elastography": not nodes,
     }
     write_text(path, render("template.html", content))
 
@@ -179,8 +182,10 @@ def error_tables(metrics: Mapping[str, Mapping[str, Any]], tissues: tuple[str, .
 def _subtitle(run: Run, posterior: xr.Dataset) -> str:
     sampler = part(run.manifest, "sampler", "name")
     exact = {True: "exact", False: "approximate"}.get(part(run.manifest, "exact"))
+    nodes = posterior.sizes["node"]
+    given = "Elastography: posterior of the elastic parameters, the displacement of the boundary given"
     parts = [
-        f"Joint posterior of the displacement at {posterior.sizes['node']:,} nodes and the elastic parameters",
+        f"Joint posterior of the displacement at {nodes:,} nodes and the elastic parameters" if nodes else given,
         f"parameters {elasticity_of(run).lower()}" if elasticity_of(run) else None,
         f"sampler {sampler}" + (f" ({exact})" if exact else "") if sampler else None,
     ]

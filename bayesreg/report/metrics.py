@@ -100,7 +100,8 @@ def compute_metrics(
     -------
     dict
         "boundary_error" (mm) and "mean_squared_error" (mm²) of the "initial" (start of the chains, or no motion),
-        the "unregistered" (no motion) and the "posterior_mean" displacement; "coverage" of the intervals of u_boundary.
+        the "unregistered" (no motion) and the "posterior_mean" displacement; "coverage" of the intervals of u_boundary,
+        empty where none of it was sampled.
     """
     unmoved = np.zeros_like(np.asarray(truth.u, float))
     initial = unmoved if truth.initial is None else truth.initial
@@ -108,7 +109,7 @@ def compute_metrics(
     return {
         "boundary_error": {name: boundary_error(u, truth.u, mesh.boundary) for name, u in fields.items()},
         "mean_squared_error": {name: mean_squared_error(mesh, u, truth.u) for name, u in fields.items()},
-        "coverage": coverage(*_boundary_draws(posterior, truth, max_draws)),
+        "coverage": coverage(*_boundary_draws(posterior, truth, max_draws)) if posterior.sizes["node"] else {},
     }
 
 
