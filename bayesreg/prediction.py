@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from bayesreg.fem.location import locate
-from bayesreg.inference.predictive import push_forward, summarise, thinned
+from bayesreg.inference.predictive import Summary, push_forward, summarise, thinned
 from bayesreg.io.store import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual, t_similarity_of
@@ -25,6 +25,7 @@ Landmarks = Mapping[str, tuple[float, float, float]]
 MOST_DRAWS = 400
 FAR = 2.0
 REACH = 0.95
+STIFFER = 1.5
 
 
 def predict(
@@ -35,7 +36,7 @@ def predict(
     landmarks: Landmarks,
     seed: int,
 ) -> Predicted:
-    """Push at most 400 evenly spaced draws forward: u at every node and landmark, residuals and replications.
+    """Push at most 400 evenly spaced draws forward: u at nodes and landmarks, stiffness, residuals and replications.
 
     Parameters
     ----------
@@ -68,8 +69,10 @@ def predict(
         observed, replicated = (discrepancies(x, cells, neighbours, len(mesh.cells)) for x in (z, noise))
         distance = jnp.linalg.norm(u - u_mean, axis=1)
         marks = jnp.einsum("la,lai->li", weights, u[nodes])
+        stiffness = posterior.stiffness(draw)
         return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "landmarks": marks,
-                "observed": observed, "replicated": replicated}  # fmt: skip
+                "observed": observed, "replicated": replicated,
+                "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
 
     some = thinned(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = some["u_boundary"].shape[:2]
@@ -91,7 +94,17 @@ def predict(
         discrepancies=np.array(DISCREPANCIES),
         observed=whole["observed"],
         replicated=whole["replicated"],
+        **(_stiffness(found) if posterior.data.field is not None else {}),
     )
+
+
+def _stiffness(found: Summary) -> dict[str, np.ndarray]:
+    return {
+        "stiffness_mean": found.mean["stiffness"],
+        "stiffness_sd": found.sd["stiffness"],
+        "stiffer": np.array(STIFFER),
+        "stiffer_probability": found.mean["stiffer"],
+    }
 
 
 def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]]) -> Iterator[dict[str, Any]]:

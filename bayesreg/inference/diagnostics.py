@@ -22,12 +22,14 @@ STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
     "outside_support", "diverging", "gradients",
 )  # fmt: skip
-TEMPERATURES = ("t_similarity", "t_elastic")
+# Estimands besides u_boundary, λ and μ, which only some posteriors have.
+OTHERS = ("t_similarity", "t_elastic", "field_sd", "field")
 _DIMS = {
     "u_boundary": ["node", "axis"],
     "lam": ["tissue"],
     "mu": ["tissue"],
     "ratio": ["tissue"],
+    "field": ["mode"],
     "points": ["point", "axis"],
     "cells": ["cell", "corner"],
     "tissue": ["cell"],
@@ -49,7 +51,8 @@ def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> An
     -------
     arviz.InferenceData or xarray.DataTree
         posterior: u_boundary (chain, draw, node, axis) in mm, lam, mu and ratio = λ/μ (chain, draw, tissue),
-        known entries included, t_similarity and t_elastic (chain, draw) where they were sampled; sample_stats;
+        known entries included, where they were sampled t_similarity, t_elastic, field_sd (chain, draw) and
+        field (chain, draw, mode), the components of the log-stiffness; sample_stats;
         constant_data.
     """
     draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in blocks[0]}
@@ -57,7 +60,7 @@ def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> An
     values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
     with np.errstate(divide="ignore", invalid="ignore"):
         values["ratio"] = values["lam"] / values["mu"]
-    values |= {name: estimands[name] for name in TEMPERATURES if name in estimands}
+    values |= {name: estimands[name] for name in OTHERS if name in estimands}
     groups: dict[str, Any] = {
         "posterior": values,
         "sample_stats": {name: draws[name] for name in STATISTICS},
@@ -109,9 +112,9 @@ class Convergence(NamedTuple):
 
 
 def convergence(idata: Any) -> Convergence:
-    """R̂ and effective sample sizes of every displacement, λ, μ and temperature; of few draws (below 4) all NaN."""
+    """R̂ and effective sample sizes of every estimand; of few draws (below 4) all NaN."""
     draws = dataset(idata, "posterior")
-    posterior = draws[["u_boundary", "lam", "mu", *(name for name in TEMPERATURES if name in draws)]]
+    posterior = draws[["u_boundary", "lam", "mu", *(name for name in OTHERS if name in draws)]]
     if posterior.sizes["draw"] < 4:
         nothing = xr.full_like(posterior.isel(chain=0, draw=0, drop=True), np.nan)
         return Convergence(nothing, nothing, nothing)

@@ -59,7 +59,7 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
             noise = jax.random.normal(subkey, (chains, *centre[name].shape))
             points[name] = centre[name] * jnp.exp(start.spread * noise)
     for index, name in enumerate(sorted(set(centre) - set(points))):
-        noise = jax.random.normal(jax.random.fold_in(key, index), (chains,))
+        noise = jax.random.normal(jax.random.fold_in(key, index), (chains, *jnp.shape(centre[name])))
         points[name] = centre[name] * jnp.exp(start.spread * noise)
     return points
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
+from bayesreg.inference.hierarchy import balanced, is_scale
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
@@ -79,9 +80,14 @@ def find_mode(
     for _ in range(5):
         before = flat
         flat = _improved(target, last[0], flat, last[1], iterations, say)
+        flat = balanced(target, flat, partial(_factor, target, flat))
         if np.abs(flat - before).max() < 1e-3:
             break
     return _admissible(target, flat)
+
+
+def _factor(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
+    return np.asarray(laplace(target, flat).factor)
 
 
 def _improved(
@@ -94,7 +100,7 @@ def _improved(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened."""
     reference = laplace(target, flat, data, moves)
-    moving = np.ones(len(flat))
+    moving = 1 - is_scale(target)
     if not moves:
         moving[: len(flat) - 3 * len(target.sampled)] = 0.0
     best: list[tuple[Any, float, Any]] = []
@@ -134,8 +140,8 @@ def laplace(
 ) -> Reference:
     """The Gaussian reference about a flat position.
 
-    The curvature in the displacements is Gauss–Newton's, the rows of the other coordinates are exact; directions
-    in which the latter are not convex are given the least curvature of a logarithmic parameter.
+    The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are exact; directions in
+    which the latter are not convex are given the least curvature of a logarithmic parameter.
 
     Parameters
     ----------
@@ -147,14 +153,19 @@ def laplace(
         Whether the other coordinates are given curvature; else they are left uncorrelated.
     """
     data = target.data if data is None else data
-    count = len(flat) - 3 * len(target.sampled)
+    curved = _curved(target, joint)
+    count = int((~curved).sum())
+    # The coordinates whose curvature is Gauss–Newton's come last.
+    order = np.argsort(curved, kind="stable")
     precision = np.zeros((len(flat), len(flat)))
     estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
     curvature = np.asarray(target.displacement_precision(data, estimands))
+    curvature = curvature[len(curvature) + count - len(flat) :, len(curvature) + count - len(flat) :]
     # A trace of the identity keeps directions finite that neither images nor elasticity see.
     precision[count:, count:] = curvature + 1e-9 * np.trace(curvature) * np.eye(len(curvature))
     if joint and count:
-        rows = -np.asarray(_hessian_rows(target, count, target.without_walls(data), jnp.asarray(flat)))
+        directions = jnp.eye(len(flat))[order[:count]]
+        rows = -np.asarray(_hessian_rows(target, target.without_walls(data), jnp.asarray(flat), directions))[:, order]
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]
@@ -166,19 +177,27 @@ def laplace(
         precision[:count, :count] = convex + cross @ inner
     else:
         precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
-    lower = np.linalg.cholesky((precision + precision.T) / 2)
+    precision[np.ix_(order, order)] = (precision + precision.T) / 2
+    lower = np.linalg.cholesky(precision)
     factor = scipy.linalg.solve_triangular(lower, np.eye(len(flat)), lower=True).T
     return Reference(jnp.asarray(flat), jnp.asarray(factor))
 
 
-def _hessian_rows_of(target: SmoothTarget, count: int, data: Any, flat: AnyArray) -> AnyArray:
-    """The first rows of the Hessian of the log density of a flat position."""
+def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
+    """Entries of a flat position whose curvature the target knows: "u_boundary" and, jointly, "field"."""
+    known = ("field", "u_boundary") if joint else ("u_boundary",)
+    position = target.unconstrain(target.reference())
+    marked = {name: jnp.full(jnp.shape(value), float(name in known)) for name, value in position.items()}
+    return np.asarray(ravel_pytree(marked)[0]) > 0
+
+
+def _hessian_rows_of(target: SmoothTarget, data: Any, flat: AnyArray, directions: AnyArray) -> AnyArray:
+    """The Hessian of the log density of a flat position times some directions."""
     gradient = jax.grad(lambda x: target.logdensity_of(data, unravel(target)(x)))
-    directions = jnp.eye(count, len(flat))
     return jax.lax.map(lambda direction: jax.jvp(gradient, (flat,), (direction,))[1], directions)
 
 
-_hessian_rows = jax.jit(_hessian_rows_of, static_argnums=(0, 1))
+_hessian_rows = jax.jit(_hessian_rows_of, static_argnums=0)
 
 
 def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:

@@ -100,4 +100,4 @@ class SmoothTarget(Target, Protocol):
         """Data of ever harder problems that end with this one, and whether each moves more than displacements."""
 
     def displacement_precision(self, data: Any, estimands: Estimands) -> AnyArray:
-        """Positive semidefinite curvature (3b, 3b) of minus the log density in "u_boundary"."""
+        """Positive semidefinite curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""

@@ -161,7 +161,12 @@ def tissue_of_cells(
     return votes.argmax(axis=1)
 
 
-def save_mesh(mesh: TetMesh, path: str | Path, point_data: Mapping[str, AnyArray] | None = None) -> None:
+def save_mesh(
+    mesh: TetMesh,
+    path: str | Path,
+    point_data: Mapping[str, AnyArray] | None = None,
+    cell_data: Mapping[str, AnyArray] | None = None,
+) -> None:
     """Write a mesh as .vtu, all of it or nothing.
 
     Parameters
@@ -171,25 +176,34 @@ def save_mesh(mesh: TetMesh, path: str | Path, point_data: Mapping[str, AnyArray
         Ends in .vtu.
     point_data : mapping, optional
         Further arrays of one row per node, by name.
+    cell_data : mapping, optional
+        Further arrays of one row per tetrahedron, by name.
 
     Raises
     ------
     InputError
-        If the path ends otherwise, its folder does not exist, or an array has not one row per node.
+        If the path ends otherwise, its folder does not exist, or an array has not one row per node or tetrahedron.
     """
     path = Path(path)
     if path.suffix != ".vtu":
         raise InputError(f"a mesh file must end in .vtu, got {path}")
     if not path.parent.is_dir():
         raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
-    extra = {name: np.asarray(values) for name, values in (point_data or {}).items()}
-    for name, values in extra.items():
-        if values.shape[:1] != (len(mesh.points),):
-            raise InputError(f"{name} must have {len(mesh.points)} rows, one per node; got shape {values.shape}")
-    content = meshio.Mesh(mesh.points, [("tetra", mesh.cells)], point_data=extra, cell_data={"tissue": [mesh.tissue]})
+    nodal = _rows(point_data, len(mesh.points), "node")
+    by_cell = {"tissue": mesh.tissue, **_rows(cell_data, len(mesh.cells), "tetrahedron")}
+    cells = {name: [values] for name, values in by_cell.items()}
+    content = meshio.Mesh(mesh.points, [("tetra", mesh.cells)], point_data=nodal, cell_data=cells)
     with replacing(path) as temporary:
         content.write(temporary)
         _insert_names(temporary, mesh.names)
+
+
+def _rows(given: Mapping[str, AnyArray] | None, count: int, what: str) -> dict[str, np.ndarray]:
+    arrays = {name: np.asarray(values) for name, values in (given or {}).items()}
+    for name, values in arrays.items():
+        if values.shape[:1] != (count,):
+            raise InputError(f"{name} must have {count} rows, one per {what}; got shape {values.shape}")
+    return arrays
 
 
 def load_mesh(path: str | Path) -> TetMesh:

@@ -67,6 +67,11 @@ class Predicted(NamedTuple):
     discrepancies : (D,) array of str
     observed, replicated : (chains, draws, D) arrays
         Discrepancies of the standardised residuals of each draw, and of noise that follows the model.
+    stiffness_mean, stiffness_sd : (m,) array or None
+        Posterior mean and standard deviation of every element's stiffness over its tissue's; None without a field.
+    stiffer : scalar or None
+    stiffer_probability : (m,) array or None
+        P(stiffness over the tissue's > stiffer).
     """
 
     chain_mean: AnyArray
@@ -81,6 +86,21 @@ class Predicted(NamedTuple):
     discrepancies: np.ndarray
     observed: AnyArray
     replicated: AnyArray
+    stiffness_mean: AnyArray | None = None
+    stiffness_sd: AnyArray | None = None
+    stiffer: AnyArray | None = None
+    stiffer_probability: AnyArray | None = None
+
+    @property
+    def known(self) -> dict[str, AnyArray]:
+        """Those of the entries that there are."""
+        return {name: value for name, value in self._asdict().items() if value is not None}
+
+    @property
+    def by_cell(self) -> dict[str, AnyArray]:
+        """Those that have one row per element."""
+        fields = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
+        return {name: value for name, value in self.known.items() if name in fields}
 
 
 class Inputs(NamedTuple):
@@ -216,7 +236,8 @@ def write_results(
         resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
     """
     folder = Path(folder)
-    save_mesh(run.mesh, folder / "mesh.vtu", point_data={"u_mean": run.u_mean, "u_sd": run.u_sd})
+    by_cell = {} if run.predicted is None else run.predicted.by_cell
+    save_mesh(run.mesh, folder / "mesh.vtu", {"u_mean": run.u_mean, "u_sd": run.u_sd}, by_cell)
     save_image(run.warped, folder / "warped_mean.nii.gz")
     save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, run.fixed.affine)
     # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
@@ -225,7 +246,7 @@ def write_results(
     if run.metrics is not None:
         write_json(folder / "metrics.json", run.metrics)
     if run.predicted is not None:
-        save_arrays(folder / "predicted.npz", run.predicted._asdict())
+        save_arrays(folder / "predicted.npz", run.predicted.known)
     write_json(folder / "run.json", run.manifest)
 
 

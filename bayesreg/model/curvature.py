@@ -9,7 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from bayesreg.fem.elasticity import stiffness
+from bayesreg.fem.elasticity import element_stiffness, stiffness
 from bayesreg.mesh import TetMesh
 from bayesreg.model.program import RegistrationData
 from bayesreg.model.warp import displacement_at
@@ -22,30 +22,61 @@ def displacement_precision(
     lam: Float[AnyArray, "cells"],
     mu: Float[AnyArray, "cells"],
     u: Float[AnyArray, "nodes 3"],
+    field_sd: float = 0.0,
 ) -> Float[np.ndarray, "rows rows"]:
-    """Curvature of E_s/T_s + E_r/T_r in the displacements of the sampled nodes, at fixed λ, μ (by cell).
+    """Curvature of E_s/T_s + E_r/T_r in the field's components z, if any, and the sampled displacements.
 
     With u_I = W u_B of eq. (7), W = −K_II⁻¹ K_IB, the elastic energy has the Hessian K_BB + K_BI W, and the sum of
-    squared residuals r the Gauss–Newton approximation 2 Jᵀ J of its own, J = ∂r/∂u [1; W].
+    squared residuals r the Gauss–Newton approximation 2 Jᵀ J of its own, J = ∂r/∂u [1; W]. The field multiplies the
+    stiffness of element e by exp(s_e), s = sd · basis · z, so that ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I; z has the prior
+    N(0, I), and E_r, small beside E_s in z and not convex, is left out there.
+
+    Parameters
+    ----------
+    mesh, data
+    lam, mu : (m,) array
+        With the field's factor.
+    u : (n, 3) array
+        The equilibrium, mm.
+    field_sd : float
+        Where there is a field.
 
     Returns
     -------
-    (3b, 3b) array
-        1/mm², row 3 · node + axis; positive semidefinite.
+    (k + 3b, k + 3b) array
+        First z, then row 3 · node + axis, 1/mm²; positive semidefinite.
     """
     sampled = _degrees(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
     free = _degrees(np.asarray(data.system.free))
     K = stiffness(mesh, lam, mu)
     normal = _normal_matrix(mesh, data, u)
     coupling = K[free][:, sampled]
-    if len(free) == 0:
-        return (K[sampled][:, sampled] / float(data.t_elastic) + normal[sampled][:, sampled]).toarray()
-    W = -scipy.sparse.linalg.splu(K[free][:, free].tocsc()).solve(coupling.toarray())
-    schur = K[sampled][:, sampled] + coupling.T @ W
-    cross = normal[sampled][:, free] @ W
-    similarity = normal[sampled][:, sampled] + cross + cross.T + W.T @ (normal[free][:, free] @ W)
-    precision = np.asarray(schur / float(data.t_elastic) + similarity)
+    load = np.zeros((len(free), 0))
+    if data.field is not None:
+        load = (_element_forces(data, lam, mu, u) @ (field_sd * np.asarray(data.field.basis)))[free]
+    modes = load.shape[1]
+    W = np.zeros((0, modes + len(sampled)))
+    if len(free):
+        W = -scipy.sparse.linalg.splu(K[free][:, free].tocsc()).solve(np.hstack([load, coupling.toarray()]))
+    schur = K[sampled][:, sampled] + coupling.T @ W[:, modes:]
+    # ∂u/∂(z, u_B): what is sampled moves by itself, the rest by W.
+    unit = np.hstack([np.zeros((len(sampled), modes)), np.eye(len(sampled))])
+    cross = unit.T @ (normal[sampled][:, free] @ W)
+    precision = unit.T @ (normal[sampled][:, sampled] @ unit) + cross + cross.T + W.T @ (normal[free][:, free] @ W)
+    precision[modes:, modes:] += np.asarray(schur) / float(data.t_elastic)
+    precision[:modes, :modes] += np.eye(modes)
     return (precision + precision.T) / 2
+
+
+def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:
+    """Column e: the nodal forces K_e u of element e alone."""
+    elements = data.system.elements
+    corners = jnp.moveaxis(jnp.asarray(u)[elements.cells], -1, 0)
+    forces = jnp.einsum("aibjm,jbm->aim", element_stiffness(elements, jnp.asarray(lam), jnp.asarray(mu)), corners)
+    rows = 3 * np.asarray(elements.cells)[:, None] + np.arange(3)[:, None]
+    columns = np.broadcast_to(np.arange(rows.shape[-1]), rows.shape)
+    shape = (3 * len(u), rows.shape[-1])
+    return scipy.sparse.csr_matrix((np.asarray(forces).ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
 def _degrees(nodes: np.ndarray) -> np.ndarray:

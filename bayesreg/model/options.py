@@ -65,13 +65,36 @@ class TemperaturePrior(BaseModel):
     log_sd: Positive = 1.0
 
 
+class FieldConfig(BaseModel):
+    """Prior of the field of log-stiffness of `elasticity: field`; see `bayesreg.model.field`.
+
+    Attributes
+    ----------
+    correlation : float
+        Distance, mm, at which the correlation of the log-stiffness of two places has fallen to 0.14.
+    sd : float
+        Scale of the half-normal prior of the field's standard deviation, which is inferred; 0.5 is a factor of e^0.5.
+    modes : int
+        Most principal components of the field that are sampled.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    correlation: Positive = 20.0
+    sd: Positive = 0.5
+    modes: Annotated[int, Field(strict=True, ge=1)] = 300
+
+
 class ModelConfig(BaseModel):
     """The posterior to sample; the defaults are the paper's.
 
     Attributes
     ----------
-    elasticity : {"tissue", "uniform", "element"}
-        One pair (λ, μ) for each tissue, one for all, or one for each tetrahedron.
+    elasticity : {"tissue", "uniform", "element", "field"}
+        One pair (λ, μ) for each tissue, one for all, one for each tetrahedron; or one for each tissue, times the
+        exponential of a smooth random field over its tetrahedra.
+    field : FieldConfig, optional
+        Prior of that field; for "field" alone.
     fixed : mapping, optional
         Parameters that are known: ``{"mu": {"gm": 1.0}}`` by tissue name (by element it fixes every
         element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of "gm" (or
@@ -108,7 +131,8 @@ class ModelConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    elasticity: Literal["tissue", "uniform", "element"] = "tissue"
+    elasticity: Literal["tissue", "uniform", "element", "field"] = "tissue"
+    field: FieldConfig | None = None
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
     priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = {}
     similarity: Literal["ssd", "student_t"] = "ssd"
@@ -125,6 +149,8 @@ class ModelConfig(BaseModel):
 
     @model_validator(mode="after")
     def _is_proper(self) -> ModelConfig:
+        if self.field is not None and self.elasticity != "field":
+            raise wrong("field", f"expected null: it belongs to elasticity: field, which is {self.elasticity} here")
         if isinstance(self.t_elastic, TemperaturePrior) and not self.normalised:
             raise wrong("t_elastic", "a T_r with a prior needs normalised: true; without it T_r has no likelihood")
         if isinstance(self.t_elastic, TemperaturePrior) and self.fixed is not None and not any(self.fixed.values()):

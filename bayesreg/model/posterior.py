@@ -21,7 +21,14 @@ from bayesreg.model.curvature import displacement_precision
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
-from bayesreg.model.program import LameParameter, RegistrationData, in_support, log_elastic_normaliser, registration
+from bayesreg.model.program import (
+    LameParameter,
+    RegistrationData,
+    in_support,
+    log_elastic_normaliser,
+    registration,
+    stiffness_factor,
+)
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -29,6 +36,7 @@ from bayesreg.types import AnyArray, InputError, Scalar
 Values = Mapping[str, AnyArray]
 
 LAME = ("lam", "mu")
+FIELD = ("field_sd", "field")
 
 # Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
 # instead of seven left single nodes of the paper's pair in wrong places, up to 15 mm off.
@@ -74,8 +82,9 @@ class Posterior:
 
     Three sets of coordinates name the same state:
 
-    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries}``, known entries included, and
-      the scalars "t_similarity", "t_elastic" where they have a prior;
+    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries}``, known entries included,
+      the scalars "t_similarity", "t_elastic" where they have a prior, and where the elasticity has a field its
+      "field_sd" and whitened components "field" (k,);
     - *estimands*: the same with the sampled entries of λ and μ only;
     - *position*: estimands mapped to the real line (log, or logit where a prior is bounded).
 
@@ -110,6 +119,7 @@ class Posterior:
             "tissue": self.mesh.names,
             "uniform": ("all",),
             "element": tuple(f"element {i}" for i in range(len(self.mesh.cells))),
+            "field": self.mesh.names,
         }[self.options.elasticity]
 
     def logdensity_constrained(self, values: Values) -> Scalar:
@@ -212,22 +222,26 @@ class Posterior:
         return self.data._replace(system=_conditioned_system(self, *(tuple(x.tolist()) for x in near)))
 
     def displacement_precision(self, data: RegistrationData, estimands: Values) -> Float[np.ndarray, "rows rows"]:
-        """Curvature of −log p(u, λ, μ | m) in "u_boundary": Gauss–Newton, positive semidefinite.
+        """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary": Gauss–Newton.
 
         Returns
         -------
-        (3b, 3b) array
-            1/mm², row 3 · node + axis.
+        (k + 3b, k + 3b) array
+            Positive semidefinite; first the k components of the field, then row k + 3 · node + axis, 1/mm². Of the
+            elastic energy the curvature in the displacements alone is counted.
         """
         values = _complete(data, estimands, self.free)
-        lam, mu = (np.asarray(values[name])[np.asarray(data.cell_entry)] for name in LAME)
+        field = {name: values[name] for name in FIELD if name in values}
+        factor = np.asarray(stiffness_factor(data, **field)) if field else 1.0
+        lam, mu = (factor * np.asarray(values[name])[np.asarray(data.cell_entry)] for name in LAME)
         u = self.evaluate_estimands(data, estimands, normaliser=False).u
         data = data._replace(**{name: values[name] for name in data.temperature_log_sd})
-        precision = displacement_precision(self.mesh, data, lam, mu, u)
+        precision = displacement_precision(self.mesh, data, lam, mu, u, float(values.get("field_sd", 0.0)))
         if not len(self.sampled):
             return precision
-        weight = 1 / (len(self.sampled) * float(data.rigid_sd) ** 2)
-        return precision + weight * np.asarray(data.rigid_modes @ data.rigid_modes.T)
+        weight, rows = 1 / (len(self.sampled) * float(data.rigid_sd) ** 2), 3 * len(self.sampled)
+        precision[-rows:, -rows:] += weight * np.asarray(data.rigid_modes @ data.rigid_modes.T)
+        return precision
 
     def constrain_of(self, data: RegistrationData, position: Values) -> dict[str, AnyArray]:
         """Estimands of an unconstrained position, as a pure function of the data."""
@@ -248,22 +262,29 @@ class Posterior:
         for name, free in self.free.items():
             if len(free):
                 position[name] = _transform(getattr(data, name), free).inv(estimands[name])
-        return position | {name: jnp.log(estimands[name]) for name in data.temperature_log_sd}
+        return position | _whitened(data, estimands) | {name: jnp.log(estimands[name]) for name in data.scales}
 
     def estimands(self, values: Values) -> dict[str, AnyArray]:
         """The sampled entries of values."""
         self._require_shapes(values)
         free = {name: jnp.asarray(values[name], float)[free] for name, free in self.free.items() if len(free)}
-        warm = {name: jnp.asarray(values[name], float) for name in self.data.temperature_log_sd}
-        return {"u_boundary": jnp.asarray(values["u_boundary"], float), **free, **warm}
+        scales = {name: jnp.asarray(values[name], float) for name in self.data.scales}
+        u = {"u_boundary": jnp.asarray(values["u_boundary"], float)}
+        return u | free | _whitened(self.data, values) | scales
 
     def reference(self) -> dict[str, AnyArray]:
-        """Values at rest: no displacement, λ and μ at their known or reference values, T_s and T_r at their medians."""
+        """Values at rest: no displacement, λ, μ at their known or reference values, temperatures at their medians.
+
+        The field is zero, its sd the scale of its prior.
+        """
+        field = self.data.field
+        components = {} if field is None else {"field": jnp.zeros(field.basis.shape[1]), "field_sd": field.sd_scale}
         return {
             "u_boundary": jnp.zeros((len(self.sampled), 3)),
             "lam": jnp.asarray(self.data.lam.reference),
             "mu": jnp.asarray(self.data.mu.reference),
             **{name: jnp.asarray(getattr(self.data, name)) for name in self.data.temperature_log_sd},
+            **components,
         }
 
     def allowed(self, u_boundary: Float[AnyArray, "sampled 3"]) -> Bool[np.ndarray, "sampled"]:
@@ -272,6 +293,12 @@ class Posterior:
         if distance is None:
             return np.ones(len(self.sampled), bool)
         return np.asarray(is_allowed(distance, self.data.points_sampled + jnp.asarray(u_boundary)))
+
+    def stiffness(self, values: Values) -> Float[AnyArray, "cells"]:
+        """Stiffness of every element over that of its tissue, e^s of the field; one where there is no field."""
+        if self.data.field is None:
+            return jnp.ones(len(self.mesh.cells))
+        return stiffness_factor(self.data, *(jnp.asarray(values[name]) for name in FIELD))
 
     def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """f(x_q) − m(x_q + u(x_q)) at the quadrature points."""
@@ -311,14 +338,17 @@ class Posterior:
             "similarity_energy" (E_s), "strain_energy" (E_r), and the terms that sum to the log density:
             "log_similarity", "log_elastic", "log_rigid", "log_prior_lam", "log_prior_mu", "log_support",
             "log_solved" ("log_elastic" and "log_rigid" where nodes are sampled); where T_s is inferred "log_similarity_normaliser", where the density is normalised
-            "log_normaliser", and "log_prior_t_similarity", "log_prior_t_elastic" of those inferred.
+            "log_normaliser", and "log_prior_t_similarity", "log_prior_t_elastic", "log_prior_field_sd",
+            "log_prior_field" of those inferred.
         """
         self._require_shapes(values)
         return _terms(self.data, dict(values), self.options.similarity)
 
     def _require_shapes(self, values: Values) -> None:
         expected = {"u_boundary": (len(self.sampled), 3), **{n: getattr(self.data, n).low.shape for n in LAME}}
-        expected |= dict.fromkeys(self.data.temperature_log_sd, ())
+        expected |= dict.fromkeys(self.data.scales, ())
+        if self.data.field is not None:
+            expected["field"] = (self.data.field.basis.shape[1],)
         for name, shape in expected.items():
             if name not in values:
                 raise InputError(f"values lack {name!r}; expected {', '.join(expected)}")
@@ -377,7 +407,12 @@ def _complete(data: RegistrationData, estimands: Values, free: Mapping[str, np.n
     for name in LAME:
         known = jnp.asarray(getattr(data, name).reference)
         values[name] = known.at[free[name]].set(estimands[name]) if len(free[name]) else known
-    return values | {name: estimands[name] for name in data.temperature_log_sd}
+    return values | _whitened(data, estimands) | {name: estimands[name] for name in data.scales}
+
+
+def _whitened(data: RegistrationData, values: Values) -> dict[str, AnyArray]:
+    """The field's components, where there is a field: the same in all coordinates."""
+    return {} if data.field is None else {"field": jnp.asarray(values["field"], float)}
 
 
 def _transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
@@ -387,13 +422,13 @@ def _transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
 def _to_estimands(
     data: RegistrationData, position: Values, free: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, AnyArray], Scalar]:
-    estimands, log_jacobian = {"u_boundary": position["u_boundary"]}, jnp.zeros(())
+    estimands, log_jacobian = {"u_boundary": position["u_boundary"], **_whitened(data, position)}, jnp.zeros(())
     for name in LAME:
         if len(free[name]):
             transform = _transform(getattr(data, name), free[name])
             estimands[name] = transform(position[name])
             log_jacobian += transform.log_abs_det_jacobian(position[name], estimands[name]).sum()
-    for name in data.temperature_log_sd:
+    for name in data.scales:
         estimands[name] = jnp.exp(position[name])
         log_jacobian += position[name]
     return estimands, log_jacobian
@@ -419,14 +454,16 @@ def _terms(data: RegistrationData, values: dict[str, AnyArray], similarity: str)
     terms = {name: trace[name]["value"] for name in ("similarity_energy", "strain_energy")}
     for name in (name for name in trace if name.startswith("log_")):
         terms[name] = trace[name]["fn"].log_prob(trace[name]["value"])
-    for name in (*LAME, *data.temperature_log_sd):
+    for name in (name for name in (*LAME, *data.scales, "field") if name in values):
         terms[f"log_prior_{name}"] = trace[name]["fn"].log_prob(values[name])
     return terms
 
 
 @jax.jit
 def _log_normaliser(data: RegistrationData, values: dict[str, AnyArray]) -> Scalar:
-    return log_elastic_normaliser(data, values["lam"], values["mu"], values.get("t_elastic", data.t_elastic))
+    field = {name: values[name] for name in FIELD if name in values}
+    t_elastic = values.get("t_elastic", data.t_elastic)
+    return log_elastic_normaliser(data, values["lam"], values["mu"], t_elastic, **field)
 
 
 @jax.jit

@@ -17,7 +17,8 @@ from bayesreg.fem.location import locate
 from bayesreg.image import Image, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
-from bayesreg.model.options import Lame, ModelConfig, PriorConfig, TemperaturePrior, of_tissue
+from bayesreg.model.field import stiffness_field
+from bayesreg.model.options import FieldConfig, Lame, ModelConfig, PriorConfig, TemperaturePrior, of_tissue
 from bayesreg.model.program import LameParameter, RegistrationData
 from bayesreg.types import AnyArray, InputError
 
@@ -48,6 +49,7 @@ def registration_data(
         cell_entry=jnp.asarray(entry),
         lam=lam,
         mu=mu,
+        field=stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None,
         moving=moving.interpolator(model.interpolation),
         skull_distance=distance,
         quadrature=quadrature,
@@ -181,6 +183,7 @@ def cell_entries(mesh: TetMesh, model: ModelConfig) -> Int[np.ndarray, "cells"]:
         "tissue": mesh.tissue,
         "uniform": np.zeros(len(mesh.cells), int),
         "element": np.arange(len(mesh.cells)),
+        "field": mesh.tissue,
     }[model.elasticity]
 
 
@@ -195,7 +198,7 @@ def lame_parameter(
         If the options name a tissue that the mesh does not have, two tissues that share one entry are given
         different values, or the reference has the wrong shape or sign.
     """
-    entries = int(cell_entries(mesh, model).max()) + 1 if model.elasticity != "tissue" else len(mesh.names)
+    entries = {"uniform": 1, "element": len(mesh.cells)}.get(model.elasticity, len(mesh.names))
     prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
     fixed = model.known(mesh.names)
     known = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
@@ -220,7 +223,7 @@ def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: i
     """λ = 10, μ = 1 (the literature's λ/μ is about 24); fluid-like 0.01 in CSF."""
     solid = 10.0 if name == "lam" else 1.0
     by_tissue = np.array([0.01 if tissue == "csf" else solid for tissue in mesh.names])
-    return {"tissue": by_tissue, "uniform": np.full(1, solid), "element": by_tissue[mesh.tissue]}[model.elasticity]
+    return {"uniform": np.full(1, solid), "element": by_tissue[mesh.tissue]}.get(model.elasticity, by_tissue)
 
 
 def _within(prior: list[PriorConfig], values: Float[np.ndarray, "entries"]) -> Float[np.ndarray, "entries"]:
@@ -239,8 +242,8 @@ def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: 
         raise InputError(f"model.{where} names {sorted(unknown)}, but the mesh's tissues are {list(mesh.names)}")
     if model.elasticity == "uniform" and len(set(given.values())) > 1:
         raise InputError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
-    tissues = {"tissue": mesh.names, "uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
-    found = (of_tissue(model, given, tissue) for tissue in tissues[model.elasticity])
+    tissues = {"uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
+    found = (of_tissue(model, given, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
     return [default if value is None else value for value in found]
 
 

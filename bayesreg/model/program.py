@@ -17,6 +17,7 @@ from bayesreg.fem.elements import Quadrature
 from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
 from bayesreg.image import Interpolator
 from bayesreg.model.constraint import is_allowed
+from bayesreg.model.field import StiffnessField
 from bayesreg.model.priors import ScaledBeta
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
@@ -60,6 +61,8 @@ class RegistrationData(NamedTuple):
     cell_entry : (m,) int array
         Index of each cell's entry in λ and μ.
     lam, mu : LameParameter
+    field : StiffnessField or None
+        Prior of the logarithm of a factor on λ and μ of every cell.
     moving : Interpolator
     skull_distance : Interpolator or None
         Signed distance to Ω_SK, mm.
@@ -94,6 +97,7 @@ class RegistrationData(NamedTuple):
     cell_entry: Int[AnyArray, "cells"]
     lam: LameParameter
     mu: LameParameter
+    field: StiffnessField | None
     moving: Interpolator
     skull_distance: Interpolator | None
     quadrature: Quadrature
@@ -110,6 +114,11 @@ class RegistrationData(NamedTuple):
     degrees_of_freedom: Scalar
     independent_share: Scalar
     determinant: SchurDeterminant | None
+
+    @property
+    def scales(self) -> tuple[str, ...]:
+        """Names of the positive scalars that are sampled: temperatures with a prior, and the field's sd."""
+        return (*self.temperature_log_sd, *(() if self.field is None else ("field_sd",)))
 
 
 def registration(
@@ -132,7 +141,8 @@ def registration(
     mu = numpyro.sample("mu", data.mu.prior())
     t_similarity, t_elastic = (_temperature(data, name) for name in ("t_similarity", "t_elastic"))
 
-    lam_cells, mu_cells = _by_cell(data, lam, mu)
+    field = _field(data)
+    lam_cells, mu_cells = _by_cell(data, lam, mu, **field)
     u_prescribed = data.held.at[data.slots].set(u_boundary)
     state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, SOLVER_TOLERANCE, guess)
 
@@ -143,7 +153,7 @@ def registration(
     strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)
     # Without the barrier XLA computes both energies twice, for the density and for the record.
     similarity_energy, strain_energy = jax.lax.optimization_barrier((similarity_energy, strain_energy))
-    inside = in_support(data, u_boundary, lam, mu, t_similarity, t_elastic)
+    inside = in_support(data, u_boundary, lam, mu, t_similarity, t_elastic, **field)
 
     numpyro.factor("log_similarity", -data.independent_share * similarity_energy / t_similarity)
     if "t_similarity" in data.temperature_log_sd:
@@ -153,7 +163,7 @@ def registration(
     if len(data.slots):
         numpyro.factor("log_elastic", -strain_energy / t_elastic)
     if data.determinant is not None and normaliser:
-        numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic))
+        numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic, **field))
         numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
     numpyro.factor("log_support", jnp.where(inside, 0.0, -jnp.inf))
     numpyro.factor("log_solved", jnp.where(state.converged, 0.0, -jnp.inf))
@@ -166,11 +176,13 @@ def registration(
     numpyro.deterministic("outside_support", ~inside)
 
 
-def log_elastic_normaliser(data: RegistrationData, lam: AnyArray, mu: AnyArray, t_elastic: AnyArray) -> Scalar:
+def log_elastic_normaliser(
+    data: RegistrationData, lam: AnyArray, mu: AnyArray, t_elastic: AnyArray, **field: AnyArray
+) -> Scalar:
     """½ log pdet S(λ, μ) − r/2 log(2π T_r), r the rank of S: makes exp(−E_r / T_r) a density of u_B."""
     if data.determinant is None:
         return jnp.zeros(())
-    log_pdet = log_pseudo_determinant(data.determinant, data.system.elements, *_by_cell(data, lam, mu))
+    log_pdet = log_pseudo_determinant(data.determinant, data.system.elements, *_by_cell(data, lam, mu, **field))
     return 0.5 * (log_pdet - data.determinant.rank * jnp.log(2 * jnp.pi * t_elastic))
 
 
@@ -182,14 +194,41 @@ def _temperature(data: RegistrationData, name: str) -> Scalar:
     return numpyro.sample(name, dist.LogNormal(jnp.log(known), data.temperature_log_sd[name]))
 
 
+def _field(data: RegistrationData) -> dict[str, AnyArray]:
+    """The field's standard deviation and its whitened components, where there is a field."""
+    if data.field is None:
+        return {}
+    components = dist.Normal(jnp.zeros(data.field.basis.shape[1]), 1.0).to_event(1)
+    return {
+        "field_sd": numpyro.sample("field_sd", dist.HalfNormal(data.field.sd_scale)),
+        "field": numpyro.sample("field", components),
+    }
+
+
+def stiffness_factor(data: RegistrationData, field_sd: AnyArray | float, field: AnyArray) -> Float[AnyArray, "cells"]:
+    """exp(sd · basis · z), by which the field multiplies λ and μ of every cell."""
+    if data.field is None:
+        return jnp.ones(data.cell_entry.shape)
+    return jnp.exp(field_sd * (data.field.basis @ field))
+
+
 def _by_cell(
-    data: RegistrationData, lam: AnyArray, mu: AnyArray
+    data: RegistrationData,
+    lam: AnyArray,
+    mu: AnyArray,
+    field_sd: AnyArray | float = 1.0,
+    field: AnyArray | float = 0.0,
 ) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
     """λ and μ of every cell. Where K may be indefinite the density is −∞; the reference then lets a solve end soon."""
     physical = _physical(lam, mu)
+    if data.field is not None:
+        factor = stiffness_factor(data, field_sd, field)
+        physical &= _finite(factor)
+        factor = jnp.where(physical, factor, 1.0)
     safe = (jnp.where(physical, values, known.reference) for values, known in ((lam, data.lam), (mu, data.mu)))
     lam_entries, mu_entries = safe
-    return lam_entries[data.cell_entry], mu_entries[data.cell_entry]
+    lam_cells, mu_cells = lam_entries[data.cell_entry], mu_entries[data.cell_entry]
+    return (lam_cells, mu_cells) if data.field is None else (lam_cells * factor, mu_cells * factor)
 
 
 def in_support(
@@ -199,16 +238,25 @@ def in_support(
     mu: AnyArray,
     t_similarity: AnyArray | float = 1.0,
     t_elastic: AnyArray | float = 1.0,
+    field_sd: AnyArray | float = 1.0,
+    field: AnyArray | float = 0.0,
 ) -> Bool[AnyArray, ""]:
     """Whether no sampled node lies in Ω_SK and every parameter is physical and in the range of its prior."""
     in_range = _in_range(lam, data.lam) & _in_range(mu, data.mu)
     warm = jnp.isfinite(t_similarity) & (t_similarity > 0) & jnp.isfinite(t_elastic) & (t_elastic > 0)
+    warm &= jnp.asarray(field_sd) > 0
+    if data.field is not None:
+        warm &= _finite(stiffness_factor(data, field_sd, field))
     return _physical(lam, mu) & in_range & warm & _clear_of_skull(data, u_boundary)
 
 
 def _physical(lam: AnyArray, mu: AnyArray) -> Bool[AnyArray, ""]:
     """Whether K is positive definite up to rigid motions: λ ≥ 0 and μ > 0, all of them finite."""
     return ((lam >= 0) & jnp.isfinite(lam)).all() & ((mu > 0) & jnp.isfinite(mu)).all()
+
+
+def _finite(factor: AnyArray) -> Bool[AnyArray, ""]:
+    return (jnp.isfinite(factor) & (factor > 0)).all()
 
 
 def _in_range(values: AnyArray, parameter: LameParameter) -> Bool[AnyArray, ""]:

@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from bayesreg.image import Image
-from bayesreg.io.store import Run
+from bayesreg.io.store import Predicted, Run
 from bayesreg.report import panels, style
 from bayesreg.report.estimands import elastic_draws
 from bayesreg.report.metrics import divergence
 from bayesreg.report.panels import View
-from bayesreg.report.slices import Plane, sample
+from bayesreg.report.slices import Plane, planes_through, sample
 from bayesreg.report.style import Drawing
+from bayesreg.report.verdict import number
 
 CONVENTION = (
     "Neurological convention: the left of the patient is on the left (L left, R right, A anterior, P posterior, "
@@ -235,6 +236,40 @@ def element_stiffness(view: View, posterior: xr.Dataset) -> Drawing | None:
         uri = style.data_uri(figure)
     caption = "Posterior median of λ/μ of every tetrahedron; lines: interfaces of the tissues."
     return Drawing("elements", "Stiffness by element", caption, "Maps of the median of λ/μ on three planes.", uri)
+
+
+def stiffness_field(view: View, predicted: Predicted) -> Drawing | None:
+    """Mean, sd and P(> 1.5) of every element's stiffness over its tissue's; None unless there is a field."""
+    if predicted.stiffness_mean is None:
+        return None
+    mean, sd, likely = (np.asarray(values) for values in (
+        predicted.stiffness_mean, predicted.stiffness_sd, predicted.stiffer_probability
+    ))  # fmt: skip
+    span = float(np.abs(np.log(mean)).max()) + 1e-3
+    times = float(predicted.stiffer)
+    rows = [
+        ("mean", mean, style.SIGNED, LogNorm(np.exp(-span), np.exp(span))),
+        ("sd", sd, style.ERROR, panels.from_zero(sd)),
+        (f"P(> {times:g})", likely, style.MAGNITUDE, Normalize(0, 1)),
+    ]
+    place = view.run.mesh.points[view.run.mesh.cells[mean.argmax()]].mean(axis=0)
+    planes = planes_through(view.run.mesh, place)[::-1]
+    with style.look():
+        figure, axes = _field_grid(view, len(rows))
+        for row, (name, values, cmap, norm) in zip(axes, rows, strict=True):
+            for panel, plane in zip(row, planes, strict=True):
+                drawn = panels.field_panel(panel, view.slice(plane).cellwise(values), plane, norm, cmap)
+                panels.outline(panel, view, plane)
+            panels.colourbar(figure, drawn, list(row), name)
+        for panel, plane in zip(axes[0], planes, strict=True):
+            panel.set_title(plane.title)
+        uri = style.data_uri(figure)
+    caption = (
+        "Stiffness of every tetrahedron over the geometric mean of its tissue: posterior mean, standard deviation and "
+        f"the probability of more than {times:g} times, through the stiffest tetrahedron "
+        f"({number(float(mean.max()))} ± {number(float(sd[mean.argmax()]))} times); lines: interfaces of the tissues."
+    )
+    return Drawing("field", "Stiffness within the tissues", caption, "Maps of mean, sd and probability.", uri)
 
 
 def element_ratio(run: Run, posterior: xr.Dataset) -> np.ndarray | None:

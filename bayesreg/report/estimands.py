@@ -11,7 +11,15 @@ import xarray as xr
 from bayesreg.mesh import TetMesh
 from bayesreg.report.places import regions
 
-SYMBOLS = {"lam": "λ", "mu": "μ", "ratio": "λ/μ", "t_similarity": "T_s", "t_elastic": "T_r"}
+SYMBOLS = {
+    "lam": "λ",
+    "mu": "μ",
+    "ratio": "λ/μ",
+    "t_similarity": "T_s",
+    "t_elastic": "T_r",
+    "field_sd": "sd of the log-stiffness",
+    "field": "component of the log-stiffness",
+}
 DISPLACEMENT = "u_boundary"
 TEMPERATURES = ("t_similarity", "t_elastic")
 AXES = ("x", "y", "z")

@@ -96,6 +96,7 @@ def write_report(
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
         anatomy.element_stiffness(view, posterior),
+        anatomy.stiffness_field(view, predicted) if predicted else None,
         marginals.temperatures(run, posterior),
         adequacy.residual(view),
         marginals.skull_node(run, posterior) if nodes else None,
@@ -159,7 +160,7 @@ def name_of(run: Run) -> str:
 
 def elasticity_of(run: Run) -> str:
     """How the elastic parameters vary, for people."""
-    known = {"tissue": "By tissue", "uniform": "Uniform", "element": "By element"}
+    known = {"tissue": "By tissue", "uniform": "Uniform", "element": "By element", "field": "By tissue, with a field"}
     return known.get(str(part(run.manifest, "model", "elasticity")), "")
 
 

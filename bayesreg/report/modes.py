@@ -25,6 +25,7 @@ APART = 3.0
 TOGETHER_IN_ALL_BUT = 3
 MOST_SHOWN = 4
 NODES_SHOWN = 10
+SEEN = (DISPLACEMENT, "lam", "mu", "field_sd", "field")
 
 
 class Grouping(NamedTuple):
@@ -70,14 +71,14 @@ def _renumbered(label: np.ndarray) -> np.ndarray:
 def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"]:
     """All estimands side by side."""
     posterior = _fewer(posterior)
-    found = [posterior[name] for name in (DISPLACEMENT, "lam", "mu") if name in posterior]
+    found = [posterior[name] for name in SEEN if name in posterior]
     flat = [one.transpose("chain", "draw", ...).to_numpy().reshape(*_shape(one), -1) for one in found]
     return np.concatenate(flat, axis=-1).astype(float)
 
 
 def _fewer(posterior: xr.Dataset) -> xr.Dataset:
     """Evenly thinned, where the draws would take much memory."""
-    numbers = sum(posterior[name].size for name in (DISPLACEMENT, "lam", "mu") if name in posterior)
+    numbers = sum(posterior[name].size for name in SEEN if name in posterior)
     return posterior.isel(draw=slice(None, None, max(1, numbers // MOST_VALUES)))
 
 

@@ -1,0 +1,118 @@
+"""A Gaussian Markov random field of log-stiffness on the graph of the elements that share a face.
+
+The field s multiplies λ and μ of an element alike, by e^s: it makes tissue stiffer or softer and leaves ν alone. It has
+the Matérn covariance of smoothness ½ in space, sd² exp(−κr), through the stochastic equation of Lindgren, Rue and
+Lindström (2011), (κ² − Δ) s = white noise, in finite volumes: with the elements' volumes V and the weights
+w_ef = area of the common face / distance of the centroids in the graph's Laplacian G, the precision is
+
+Q = (κ²V + G) V⁻¹ (κ²V + G) / (8πκ sd²).
+
+The weights make it the same field on every mesh; a plain graph Laplacian would tie small elements as fast as large ones.
+At the surface, where the equation's flux is zero, the variance rises towards its double.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from jaxtyping import Float
+
+from bayesreg.mesh import TetMesh
+from bayesreg.model.options import FieldConfig
+from bayesreg.types import AnyArray, InputError, Scalar
+
+# Beyond this many elements the dense covariance (8 bytes × their square, a few times over) outgrows memory.
+DENSE_LIMIT = 8000
+
+
+class StiffnessField(NamedTuple):
+    """The prior of the log-stiffness of every element, s = sd · basis · z with z ~ N(0, I) (a pytree).
+
+    Attributes
+    ----------
+    basis : (m, k) array
+        Leading principal components of the field with sd 1, times their standard deviations.
+    sd_scale : scalar
+        Of the half-normal prior of sd.
+    share : scalar
+        Of the field's variance, averaged over the volume, that the k components carry.
+    """
+
+    basis: Float[AnyArray, "cells modes"]
+    sd_scale: Scalar
+    share: Scalar
+
+
+def stiffness_field(mesh: TetMesh, options: FieldConfig) -> StiffnessField:
+    """The field on a mesh, conditioned on a mean of zero in every tissue.
+
+    So λ and μ of a tissue are its geometric mean stiffness, and the field is what differs inside it: without the
+    condition, a shift of the field and one of the tissue's μ would be told apart by the prior alone.
+
+    Raises
+    ------
+    InputError
+        If the mesh has more elements than a dense covariance can serve.
+    """
+    count = len(mesh.cells)
+    if count > DENSE_LIMIT:
+        raise InputError(
+            f"model.elasticity field needs a mesh of at most {DENSE_LIMIT:,} elements, this one has {count:,}; "
+            "give a longer mesh.edge_length"
+        )
+    covariance = _conditioned(scipy.linalg.inv(precision(mesh, options.correlation).toarray()), _tissue_means(mesh))
+    # The best k components in the mean square over the volume.
+    root = np.sqrt(mesh.volumes)
+    weighted = root[:, None] * covariance * root
+    modes = min(options.modes, count - len(np.unique(mesh.tissue)))
+    values, vectors = scipy.linalg.eigh(weighted, subset_by_index=(count - modes, count - 1))
+    basis = (vectors * np.sqrt(np.maximum(values, 0.0)) / root[:, None])[:, ::-1]
+    share = values.sum() / np.trace(weighted)
+    return StiffnessField(jnp.asarray(basis), jnp.asarray(options.sd), jnp.asarray(share))
+
+
+def precision(mesh: TetMesh, correlation: float) -> scipy.sparse.csr_matrix:
+    """Q of the field with sd = 1 inside, before it is conditioned; sparse: an element, its neighbours, and theirs.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    correlation : float
+        2/κ, mm: the distance at which the correlation has fallen to e⁻² = 0.14.
+    """
+    kappa, volumes = 2 / correlation, mesh.volumes
+    operator = scipy.sparse.diags(kappa**2 * volumes) + face_laplacian(mesh)
+    return (operator @ scipy.sparse.diags(1 / volumes) @ operator / (8 * np.pi * kappa)).tocsr()
+
+
+def face_laplacian(mesh: TetMesh) -> scipy.sparse.csr_matrix:
+    """G: sᵀGs = Σ over pairs of elements that share a face of w_ef (s_e − s_f)² ≈ ∫|∇s|², in mm."""
+    one, other = mesh.neighbours.T
+    corners = mesh.cells[one]
+    shared = (corners[:, :, None] == mesh.cells[other][:, None, :]).any(axis=2)
+    faces = mesh.points[corners[shared].reshape(-1, 3)]
+    areas = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1) / 2
+    centres = mesh.points[mesh.cells].mean(axis=1)
+    weights = areas / np.linalg.norm(centres[one] - centres[other], axis=1)
+    size = len(mesh.cells)
+    coupling = scipy.sparse.coo_matrix((weights, (one, other)), shape=(size, size)).tocsr()
+    coupling = coupling + coupling.T
+    return (scipy.sparse.diags(np.asarray(coupling.sum(axis=1)).ravel()) - coupling).tocsr()
+
+
+def _tissue_means(mesh: TetMesh) -> Float[np.ndarray, "tissues cells"]:
+    """Rows that take the mean over the volume of each tissue that the mesh has."""
+    rows = [(mesh.tissue == tissue) * mesh.volumes for tissue in np.unique(mesh.tissue)]
+    return np.array([row / row.sum() for row in rows])
+
+
+def _conditioned(
+    covariance: Float[np.ndarray, "cells cells"], C: Float[np.ndarray, "tissues cells"]
+) -> Float[np.ndarray, "cells cells"]:
+    """Covariance given C s = 0."""
+    cross = covariance @ C.T
+    return covariance - cross @ np.linalg.solve(C @ cross, cross.T)
