@@ -94,6 +94,11 @@ def judged(found: Phantom, post: br.Posterior, idata) -> dict[str, float]:
     }
 
 
+def sampled(figures):
+    """Convergence figures of the sampled variables."""
+    return [part for part in figures.data_vars.values() if part.size and part.notnull().any()]
+
+
 def main() -> None:
     """Draw, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -115,9 +120,9 @@ def main() -> None:
     diagnosed = convergence(samples.idata)
     figures |= {
         "share_of_variance": float(post.data.field.share),
-        "rhat": max(float(x.max()) for x in diagnosed.rhat.data_vars.values() if x.size),
-        "ess_bulk": min(float(x.min()) for x in diagnosed.ess_bulk.data_vars.values() if x.size),
-        "ess_tail": min(float(x.min()) for x in diagnosed.ess_tail.data_vars.values() if x.size),
+        "rhat": max(float(part.max()) for part in sampled(diagnosed.rhat)),
+        "ess_bulk": min(float(part.min()) for part in sampled(diagnosed.ess_bulk)),
+        "ess_tail": min(float(part.min()) for part in sampled(diagnosed.ess_tail)),
         "gradients_per_chain": float(np.mean(samples.tally.gradients)),
         "acceptance": float((samples.tally.acceptance / samples.tally.steps).mean()),
         "seconds": time.perf_counter() - began,
