@@ -29,6 +29,7 @@ from bayesreg.inference.run import (
 )
 from bayesreg.io import store
 from bayesreg.io.atomic import write_text
+from bayesreg.io.displacements import read_displacement
 from bayesreg.io.store import Inputs, Run
 from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
@@ -334,7 +335,7 @@ def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
     if wanted == "truth":
         assert inputs.truth is not None
         return np.asarray(inputs.truth.u)
-    return store.read_displacement(Path(wanted), inputs.mesh)
+    return read_displacement(Path(wanted), inputs.mesh)
 
 
 def _with_initial(inputs: Inputs, config: Config) -> Inputs:

@@ -14,8 +14,9 @@ from bayesreg.config.sections import BrainWebData, CalibratedPair, FilesData, Me
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
+from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
-from bayesreg.io.store import Inputs, Truth, read_boundary, read_displacement, require_displacement
+from bayesreg.io.store import Inputs, Truth
 from bayesreg.io.volumes import load_image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.simulation import SyntheticPair, make_pair

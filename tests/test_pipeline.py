@@ -251,7 +251,6 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
 
 @pytest.mark.slow
 def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
-    """From the truth, and from the mesh of the run with the truth: the same draws."""
     out = folder / "elastography"
     overrides = ["known_boundary=truth", "sampler.sigma_lam=0.5", "sampler.sigma_mu=0.05", "start.field=identity"]
     result = br.run(synthetic("paper", *overrides), out, progress=False)
@@ -265,11 +264,36 @@ def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
     page = result.report.read_text()
     assert "Elastography: posterior of the elastic parameters" in page
     assert 'id="one-node"' not in page
-    br.save_mesh(result.mesh, folder / "known.vtu", {"u_mean": truth.u})
-    overrides[0] = f"known_boundary={folder / 'known.vtu'}"
-    again = br.run(synthetic("paper", *overrides), folder / "from a file", progress=False)
-    np.testing.assert_array_equal(again.idata.posterior["lam"], posterior["lam"])
     np.testing.assert_array_equal(store.read_inputs(out).boundary, truth.u[boundary])
+
+
+@pytest.mark.slow
+def test_a_field_of_stiffness_is_stored_and_shown(finished, folder):
+    """With the displacement of the boundary from a file."""
+    u = 0.1 * np.sin(finished.mesh.points)
+    br.save_mesh(finished.mesh, folder / "known.vtu", {"u": u})
+    settings = ["model.elasticity=field", "model.field={modes: 6, correlation: 30}", "stop={rhat: null, max_steps: 8}"]
+    settings += ["sampler={name: laplace, chains: 2}", f"known_boundary={folder / 'known.vtu'}"]
+    result = br.run(br.load_config(folder / "run.yaml", settings), folder / "field", progress=False)
+    boundary = result.mesh.boundary
+    np.testing.assert_allclose(result.u_mean[boundary], u[boundary], rtol=1e-12)
+    posterior, mesh = result.idata.posterior, result.mesh
+    assert posterior["field"].shape == (2, 8, 6)
+    assert (posterior["field_sd"] > 0).all()
+    assert posterior["lam"].sizes["tissue"] == 3
+    known = br.load_result(folder / "field").run.predicted
+    stored = meshio.read(folder / "field" / "mesh.vtu").cell_data
+    np.testing.assert_allclose(stored["stiffness_mean"][0], known.stiffness_mean)
+    post = pipeline.posterior_of(br.load_config(folder / "field" / "config.yaml"), store.read_inputs(folder / "field"))
+    z, sd = posterior["field"].values.reshape(-1, 6), posterior["field_sd"].values.reshape(-1)
+    factors = np.exp(sd[:, None] * (z @ np.asarray(post.data.field.basis).T))
+    assert factors.shape == (16, len(mesh.cells))
+    np.testing.assert_allclose(known.stiffness_mean, factors.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(known.stiffness_sd, factors.std(axis=0, ddof=1), rtol=1e-6)
+    np.testing.assert_allclose(known.stiffer_probability, (factors > 1.5).mean(axis=0), atol=1e-9)
+    page = result.report.read_text()
+    assert "Stiffness within the tissues" in page
+    assert "of the log-stiffness" in page
 
 
 @pytest.mark.slow

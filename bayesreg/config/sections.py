@@ -17,7 +17,17 @@ from pydantic import (
     field_validator,
 )
 
-from bayesreg.config.values import Count, Direction, FoundFile, Labels, NotNegative, Positive, Range, find_boundary, find_field
+from bayesreg.config.values import (
+    Count,
+    Direction,
+    FoundFile,
+    Labels,
+    NotNegative,
+    Positive,
+    Range,
+    find_boundary,
+    find_field,
+)
 from bayesreg.model.options import ModelConfig, Vector
 from bayesreg.model.options import wrong as _wrong
 
@@ -278,7 +288,7 @@ def _require_nothing_else(model: ModelConfig) -> None:
     """Refuse what known_boundary leaves no room for."""
     if model.sampled != "boundary" or model.held:
         key = "held" if model.held else "sampled"
-        raise _wrong(key, "expected the default: known_boundary holds the nodes of the boundary and no other is sampled")
+        raise _wrong(key, "expected the default: known_boundary holds the boundary, and no other node is sampled")
     if model.normalised:
         raise _wrong("normalised", "expected false with known_boundary: a given u_B has no prior to be normalised")
 
@@ -362,7 +372,9 @@ class Config(Section):
         if start.field == "truth" and "simulate" in info.data and info.data["simulate"] is None:
             raise _wrong("field", "the truth of this pair is not known; expected identity or a file")
         for name in ("lam", "mu"):
-            if model is not None and model.elasticity != "tissue" and isinstance(getattr(start, name), Tissues):
+            if model is None or model.elasticity in ("tissue", "field"):
+                continue
+            if isinstance(getattr(start, name), Tissues):
                 raise _wrong(name, f"expected one number, since model.elasticity is {model.elasticity}")
         return start
 

@@ -36,7 +36,7 @@ def find_field(value: object, info: ValidationInfo) -> object:
 
 
 def find_boundary(value: object, info: ValidationInfo) -> object:
-    """"truth" and null as they are, anything else as a file."""
+    """The word truth and null as they are, anything else as a file."""
     return value if value in (None, "truth") else _find_file(value, info)
 
 

@@ -422,7 +422,7 @@ def _reason(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block], converg
     else:
         found = worst(blocks)
         state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"
-        rule = f"R̂ below {stop.rhat:g} and both ESS above {stop.ess:g}"
+        rule = f"R̂ below {stop.rhat} and both ESS above {stop.ess:g}"
     if converged:
         return f"every estimand has converged: {state}"
     limit = f"{draws} draws per chain"

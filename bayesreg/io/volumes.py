@@ -137,11 +137,11 @@ def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
     source = _open(path)
     if source.shape[3:] != (1, 3):
         raise InputError(
-            f"{path} is no displacement field: expected the shape (X, Y, Z, 1, 3), LPS vectors in mm, got {source.shape}"
+            f"{path} is no displacement field: expected the shape (X, Y, Z, 1, 3), vectors in mm, got {source.shape}"
         )
     try:
-        lps = np.asarray(source.dataobj, float)[:, :, :, 0]
-        return tuple(Image(lps[..., k] * sign, source.affine) for k, sign in enumerate((-1, -1, 1)))  # type: ignore[return-value]
+        x, y, z = np.moveaxis(np.asarray(source.dataobj, float)[:, :, :, 0], -1, 0)
+        return Image(-x, source.affine), Image(-y, source.affine), Image(z, source.affine)
     except (OSError, EOFError, zlib.error, ValueError) as error:
         raise InputError(f"displacement field {path}: {error}") from error
 

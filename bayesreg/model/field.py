@@ -7,8 +7,8 @@ w_ef = area of the common face / distance of the centroids in the graph's Laplac
 
 Q = (κ²V + G) V⁻¹ (κ²V + G) / (8πκ sd²).
 
-The weights make it the same field on every mesh; a plain graph Laplacian would tie small elements as fast as large ones.
-At the surface, where the equation's flux is zero, the variance rises towards its double.
+The weights make it the same field on every mesh; a plain graph Laplacian would tie small elements as fast as large
+ones. At the surface, where the equation's flux is zero, the variance rises towards its double.
 """
 
 from __future__ import annotations

@@ -17,12 +17,11 @@ from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
+from bayesreg.model.coordinates import FIELD, LAME, Values, complete, lame_by_cell, to_estimands, transform, whitened
 from bayesreg.model.curvature import displacement_precision
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.priors import RangeTransform
 from bayesreg.model.problem import registration_data
 from bayesreg.model.program import (
-    LameParameter,
     RegistrationData,
     in_support,
     log_elastic_normaliser,
@@ -32,11 +31,6 @@ from bayesreg.model.program import (
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, InputError, Scalar
-
-Values = Mapping[str, AnyArray]
-
-LAME = ("lam", "mu")
-FIELD = ("field_sd", "field")
 
 # Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
 # instead of seven left single nodes of the paper's pair in wrong places, up to 15 mm off.
@@ -154,7 +148,7 @@ class Posterior:
         With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
         Without `normaliser`, `log_normaliser` is left out of the density, and its cost with it.
         """
-        values = _complete(data, estimands, self.free)
+        values = complete(data, estimands, self.free)
         return _evaluate(data, values, self.options.similarity, guess, normaliser)
 
     def log_normaliser(self, data: RegistrationData, estimands: Values) -> Scalar:
@@ -162,11 +156,11 @@ class Posterior:
 
         The same for all displacements: what moves these alone does not need it.
         """
-        return _log_normaliser(data, _complete(data, estimands, self.free))
+        return _log_normaliser(data, complete(data, estimands, self.free))
 
     def supports(self, data: RegistrationData, estimands: Values) -> Bool[AnyArray, ""]:
         """Whether estimands lie where the density may be positive; costs no elastic solve."""
-        return in_support(data, **_complete(data, estimands, self.free))
+        return in_support(data, **complete(data, estimands, self.free))
 
     def logdensity(self, position: Values) -> Scalar:
         """Log density of the unconstrained position, the Jacobian of `constrain` included."""
@@ -174,7 +168,7 @@ class Posterior:
 
     def logdensity_of(self, data: RegistrationData, position: Values, normaliser: bool = True) -> Scalar:
         """`logdensity` as a pure function of the data, for samplers; without `normaliser` less `log_normaliser`."""
-        estimands, log_jacobian = _to_estimands(data, position, self.free)
+        estimands, log_jacobian = to_estimands(data, position, self.free)
         return self.evaluate_estimands(data, estimands, normaliser=normaliser).logdensity + log_jacobian
 
     def clearance(
@@ -214,12 +208,13 @@ class Posterior:
         yield self.data, True
 
     def conditioned(self, estimands: Values) -> RegistrationData:
-        """The data of the same problem, the interior solves preconditioned at these λ and μ: faster near them."""
-        values = _complete(self.data, estimands, self.free)
+        """The data of the same problem, the solves preconditioned at these λ, μ and field: faster near them."""
+        values = complete(self.data, estimands, self.free)
         # A tissue that is next to nothing leaves K_II without a factor.
         reference = {name: np.asarray(getattr(self.data, name).reference) for name in LAME}
-        near = (np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items())
-        return self.data._replace(system=_conditioned_system(self, *(tuple(x.tolist()) for x in near)))
+        near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
+        lam, mu = (tuple(by_cell.tolist()) for by_cell in lame_by_cell(self.data, {**values, **near}))
+        return self.data._replace(system=_conditioned_system(self, lam, mu))
 
     def displacement_precision(self, data: RegistrationData, estimands: Values) -> Float[np.ndarray, "rows rows"]:
         """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary": Gauss–Newton.
@@ -230,10 +225,8 @@ class Posterior:
             Positive semidefinite; first the k components of the field, then row k + 3 · node + axis, 1/mm². Of the
             elastic energy the curvature in the displacements alone is counted.
         """
-        values = _complete(data, estimands, self.free)
-        field = {name: values[name] for name in FIELD if name in values}
-        factor = np.asarray(stiffness_factor(data, **field)) if field else 1.0
-        lam, mu = (factor * np.asarray(values[name])[np.asarray(data.cell_entry)] for name in LAME)
+        values = complete(data, estimands, self.free)
+        lam, mu = lame_by_cell(data, values)
         u = self.evaluate_estimands(data, estimands, normaliser=False).u
         data = data._replace(**{name: values[name] for name in data.temperature_log_sd})
         precision = displacement_precision(self.mesh, data, lam, mu, u, float(values.get("field_sd", 0.0)))
@@ -245,12 +238,12 @@ class Posterior:
 
     def constrain_of(self, data: RegistrationData, position: Values) -> dict[str, AnyArray]:
         """Estimands of an unconstrained position, as a pure function of the data."""
-        return _to_estimands(data, position, self.free)[0]
+        return to_estimands(data, position, self.free)[0]
 
     def constrain(self, position: Values) -> dict[str, AnyArray]:
         """Values (known entries included) of an unconstrained position."""
-        estimands, _ = _to_estimands(self.data, position, self.free)
-        return _complete(self.data, estimands, self.free)
+        estimands, _ = to_estimands(self.data, position, self.free)
+        return complete(self.data, estimands, self.free)
 
     def unconstrain(self, values: Values) -> dict[str, AnyArray]:
         """Unconstrained position of values; the inverse of `constrain`."""
@@ -261,8 +254,8 @@ class Posterior:
         position = {"u_boundary": estimands["u_boundary"]}
         for name, free in self.free.items():
             if len(free):
-                position[name] = _transform(getattr(data, name), free).inv(estimands[name])
-        return position | _whitened(data, estimands) | {name: jnp.log(estimands[name]) for name in data.scales}
+                position[name] = transform(getattr(data, name), free).inv(estimands[name])
+        return position | whitened(data, estimands) | {name: jnp.log(estimands[name]) for name in data.scales}
 
     def estimands(self, values: Values) -> dict[str, AnyArray]:
         """The sampled entries of values."""
@@ -270,7 +263,7 @@ class Posterior:
         free = {name: jnp.asarray(values[name], float)[free] for name, free in self.free.items() if len(free)}
         scales = {name: jnp.asarray(values[name], float) for name in self.data.scales}
         u = {"u_boundary": jnp.asarray(values["u_boundary"], float)}
-        return u | free | _whitened(self.data, values) | scales
+        return u | free | whitened(self.data, values) | scales
 
     def reference(self) -> dict[str, AnyArray]:
         """Values at rest: no displacement, λ, μ at their known or reference values, temperatures at their medians.
@@ -336,9 +329,9 @@ class Posterior:
         -------
         dict
             "similarity_energy" (E_s), "strain_energy" (E_r), and the terms that sum to the log density:
-            "log_similarity", "log_elastic", "log_rigid", "log_prior_lam", "log_prior_mu", "log_support",
-            "log_solved" ("log_elastic" and "log_rigid" where nodes are sampled); where T_s is inferred "log_similarity_normaliser", where the density is normalised
-            "log_normaliser", and "log_prior_t_similarity", "log_prior_t_elastic", "log_prior_field_sd",
+            "log_similarity", "log_prior_lam", "log_prior_mu", "log_support", "log_solved"; where nodes are sampled
+            "log_elastic" and "log_rigid"; where T_s is inferred "log_similarity_normaliser", where the density is
+            normalised "log_normaliser", and "log_prior_t_similarity", "log_prior_t_elastic", "log_prior_field_sd",
             "log_prior_field" of those inferred.
         """
         self._require_shapes(values)
@@ -397,41 +390,7 @@ def build_posterior(
 
 @lru_cache(maxsize=2)
 def _conditioned_system(posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...]) -> ElasticSystem:
-    entry = np.asarray(posterior.data.cell_entry)
-    prescribed = np.asarray(posterior.data.system.prescribed)
-    return elastic_system(posterior.mesh, prescribed, np.array(lam)[entry], np.array(mu)[entry])
-
-
-def _complete(data: RegistrationData, estimands: Values, free: Mapping[str, np.ndarray]) -> dict[str, AnyArray]:
-    values = {"u_boundary": estimands["u_boundary"]}
-    for name in LAME:
-        known = jnp.asarray(getattr(data, name).reference)
-        values[name] = known.at[free[name]].set(estimands[name]) if len(free[name]) else known
-    return values | _whitened(data, estimands) | {name: estimands[name] for name in data.scales}
-
-
-def _whitened(data: RegistrationData, values: Values) -> dict[str, AnyArray]:
-    """The field's components, where there is a field: the same in all coordinates."""
-    return {} if data.field is None else {"field": jnp.asarray(values["field"], float)}
-
-
-def _transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
-    return RangeTransform(jnp.asarray(parameter.low)[free], jnp.asarray(parameter.high)[free])
-
-
-def _to_estimands(
-    data: RegistrationData, position: Values, free: Mapping[str, np.ndarray]
-) -> tuple[dict[str, AnyArray], Scalar]:
-    estimands, log_jacobian = {"u_boundary": position["u_boundary"], **_whitened(data, position)}, jnp.zeros(())
-    for name in LAME:
-        if len(free[name]):
-            transform = _transform(getattr(data, name), free[name])
-            estimands[name] = transform(position[name])
-            log_jacobian += transform.log_abs_det_jacobian(position[name], estimands[name]).sum()
-    for name in data.scales:
-        estimands[name] = jnp.exp(position[name])
-        log_jacobian += position[name]
-    return estimands, log_jacobian
+    return elastic_system(posterior.mesh, np.asarray(posterior.data.system.prescribed), np.array(lam), np.array(mu))
 
 
 @partial(jax.jit, static_argnames=("similarity", "normaliser"))

@@ -246,7 +246,7 @@ def stiffness_field(view: View, predicted: Predicted) -> Drawing | None:
         predicted.stiffness_mean, predicted.stiffness_sd, predicted.stiffer_probability
     ))  # fmt: skip
     span = float(np.abs(np.log(mean)).max()) + 1e-3
-    times = float(predicted.stiffer)
+    times = float(np.asarray(predicted.stiffer))
     rows = [
         ("mean", mean, style.SIGNED, LogNorm(np.exp(-span), np.exp(span))),
         ("sd", sd, style.ERROR, panels.from_zero(sd)),

@@ -143,9 +143,9 @@ def distributions(mesh: TetMesh, entries: Sequence[Estimand], nodes: np.ndarray,
         f"below for the elastic parameters; dashed, the R̂ of {threshold:g} that was asked for."
     )
     if len(nodes):
-        caption = "Top: " + caption + (
-            " Bottom: the greatest R̂ of the three components at every sampled node, seen along z, y and x; the worst "
-            "lie on top."
+        caption = (
+            f"Top: {caption} Bottom: the greatest R̂ of the three components at every sampled node, seen along z, y and "
+            "x; the worst lie on top."
         )
     return Drawing("distributions", "Convergence of all estimands", caption, "Distributions of R-hat and ESS.", uri)
 

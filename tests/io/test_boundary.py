@@ -5,10 +5,10 @@ from __future__ import annotations
 import nibabel as nib
 import numpy as np
 import pytest
-import SimpleITK as sitk
+import SimpleITK
 
 import bayesreg as br
-from bayesreg.io.store import read_boundary
+from bayesreg.io.displacements import read_boundary
 from bayesreg.io.volumes import load_displacement, save_displacement
 from bayesreg.model.warp import nodal_field_on_grid
 from tests.phantoms import ball_mesh, rotated_affine
@@ -37,9 +37,9 @@ def test_a_field_of_itk_is_read_in_ras(tmp_path):
     """SimpleITK, which thinks in LPS, writes it."""
     values = np.zeros((4, 5, 6, 3))
     values[:] = (1.0, 2.0, 3.0)  # LPS, mm.
-    field = sitk.GetImageFromArray(values, isVector=True)
+    field = SimpleITK.GetImageFromArray(values, isVector=True)
     field.SetSpacing((2.0, 3.0, 4.0))
-    sitk.WriteImage(field, str(tmp_path / "itk.nii.gz"))
+    SimpleITK.WriteImage(field, str(tmp_path / "itk.nii.gz"))
     components = load_displacement(tmp_path / "itk.nii.gz")
     assert [np.unique(one.voxels).tolist() for one in components] == [[-1.0], [-2.0], [3.0]]
     np.testing.assert_allclose(components[0].voxel_sizes, (2, 3, 4))

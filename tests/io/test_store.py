@@ -1,5 +1,6 @@
 from dataclasses import fields, replace
 
+import meshio
 import nibabel as nib
 import numpy as np
 import pytest
@@ -65,11 +66,16 @@ def test_a_run_comes_back_as_it_was_written(run, tmp_path):
 
 def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
     arrays = {name: np.arange(k + 2.0) for k, name in enumerate(Predicted._fields)}
+    by_cell = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
+    arrays |= {name: np.linspace(0, k + 1.0, len(run.mesh.cells)) for k, name in enumerate(by_cell)}
     names = {"landmark_names": np.array(["third ventricle", "λ"]), "discrepancies": np.array(["sd"])}
     write(tmp_path, replace(run, predicted=Predicted(**arrays | names)))
     back = store.read_run(tmp_path).predicted
     assert list(back.landmark_names) == ["third ventricle", "λ"]
     np.testing.assert_array_equal(back.reach, arrays["reach"])
+    stored = meshio.read(tmp_path / "mesh.vtu").cell_data
+    for name in by_cell:
+        np.testing.assert_array_equal(stored[name][0], arrays[name])
 
 
 def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):

@@ -1,4 +1,4 @@
-"""The field of log-stiffness: its prior against dense multivariate normals, its density against parameters by element."""
+"""The field of log-stiffness: its prior against dense normals, its density against that of parameters by element."""
 
 from __future__ import annotations
 

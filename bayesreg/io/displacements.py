@@ -1,0 +1,107 @@
+"""Displacements from files: of the nodes of a mesh (.npz, .vtu), or a field on a grid (.nii, .nii.gz)."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import meshio
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.io.atomic import load_arrays
+from bayesreg.io.volumes import load_displacement
+from bayesreg.mesh import TetMesh
+from bayesreg.types import InputError
+
+
+def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
+    """Named nodal arrays of a mesh file; InputError where one is missing."""
+    data = _point_data(Path(path))
+    missing = [name for name in names if name not in data]
+    if missing:
+        raise InputError(f"{path} holds no {' and no '.join(missing)}: the run has not been finished")
+    return [np.asarray(data[name], float) for name in names]
+
+
+def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarray, "nodes 3"]:
+    """A displacement of every node: array "u" of an .npz file, or "u" or "u_mean" of a .vtu mesh, mm.
+
+    Parameters
+    ----------
+    path : path
+    mesh : TetMesh, optional
+        Whose nodes the displacement must fit; None where there is no mesh yet.
+
+    Raises
+    ------
+    InputError
+        If the file holds none, or one for another mesh.
+    """
+    data = load_arrays(path, "give another file") if path.suffix == ".npz" else _point_data(path)
+    found = [data[name] for name in ("u", "u_mean") if name in data]
+    if not found:
+        raise InputError(f"{path} holds no displacement: expected an array named 'u', got {', '.join(data) or 'none'}")
+    shape = np.shape(found[0])
+    if shape[1:] != (3,) or (mesh is not None and len(mesh.points) != shape[0]):
+        rows = "n" if mesh is None else len(mesh.points)
+        raise InputError(
+            f"the displacement in {path} has shape {shape}; expected ({rows}, 3), one row per node of the run's mesh"
+        )
+    if found[0].dtype.kind not in "fiu" or not np.isfinite(found[0]).all():
+        raise InputError(f"the displacement in {path} must consist of finite numbers")
+    return np.asarray(found[0], float)
+
+
+def require_displacement(path: Path) -> None:
+    """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid (.nii, .nii.gz)."""
+    load_displacement(path) if _is_volume(path) else read_displacement(path)
+
+
+def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
+    """Displacement of the boundary nodes from a file of all nodes (.npz, .vtu) or a displacement field on a grid.
+
+    Parameters
+    ----------
+    path : path
+        A field (.nii, .nii.gz) as `bayesreg.io.volumes.save_displacement` and ITK write it is interpolated linearly.
+    mesh : TetMesh
+
+    Raises
+    ------
+    InputError
+        If the file holds no displacement or one for another mesh, the field's grid does not reach the boundary,
+        or the field ends there: it is zero on one side.
+    """
+    if not _is_volume(path):
+        return read_displacement(path, mesh)[mesh.boundary]
+    components = load_displacement(path)
+    places = mesh.points[mesh.boundary]
+    off_grid = ~components[0].contains(places)
+    if off_grid.any():
+        raise InputError(
+            f"the displacement field {path} does not reach {int(off_grid.sum())} of the {len(places)} boundary nodes: "
+            f"they lie off its grid, the first at {places[off_grid][0].round(1).tolist()} mm"
+        )
+    defined = components[0].with_voxels(np.any([np.asarray(one.voxels) != 0 for one in components], axis=0) * 1.0)
+    share = np.asarray(defined.interpolate(places))
+    ends = (share > 1e-9) & (share < 1 - 1e-9)
+    if ends.any():
+        raise InputError(
+            f"the displacement field {path} ends at {int(ends.sum())} of the {len(places)} boundary nodes: it is zero "
+            f"in voxels beside them, first at {places[ends][0].round(1).tolist()} mm, as where it is known inside the "
+            "organ alone; give one that goes on beyond the boundary, or a run's mesh.vtu"
+        )
+    return np.stack([np.asarray(one.interpolate(places)) for one in components], axis=1)
+
+
+def _is_volume(path: Path) -> bool:
+    return path.name.endswith((".nii", ".nii.gz"))
+
+
+def _point_data(path: Path) -> dict[str, np.ndarray]:
+    try:
+        # Not `meshio.read`, which ends the program where it fails.
+        return meshio.vtu.read(path).point_data
+    except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as a .vtu mesh: {str(error) or type(error).__name__}") from error
