@@ -208,6 +208,7 @@ start: {field: truth}
         (SMALL + "model: {elasticity: field, field: {sd: -1}}", "model.field.sd = -1: expected greater than 0"),
         (SMALL + "known_boundary: brain.nii", 'known_boundary = "brain.nii": no such file'),
         (FILES + "known_boundary: truth", "the truth of this pair is not known; expected a file or null"),
+        (SMALL + "known_boundary: truth", "model.priors.lam: a given boundary needs a prior with a finite high"),
         (SMALL + "known_boundary: truth\nmodel: {sampled: all}", 'model.sampled = "all": expected the default'),
         (
             SMALL + "known_boundary: truth\n" + PROPER + "}",

@@ -24,6 +24,7 @@ from tests.phantoms import ball_mesh
 ROOT = Path(__file__).parent.parent
 CENTRE = np.array([5.0, -3.0, 8.0])
 STOP = {"rhat": 1.2, "ess": None, "max_steps": 36}
+PROPER = "model.priors={lam: {high: 60}, mu: {high: 5}}"
 SAMPLER = {"name": "rwmh", "chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
 
 
@@ -252,7 +253,7 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
 @pytest.mark.slow
 def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
     out = folder / "elastography"
-    overrides = ["known_boundary=truth", "sampler.sigma_lam=0.5", "sampler.sigma_mu=0.05", "start.field=identity"]
+    overrides = ["known_boundary=truth", PROPER, "sampler.sigma_lam=0.5", "sampler.sigma_mu=0.05", "start.field=identity"]
     result = br.run(synthetic("paper", *overrides), out, progress=False)
     posterior, truth = result.idata.posterior, result.run.truth
     assert posterior.u_boundary.shape == (2, 12, 0, 3)
@@ -273,7 +274,7 @@ def test_a_field_of_stiffness_is_stored_and_shown(finished, folder):
     u = 0.1 * np.sin(finished.mesh.points)
     br.save_mesh(finished.mesh, folder / "known.vtu", {"u": u})
     settings = ["model.elasticity=field", "model.field={modes: 6, correlation: 30}", "stop={rhat: null, max_steps: 8}"]
-    settings += ["sampler={name: laplace, chains: 2}", f"known_boundary={folder / 'known.vtu'}"]
+    settings += ["sampler={name: laplace, chains: 2}", f"known_boundary={folder / 'known.vtu'}", PROPER]
     result = br.run(br.load_config(folder / "run.yaml", settings), folder / "field", progress=False)
     boundary = result.mesh.boundary
     np.testing.assert_allclose(result.u_mean[boundary], u[boundary], rtol=1e-12)

@@ -308,7 +308,7 @@ class Config(Section):
     known_boundary: Annotated[Literal["truth"] | Path | None, BeforeValidator(find_boundary)] = None
     """Elastography: the displacement of the boundary is known, truth (of a synthetic pair) or a file (.vtu or .npz of
     this mesh, or a displacement field .nii, .nii.gz), and λ, μ alone are sampled; null samples both."""
-    model: ModelConfig = ModelConfig()
+    model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
     sampler: Annotated[
         SamplerConfig,
         Field(discriminator="name"),
@@ -360,6 +360,7 @@ class Config(Section):
                     raise _wrong(f"{key}.{parameter}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
         if info.data.get("known_boundary") is not None:
             _require_nothing_else(model)
+            model.model_copy(update={"sampled": []}).require_proper_priors(names)
         elif not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
             raise _wrong("sampled", "expected at least three nodes, held ones included; fewer do not hold the mesh")
         model.require_proper_priors(names)

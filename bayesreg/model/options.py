@@ -160,11 +160,17 @@ class ModelConfig(BaseModel):
                 "fix one parameter or t_elastic",
             )
         if self.normalised:
-            if not isinstance(self.sampled, str) and not set(self.sampled) - set(self.held):
+            if self.is_elastography:
                 raise wrong("normalised", "expected false where no node is sampled: a given u_B has no prior")
             self._require_rest()
+        if self.normalised or self.is_elastography:
             self.require_proper_priors(self._named_tissues or USUAL_TISSUES)
         return self
+
+    @property
+    def is_elastography(self) -> bool:
+        """Whether no node is sampled."""
+        return not isinstance(self.sampled, str) and not set(self.sampled) - set(self.held)
 
     def _require_rest(self) -> None:
         for node, displacement in self.held.items():
@@ -182,19 +188,23 @@ class ModelConfig(BaseModel):
             )
 
     def require_proper_priors(self, tissues: Sequence[str]) -> None:
-        """Refuse flat priors on [low, ∞) of free parameters where the density is normalised.
+        """Refuse flat priors on [low, ∞) of free parameters where the density is normalised, or u_B given.
+
+        With them the images tell ratios alone, and have a limit where one goes to infinity.
 
         Raises
         ------
         ValueError
         """
         known = self.known(tissues)
-        for name, tissue in product(get_args(Lame), tissues if self.normalised else ()):
+        case = "a given boundary" if self.is_elastography else "normalised: true"
+        needed = self.normalised or self.is_elastography
+        for name, tissue in product(get_args(Lame), tissues if needed else ()):
             prior = of_tissue(self, self.priors.get(name), tissue) or PriorConfig()
             if math.isinf(prior.high) and of_tissue(self, known.get(name), tissue) is None:
                 raise wrong(
                     f"priors.{name}",
-                    f"normalised: true needs a prior with a finite high (r2) for every free parameter, and {name} of "
+                    f"{case} needs a prior with a finite high (r2) for every free parameter, and {name} of "
                     f"{tissue} has none: the posterior would be improper",
                 )
 

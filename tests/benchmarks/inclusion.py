@@ -61,7 +61,9 @@ def phantom(
 def posterior(found: Phantom, mode: str, modes: int = 300, correlation: float = 20.0) -> br.Posterior:
     """λ/μ of the tissue known (ν = 0.45), the field unknown."""
     held = {int(node): tuple(found.u[node].tolist()) for node in found.mesh.boundary}
-    known = {"sampled": [], "held": held} if mode == "elastography" else {"normalised": True, "t_elastic": 1e3}
+    temperature = br.TemperaturePrior(median=100.0, log_sd=2.0)
+    joint = {"normalised": True, "t_elastic": temperature}
+    known = {"sampled": [], "held": held} if mode == "elastography" else joint
     model = br.ModelConfig(
         elasticity="field",
         field=FieldConfig(modes=modes, correlation=correlation),

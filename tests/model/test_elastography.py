@@ -39,13 +39,12 @@ def posterior(free=("lam gm", "mu wm"), **options):
     }
     model = br.ModelConfig(
         fixed=known,
-        priors={name: br.PriorConfig(low=low, high=high) for name, (low, high) in RANGE.items()},
         sampled=[],
         held={int(node): tuple(u[node].tolist()) for node in MESH.boundary},
         t_similarity=t_similarity,
         quadrature="voxels",
         interpolation="cubic",
-        **options,
+        **{"priors": {name: br.PriorConfig(low=low, high=high) for name, (low, high) in RANGE.items()}} | options,
     )
     return br.build_posterior(fixed, moving, MESH, model=model)
 
@@ -147,8 +146,15 @@ def test_gradient():
 def test_a_part_of_the_boundary_is_not_enough():
     fixed, moving, _, u = phantom()
     held = {int(node): tuple(u[node].tolist()) for node in MESH.boundary[1:]}
+    priors = {name: br.PriorConfig(high=9.0) for name in RANGE}
     with pytest.raises(ValueError, match=rf"needs every boundary node held .* 1 of {len(MESH.boundary)} are not"):
-        br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(sampled=[], held=held))
+        br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(sampled=[], held=held, priors=priors))
+
+
+def test_a_flat_prior_would_be_improper():
+    """The images have a limit where λ goes to infinity, and E_r is not there to bound it."""
+    with pytest.raises(ValueError, match="a given boundary needs a prior with a finite high"):
+        posterior(priors={})
 
 
 def test_a_given_boundary_has_no_normaliser():
