@@ -253,7 +253,8 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
 @pytest.mark.slow
 def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
     out = folder / "elastography"
-    overrides = ["known_boundary=truth", PROPER, "sampler.sigma_lam=0.5", "sampler.sigma_mu=0.05", "start.field=identity"]
+    overrides = ["known_boundary=truth", PROPER, "start.field=identity"]
+    overrides += ["sampler.sigma_lam=0.5", "sampler.sigma_mu=0.05"]
     result = br.run(synthetic("paper", *overrides), out, progress=False)
     posterior, truth = result.idata.posterior, result.run.truth
     assert posterior.u_boundary.shape == (2, 12, 0, 3)

@@ -40,7 +40,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
             raise InputError(f"the step of {name} must be positive, got {value}")
     warm = [name for name in target.estimands(target.reference()) if name not in sigma]
     if warm:
-        raise InputError(f"rwmh has no step for {', '.join(warm)}; use the sampler hmc where a temperature has a prior")
+        raise InputError(f"rwmh has no step for {', '.join(sorted(warm))}; use the sampler hmc")
 
     def init(data: Any, _: None, estimands: Estimands) -> State:
         evaluation = target.evaluate_estimands(data, estimands)

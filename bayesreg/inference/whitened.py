@@ -69,8 +69,9 @@ Density = Callable[[SmoothTarget, Any, Reference], Callable[[AnyArray], AnyArray
 def setup_about(target: SmoothTarget, reference: Reference) -> Setup:
     """A setup before its tuning."""
     nodes = len(target.sampled)
-    centre = reference.centre[-3 * nodes :].reshape(nodes, 3)
-    rows = reference.factor[-3 * nodes :].reshape(nodes, 3, -1)
+    first = len(reference.centre) - 3 * nodes
+    centre = reference.centre[first:].reshape(nodes, 3)
+    rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
     return Setup(reference, walls(centre, rows, jnp.arange(nodes)), jnp.asarray(FIRST_STEP), jnp.asarray(1))
 
 

@@ -60,12 +60,9 @@ def test_three_nodes_on_a_line_do_not_hold_a_mesh():
 
 
 def test_something_must_be_sampled():
+    priors = {"lam": {"high": 9.0}, "mu": {"high": 9.0}}
     with pytest.raises(ValueError, match="no node is sampled"):
-        build(
-            sampled=[0, 5],
-            held=dict.fromkeys((0, 5, 9), (0.0, 0.0, 0.0)),
-            priors=dict.fromkeys(("lam", "mu"), {"high": 9.0}),
-        )
+        build(sampled=[0, 5], held=dict.fromkeys((0, 5, 9), (0.0, 0.0, 0.0)), priors=priors)
 
 
 @pytest.mark.parametrize("options", [{"sampled": [0, 1, 2, 31]}, {"held": {31: (0.0, 0.0, 0.0)}}])
