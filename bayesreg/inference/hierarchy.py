@@ -8,24 +8,37 @@ point (1992): |z|² = γ, the number of components that the data determine.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.target import Estimands
+from bayesreg.types import AnyArray
 
 SCALE, COMPONENTS = "field_sd", "field"
 _MOST = 1.0
 
 
-def is_scale(target: SmoothTarget) -> Float[np.ndarray, "dimension"]:
+@runtime_checkable
+class Placed(Protocol):
+    """What is asked of a target here."""
+
+    def reference(self) -> dict[str, AnyArray]:
+        """Values at rest."""
+
+    def unconstrain(self, values: Estimands) -> dict[str, AnyArray]:
+        """Position of values."""
+
+
+def is_scale(target: Placed) -> Float[np.ndarray, "dimension"]:
     """One at the entry of a flat position that holds log sd, zero elsewhere."""
     return _marked(target, SCALE)
 
 
 def balanced(
-    target: SmoothTarget,
+    target: Placed,
     flat: Float[np.ndarray, "dimension"],
     factor: Callable[[], Float[np.ndarray, "dimension dimension"]],
 ) -> Float[np.ndarray, "dimension"]:
@@ -33,7 +46,7 @@ def balanced(
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Placed
     flat : (d,) array
         A mode given sd.
     factor : callable
@@ -56,7 +69,7 @@ def balanced(
     return moved
 
 
-def _marked(target: SmoothTarget, wanted: str) -> Float[np.ndarray, "dimension"]:
+def _marked(target: Placed, wanted: str) -> Float[np.ndarray, "dimension"]:
     position = target.unconstrain(target.reference())
     marks = {name: np.full(np.shape(value), float(name == wanted)) for name, value in position.items()}
     return np.asarray(ravel_pytree(marks)[0])

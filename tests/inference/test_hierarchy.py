@@ -1,0 +1,64 @@
+"""The scale of a field, where its evidence is known: y_i = sd z_i + σ e_i, marginally N(0, sd² + σ²)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bayesreg.inference.hierarchy import balanced, is_scale
+
+COUNT, NOISE = 100, 0.5
+
+
+class Field:
+    """What `balanced` asks of a target; flat positions are field, field_sd, lam."""
+
+    def __init__(self, **position):
+        self.position = position
+
+    def reference(self):
+        return self.position
+
+    def unconstrain(self, values):
+        return values
+
+
+TARGET = Field(field=np.zeros(COUNT), field_sd=np.array(0.0), lam=np.zeros(2))
+
+
+def given_scale(y, sd):
+    """The mode of z, and a covariance of (z, log sd, λ) that is the exact one of z where sd is given."""
+    z = sd * y / (sd**2 + NOISE**2)
+    slope = np.append(-z, [1.0, 0.3, -0.2])
+    own = np.append(np.full(COUNT, NOISE**2 / (sd**2 + NOISE**2)), [0.0, 0.5, 0.5])
+    covariance = np.diag(own) + np.outer(slope, slope) * 0.01
+    return np.concatenate([z, [np.log(sd)], [1.0, 2.0]]), np.linalg.cholesky(covariance + 1e-12 * np.eye(len(own)))
+
+
+@pytest.mark.parametrize("first", [0.2, 5.0])
+@pytest.mark.parametrize("truth", [0.5, 2.0])
+def test_fixed_point_is_the_maximum_of_the_evidence(truth, first):
+    rng = np.random.default_rng(0)
+    y = truth * rng.normal(size=COUNT) + NOISE * rng.normal(size=COUNT)
+    sd = first
+    for _ in range(60):
+        flat, factor = given_scale(y, sd)
+        moved = balanced(TARGET, flat, lambda factor=factor: factor)
+        # The field stays, and so does what has nothing to do with it.
+        np.testing.assert_allclose(np.exp(moved[COUNT]) * moved[:COUNT], sd * flat[:COUNT], rtol=1e-10)
+        np.testing.assert_array_equal(moved[COUNT + 1 :], [1.0, 2.0])
+        sd = float(np.exp(moved[COUNT]))
+    best = np.sqrt((y**2).mean() - NOISE**2)
+    assert sd == pytest.approx(best, rel=0.03)
+
+
+def test_without_a_field_nothing_is_asked_for():
+    target = Field(lam=np.zeros(2), u_boundary=np.zeros((3, 3)))
+    flat = np.arange(11.0)
+
+    def never():
+        raise AssertionError("no factor is needed")
+
+    np.testing.assert_array_equal(balanced(target, flat, never), flat)
+    assert not is_scale(target).any()
+    np.testing.assert_array_equal(np.flatnonzero(is_scale(TARGET)), [COUNT])
