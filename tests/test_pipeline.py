@@ -270,35 +270,6 @@ def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
 
 
 @pytest.mark.slow
-def test_a_field_of_stiffness_is_stored_and_shown(finished, folder):
-    """With the displacement of the boundary from a file."""
-    u = 0.1 * np.sin(finished.mesh.points)
-    br.save_mesh(finished.mesh, folder / "known.vtu", {"u": u})
-    settings = ["model.elasticity=field", "model.field={modes: 6, correlation: 30}", "stop={rhat: null, max_steps: 8}"]
-    settings += ["sampler={name: laplace, chains: 2}", f"known_boundary={folder / 'known.vtu'}", PROPER]
-    result = br.run(br.load_config(folder / "run.yaml", settings), folder / "field", progress=False)
-    boundary = result.mesh.boundary
-    np.testing.assert_allclose(result.u_mean[boundary], u[boundary], rtol=1e-12)
-    posterior, mesh = result.idata.posterior, result.mesh
-    assert posterior["field"].shape == (2, 8, 6)
-    assert (posterior["field_sd"] > 0).all()
-    assert posterior["lam"].sizes["tissue"] == 3
-    known = br.load_result(folder / "field").run.predicted
-    stored = meshio.read(folder / "field" / "mesh.vtu").cell_data
-    np.testing.assert_allclose(stored["stiffness_mean"][0], known.stiffness_mean)
-    post = pipeline.posterior_of(br.load_config(folder / "field" / "config.yaml"), store.read_inputs(folder / "field"))
-    z, sd = posterior["field"].values.reshape(-1, 6), posterior["field_sd"].values.reshape(-1)
-    factors = np.exp(sd[:, None] * (z @ np.asarray(post.data.field.basis).T))
-    assert factors.shape == (16, len(mesh.cells))
-    np.testing.assert_allclose(known.stiffness_mean, factors.mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(known.stiffness_sd, factors.std(axis=0, ddof=1), rtol=1e-6)
-    np.testing.assert_allclose(known.stiffer_probability, (factors > 1.5).mean(axis=0), atol=1e-9)
-    page = result.report.read_text()
-    assert "Stiffness within the tissues" in page
-    assert "of the log-stiffness" in page
-
-
-@pytest.mark.slow
 def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeypatch, capsys):
     """On a phantom in place of MNI152, from a quickstart made small."""
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
