@@ -217,7 +217,7 @@ class TestTruncatedPosterior:
         assert abs(quantiles).max() > 10
 
 
-STEPS = {"mclmc": (1.2, 1), "mala": (0.7, 1), "barker": (0.6, 1), "rwmh_adaptive": (0.25, 1), "pcn": (0.5, 1)}
+STEPS = {"mclmc": (0.8, 1), "mala": (0.7, 1), "barker": (0.6, 1), "rwmh_adaptive": (0.25, 1), "pcn": (0.5, 1)}
 
 
 class TestEverySamplerFromExactDraws:
