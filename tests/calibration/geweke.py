@@ -64,8 +64,8 @@ def compare(
     simulator: Simulator,
     sampler: str,
     posterior: br.Posterior | None = None,
-    chains: int = 100,
-    steps: int = 60,
+    chains: int = 60,
+    steps: int = 40,
     draws: int = 2000,
     seed: int = 0,
 ) -> Comparison:

@@ -56,11 +56,11 @@ class Settings(NamedTuple):
     """
 
     replications: int = 200
-    approach: int = 40
-    warm_up: int = 25
-    draws: int = 100
-    step_size: float = 0.45
-    steps: int = 4
+    approach: int = 30
+    warm_up: int = 20
+    draws: int = 60
+    step_size: float = 0.55
+    steps: int = 3
 
 
 SETTINGS = Settings()

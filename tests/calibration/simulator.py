@@ -1,9 +1,9 @@
 """The model as a simulator: parameters and displacements from the prior, the fixed image at the quadrature points.
 
-(λ, μ, T_s, T_r) come from their priors; u_B from the Gaussian of precision S / T_r, S the Schur complement of K, and that
-of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of variance T_s / (2 w_q).
-The skull belongs to the likelihood: a draw with a node in it is rejected whole, (λ, μ, u) together. The prior is drawn
-by the oracle's matrices and NumPy, and shares no code with the density under test.
+(λ, μ, T_s, T_r) come from their priors; u_B from the Gaussian of precision S / T_r, S the Schur complement of K, and
+that of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of variance
+T_s / (2 w_q). The skull belongs to the likelihood: a draw with a node in it is rejected whole, (λ, μ, u) together. The
+prior is drawn by the oracle's matrices and NumPy, and shares no code with the density under test.
 """
 
 from __future__ import annotations
