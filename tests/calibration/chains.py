@@ -22,6 +22,8 @@ from tests.calibration.simulator import MESH, Simulator, draw_data
 # Every third node's displacement is looked at: neighbours say much the same.
 NODES = np.arange(0, len(MESH.boundary), 3)
 
+# So many data sets at a time: what they need together stays in the cache, four times as fast as all at once.
+BATCH = 20
 PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic")
 
 Estimands = dict[str, Any]

@@ -18,6 +18,7 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.samplers import SAMPLERS, Sampler
 from tests.calibration.chains import (
+    BATCH,
     of_posterior,
     prior_reference,
     quantities,
@@ -76,7 +77,7 @@ def compare(
     key_data, key_chains = jax.random.split(jax.random.key(seed))
     observed = simulated(simulator.posterior, simulator.posterior.data, direct, key_data)
     at_direct = jax.jit(
-        partial(jax.lax.map, lambda both: quantities_at(posterior, posterior.data, *both), batch_size=50)
+        partial(jax.lax.map, lambda both: quantities_at(posterior, posterior.data, *both), batch_size=BATCH)
     )
     marginal = np.asarray(at_direct((observed, direct)))
     kernel = SAMPLERS[sampler](posterior, **(RANDOM_WALK if sampler == "rwmh" else {}))
@@ -112,7 +113,9 @@ def _successive(
 ) -> Any:
     """Quantities (chain, step, k) after each step of the kernel, and its acceptance."""
 
-    def chain(key: Any, first: Any) -> Any:
+    def chain(given: Any) -> Any:
+        key, first = given
+
         def one(estimands: Any, key: Any) -> Any:
             key_data, key_step = jax.random.split(key)
             here = data._replace(fixed_values=draw_data(model, truth, key_data, estimands))
@@ -122,4 +125,5 @@ def _successive(
 
         return jax.lax.scan(one, first, jax.random.split(key, steps))[1]
 
-    return jax.vmap(chain)(jax.random.split(key, len(first["u_boundary"])), first)
+    keys = jax.random.split(key, len(first["u_boundary"]))
+    return jax.lax.map(chain, (keys, first), batch_size=BATCH)

@@ -22,6 +22,7 @@ import bayesreg as br
 from bayesreg.inference.laplace import laplace
 from bayesreg.inference.samplers import SAMPLERS, Sampler, Setup
 from tests.calibration.chains import (
+    BATCH,
     Estimands,
     of_posterior,
     prior_reference,
@@ -180,19 +181,26 @@ def _chains(
 
 @partial(jax.jit, static_argnums=0)
 def _begin(kernel: Sampler, data: Any, setup: Setup, observed: Any, starts: Estimands) -> Any:
-    return jax.vmap(lambda s, f, x: kernel.init(data._replace(fixed_values=f), s, x))(setup, observed, starts)
+    def one(given: Any) -> Any:
+        setup, observed, start = given
+        return kernel.init(data._replace(fixed_values=observed), setup, start)
+
+    return jax.lax.map(one, (setup, observed, starts), batch_size=BATCH)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _advance(kernel: Sampler, posterior: br.Posterior, data: Any, setup: Setup, observed: Any, keys: Any, states: Any):  # type: ignore[no-untyped-def]
-    def one(setup: Setup, observed: Any, key: Any, state: Any) -> Any:
+def _advance(  # type: ignore[no-untyped-def]
+    kernel: Sampler, posterior: br.Posterior, data: Any, setup: Setup, observed: Any, keys: Any, states: Any
+):
+    def one(given: Any) -> Any:
+        setup, observed, key, state = given
         here = data._replace(fixed_values=observed)
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
         place = ravel_pytree(posterior.unconstrain_of(data, drawn.estimands))[0]
         return state, drawn.estimands, place, quantities(drawn.estimands, drawn.evaluation), info.acceptance_rate
 
-    return jax.vmap(one)(setup, observed, keys, states)
+    return jax.lax.map(one, (setup, observed, keys, states), batch_size=BATCH)
 
 
 def _run(

@@ -96,7 +96,7 @@ def test_the_skull_rejects_what_the_density_excludes():
     walled = simulator("skull").posterior
     draws = simulator().draw_prior(np.random.default_rng(4), 150)
     inside = (MESH.points[MESH.boundary, 0] + draws["u_boundary"][..., 0] <= WALL).all(axis=1)
-    supported = jax.vmap(lambda x: walled.supports(walled.data, x))(draws)
+    supported = jax.jit(jax.vmap(walled.supports, in_axes=(None, 0)))(walled.data, draws)
     np.testing.assert_array_equal(supported, inside)
     assert 0.1 < inside.mean() < 0.8
     kept = simulator("skull").draw_prior(np.random.default_rng(4), int(inside.sum()))
