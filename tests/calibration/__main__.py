@@ -24,7 +24,7 @@ PLANTED: dict[str, dict[str, Any]] = {
     "not normalised": {"normalised": False},
 }
 # How many steps of each kernel: as many as move its chains by about one standard deviation.
-GEWEKE_STEPS = {"hmc": 40, "nuts": 40, "rwmh": 200}
+GEWEKE_STEPS = {"hmc": 10, "nuts": 10, "rwmh": 60}
 
 BEGAN = time.perf_counter()
 

@@ -15,8 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.inference.laplace import Reference, laplace
-from bayesreg.inference.reflection import walls
-from bayesreg.inference.samplers import Setup
+from bayesreg.inference.whitened import Setup, setup_about
 from tests.calibration.simulator import MESH, Simulator, draw_data
 
 # Every third node's displacement is looked at: neighbours say much the same.
@@ -69,11 +68,6 @@ def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Reference:
 
 def setups_about(posterior: br.Posterior, references: list[Reference], step_size: float, steps: int) -> Setup:
     """The setups of all replications, stacked."""
-    nodes = len(posterior.sampled)
-
-    def one(reference: Reference) -> Setup:
-        rows = reference.factor[-3 * nodes :].reshape(nodes, 3, -1)
-        found = walls(reference.centre[-3 * nodes :].reshape(nodes, 3), rows, jnp.arange(nodes))
-        return Setup(reference, found, jnp.asarray(step_size), jnp.asarray(steps))
-
-    return jax.vmap(one)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *references))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
+    size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
+    return jax.vmap(lambda reference: setup_about(posterior, reference)._replace(**size))(stacked)

@@ -19,8 +19,10 @@ from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.laplace import laplace
-from bayesreg.inference.samplers import SAMPLERS, Sampler, Setup
+from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.whitened import Setup
 from tests.calibration.chains import (
     BATCH,
     Estimands,

@@ -10,7 +10,7 @@ import pytest
 from tests.calibration import geweke
 from tests.calibration.simulator import VARIANTS, Simulator, posterior_of
 
-SIZE = {"chains": 64, "steps": 150, "draws": 1000}
+SIZE = {"chains": 120, "steps": 40}
 
 
 @cache
