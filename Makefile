@@ -21,8 +21,7 @@ test: $(VENV)/.installed-dev
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s
 
-# Simulation-based calibration, Geweke's test and the calibrated pairs: up to 90 minutes on 2 cores. Small matrices are
-# slower with more threads than cores for them.
+# Simulation-based calibration and Geweke's test. Threads of a linear algebra library only hinder such small matrices.
 calibrate: $(VENV)/.installed-dev
 	OPENBLAS_NUM_THREADS=1 JAX_COMPILATION_CACHE_DIR=.jax_cache $(BIN)/python -m tests.calibration -o runs/calibration
 
