@@ -6,7 +6,7 @@ DEMO := runs/quickstart
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install -c constraints.txt --build-constraint constraints.txt -e .
 
-.PHONY: demo test bench check
+.PHONY: demo test bench calibrate check
 .DELETE_ON_ERROR:
 
 # Status 3, "not converged within its budget", is an honest end of a demonstration.
@@ -20,6 +20,10 @@ test: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s
+
+# Simulation-based calibration and Geweke's test. Threads of a linear algebra library only hinder such small matrices.
+calibrate: $(VENV)/.installed-dev
+	OPENBLAS_NUM_THREADS=1 JAX_COMPILATION_CACHE_DIR=.jax_cache $(BIN)/python -m tests.calibration -o runs/calibration
 
 # What the tests ask of the source before anything else, in half a minute.
 check: $(VENV)/.installed-dev

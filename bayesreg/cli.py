@@ -50,7 +50,9 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override an entry, e.g. sampler.chains=4; may be repeated."),
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the run that DIR holds; a finished one needs a larger budget.")]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with the run that DIR holds; a finished one needs a larger budget.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 Samplers = Annotated[str | None, typer.Option(metavar="NAME,NAME...", help="Which ones; all of them if left out.")]
 Minutes = Annotated[float, typer.Option(help="Budget of each sampler.")]

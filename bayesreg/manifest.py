@@ -11,12 +11,13 @@ from typing import Any
 
 import jax
 import numpy as np
+import xarray as xr
 
 from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.config.sections import StopConfig
 from bayesreg.distance import signed_distance
-from bayesreg.inference.diagnostics import Convergence
+from bayesreg.inference.diagnostics import Convergence, dataset
 from bayesreg.inference.moments import greatest_rhat
 from bayesreg.inference.run import Samples
 from bayesreg.io.store import Inputs
@@ -92,8 +93,15 @@ def manifest(
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
         "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
-        "implied_noise_sd": posterior.implied_noise_sd,
+        "implied_noise_sd": implied_noise_sd(posterior, dataset(samples.idata, "posterior")),
     }
+
+
+def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float:
+    """The noise that T_s stands for (see `Posterior.noise_sd`): the known one, or its posterior mean."""
+    if "t_similarity" in draws:
+        return posterior.noise_sd(float(draws["t_similarity"].mean()))
+    return posterior.implied_noise_sd
 
 
 def _converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:

@@ -299,8 +299,8 @@ def _resumed_config(out: Path, config: Config) -> Config:
     known = load_config(out / "config.yaml")
     if resolved_yaml(known.model_copy(update={"stop": config.stop})) != resolved_yaml(config):
         raise InputError(
-            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which only "
-            "the section stop may change, or name another folder"
+            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which "
+            "only the section stop may change, or name another folder"
         )
     return known
 

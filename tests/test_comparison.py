@@ -19,6 +19,7 @@ def test_every_sampler_has_a_section_whose_settings_it_takes():
         assert sampler_section(name).name == name
 
 
+@pytest.mark.slow
 def test_a_comparison_from_a_file(folder, tmp_path):  # noqa: F811
     out = tmp_path / "compared"
     arguments = ("--samplers", "rwmh", "--minutes", "0.2", "--set", "stop.max_steps=60", "-q")

@@ -155,7 +155,7 @@ def test_a_finished_run_is_continued_with_more_draws(finished, folder):
         for name in expected:
             np.testing.assert_array_equal(found[name], expected[name])
     np.testing.assert_allclose(continued.u_sd, whole.u_sd, rtol=1e-12)
-    assert "max_steps: %d" % (2 * STOP["max_steps"]) in (folder / "continued" / "config.yaml").read_text()
+    assert f"max_steps: {2 * STOP['max_steps']}" in (folder / "continued" / "config.yaml").read_text()
     (folder / "continued" / "state.npz").unlink()
     with pytest.raises(br.InputError, match=r"cannot be continued: state\.npz"):
         br.run(folder / "run.yaml", folder / "continued", resume=True, progress=False)

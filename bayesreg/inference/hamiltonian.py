@@ -33,7 +33,7 @@ def hmc(target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.75
     def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
         key_step, key_move = jax.random.split(key)
         kernel = blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
-        density = whitened_density(target, data, setup.reference)
+        density = whitened_density(target, data, setup)
         size = setup.step_size * _jitter(key_step)
         state, info = kernel(key_move, state, density, size, jnp.ones_like(state.position), setup.steps)
         return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
@@ -46,7 +46,7 @@ def nuts(target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.8
 
     def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
         kernel = blackjax.mcmc.nuts.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
-        density = whitened_density(target, data, setup.reference)
+        density = whitened_density(target, data, setup)
         unit = jnp.ones_like(state.position)
         state, info = kernel(key, state, density, setup.step_size, unit, max_num_doublings=6)
         return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
@@ -67,7 +67,7 @@ def mclmc(
         kernel = blackjax.mcmc.adjusted_mclmc.build_kernel(
             reflective_microcanonical(setup.walls, clearance_of(target, data, setup))
         )
-        density = whitened_density(target, data, setup.reference)
+        density = whitened_density(target, data, setup)
         size = jnp.sqrt(len(state.position)) * setup.step_size * _jitter(key_step)
         state, info = kernel(key_move, state, density, size, (setup.steps,))
         # McLachlan's integrator has two stages.

@@ -100,6 +100,9 @@ def _improved(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened."""
     reference = laplace(target, flat, data, moves)
+    if not moves:
+        # The same for all displacements.
+        data = target.without_normaliser(data)
     moving = 1 - is_scale(target)
     if not moves:
         moving[: len(flat) - 3 * len(target.sampled)] = 0.0

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from blackjax.mcmc import random_walk
 
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.laplace import Reference
 from bayesreg.inference.reflection import reflective_leapfrog, rotated, shifted
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.warm_up import Tuning
@@ -42,7 +41,7 @@ def mala(
 
     def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
         kernel = blackjax.mcmc.hmc.build_kernel(reflective_leapfrog(setup.walls, clearance_of(target, data, setup)))
-        density = whitened_density(target, data, setup.reference)
+        density = whitened_density(target, data, setup)
         state, info = kernel(key, state, density, setup.step_size, jnp.ones_like(state.position), 1)
         return state, Moved(info.acceptance_rate, info.is_divergent, gradients=1)
 
@@ -58,7 +57,7 @@ def barker(
     """
 
     def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        density = whitened_density(target, data, setup.reference)
+        density = whitened_density(target, data, setup)
         state, info = blackjax.mcmc.barker.build_kernel()(key, state, density, setup.step_size)
         # Outside the support the gradient, and with it the acceptance, may be NaN, which the kernel refuses.
         outside = ~jnp.isfinite(info.proposal.logdensity)
@@ -82,7 +81,7 @@ def rwmh_adaptive(
             momentum = jax.random.normal(key, position.shape)
             return shifted(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
 
-        state, info = random_walk.build_rmh()(key, state, whitened_density(target, data, setup.reference), flight)
+        state, info = random_walk.build_rmh()(key, state, whitened_density(target, data, setup), flight)
         return state, Moved(info.acceptance_rate, densities=1)
 
     tuning = Tuning(warm_up, target_acceptance, LEAST)
@@ -103,14 +102,14 @@ def pcn(
             momentum = jax.random.normal(key, position.shape)
             return rotated(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
 
-        state, info = random_walk.build_rmh()(key, state, against_reference(target, data, setup.reference), turn)
+        state, info = random_walk.build_rmh()(key, state, against_reference(target, data, setup), turn)
         return state, Moved(info.acceptance_rate, densities=1)
 
     tuning = Tuning(warm_up, target_acceptance, LEAST)
     return about_reference(target, transition, tuning, random_walk.init, against_reference, mode_search)
 
 
-def against_reference(target: SmoothTarget, data: Any, reference: Reference) -> Callable[[AnyArray], AnyArray]:
+def against_reference(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ) − log N(ξ; 0, I), up to a constant."""
-    density = whitened_density(target, data, reference)
+    density = whitened_density(target, data, setup)
     return lambda xi: density(xi) + 0.5 * (xi @ xi)

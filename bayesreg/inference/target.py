@@ -87,6 +87,16 @@ class SmoothTarget(Target, Protocol):
     def unconstrain(self, values: Estimands) -> dict[str, AnyArray]:
         """Position of values."""
 
+    @property
+    def normalised(self) -> bool:
+        """Whether the density has a normaliser that depends on estimands other than "u_boundary", and is costly."""
+
+    def log_normaliser(self, data: Any, estimands: Estimands) -> AnyArray:
+        """It, as part of the log density; it is the same for all displacements."""
+
+    def without_normaliser(self, data: Any) -> Any:
+        """The data of the same problem without it."""
+
     def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
         """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
 

@@ -125,7 +125,7 @@ def _rise(
     key: AnyArray,
 ) -> tuple[Any, AnyArray]:
     """Resample, move, and reweight for the next β; and the acceptance of the moves."""
-    density = whitened_density(target, data, setup.reference)
+    density = whitened_density(target, data, setup)
     clearance = clearance_of(target, data, setup)
 
     def broad(xi: AnyArray) -> AnyArray:

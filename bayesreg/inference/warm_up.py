@@ -77,7 +77,7 @@ def tuned(
 
         def one(carry: Any, key: AnyArray) -> Any:
             states, averaging = carry
-            keys = jax.random.split(key, len(states.logdensity))
+            keys = jax.random.split(key, len(next(iter(starts.values()))))
             states, info = jax.vmap(partial(step, data, sized(setup, jnp.exp(averaging.log_step_size))))(keys, states)
             rate = jnp.nan_to_num(info.acceptance_rate).mean()
             return (states, update(averaging, rate)), rate

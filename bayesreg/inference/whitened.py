@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
 from bayesreg.inference.laplace import Reference, unravel
 from bayesreg.inference.modes import search_modes
+from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
 from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
 from bayesreg.inference.target import Estimands, SmoothTarget
 from bayesreg.inference.warm_up import FIRST_STEP, Tuning, require_sound, tuned
@@ -42,12 +43,15 @@ class Setup(NamedTuple):
         In whitened coordinates; π/2 is a quarter turn of the reference's motion.
     steps : scalar integer
         Steps of a trajectory of fixed length: those of a quarter turn.
+    stand_in : StandIn
+        Of the density's normaliser, where it has one.
     """
 
     reference: Reference
     walls: Walls
     step_size: Scalar
     steps: AnyArray
+    stand_in: StandIn
 
 
 class Moved(NamedTuple):
@@ -62,8 +66,8 @@ class Moved(NamedTuple):
 
 # (data, setup, key, state) → (state, Moved)
 Transition = Callable[[Any, Setup, AnyArray, Any], tuple[Any, Moved]]
-# (target, data, reference) → the log density of the whitened coordinates that the transition works with
-Density = Callable[[SmoothTarget, Any, Reference], Callable[[AnyArray], AnyArray]]
+# (target, data, setup) → the log density of the whitened coordinates that the transition works with
+Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
 def setup_about(target: SmoothTarget, reference: Reference) -> Setup:
@@ -72,7 +76,8 @@ def setup_about(target: SmoothTarget, reference: Reference) -> Setup:
     first = len(reference.centre) - 3 * nodes
     centre = reference.centre[first:].reshape(nodes, 3)
     rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
-    return Setup(reference, walls(centre, rows, jnp.arange(nodes)), jnp.asarray(FIRST_STEP), jnp.asarray(1))
+    nothing = no_stand_in(target, reference)
+    return Setup(reference, walls(centre, rows, jnp.arange(nodes)), jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing)
 
 
 def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
@@ -85,9 +90,17 @@ def whitened_position(target: SmoothTarget, reference: Reference, xi: AnyArray) 
     return unravel(target)(reference.centre + reference.factor @ xi)
 
 
-def whitened_density(target: SmoothTarget, data: Any, reference: Reference) -> Callable[[AnyArray], AnyArray]:
-    """log π(ξ), up to a constant."""
-    return lambda xi: target.logdensity_of(data, whitened_position(target, reference, xi))
+def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
+    """log π(ξ), up to a constant, with the stand-in for its normaliser."""
+    reference = setup.reference
+    plain = target.without_normaliser(data)
+
+    def density(xi: AnyArray) -> AnyArray:
+        return target.logdensity_of(plain, whitened_position(target, reference, xi))
+
+    if not target.normalised:
+        return density
+    return lambda xi: density(xi) + setup.stand_in(reference.factor @ xi)
 
 
 def clearance_of(target: SmoothTarget, data: Any, setup: Setup) -> Clearance:
@@ -116,7 +129,7 @@ def about_reference(
     begin : callable
         (position, log density) → the state that the transition takes, with fields `position` and `logdensity`.
     density : callable
-        (target, data, reference) → the log density of a whitened position that `begin` is given.
+        (target, data, setup) → the log density of a whitened position that `begin` is given.
     mode_search : str
         "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
     exact : bool
@@ -133,7 +146,7 @@ def about_reference(
 
     def init(data: Any, setup: Setup, estimands: Estimands) -> Any:
         flat = ravel_pytree(target.unconstrain_of(data, estimands))[0]
-        return begin(whitened(setup.reference, flat), density(target, data, setup.reference))
+        return begin(whitened(setup.reference, flat), density(target, data, setup))
 
     def step(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
         state, moved = transition(data, setup, key, state)
@@ -155,11 +168,22 @@ def about_reference(
         estimands = estimands_of(data, setup, state)
         return Draw(estimands, target.evaluate_estimands(data, estimands))
 
+    def flat_of(setup: Setup, state: Any) -> AnyArray:
+        return setup.reference.centre + setup.reference.factor @ state.position
+
+    def init_delayed(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
+        return Delayed(init(data, setup, estimands), target.log_normaliser(data, estimands))
+
+    def observe_delayed(data: Any, setup: Setup, state: Delayed) -> Draw:
+        estimands, evaluation = observe(target.without_normaliser(data), setup, state.kernel)
+        return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
+
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         found = search_modes(target, points, mode_search == "per_chain", say)
         key_start, key_tune = jax.random.split(key)
         keys = jax.random.split(key_start, len(found.chains))
         setups = [setup_about(target, reference) for reference in found.references]
+        setups[0] = setups[0]._replace(stand_in=stand_in(target, setups[0].reference))
         starts = [_overdispersed(target, setup, keys) for setup in setups]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
@@ -174,6 +198,10 @@ def about_reference(
         d = len(ravel_pytree(target.unconstrain(target.reference()))[0])
         return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))))
 
+    # What is approximate anyway does without the normaliser's own value.
+    if target.normalised and exact:
+        whole_step = delayed(step, flat_of, partial(log_normaliser_at, target))
+        return Sampler(prepare, conditioned, blank, init_delayed, whole_step, observe_delayed, exact)
     return Sampler(prepare, conditioned, blank, init, step, observe, exact)
 
 

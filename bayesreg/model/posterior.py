@@ -141,15 +141,21 @@ class Posterior:
         data: RegistrationData,
         estimands: Values,
         guess: Float[AnyArray, "nodes 3"] | None = None,
-        normaliser: bool = True,
     ) -> Evaluation:
         """`evaluate` as a pure function of the data, for samplers of the constrained space.
 
         With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
-        Without `normaliser`, `log_normaliser` is left out of the density, and its cost with it.
         """
-        values = complete(data, estimands, self.free)
-        return _evaluate(data, values, self.options.similarity, guess, normaliser)
+        return _evaluate(data, complete(data, estimands, self.free), self.options.similarity, guess)
+
+    @property
+    def normalised(self) -> bool:
+        """Whether the elastic prior's normaliser is part of the density."""
+        return self.options.normalised
+
+    def without_normaliser(self, data: RegistrationData) -> RegistrationData:
+        """The data of the same problem without `log_normaliser` in its density, and without its cost."""
+        return data._replace(determinant=None)
 
     def log_normaliser(self, data: RegistrationData, estimands: Values) -> Scalar:
         """½ log pdet S(λ, μ) − r/2 log(2π T_r), the elastic prior's normaliser; zero if not `normalised`.
@@ -166,10 +172,10 @@ class Posterior:
         """Log density of the unconstrained position, the Jacobian of `constrain` included."""
         return self.logdensity_of(self.data, position)
 
-    def logdensity_of(self, data: RegistrationData, position: Values, normaliser: bool = True) -> Scalar:
-        """`logdensity` as a pure function of the data, for samplers; without `normaliser` less `log_normaliser`."""
+    def logdensity_of(self, data: RegistrationData, position: Values) -> Scalar:
+        """`logdensity` as a pure function of the data, for samplers."""
         estimands, log_jacobian = to_estimands(data, position, self.free)
-        return self.evaluate_estimands(data, estimands, normaliser=normaliser).logdensity + log_jacobian
+        return self.evaluate_estimands(data, estimands).logdensity + log_jacobian
 
     def clearance(
         self, data: RegistrationData, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
@@ -227,7 +233,7 @@ class Posterior:
         """
         values = complete(data, estimands, self.free)
         lam, mu = lame_by_cell(data, values)
-        u = self.evaluate_estimands(data, estimands, normaliser=False).u
+        u = self.evaluate_estimands(self.without_normaliser(data), estimands).u
         data = data._replace(**{name: values[name] for name in data.temperature_log_sd})
         precision = displacement_precision(self.mesh, data, lam, mu, u, float(values.get("field_sd", 0.0)))
         if not len(self.sampled):
@@ -393,15 +399,14 @@ def _conditioned_system(posterior: Posterior, lam: tuple[float, ...], mu: tuple[
     return elastic_system(posterior.mesh, np.asarray(posterior.data.system.prescribed), np.array(lam), np.array(mu))
 
 
-@partial(jax.jit, static_argnames=("similarity", "normaliser"))
+@partial(jax.jit, static_argnames="similarity")
 def _evaluate(
     data: RegistrationData,
     values: dict[str, AnyArray],
     similarity: str,
     guess: Float[AnyArray, "nodes 3"] | None = None,
-    normaliser: bool = True,
 ) -> Evaluation:
-    total, trace = log_density(registration, (data, similarity, guess, normaliser), {}, values)
+    total, trace = log_density(registration, (data, similarity, guess), {}, values)
     found = {name: trace[name]["value"] for name in Evaluation._fields if name != "logdensity"}
     # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
     return Evaluation(logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), **found)

@@ -125,15 +125,13 @@ def registration(
     data: RegistrationData,
     similarity: str = "ssd",
     guess: Float[AnyArray, "nodes 3"] | None = None,
-    normaliser: bool = True,
 ) -> None:
     """p(m, u, λ, μ) of eq. (8): the program whose log joint density is the posterior's up to a constant.
 
     The displacements have a flat base measure, on which the Boltzmann elastic prior (12), the rigid prior
     and the Boltzmann likelihood (11) are factors. The skull belongs to the likelihood: a configuration with
     a sampled node in Ω_SK cannot have produced the image. So does an elastic solve that failed. A `guess` of
-    the displacement of all nodes speeds up the solve (see `equilibrium`). Without `normaliser` that of the
-    elastic prior is left out, where there is one.
+    the displacement of all nodes speeds up the solve (see `equilibrium`).
     """
     flat = dist.ImproperUniform(constraints.real_matrix, (), event_shape=data.points_sampled.shape)
     u_boundary = numpyro.sample("u_boundary", flat)
@@ -162,9 +160,9 @@ def registration(
     # E_r / T_r is minus the log prior of u_B. Where u_B is given there is none: u_I follows from it and θ.
     if len(data.slots):
         numpyro.factor("log_elastic", -strain_energy / t_elastic)
-    if data.determinant is not None and normaliser:
-        numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic, **field))
         numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
+    if data.determinant is not None:
+        numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic, **field))
     numpyro.factor("log_support", jnp.where(inside, 0.0, -jnp.inf))
     numpyro.factor("log_solved", jnp.where(state.converged, 0.0, -jnp.inf))
 

@@ -24,6 +24,7 @@ HEADER = (
     "", "ESS/s", "ESS/s, all in", "ESS per 1,000 evaluations", "ESS bulk", "ESS tail", "Worst R̂", "Acceptance",
     "Draws", "Prepared, s", "Sampling, s", "All, s", "Rule met, s",
 )  # fmt: skip
+IN_TERMINAL = ("ESS/s", "ESS/s, all in", "ESS per 1,000 evaluations", "Worst R̂", "All, s", "Rule met, s")
 BARS = ("#2b5c8a", "#9bb8d3")
 
 
@@ -85,13 +86,15 @@ def efficiency_table(found: Sequence[Efficiency], setting: Setting) -> Table:
 
 
 def terminal_table(table: Table) -> TerminalTable:
-    """The same table for a terminal."""
+    """What matters most of the same table, for a terminal."""
+    columns = [0, *(HEADER.index(name) for name in IN_TERMINAL)]
     shown = TerminalTable(title=table.title)
-    for column in table.header:
-        shown.add_column(column, justify="right" if column else "left")
+    for column in columns:
+        shown.add_column(table.header[column], justify="right" if column else "left")
     for title, rows in table.groups:
         for row in rows:
-            shown.add_row(row[0] + (" (approximate)" if title == "Approximate" else ""), *row[1:])
+            name = row[0] + (" (approximate)" if title == "Approximate" else "")
+            shown.add_row(name, *(row[column] for column in columns[1:]))
     return shown
 
 

@@ -37,6 +37,7 @@ class GaussianTarget:
     free: ClassVar = {"lam": np.zeros(0, int), "mu": np.zeros(0, int)}
     entry_names = ("tissue",)
     sampled = np.arange(NODES)
+    normalised = False
 
     def __init__(self, wall: float = WALL, apart: float = 0.0):
         root = np.random.default_rng(0).normal(size=(DIMENSION, DIMENSION))
@@ -83,6 +84,9 @@ class GaussianTarget:
 
     def conditioned(self, estimands):
         return self.data
+
+    def without_normaliser(self, data):
+        return data
 
     def without_walls(self, data):
         return data._replace(wall=jnp.asarray(jnp.inf))

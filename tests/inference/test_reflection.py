@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesreg.inference import reflection
-from bayesreg.inference.reflection import rotated, walls
+from bayesreg.inference.reflection import rotated, shifted, walls
 
 DIMENSION, NODES = 9, 3
 CENTRE = np.array([[0.3, 0.0, 0.0], [0.0, 0.5, 0.0], [0.1, 0.1, 0.1]])
@@ -25,6 +25,9 @@ def made():
 
 
 turn = jax.jit(lambda made, position, momentum, time: rotated(made, ball, position, momentum, time))
+
+
+fly = jax.jit(lambda made, position, momentum, time: shifted(made, ball, position, momentum, time))
 
 
 def clearance(made, position):
@@ -56,6 +59,22 @@ def test_running_backward_leads_back(made):
         np.testing.assert_allclose(by_momentum[0], 0, atol=1e-4)
         np.testing.assert_allclose(by_time[0], 0, atol=1e-4)
         np.testing.assert_allclose(by_time[1], momentum, atol=1e-4)
+
+
+def test_straight_flights_keep_their_speed_and_the_walls_and_lead_back(made):
+    rng, position, reflected = np.random.default_rng(6), np.zeros(DIMENSION), 0
+    for _ in range(60):
+        momentum = rng.normal(size=DIMENSION)
+        end, last = (np.asarray(x) for x in fly(made, position, momentum, 0.7))
+        assert last @ last == pytest.approx(momentum @ momentum, rel=1e-12)
+        assert (clearance(made, end) > -1e-9).all()
+        np.testing.assert_allclose(fly(made, end, -last, 0.7)[0], position, atol=1e-4)
+        if np.allclose(end, position + 0.7 * momentum):
+            np.testing.assert_allclose(last, momentum)
+        else:
+            reflected += 1
+        position = end
+    assert 10 < reflected < 60
 
 
 def test_volume_is_kept(made):

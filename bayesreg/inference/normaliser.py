@@ -1,0 +1,129 @@
+"""A normaliser too costly for every step of a trajectory, which sees a quadratic instead: the test sees both.
+
+The normaliser of the elastic prior depends on the parameters alone, a few coordinates in which it is smooth. A kernel
+that is reversible for the density with a stand-in proposes; its proposal is accepted with the ratio of the normaliser
+to the stand-in, there over here. That is exact (the surrogate transition method, Liu 2001; delayed acceptance,
+Christen and Fox 2005), and costs one normaliser a transition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.target import SmoothTarget
+from bayesreg.types import AnyArray, Scalar
+
+# With more parameters than this the stand-in is linear: its curvature would cost two gradients for each of them.
+MOST_CURVED = 20
+
+
+class StandIn(NamedTuple):
+    """The normaliser to second order about the centre of the reference, less its value there (a pytree).
+
+    Attributes
+    ----------
+    slope : (k,) array
+        In the coordinates of a flat position that are no displacements.
+    curvature : (k, k) array
+    """
+
+    slope: Float[AnyArray, "parameters"]
+    curvature: Float[AnyArray, "parameters parameters"]
+
+    def __call__(self, away: Float[AnyArray, "dimension"]) -> Scalar:
+        """Its value at a flat position, given less the centre."""
+        x = away[: len(self.slope)]
+        return self.slope @ x + 0.5 * (x @ self.curvature @ x)
+
+
+class Delayed(NamedTuple):
+    """A chain whose kernel sees the stand-in.
+
+    Attributes
+    ----------
+    kernel : state of the kernel
+    log_normaliser : scalar
+        The true one, where the chain stands.
+    """
+
+    kernel: Any
+    log_normaliser: Scalar
+
+
+def parameters_of(target: SmoothTarget, reference: Reference) -> int:
+    """Number of coordinates that are no displacements."""
+    return len(reference.centre) - 3 * len(target.sampled)
+
+
+def no_stand_in(target: SmoothTarget, reference: Reference) -> StandIn:
+    """That of a density without a normaliser, or before it is found."""
+    count = parameters_of(target, reference)
+    return StandIn(jnp.zeros(count), jnp.zeros((count, count)))
+
+
+def stand_in(target: SmoothTarget, reference: Reference) -> StandIn:
+    """The normaliser's slope at the centre, and its curvature by differences over one standard deviation each way."""
+    found = no_stand_in(target, reference)
+    count = len(found.slope)
+    if not target.normalised or not count:
+        return found
+    slope_at = partial(_slope, target, target.data)
+    found = found._replace(slope=slope_at(reference.centre)[:count])
+    if count > MOST_CURVED:
+        return found
+    sd = np.minimum(np.linalg.norm(np.asarray(reference.factor[:count]), axis=1), 1.0)
+    rows = []
+    for index, h in enumerate(sd):
+        step = jnp.zeros_like(reference.centre).at[index].set(h)
+        rows.append((slope_at(reference.centre + step) - slope_at(reference.centre - step))[:count] / (2 * h))
+    curvature = jnp.stack(rows)
+    return found._replace(curvature=(curvature + curvature.T) / 2)
+
+
+def log_normaliser_at(target: SmoothTarget, data: Any, flat: AnyArray) -> Scalar:
+    """The true one, at a flat position."""
+    return target.log_normaliser(data, target.constrain_of(data, unravel(target)(flat)))
+
+
+_slope = jax.jit(jax.grad(log_normaliser_at, argnums=2), static_argnums=0)
+
+
+def delayed(
+    step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Any]],
+    flat_of: Callable[[Any, Any], AnyArray],
+    log_normaliser: Callable[[Any, AnyArray], Scalar],
+) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Any]]:
+    """A step for the density with the stand-in made one for the density with the normaliser.
+
+    Parameters
+    ----------
+    step : callable
+        (data, setup, key, state) → (state, info); reversible, and setup with fields `reference` and `stand_in`.
+    flat_of : callable
+        (setup, state) → flat position.
+    log_normaliser : callable
+        (data, flat position) → the true one.
+    """
+
+    def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Any]:
+        key_step, key_accept = jax.random.split(key)
+        proposed, info = step(data, setup, key_step, state.kernel)
+        here, there = flat_of(setup, state.kernel), flat_of(setup, proposed)
+        true = log_normaliser(data, there)
+        centre, approximate = setup.reference.centre, setup.stand_in
+        gain = true - state.log_normaliser - approximate(there - centre) + approximate(here - centre)
+        probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
+        accepted = jax.random.uniform(key_accept) < probability
+        moved = Delayed(proposed, true)
+        kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
+        return kept, info._replace(acceptance_rate=info.acceptance_rate * probability)
+
+    return whole_step

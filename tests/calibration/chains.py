@@ -1,0 +1,73 @@
+"""What calibration and Geweke's test share: chains of many data sets side by side, and the quantities they look at.
+
+All data sets share one mesh, one moving image and what is compiled: f at the quadrature points differs alone.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+import bayesreg as br
+from bayesreg.inference.laplace import Reference, laplace
+from bayesreg.inference.whitened import Setup, setup_about
+from tests.calibration.simulator import MESH, Simulator, draw_data
+
+# Every third node's displacement is looked at: neighbours say much the same.
+NODES = np.arange(0, len(MESH.boundary), 3)
+
+# So many data sets at a time: what they need together stays in the cache, four times as fast as all at once.
+BATCH = 20
+PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic")
+
+Estimands = dict[str, Any]
+
+
+def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
+    """What is looked at: parameters, some displacements, E_s and the log density."""
+    entries = [f"{name} {posterior.entry_names[i]}" for name, free in posterior.free.items() for i in free]
+    warm = [name for name in PARAMETERS if name in posterior.data.temperature_log_sd]
+    nodes = [f"u{posterior.sampled[node]} {axis}" for node in NODES for axis in "xyz"]
+    return (*entries, *warm, *nodes, "E_s", "log p")
+
+
+def quantities(estimands: Estimands, evaluation: Any) -> Any:
+    """Their values, in the order of `quantity_names`."""
+    parameters = [jnp.atleast_1d(estimands[name]) for name in PARAMETERS if name in estimands]
+    rest = [estimands["u_boundary"][NODES].ravel(), evaluation.similarity_energy[None], evaluation.logdensity[None]]
+    return jnp.concatenate(parameters + rest)
+
+
+def quantities_at(posterior: br.Posterior, data: Any, observed: Any, estimands: Estimands) -> Any:
+    return quantities(estimands, posterior.evaluate_estimands(data._replace(fixed_values=observed), estimands))
+
+
+def of_posterior(posterior: br.Posterior, estimands: Estimands) -> Estimands:
+    """In the posterior's order, without temperatures that it takes for known."""
+    return {name: estimands[name] for name in posterior.estimands(posterior.reference())}
+
+
+@partial(jax.jit, static_argnums=0)
+def simulated(posterior: br.Posterior, data: Any, truths: Estimands, key: Any) -> Any:
+    keys = jax.random.split(key, len(truths["u_boundary"]))
+    return jax.vmap(partial(draw_data, posterior, data))(keys, truths)
+
+
+def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Reference:
+    """At rest, with data of its own: any reference is exact."""
+    truth = simulator.draw_prior(np.random.default_rng(1000), 1)
+    observed = simulated(simulator.posterior, simulator.posterior.data, truth, jax.random.key(1000))[0]
+    at_rest = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
+    return laplace(posterior, np.asarray(at_rest), posterior.data._replace(fixed_values=observed))
+
+
+def setups_about(posterior: br.Posterior, references: list[Reference], step_size: float, steps: int) -> Setup:
+    """The setups of all replications, stacked."""
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
+    size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
+    return jax.vmap(lambda reference: setup_about(posterior, reference)._replace(**size))(stacked)

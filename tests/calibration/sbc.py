@@ -1,0 +1,242 @@
+"""Simulation-based calibration: the rank of the truth among posterior draws is uniform over draws of the model.
+
+Talts et al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018; test quantities that
+look at the data too, here E_s and log p, after Modrák et al., Bayesian Analysis 2023. All replications share one mesh,
+one moving image and what is compiled, and run side by side; f at the quadrature points differs, and the
+Gaussian reference about which the sampler moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
+from scipy import stats
+
+import bayesreg as br
+from bayesreg.inference.kernel import Sampler
+from bayesreg.inference.laplace import laplace
+from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.whitened import Setup
+from tests.calibration.chains import (
+    BATCH,
+    Estimands,
+    of_posterior,
+    prior_reference,
+    quantities,
+    quantities_at,
+    quantity_names,
+    setups_about,
+    simulated,
+)
+from tests.calibration.simulator import Simulator
+
+BINS = 10
+LEVELS = (0.5, 0.9)
+SIGNIFICANCE = 0.01
+
+Say = Callable[[str], None]
+
+
+class Settings(NamedTuple):
+    """How the posterior of each replication is sampled, by one chain.
+
+    Attributes
+    ----------
+    replications : int
+    approach : int
+        Transitions about a reference that all replications share, from a draw of the prior; their second half says
+        where each replication's own reference goes.
+    warm_up, draws : int
+        Transitions about that, not kept and kept.
+    step_size, steps : float, int
+        Of the trajectories about it.
+    """
+
+    replications: int = 200
+    approach: int = 30
+    warm_up: int = 20
+    draws: int = 60
+    step_size: float = 0.55
+    steps: int = 3
+
+
+SETTINGS = Settings()
+
+
+class Ranks(NamedTuple):
+    """What a calibration found (arrays, the replications leading).
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the k quantities.
+    place : (r, k) array
+        (rank of the truth + uniform) / (thinned draws + 1): uniform on (0, 1) if the posterior is right.
+    ess : (r, k) array
+        Effective draws; to as many each posterior was thinned.
+    rhat : (r, k) array
+        Split R̂ of the chains.
+    acceptance : (r,) array
+    """
+
+    names: tuple[str, ...]
+    place: np.ndarray
+    ess: np.ndarray
+    rhat: np.ndarray
+    acceptance: np.ndarray
+
+
+class Verdict(NamedTuple):
+    """Tests of uniform ranks; a quantity fails below a significance shared out over all of them (Bonferroni).
+
+    Attributes
+    ----------
+    histogram : (k,) array
+        p-value of χ² over `BINS` bins.
+    coverage : (levels, k) array
+        Share of the truths inside the central intervals.
+    coverage_p : (levels, k) array
+        p-value of that share under the binomial distribution, two-sided.
+    """
+
+    histogram: np.ndarray
+    coverage: np.ndarray
+    coverage_p: np.ndarray
+
+    @property
+    def passes(self) -> bool:
+        """Whether no quantity fails."""
+        return bool(self.histogram.min() > self.threshold and self.coverage_p.min() > self.threshold)
+
+    @property
+    def threshold(self) -> float:
+        """Of a p-value."""
+        return SIGNIFICANCE / len(self.histogram)
+
+
+def verdict(place: np.ndarray) -> Verdict:
+    """Whether the ranks (r, k) are uniform."""
+    counts = np.stack([np.histogram(column, BINS, (0, 1))[0] for column in place.T])
+    inside = np.stack([(abs(place - 0.5) < level / 2).sum(axis=0) for level in LEVELS])
+    p = [
+        [stats.binomtest(int(n), len(place), level).pvalue for n in row]
+        for row, level in zip(inside, LEVELS, strict=True)
+    ]
+    return Verdict(stats.chisquare(counts, axis=1).pvalue, inside / len(place), np.array(p))
+
+
+def calibrate(
+    simulator: Simulator,
+    posterior: br.Posterior | None = None,
+    settings: Settings = SETTINGS,
+    seed: int = 0,
+    sampler: str = "hmc",
+    say: Say = lambda text: None,
+) -> Ranks:
+    """Ranks of truths drawn by the simulator among draws of a posterior, its own or one that errs."""
+    posterior = simulator.posterior if posterior is None else posterior
+    rng = np.random.default_rng(seed)
+    truths = simulator.draw_prior(rng, settings.replications)
+    key_data, key_chains = jax.random.split(jax.random.key(seed))
+    observed = simulated(simulator.posterior, simulator.posterior.data, truths, key_data)
+    starts = of_posterior(posterior, simulator.draw_prior(rng, settings.replications))
+    draws, acceptance = _chains(simulator, posterior, observed, starts, key_chains, settings, sampler, say)
+    at_truth = jax.jit(jax.vmap(partial(quantities_at, posterior), in_axes=(None, 0, 0)))
+    true = np.asarray(at_truth(posterior.data, observed, of_posterior(posterior, truths)))
+    return _ranks(quantity_names(posterior), true, draws, acceptance, rng)
+
+
+def _chains(
+    simulator: Simulator,
+    posterior: br.Posterior,
+    observed: Any,
+    starts: Estimands,
+    key: Any,
+    settings: Settings,
+    sampler: str,
+    say: Say,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Quantities (draw, r, k) after the warm-up, and the mean acceptance of each replication."""
+    kernel = SAMPLERS[sampler](posterior)
+    shared = setups_about(
+        posterior, [prior_reference(simulator, posterior)] * len(observed), settings.step_size, settings.steps
+    )
+    states, places, _, _ = _run(kernel, posterior, shared, observed, starts, key, settings.approach, say)
+    middle = places[settings.approach // 2 :].mean(axis=0)
+    say("a reference for each replication")
+    references = [
+        laplace(posterior, place, posterior.data._replace(fixed_values=f))
+        for place, f in zip(middle, observed, strict=True)
+    ]
+    setup = setups_about(posterior, references, settings.step_size, settings.steps)
+    key, starts = jax.random.fold_in(key, 1), states
+    steps = settings.warm_up + settings.draws
+    _, _, found, acceptance = _run(kernel, posterior, setup, observed, starts, key, steps, say)
+    return found[settings.warm_up :], acceptance[settings.warm_up :].mean(axis=0)
+
+
+@partial(jax.jit, static_argnums=0)
+def _begin(kernel: Sampler, data: Any, setup: Setup, observed: Any, starts: Estimands) -> Any:
+    def one(given: Any) -> Any:
+        setup, observed, start = given
+        return kernel.init(data._replace(fixed_values=observed), setup, start)
+
+    return jax.lax.map(one, (setup, observed, starts), batch_size=BATCH)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _advance(  # type: ignore[no-untyped-def]
+    kernel: Sampler, posterior: br.Posterior, data: Any, setup: Setup, observed: Any, keys: Any, states: Any
+):
+    def one(given: Any) -> Any:
+        setup, observed, key, state = given
+        here = data._replace(fixed_values=observed)
+        state, info = kernel.step(here, setup, key, state)
+        drawn = kernel.observe(here, setup, state)
+        place = ravel_pytree(posterior.unconstrain_of(data, drawn.estimands))[0]
+        return state, drawn.estimands, place, quantities(drawn.estimands, drawn.evaluation), info.acceptance_rate
+
+    return jax.lax.map(one, (setup, observed, keys, states), batch_size=BATCH)
+
+
+def _run(
+    kernel: Sampler,
+    posterior: br.Posterior,
+    setup: Setup,
+    observed: Any,
+    starts: Estimands,
+    key: Any,
+    steps: int,
+    say: Say,
+) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray]:
+    """Where the chains end; flat positions, quantities and acceptances, the steps leading, then the replications."""
+    states = _begin(kernel, posterior.data, setup, observed, starts)
+    kept = []
+    for step in range(steps):
+        keys = jax.random.split(jax.random.fold_in(key, step), len(observed))
+        states, ends, *found = _advance(kernel, posterior, posterior.data, setup, observed, keys, states)
+        kept.append([np.asarray(x) for x in found])
+        if step % 20 == 0:
+            say(f"transition {step} of {steps}, acceptance {kept[-1][2].mean():.0%}")
+    return ends, *(np.stack(x) for x in zip(*kept, strict=True))
+
+
+def _ranks(
+    names: tuple[str, ...], true: np.ndarray, draws: np.ndarray, acceptance: np.ndarray, rng: np.random.Generator
+) -> Ranks:
+    """Each quantity of each replication, thinned to as many draws as are independent."""
+    chain = draws[None]
+    ess = effective_sample_size(chain)
+    # Draws that alternate about their mean are worth more than independent ones, and may be estimated below zero.
+    ess = np.where(ess > 0, np.clip(ess, 1, len(draws)), len(draws))
+    place = np.empty_like(true)
+    for r, k in np.ndindex(*true.shape):
+        thinned = draws[np.linspace(0, len(draws) - 1, int(ess[r, k])).round().astype(int), r, k]
+        place[r, k] = ((thinned < true[r, k]).sum() + rng.uniform()) / (len(thinned) + 1)
+    return Ranks(names, place, ess, split_gelman_rubin(chain), acceptance)

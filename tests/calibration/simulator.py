@@ -1,0 +1,150 @@
+"""The model as a simulator: parameters and displacements from the prior, the fixed image at the quadrature points.
+
+(λ, μ, T_s, T_r) come from their priors; u_B from the Gaussian of precision S / T_r, S the Schur complement of K, and
+that of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of variance
+T_s / (2 w_q). The skull belongs to the likelihood: a draw with a node in it is rejected whole, (λ, μ, u) together. The
+prior is drawn by the oracle's matrices and NumPy, and shares no code with the density under test.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import solve_triangular
+
+import bayesreg as br
+from bayesreg.model.warp import displacement_at
+from tests.oracles import paper
+from tests.phantoms import box_mesh, flat_skull, smooth_image
+
+MESH = box_mesh(2)
+LAME = ("lam", "mu")
+# Displacements of about half a millimetre in a box of 20 mm, seen through noise of sd 0.014 in a picture of contrast
+# one whose waves are too long for several modes; the wall is met by two draws of three.
+RIGID_SD, T_SIMILARITY, T_ELASTIC = 0.3, 0.008, 3.0
+PRIOR = {"alpha": 3.0, "beta": 3.0, "high": 4.0}
+WALL = 20.8
+
+
+class Variant(NamedTuple):
+    """A model to be calibrated.
+
+    Attributes
+    ----------
+    skull : bool
+        Whether a flat skull stands one millimetre beyond a face of the box.
+    temperatures : bool
+        Whether T_s and T_r are inferred; μ of one tissue is then known.
+    """
+
+    skull: bool = False
+    temperatures: bool = False
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of `ModelConfig`."""
+        known = T_SIMILARITY, T_ELASTIC
+        inferred = tuple({"median": value, "log_sd": 0.5} for value in known)
+        t_similarity, t_elastic = inferred if self.temperatures else known
+        return {
+            "fixed": {"mu": {"gm": 2.0}} if self.temperatures else {},
+            "priors": dict.fromkeys(LAME, PRIOR),
+            "t_similarity": t_similarity,
+            "t_elastic": t_elastic,
+            "normalised": True,
+            "interpolation": "cubic",
+            "rigid_sd": RIGID_SD,
+        }
+
+
+VARIANTS = {
+    "no skull": Variant(),
+    "skull": Variant(skull=True),
+    "temperatures": Variant(temperatures=True),
+}
+
+
+def posterior_of(variant: Variant, **planted: Any) -> br.Posterior:
+    """The density under test; `planted` are options that are wrong on purpose."""
+    moving = smooth_image(MESH.points, seed=1, blur=2.0)
+    skull = flat_skull(MESH.points, axis=0, wall=WALL, voxel=1.0) if variant.skull else None
+    # The fixed image is replaced at the quadrature points, one replication after another.
+    return br.build_posterior(moving, moving, MESH, br.ModelConfig(**variant.options | planted), skull)
+
+
+class Simulator:
+    """Draws of (parameters, displacements) from the prior and of data given these.
+
+    Parameters
+    ----------
+    variant : Variant
+    """
+
+    def __init__(self, variant: Variant) -> None:
+        self.variant = variant
+        self.posterior = posterior_of(variant)
+
+    @cached_property
+    def unit_stiffness(self) -> dict[str, np.ndarray]:
+        """K of λ = 1, and of μ = 1, in one tissue: (3n, 3n) for each."""
+        found = {}
+        for name in LAME:
+            of_tissue = []
+            for tissue in range(len(MESH.names)):
+                here = (MESH.tissue == tissue).astype(float)
+                lam, mu = (here, 0 * here) if name == "lam" else (0 * here, here)
+                of_tissue.append(paper.stiffness(MESH.points, MESH.cells, lam, mu).toarray())
+            found[name] = np.stack(of_tissue)
+        return found
+
+    def schur_complement(self, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
+        """S of the boundary, (3b, 3b)."""
+        K = np.tensordot(lam, self.unit_stiffness["lam"], 1) + np.tensordot(mu, self.unit_stiffness["mu"], 1)
+        boundary = (3 * MESH.boundary[:, None] + np.arange(3)).ravel()
+        interior = np.setdiff1d(np.arange(len(K)), boundary)
+        coupling = K[np.ix_(interior, boundary)]
+        return K[np.ix_(boundary, boundary)] - coupling.T @ np.linalg.solve(K[np.ix_(interior, interior)], coupling)
+
+    def draw_displacement(self, rng: np.random.Generator, lam: np.ndarray, mu: np.ndarray, t_elastic: float) -> Any:
+        """u_B of the untruncated Gaussian prior, (b, 3) in mm."""
+        rigid = paper.rigid_modes(MESH.points[MESH.boundary]) / (RIGID_SD * np.sqrt(len(MESH.boundary)))
+        precision = self.schur_complement(lam, mu) / t_elastic + rigid @ rigid.T
+        factor = np.linalg.cholesky(precision)
+        return solve_triangular(factor, rng.normal(size=len(factor)), lower=True, trans=1).reshape(-1, 3)
+
+    def draw_parameters(self, rng: np.random.Generator) -> dict[str, Any]:
+        """λ, μ (all entries) and the temperatures of the prior."""
+        values: dict[str, Any] = {}
+        for name in LAME:
+            free = self.posterior.free[name]
+            values[name] = np.array(self.posterior.reference()[name])
+            values[name][free] = PRIOR["high"] * rng.beta(PRIOR["alpha"], PRIOR["beta"], len(free))
+        if self.variant.temperatures:
+            values["t_similarity"] = T_SIMILARITY * np.exp(0.5 * rng.normal())
+            values["t_elastic"] = T_ELASTIC * np.exp(0.5 * rng.normal())
+        return values
+
+    def draw_prior(self, rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
+        """Estimands, the draws leading: parameters and displacements together, no node of which is in the skull."""
+        draws: list[dict[str, Any]] = []
+        while len(draws) < count:
+            values = self.draw_parameters(rng)
+            u = self.draw_displacement(rng, values["lam"], values["mu"], values.get("t_elastic", T_ELASTIC))
+            if not self.variant.skull or (MESH.points[MESH.boundary, 0] + u[:, 0] <= WALL).all():
+                free = self.posterior.free
+                values |= {name: values[name][free[name]] for name in LAME}
+                draws.append({"u_boundary": u, **values})
+        return {name: np.stack([draw[name] for draw in draws]) for name in draws[0]}
+
+
+def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
+    """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
+    u = posterior.evaluate_estimands(data, estimands, normaliser=False).u
+    predicted = data.moving(data.positions + displacement_at(data.system.elements, data.quadrature, u))
+    t_similarity = estimands.get("t_similarity", data.t_similarity)
+    sd = jnp.sqrt(t_similarity / (2 * data.quadrature.weights))
+    return predicted + sd * jax.random.normal(key, predicted.shape)

@@ -1,0 +1,124 @@
+"""A costly normaliser kept out of trajectories: its stand-in, and that the draws are of the true density anyway."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import bayesreg as br
+from bayesreg.inference.hamiltonian import hmc
+from bayesreg.inference.kernel import Info
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.normaliser import Delayed, StandIn, delayed, stand_in
+from bayesreg.inference.whitened import setup_about
+from tests.phantoms import box_mesh, smooth_image
+
+MESH = box_mesh(2)
+
+
+@cache
+def posterior():
+    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    model = br.ModelConfig(
+        normalised=True,
+        interpolation="cubic",
+        priors={name: {"high": 20.0} for name in ("lam", "mu")},
+        t_elastic=30.0,
+        t_similarity=5.0,
+        rigid_sd=1.0,
+    )
+    return br.build_posterior(*images, MESH, model=model)
+
+
+def test_the_stand_in_is_the_normaliser_to_second_order():
+    post = posterior()
+    position = post.unconstrain(post.reference())
+    flat = jax.flatten_util.ravel_pytree(position)[0]
+    found = stand_in(post, Reference(flat, 0.1 * jnp.eye(len(flat))))
+    count = len(flat) - 3 * len(post.sampled)
+    assert found.slope.shape == (count,)
+
+    def true(x):
+        away = flat.at[:count].add(x)
+        estimands = post.constrain_of(post.data, jax.flatten_util.ravel_pytree(position)[1](away))
+        return float(post.log_normaliser(post.data, estimands))
+
+    at_centre = true(jnp.zeros(count))
+    for seed in range(3):
+        x = 0.05 * np.random.default_rng(seed).normal(size=count)
+        error = true(jnp.asarray(x)) - at_centre - float(found(jnp.zeros(len(flat)).at[:count].set(x)))
+        assert abs(error) < 0.02 * abs(0.5 * x @ found.curvature @ x) + 1e-6
+
+
+class Setup(NamedTuple):
+    reference: Reference
+    stand_in: StandIn
+
+
+def log_normaliser(data, flat):
+    return 1.5 * jnp.sin(2 * flat[0])
+
+
+@pytest.mark.parametrize(("slope", "curvature"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.3)])
+def test_draws_are_of_the_density_with_the_normaliser(slope, curvature):
+    """Whatever the stand-in: against sums over a grid."""
+    approximate = StandIn(jnp.array([slope]), jnp.array([[curvature]]))
+    setup = Setup(Reference(jnp.zeros(1), jnp.eye(1)), approximate)
+    kernel = blackjax.additive_step_random_walk(
+        lambda x: -0.5 * (x @ x) + approximate(x), blackjax.mcmc.random_walk.normal(jnp.array([1.5]))
+    )
+
+    def step(data, setup, key, state):
+        state, info = kernel.step(key, state)
+        no = jnp.zeros((), bool)
+        return state, Info(info.acceptance_rate, no, no, no, no, no, no)
+
+    whole_step = delayed(step, lambda setup, state: state.position, log_normaliser)
+
+    def chain(key):
+        first = kernel.init(jnp.zeros(1))
+        state = Delayed(first, log_normaliser(None, jnp.zeros(1)))
+        _, found = jax.lax.scan(
+            lambda state, key: (lambda new: (new, new.kernel.position[0]))(whole_step(None, setup, key, state)[0]),
+            state,
+            jax.random.split(key, 2100),
+        )
+        return found[100:]
+
+    draws = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(0), 64)))
+    x = np.linspace(-7, 7, 4001)
+    weights = np.exp(-0.5 * x**2 + 1.5 * np.sin(2 * x))
+    weights /= weights.sum()
+    for function in (np.sin, np.cos, np.square):
+        per_chain = function(draws).mean(axis=1)
+        error = per_chain.std(ddof=1) / np.sqrt(len(per_chain))
+        assert abs(per_chain.mean() - weights @ function(x)) < 4.5 * error
+        assert error < 0.03
+
+
+def test_a_chain_knows_the_whole_density_where_it_stands():
+    post = posterior()
+    sampler = hmc(post)
+    estimands = post.estimands(post.reference())
+    flat = jax.flatten_util.ravel_pytree(post.unconstrain_of(post.data, estimands))[0]
+    reference = Reference(flat, 0.05 * jnp.eye(len(flat)))
+    setup = setup_about(post, reference)._replace(stand_in=stand_in(post, reference), step_size=jnp.asarray(0.3))
+
+    @jax.jit
+    def moved(data, setup, key):
+        states = jax.vmap(lambda key: sampler.init(data, setup, estimands))(jax.random.split(key, 2))
+        for number in range(3):
+            keys = jax.random.split(jax.random.fold_in(key, number), 2)
+            states, _ = jax.vmap(lambda key, state: sampler.step(data, setup, key, state))(keys, states)
+        return jax.vmap(lambda state: sampler.observe(data, setup, state))(states)
+
+    found = moved(post.data, setup, jax.random.key(0))
+    expected = jax.vmap(lambda estimands: post.evaluate_estimands(post.data, estimands).logdensity)(found.estimands)
+    np.testing.assert_allclose(found.evaluation.logdensity, expected, rtol=1e-9)
+    assert (found.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()

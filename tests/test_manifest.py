@@ -1,0 +1,21 @@
+"""What run.json says beyond what the pipeline's tests look at."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import bayesreg as br
+from bayesreg.manifest import implied_noise_sd
+from tests.phantoms import ball_mesh, smooth_image
+
+
+def test_noise_of_an_inferred_temperature_is_that_of_its_mean():
+    mesh = ball_mesh(spacing=30.0)
+    image = smooth_image(mesh.points)
+    known, inferred = (
+        br.build_posterior(image, image, mesh, br.ModelConfig(t_similarity=t)) for t in (0.8, {"median": 0.8})
+    )
+    u = xr.Dataset({"lam": (("chain", "draw", "tissue"), np.ones((2, 3, 3)))})
+    drawn = u.assign(t_similarity=(("chain", "draw"), [[3.0, 3.2, 3.4], [2.8, 3.2, 3.6]]))
+    assert implied_noise_sd(known, u) == known.implied_noise_sd
+    assert implied_noise_sd(inferred, drawn) == pytest.approx(2 * known.implied_noise_sd)
