@@ -1,9 +1,9 @@
 """Effective draws per second of the default sampler against the paper's kernel, on the paper's posterior.
 
 The kernel cannot be run until its effective sample size can be estimated: a short chain flatters it a thousandfold.
-For a random walk with step variances D, acceptance a and posterior covariance C, entry i gains per step, in the diffusion
-limit, a C_ii / (4 [C D⁻¹ C]_ii) effective draws. Acceptance and steps per second are measured at draws of the converged
-posterior; the formula is checked on a Gaussian of that covariance, where millions of steps are cheap.
+For a random walk with step variances D, acceptance a and posterior covariance C, entry i gains per step, in the
+diffusion limit, a C_ii / (4 [C D⁻¹ C]_ii) effective draws. Acceptance and steps per second are measured at draws of the
+converged posterior; the formula is checked on a Gaussian of that covariance, where steps are cheap.
 """
 
 import os
