@@ -65,6 +65,7 @@ def bench_steps_of_the_papers_sampler():
         blocks: list[float] = []
         sample(
             posterior,
+            "rwmh",
             chains=chains,
             draws=30,
             thin=10,
