@@ -171,7 +171,7 @@ class _AboutMode(_Sampler):
 
 
 class _Tuned(_AboutMode):
-    warm_up: Count = 60
+    warm_up: Count = 80
     """Transitions that tune the step size and are not kept."""
     target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.75
     """Acceptance towards which the step size is tuned."""

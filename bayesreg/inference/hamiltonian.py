@@ -16,7 +16,7 @@ from bayesreg.inference.whitened import Moved, Setup, about_reference, clearance
 from bayesreg.types import AnyArray
 
 
-def hmc(target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
+def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
     """Hamiltonian Monte Carlo: a quarter turn about the Gaussian reference, in as many steps as acceptance asks for.
 
     Parameters
@@ -41,7 +41,7 @@ def hmc(target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.75
     return about_reference(target, transition, Tuning(warm_up, target_acceptance), mode_search=mode_search)
 
 
-def nuts(target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:
+def nuts(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:
     """The No-U-Turn sampler about the Gaussian reference; its settings are those of `hmc`."""
 
     def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -55,7 +55,7 @@ def nuts(target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.8
 
 
 def mclmc(
-    target: SmoothTarget, warm_up: int = 60, target_acceptance: float = 0.75, mode_search: str = "once"
+    target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once"
 ) -> Sampler:
     """Microcanonical trajectories with a Metropolis test (adjusted MCLMC); its settings are those of `hmc`.
 

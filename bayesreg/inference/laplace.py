@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -141,7 +141,32 @@ _softened_with_slope = jax.jit(jax.value_and_grad(softened, argnums=3), static_a
 def laplace(
     target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
 ) -> Reference:
-    """The Gaussian reference about a flat position.
+    """The Gaussian reference about a flat position, with the curvature there (see `precision_at`)."""
+    return _gaussian(flat, precision_at(target, flat, data, joint))
+
+
+def averaged(
+    target: SmoothTarget, centre: Float[np.ndarray, "dimension"], places: Sequence[Float[np.ndarray, "dimension"]]
+) -> Reference:
+    """The Gaussian about a centre whose precision is the mean of those there and at other places.
+
+    Where the images say little at the mode and much beside it, the curvature at the mode alone makes the reference too
+    wide, and trajectories meet forces in it that ask for short steps.
+    """
+    found = [precision_at(target, flat) for flat in (centre, *places)]
+    return _gaussian(centre, np.mean(found, axis=0))
+
+
+def _gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]) -> Reference:
+    lower = np.linalg.cholesky(precision)
+    factor = scipy.linalg.solve_triangular(lower, np.eye(len(centre)), lower=True).T
+    return Reference(jnp.asarray(centre), jnp.asarray(factor))
+
+
+def precision_at(
+    target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
+) -> Float[np.ndarray, "dimension dimension"]:
+    """A positive definite curvature of minus the log density.
 
     The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are exact; directions in
     which the latter are not convex are given the least curvature of a logarithmic parameter.
@@ -181,9 +206,7 @@ def laplace(
     else:
         precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
     precision[np.ix_(order, order)] = (precision + precision.T) / 2
-    lower = np.linalg.cholesky(precision)
-    factor = scipy.linalg.solve_triangular(lower, np.eye(len(flat)), lower=True).T
-    return Reference(jnp.asarray(flat), jnp.asarray(factor))
+    return precision
 
 
 def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:

@@ -32,7 +32,7 @@ def smc(
     target: SmoothTarget,
     particles: int = 128,
     spread: float = 2.0,
-    warm_up: int = 60,
+    warm_up: int = 80,
     target_acceptance: float = 0.75,
     mode_search: str = "once",
 ) -> Sampler:

@@ -46,7 +46,7 @@ def require_sound(tuning: Tuning) -> None:
 
 def tuned(
     data: Any, kernel: tuple[Callable, Callable, Callable], setup: Any, starts: Any, key: AnyArray, tuning: Tuning,
-    say: Say,
+    say: Say = lambda text: None,
 ) -> tuple[Any, Any]:  # fmt: skip
     """The setup with its step size, and where the chains then are.
 
@@ -63,30 +63,35 @@ def tuned(
     say : callable
         Told of what was found.
     """
-    init, step, estimands_of = kernel
-    begin, update, final = dual_averaging_adaptation(tuning.acceptance)
-
-    def sized(setup: Any, size: Scalar) -> Any:
-        size = jnp.clip(size, tuning.least, tuning.greatest)
-        steps = jnp.maximum(jnp.round(jnp.pi / 2 / size), 1).astype(int)
-        return setup._replace(step_size=size, steps=steps)
-
-    @jax.jit
-    def run(data: Any, setup: Any, starts: Any, key: AnyArray) -> Any:
-        states = jax.vmap(partial(init, data, setup))(starts)
-
-        def one(carry: Any, key: AnyArray) -> Any:
-            states, averaging = carry
-            keys = jax.random.split(key, len(next(iter(starts.values()))))
-            states, info = jax.vmap(partial(step, data, sized(setup, jnp.exp(averaging.log_step_size))))(keys, states)
-            rate = jnp.nan_to_num(info.acceptance_rate).mean()
-            return (states, update(averaging, rate)), rate
-
-        first = states, begin(setup.step_size)
-        (states, averaging), rates = jax.lax.scan(one, first, jax.random.split(key, tuning.warm_up))
-        return jax.vmap(partial(estimands_of, data, setup))(states), final(averaging), rates
-
-    points, size, rates = run(data, setup, starts, key)
-    setup, late = sized(setup, size), float(rates[tuning.warm_up // 2 :].mean())
+    keys = jax.random.split(key, tuning.warm_up)
+    points, size, rates = _run(kernel, tuning, data, setup, starts, keys)
+    setup, late = _sized(tuning, setup, size), float(rates[len(rates) // 2 :].mean())
     say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a quarter turn, acceptance {late:.0%}")
     return setup, points
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _run(
+    kernel: tuple[Callable, Callable, Callable], tuning: Tuning, data: Any, setup: Any, starts: Any, keys: AnyArray
+) -> tuple[Any, Scalar, AnyArray]:
+    """Estimands, step size, and the acceptance of every transition."""
+    init, step, estimands_of = kernel
+    begin, update, final = dual_averaging_adaptation(tuning.acceptance)
+    chains = len(next(iter(starts.values())))
+
+    def one(carry: Any, key: AnyArray) -> Any:
+        states, averaging = carry
+        now = _sized(tuning, setup, jnp.exp(averaging.log_step_size))
+        states, info = jax.vmap(partial(step, data, now))(jax.random.split(key, chains), states)
+        rate = jnp.nan_to_num(info.acceptance_rate).mean()
+        return (states, update(averaging, rate)), rate
+
+    first = jax.vmap(partial(init, data, setup))(starts), begin(setup.step_size)
+    (states, averaging), rates = jax.lax.scan(one, first, keys)
+    return jax.vmap(partial(estimands_of, data, setup))(states), final(averaging), rates
+
+
+def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
+    size = jnp.clip(size, tuning.least, tuning.greatest)
+    steps = jnp.maximum(jnp.round(jnp.pi / 2 / size), 1).astype(int)
+    return setup._replace(step_size=size, steps=steps)

@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
-from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.laplace import Reference, averaged, unravel
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
 from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
@@ -189,7 +189,12 @@ def about_reference(
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
             return setups[0], points
-        return tuned(conditioned(setups[0]), (init, step, estimands_of), setups[0], points, key_tune, tuning, say)
+        kernel, data, setup = (init, step, estimands_of), conditioned(setups[0]), setups[0]
+        # Two stages of one length, compiled once: the first leads the chains to where the second is whitened.
+        stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
+        key_settle, key_tune = jax.random.split(key_tune)
+        _, points = tuned(data, kernel, setup, points, key_settle, stage)
+        return tuned(data, kernel, _averaged(target, setup, points), points, key_tune, stage, say)
 
     def conditioned(setup: Setup) -> Any:
         return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.reference.centre)))
@@ -203,6 +208,14 @@ def about_reference(
         whole_step = delayed(step, flat_of, partial(log_normaliser_at, target))
         return Sampler(prepare, conditioned, blank, init_delayed, whole_step, observe_delayed, exact)
     return Sampler(prepare, conditioned, blank, init, step, observe, exact)
+
+
+def _averaged(target: SmoothTarget, setup: Setup, points: Any) -> Setup:
+    """The setup whitened by the mean of the curvatures at the mode and where the chains are."""
+    flats = jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points)
+    sound = [flat for flat in np.asarray(flats) if np.isfinite(flat).all()]
+    reference = averaged(target, np.asarray(setup.reference.centre), sound)
+    return setup_about(target, reference)._replace(stand_in=setup.stand_in)
 
 
 def _overdispersed(target: SmoothTarget, setup: Setup, keys: AnyArray) -> Any:
