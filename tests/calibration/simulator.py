@@ -143,7 +143,7 @@ class Simulator:
 
 def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
     """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
-    u = posterior.evaluate_estimands(data, estimands, normaliser=False).u
+    u = posterior.evaluate_estimands(posterior.without_normaliser(data), estimands).u
     predicted = data.moving(data.positions + displacement_at(data.system.elements, data.quadrature, u))
     t_similarity = estimands.get("t_similarity", data.t_similarity)
     sd = jnp.sqrt(t_similarity / (2 * data.quadrature.weights))

@@ -85,6 +85,9 @@ class GaussianTarget:
     def conditioned(self, estimands):
         return self.data
 
+    def log_normaliser(self, data, estimands):
+        return jnp.zeros(())
+
     def without_normaliser(self, data):
         return data
 

@@ -125,7 +125,7 @@ def test_stop_rules():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; there are rwmh, hmc, nuts, laplace"),
+        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; there are rwmh, hmc, nuts, mclmc, mala"),
         ({"chains": 0}, "chains must be at least 1, got 0"),
         ({"thin": 0}, "thin must be at least 1"),
         ({"sigma_u": -1.0}, "step of u_boundary must be positive"),
