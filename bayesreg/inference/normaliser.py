@@ -73,7 +73,7 @@ def stand_in(target: SmoothTarget, reference: Reference) -> StandIn:
     """The normaliser's slope at the centre, and its curvature by differences over one standard deviation each way."""
     found = no_stand_in(target, reference)
     count = len(found.slope)
-    if not target.normalised or not count:
+    if not target.costly_normaliser or not count:
         return found
     slope_at = partial(_slope, target, target.data)
     found = found._replace(slope=slope_at(reference.centre)[:count])

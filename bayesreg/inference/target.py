@@ -88,7 +88,7 @@ class SmoothTarget(Target, Protocol):
         """Position of values."""
 
     @property
-    def normalised(self) -> bool:
+    def costly_normaliser(self) -> bool:
         """Whether the density has a normaliser that depends on estimands other than "u_boundary", and is costly."""
 
     def log_normaliser(self, data: Any, estimands: Estimands) -> AnyArray:

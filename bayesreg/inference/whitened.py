@@ -93,12 +93,12 @@ def whitened_position(target: SmoothTarget, reference: Reference, xi: AnyArray) 
 def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ), up to a constant, with the stand-in for its normaliser."""
     reference = setup.reference
-    plain = target.without_normaliser(data)
+    seen = target.without_normaliser(data) if target.costly_normaliser else data
 
     def density(xi: AnyArray) -> AnyArray:
-        return target.logdensity_of(plain, whitened_position(target, reference, xi))
+        return target.logdensity_of(seen, whitened_position(target, reference, xi))
 
-    if not target.normalised:
+    if not target.costly_normaliser:
         return density
     return lambda xi: density(xi) + setup.stand_in(reference.factor @ xi)
 
@@ -204,7 +204,7 @@ def about_reference(
         return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))))
 
     # What is approximate anyway does without the normaliser's own value.
-    if target.normalised and exact:
+    if target.costly_normaliser and exact:
         whole_step = delayed(step, flat_of, partial(log_normaliser_at, target))
         return Sampler(prepare, conditioned, blank, init_delayed, whole_step, observe_delayed, exact)
     return Sampler(prepare, conditioned, blank, init, step, observe, exact)

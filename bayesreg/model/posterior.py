@@ -40,6 +40,9 @@ SMOOTHING = (
 )  # fmt: skip
 
 
+# Up to this many nodes the elastic prior's normaliser may stand in every step of a trajectory.
+CHEAP_NODES = 200
+
 # Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
 NEAR = 1e3
 
@@ -149,9 +152,9 @@ class Posterior:
         return _evaluate(data, complete(data, estimands, self.free), self.options.similarity, guess)
 
     @property
-    def normalised(self) -> bool:
-        """Whether the elastic prior's normaliser is part of the density."""
-        return self.options.normalised
+    def costly_normaliser(self) -> bool:
+        """Whether the elastic prior's normaliser is part of the density, and costs much more than the rest."""
+        return self.options.normalised and len(self.mesh.points) > CHEAP_NODES
 
     def without_normaliser(self, data: RegistrationData) -> RegistrationData:
         """The data of the same problem without `log_normaliser` in its density, and without its cost."""

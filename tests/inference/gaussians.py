@@ -37,7 +37,7 @@ class GaussianTarget:
     free: ClassVar = {"lam": np.zeros(0, int), "mu": np.zeros(0, int)}
     entry_names = ("tissue",)
     sampled = np.arange(NODES)
-    normalised = False
+    costly_normaliser = False
 
     def __init__(self, wall: float = WALL, apart: float = 0.0):
         root = np.random.default_rng(0).normal(size=(DIMENSION, DIMENSION))

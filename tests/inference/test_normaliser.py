@@ -22,6 +22,12 @@ from tests.phantoms import box_mesh, smooth_image
 MESH = box_mesh(2)
 
 
+@pytest.fixture(autouse=True)
+def costly(monkeypatch):
+    """A mesh of few nodes treated like one of many."""
+    monkeypatch.setattr("bayesreg.model.posterior.CHEAP_NODES", 0)
+
+
 @cache
 def posterior():
     images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
