@@ -27,7 +27,7 @@ _HOME = {
     "independent_points": "model.independence",
     "make_pair": "model.simulation",
     "Start": "inference.initialise",
-    "StopRule": "inference.run",
+    "StopRule": "inference.stopping",
     "sample": "inference.run",
     "load_image": "io.volumes",
     "save_image": "io.volumes",

@@ -8,11 +8,12 @@ from pathlib import Path
 from rich.console import Console
 
 from bayesreg import pipeline
+from bayesreg.assembly import posterior_of, start_of
 from bayesreg.config import Config, load_config, resolved_yaml
 from bayesreg.config.sections import StopConfig, sampler_section
 from bayesreg.inference.efficiency import Budget, Efficiency, efficiency
-from bayesreg.inference.run import StopRule
 from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.stopping import StopRule
 from bayesreg.io import store
 from bayesreg.io.atomic import write_text
 from bayesreg.report.efficiency import Setting, efficiency_table, terminal_table, write_efficiencies
@@ -52,23 +53,15 @@ def compare_samplers(
     InputError
         If a name is unknown, the budget is not positive, or the configuration, a file or the folder is wrong.
     """
-    for name in samplers:
-        if name not in SAMPLERS:
-            raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
-    if not samplers or len({*samplers}) < len(samplers):
-        raise InputError(f"expected one or more samplers, none of them twice; got {', '.join(samplers) or 'none'}")
-    if not minutes > 0:
-        raise InputError(f"minutes must be positive, got {minutes:g}")
+    _require_sound(samplers, minutes)
     config = config if isinstance(config, Config) else load_config(config)
     store.require_fresh(out)
     console = Console(quiet=not progress, highlight=False)
     console.print("reading the images, meshing")
     inputs = pipeline.prepared_inputs(config)[0]
-    posterior, setting = pipeline.posterior_of(config, inputs), _setting(config, minutes)
-    start, rule = (
-        pipeline.start_of(config, inputs, posterior),
-        StopRule(config.stop.rhat, config.stop.ess, 60 * minutes),
-    )
+    posterior, setting = posterior_of(config, inputs), _setting(config, minutes)
+    start = start_of(config, inputs, posterior)
+    rule = StopRule(config.stop.rhat, config.stop.ess, 60 * minutes)
     found = []
     for name in samplers:
         console.print(f"{name}:")
@@ -94,6 +87,16 @@ def compare_samplers(
     console.print(terminal_table(efficiency_table(found, setting)))
     console.print(f"{page}")
     return found
+
+
+def _require_sound(samplers: Sequence[str], minutes: float) -> None:
+    for name in samplers:
+        if name not in SAMPLERS:
+            raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
+    if not samplers or len({*samplers}) < len(samplers):
+        raise InputError(f"expected one or more samplers, none of them twice; got {', '.join(samplers) or 'none'}")
+    if not minutes > 0:
+        raise InputError(f"minutes must be positive, got {minutes:g}")
 
 
 def _setting(config: Config, minutes: float) -> Setting:

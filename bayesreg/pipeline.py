@@ -11,31 +11,25 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 from rich.console import Console
 
+from bayesreg.assembly import posterior_of, start_of, with_initial
 from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.inference.checkpoint import Block, Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.diagnostics import Convergence, convergence, dataset, open_posterior, save_posterior, to_block
-from bayesreg.inference.initialise import Start
 from bayesreg.inference.run import (
-    Block,
-    Checkpoint,
     Samples,
-    StopRule,
     checkpoint_from_arrays,
-    checkpoint_to_arrays,
     first_checkpoint,
     sample,
 )
+from bayesreg.inference.stopping import StopRule
 from bayesreg.io import store
 from bayesreg.io.atomic import write_text
-from bayesreg.io.displacements import read_displacement
 from bayesreg.io.store import Inputs, Run
 from bayesreg.manifest import manifest
 from bayesreg.mesh import TetMesh
-from bayesreg.model.options import Lame, ModelConfig
-from bayesreg.model.posterior import Posterior, build_posterior
-from bayesreg.model.problem import cell_entries, lame_parameter
+from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
 from bayesreg.prediction import predict, require_inside
 from bayesreg.preparation import prepare
@@ -156,7 +150,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs)
         reached = _first(config, inputs, posterior, progress)
-        inputs = _with_initial(inputs, config)
+        inputs = with_initial(inputs, config)
         _store(out, inputs, _timed(provenance, began))
     say(_described(inputs))
     samples = _sample(config, posterior, reached, out, progress)
@@ -257,31 +251,6 @@ def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
     return Path(out)
 
 
-def posterior_of(config: Config, inputs: Inputs) -> Posterior:
-    """The posterior of a run, its solver preconditioned at the start parameters."""
-    reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
-    model = _model(config.model, inputs)
-    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, model, inputs.skull, reference)
-
-
-def _model(model: ModelConfig, inputs: Inputs) -> ModelConfig:
-    """The model of a configuration, its boundary held where that is known."""
-    if inputs.boundary is None:
-        return model
-    held = dict(zip(inputs.mesh.boundary.tolist(), map(tuple, np.asarray(inputs.boundary).tolist()), strict=True))
-    return ModelConfig(**{**dict(model), "sampled": [], "held": held})
-
-
-def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
-    """All entries of λ or μ at the start: as the configuration gives them, else as the model chooses."""
-    values = np.array(lame_parameter(name, mesh, config.model, None).reference)
-    given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
-    for index, tissue in enumerate(mesh.names):
-        if tissue in given:
-            values[entry[mesh.tissue == index]] = given[tissue]
-    return values
-
-
 def prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
     """The images, mesh and truth of a configuration, and where they come from."""
     prepared = prepare(config)
@@ -313,37 +282,6 @@ def _narrator(progress: bool) -> Callable[[str], None]:
 def _described(inputs: Inputs) -> str:
     mesh = inputs.mesh
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
-
-
-def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
-    """Where a configuration's chains begin."""
-    field = _start_field(config, inputs)
-    return Start(
-        field=None if field is None else field[posterior.sampled],
-        fraction=config.start.fraction,
-        lam=config.start.entries("lam", posterior.entry_names),
-        mu=config.start.entries("mu", posterior.entry_names),
-        spread=config.start.spread,
-    )
-
-
-def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
-    """Displacement of every node at fraction one, mm."""
-    wanted = config.start.field
-    if wanted == "identity":
-        return None
-    if wanted == "truth":
-        assert inputs.truth is not None
-        return np.asarray(inputs.truth.u)
-    return read_displacement(Path(wanted), inputs.mesh)
-
-
-def _with_initial(inputs: Inputs, config: Config) -> Inputs:
-    """The truth with the centre of the chains' starts, for the paper's Table 1."""
-    field = _start_field(config, inputs)
-    if inputs.truth is None or field is None:
-        return inputs
-    return inputs._replace(truth=inputs.truth._replace(initial=np.mean(config.start.fraction) * field))
 
 
 def _store(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from ruamel.yaml import YAML
 
 import bayesreg as br
 from bayesreg import pipeline, preparation
+from bayesreg.assembly import posterior_of
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy
@@ -190,7 +191,7 @@ def test_nothing_is_written_where_a_chain_cannot_start(folder):
 def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, monkeypatch, overrides, lam, mu):
     built = []
     monkeypatch.setattr(problem, "elastic_system", lambda *args: built.append(args) or elastic_system(*args))
-    posterior = pipeline.posterior_of(br.load_config(folder / "run.yaml", overrides), store.read_inputs(folder / "out"))
+    posterior = posterior_of(br.load_config(folder / "run.yaml", overrides), store.read_inputs(folder / "out"))
     assert len(built) == 1
     np.testing.assert_allclose(posterior.reference()["lam"], lam)
     np.testing.assert_allclose(posterior.reference()["mu"], mu)

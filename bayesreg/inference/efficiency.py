@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesreg.inference.checkpoint import Block, Checkpoint
 from bayesreg.inference.diagnostics import convergence
 from bayesreg.inference.initialise import Start
-from bayesreg.inference.run import Block, Checkpoint, Samples, StopRule, first_checkpoint, sample
+from bayesreg.inference.run import Samples, first_checkpoint, sample
+from bayesreg.inference.stopping import StopRule
 from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 

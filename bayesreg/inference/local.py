@@ -14,7 +14,7 @@ from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.reflection import reflective_leapfrog, rotated, shifted
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.warm_up import Tuning
-from bayesreg.inference.whitened import Moved, Setup, about_reference, clearance_of, whitened_density
+from bayesreg.inference.whitened import Density, Moved, Setup, about_reference, clearance_of, whitened_density
 from bayesreg.types import AnyArray
 
 # Steps of a random walk shrink with the square root of the dimension, and with what refuses them.
@@ -76,16 +76,8 @@ def rwmh_adaptive(
     takes the same way, so that the proposal is symmetric.
     """
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        def flight(key: AnyArray, position: AnyArray) -> AnyArray:
-            momentum = jax.random.normal(key, position.shape)
-            return shifted(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
-
-        state, info = random_walk.build_rmh()(key, state, whitened_density(target, data, setup), flight)
-        return state, Moved(info.acceptance_rate, densities=1)
-
     tuning = Tuning(warm_up, target_acceptance, LEAST)
-    return about_reference(target, transition, tuning, random_walk.init, mode_search=mode_search)
+    return _symmetric(target, shifted, whitened_density, tuning, mode_search)
 
 
 def pcn(
@@ -97,16 +89,22 @@ def pcn(
     unchanged and is reversible, so that the test sees only the ratio of the posterior to the reference.
     """
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        def turn(key: AnyArray, position: AnyArray) -> AnyArray:
-            momentum = jax.random.normal(key, position.shape)
-            return rotated(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
+    tuning = Tuning(warm_up, target_acceptance, LEAST)
+    return _symmetric(target, rotated, against_reference, tuning, mode_search)
 
-        state, info = random_walk.build_rmh()(key, state, against_reference(target, data, setup), turn)
+
+def _symmetric(target: SmoothTarget, motion: Callable, density: Density, tuning: Tuning, mode_search: str) -> Sampler:
+    """A motion with a Normal momentum for the time of a step, accepted with the ratio of a density."""
+
+    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+        def proposal(key: AnyArray, position: AnyArray) -> AnyArray:
+            momentum = jax.random.normal(key, position.shape)
+            return motion(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
+
+        state, info = random_walk.build_rmh()(key, state, density(target, data, setup), proposal)
         return state, Moved(info.acceptance_rate, densities=1)
 
-    tuning = Tuning(warm_up, target_acceptance, LEAST)
-    return about_reference(target, transition, tuning, random_walk.init, against_reference, mode_search)
+    return about_reference(target, transition, tuning, random_walk.init, density, mode_search)
 
 
 def against_reference(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:

@@ -11,75 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.diagnostics import Worst, to_inference_data, worst
+from bayesreg.inference.checkpoint import Block, Checkpoint, Tally, counted, no_steps
+from bayesreg.inference.diagnostics import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, starting_points
-from bayesreg.inference.kernel import Draw, Info, Sampler
-from bayesreg.inference.moments import Moments, greatest_rhat, pooled, scale_reduction, updated, zero_moments
+from bayesreg.inference.kernel import Draw, Sampler
+from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
 from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.stopping import StopRule, converged, out_of_time, reason
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
-
-
-class StopRule(NamedTuple):
-    """When to stop: converged, or out of budget.
-
-    Attributes
-    ----------
-    rhat : float, optional
-        Stop when R̂ is below this for every estimand; None never stops early. Without `ess` it is the paper's,
-        √(var⁺/W), unsplit; with it the rank-normalised, split one of Vehtari et al. (2021).
-    ess : float, optional
-        And when every estimand's bulk and tail effective sample sizes exceed this.
-    max_seconds : float, optional
-        Of sampling, compilation, search for the mode and warm-up included.
-    min_draws : int
-        Kept draws per chain before R̂ is believed.
-    """
-
-    rhat: float | None = None
-    ess: float | None = None
-    max_seconds: float | None = None
-    min_draws: int = 100
-
-
-class Tally(NamedTuple):
-    """Sums over steps, for each chain."""
-
-    steps: AnyArray
-    acceptance: AnyArray
-    outside_support: AnyArray
-    solver_failed: AnyArray
-    solver_iterations: AnyArray
-    diverging: AnyArray
-    gradients: AnyArray
-    densities: AnyArray
-
-
-class Checkpoint(NamedTuple):
-    """All that the next block needs (a pytree of arrays with chains as the leading axis).
-
-    Attributes
-    ----------
-    draws : int
-        Kept draws per chain so far.
-    setup : pytree
-        What the sampler found before its first step.
-    state : pytree
-    moments : Moments
-        Of the estimands and of u at every node.
-    tally : Tally
-        Summed over all steps so far.
-    seconds : float
-        Spent sampling so far.
-    """
-
-    draws: AnyArray
-    setup: Any
-    state: Any
-    moments: Moments
-    tally: Tally
-    seconds: AnyArray
 
 
 class Samples(NamedTuple):
@@ -113,9 +54,6 @@ class Samples(NamedTuple):
     reason: str
     seconds: float
     exact: bool
-
-
-Block = dict[str, np.ndarray]
 
 
 def sample(
@@ -225,11 +163,6 @@ def first_checkpoint(
     return checkpoint._replace(seconds=np.array(time.perf_counter() - began))
 
 
-def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
-    """A checkpoint as named arrays, for a file."""
-    return {f"leaf_{i:03d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(checkpoint))}
-
-
 def checkpoint_from_arrays(
     arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: Any
 ) -> Checkpoint:
@@ -255,8 +188,7 @@ def _first(kernel: Sampler, data: Any, setup: Any, points: Any) -> Checkpoint:
     chains = len(next(iter(points.values())))
     shapes = jax.eval_shape(jax.vmap(partial(kernel.observe, data, setup)), state)
     moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), _watched(shapes)))
-    zeros = jnp.zeros(chains)
-    return Checkpoint(np.array(0), setup, state, moments, Tally(*(zeros,) * len(Tally._fields)), np.array(0.0))
+    return Checkpoint(np.array(0), setup, state, moments, no_steps((chains,)), np.array(0.0))
 
 
 def _observed(kernel: Sampler, checkpoint: Checkpoint) -> Draw:
@@ -312,10 +244,9 @@ def _run_block(  # type: ignore[no-untyped-def]
             def one_step(i, carry):  # type: ignore[no-untyped-def]
                 state, window = carry
                 state, info = kernel.step(data, setup, jax.random.fold_in(key, draw * thin + i), state)
-                return state, _counted(window, info)
+                return state, counted(window, info)
 
-            nothing = Tally(*(jnp.zeros(()),) * len(Tally._fields))
-            state, window = jax.lax.fori_loop(0, thin, one_step, (state, nothing))
+            state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
             drawn = kernel.observe(data, setup, state)
             moments = updated(moments, _watched(drawn))
             return (state, moments, jax.tree.map(jnp.add, tally, window)), _kept(drawn, window)
@@ -324,19 +255,6 @@ def _run_block(  # type: ignore[no-untyped-def]
         return *carry, kept
 
     return jax.vmap(chain)(chain_keys, state, moments, tally)
-
-
-def _counted(window: Tally, info: Info) -> Tally:
-    return Tally(
-        steps=window.steps + 1,
-        acceptance=window.acceptance + info.acceptance_rate,
-        outside_support=window.outside_support + info.outside_support,
-        solver_failed=window.solver_failed + info.solver_failed,
-        solver_iterations=window.solver_iterations + info.solver_iterations,
-        diverging=window.diverging + info.diverging,
-        gradients=window.gradients + info.gradients,
-        densities=window.densities + info.densities,
-    )
 
 
 def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:
@@ -365,7 +283,7 @@ def _until(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """The blocks up to the one at which the stop rule holds; `blocks` are those before, which the caller extends."""
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    while not (_converged(stop, checkpoint, blocks) or _out_of_time(stop, checkpoint)):
+    while not (converged(stop, checkpoint, blocks) or out_of_time(stop, checkpoint)):
         found = next(advance, None)
         if found is None:
             return
@@ -374,60 +292,20 @@ def _until(
         yield found
 
 
-def _converged(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block]) -> bool:
-    if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
-        return False
-    running = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
-    if stop.ess is None:
-        return running < stop.rhat
-    # The running R̂ is cheap and close to the strict one: where it is far off, that need not be worked out.
-    return running < 1 + 1.5 * (stop.rhat - 1) and _meets(worst(blocks), stop)
-
-
-def _meets(found: Worst, stop: StopRule) -> bool:
-    assert stop.rhat is not None
-    assert stop.ess is not None
-    return found.rhat < stop.rhat and min(found.ess_bulk, found.ess_tail) > stop.ess
-
-
-def _out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
-    # A first block is drawn however long the search for the mode took: a run ends with draws.
-    begun = int(checkpoint.draws) > 0
-    return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
-
-
 def _samples(
     posterior: Target, kernel: Sampler, blocks: list[Block], checkpoint: Checkpoint, stop: StopRule, draws: int
 ) -> Samples:
     mean, sd = pooled(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
-    converged = None if stop.rhat is None else _converged(stop, checkpoint, blocks)
+    holds = None if stop.rhat is None else converged(stop, checkpoint, blocks)
     return Samples(
         idata=to_inference_data(posterior, blocks),
         u_mean=mean["u"],
         u_sd=sd["u"],
         rhat=rhat,
         tally=jax.tree.map(np.asarray, checkpoint.tally),
-        converged=converged,
-        reason=_reason(stop, checkpoint, blocks, converged, draws),
+        converged=holds,
+        reason=reason(stop, checkpoint, blocks, holds, draws),
         seconds=float(checkpoint.seconds),
         exact=kernel.exact,
     )
-
-
-def _reason(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block], converged: bool | None, draws: int) -> str:
-    if stop.ess is None:
-        greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
-        state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"it below {stop.rhat}"
-    else:
-        found = worst(blocks)
-        state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"
-        rule = f"R̂ below {stop.rhat} and both ESS above {stop.ess:g}"
-    if converged:
-        return f"every estimand has converged: {state}"
-    limit = f"{draws} draws per chain"
-    if _out_of_time(stop, checkpoint):
-        limit = f"{stop.max_seconds:g} s of sampling"
-    if stop.rhat is None:
-        return f"the budget of {limit} is spent; no convergence rule was set ({state})"
-    return f"the budget of {limit} is spent before convergence: {state}; the rule asks for {rule}"

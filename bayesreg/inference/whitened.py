@@ -93,14 +93,12 @@ def whitened_position(target: SmoothTarget, reference: Reference, xi: AnyArray) 
 def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ), up to a constant, with the stand-in for its normaliser."""
     reference = setup.reference
-    seen = target.without_normaliser(data) if target.costly_normaliser else data
-
-    def density(xi: AnyArray) -> AnyArray:
-        return target.logdensity_of(seen, whitened_position(target, reference, xi))
-
     if not target.costly_normaliser:
-        return density
-    return lambda xi: density(xi) + setup.stand_in(reference.factor @ xi)
+        return lambda xi: target.logdensity_of(data, whitened_position(target, reference, xi))
+    plain = target.without_normaliser(data)
+    return lambda xi: (
+        target.logdensity_of(plain, whitened_position(target, reference, xi)) + setup.stand_in(reference.factor @ xi)
+    )
 
 
 def clearance_of(target: SmoothTarget, data: Any, setup: Setup) -> Clearance:
@@ -168,16 +166,6 @@ def about_reference(
         estimands = estimands_of(data, setup, state)
         return Draw(estimands, target.evaluate_estimands(data, estimands))
 
-    def flat_of(setup: Setup, state: Any) -> AnyArray:
-        return setup.reference.centre + setup.reference.factor @ state.position
-
-    def init_delayed(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
-        return Delayed(init(data, setup, estimands), target.log_normaliser(data, estimands))
-
-    def observe_delayed(data: Any, setup: Setup, state: Delayed) -> Draw:
-        estimands, evaluation = observe(target.without_normaliser(data), setup, state.kernel)
-        return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
-
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         found = search_modes(target, points, mode_search == "per_chain", say)
         key_start, key_tune = jax.random.split(key)
@@ -203,11 +191,26 @@ def about_reference(
         d = len(ravel_pytree(target.unconstrain(target.reference()))[0])
         return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))))
 
+    sampler = Sampler(prepare, conditioned, blank, init, step, observe, exact)
     # What is approximate anyway does without the normaliser's own value.
-    if target.costly_normaliser and exact:
-        whole_step = delayed(step, flat_of, partial(log_normaliser_at, target))
-        return Sampler(prepare, conditioned, blank, init_delayed, whole_step, observe_delayed, exact)
-    return Sampler(prepare, conditioned, blank, init, step, observe, exact)
+    return _with_normaliser(target, sampler) if target.costly_normaliser and exact else sampler
+
+
+def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
+    """A sampler of the density with the stand-in made one of the density with the normaliser."""
+
+    def init(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
+        return Delayed(sampler.init(data, setup, estimands), target.log_normaliser(data, estimands))
+
+    def observe(data: Any, setup: Setup, state: Delayed) -> Draw:
+        estimands, evaluation = sampler.observe(target.without_normaliser(data), setup, state.kernel)
+        return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
+
+    def flat_of(setup: Setup, state: Any) -> AnyArray:
+        return setup.reference.centre + setup.reference.factor @ state.position
+
+    step = delayed(sampler.step, flat_of, partial(log_normaliser_at, target))
+    return sampler._replace(init=init, step=step, observe=observe)
 
 
 def _averaged(target: SmoothTarget, setup: Setup, points: Any) -> Setup:

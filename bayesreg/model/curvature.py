@@ -84,11 +84,11 @@ def _degrees(nodes: np.ndarray) -> np.ndarray:
 
 
 def _normal_matrix(mesh: TetMesh, data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
-    """2/T_s Σ_q w_q ∇m ∇mᵀ N_a N_b at x_q + u(x_q): the curvature of E_s/T_s in all nodes."""
+    """2/T_s Σ_q w_q ∇m ∇mᵀ N_a N_b at x_q + u(x_q), tempered: the curvature of the log likelihood in all nodes."""
     gradient = np.asarray(_image_gradient(data, jnp.asarray(u)))
     quadrature = data.quadrature
-    count = len(gradient)
-    weighted = np.sqrt(2 * np.asarray(quadrature.weights) / float(data.t_similarity))[:, None] * gradient
+    count, share = len(gradient), float(data.independent_share)
+    weighted = np.sqrt(2 * share * np.asarray(quadrature.weights) / float(data.t_similarity))[:, None] * gradient
     entries = np.asarray(quadrature.barycentric)[:, :, None] * weighted[:, None]
     columns = _degrees(mesh.cells[np.asarray(quadrature.cells)].ravel()).reshape(count, 12)
     rows = np.repeat(np.arange(count), 12)

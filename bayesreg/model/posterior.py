@@ -4,73 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
-from typing import NamedTuple
+from functools import cached_property, lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpyro.infer.util import log_density
 
 from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
+from bayesreg.model import evaluation
 from bayesreg.model.constraint import is_allowed
+from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import FIELD, LAME, Values, complete, lame_by_cell, to_estimands, transform, whitened
 from bayesreg.model.curvature import displacement_precision
+from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.problem import registration_data
-from bayesreg.model.program import (
-    RegistrationData,
-    in_support,
-    log_elastic_normaliser,
-    registration,
-    stiffness_factor,
-)
+from bayesreg.model.program import RegistrationData, in_support, stiffness_factor
 from bayesreg.model.similarity import SIMILARITIES, Noise
-from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, InputError, Scalar
-
-# Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
-# instead of seven left single nodes of the paper's pair in wrong places, up to 15 mm off.
-SMOOTHING = (
-    (6.0, 30.0, 0.01), (4.0, 30.0, 0.02), (3.0, 20.0, 0.03), (2.0, 10.0, 0.05), (1.5, 5.0, 0.1), (1.0, 3.0, 0.3),
-    (0.5, 1.0, 1.0),
-)  # fmt: skip
-
 
 # Up to this many nodes the elastic prior's normaliser may stand in every step of a trajectory.
 CHEAP_NODES = 200
 
 # Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
 NEAR = 1e3
-
-
-class Evaluation(NamedTuple):
-    """The log density at one place, and what was found on the way.
-
-    Attributes
-    ----------
-    logdensity : scalar
-        log p(u, λ, μ | m) up to a constant; −∞ outside the support and where the solve failed.
-    u : (n, 3) array
-        Displacement of every node, mm.
-    similarity_energy, strain_energy : scalars
-        E_s and E_r; with "student_t" E_s is −T_s times the log of the likelihood without its normaliser.
-    solver_iterations : scalar integer
-    solver_failed, outside_support : scalar bools
-        Whether the elastic solve failed; whether a sampled node lies in Ω_SK or a parameter outside the
-        range of its prior.
-    """
-
-    logdensity: Scalar
-    u: Float[AnyArray, "nodes 3"]
-    similarity_energy: Scalar
-    strain_energy: Scalar
-    solver_iterations: Int[AnyArray, ""]
-    solver_failed: Bool[AnyArray, ""]
-    outside_support: Bool[AnyArray, ""]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +97,7 @@ class Posterior:
     def evaluate(self, values: Values) -> Evaluation:
         """`logdensity_constrained` with the energies, the full displacement and the state of the solve."""
         self._require_shapes(values)
-        return _evaluate(self.data, dict(values), self.options.similarity)
+        return evaluation.evaluate(self.data, dict(values), self.options.similarity)
 
     def evaluate_estimands(
         self,
@@ -149,7 +109,7 @@ class Posterior:
 
         With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
         """
-        return _evaluate(data, complete(data, estimands, self.free), self.options.similarity, guess)
+        return evaluation.evaluate(data, complete(data, estimands, self.free), self.options.similarity, guess)
 
     @property
     def costly_normaliser(self) -> bool:
@@ -165,7 +125,7 @@ class Posterior:
 
         The same for all displacements: what moves these alone does not need it.
         """
-        return _log_normaliser(data, complete(data, estimands, self.free))
+        return evaluation.log_normaliser(data, complete(data, estimands, self.free))
 
     def supports(self, data: RegistrationData, estimands: Values) -> Bool[AnyArray, ""]:
         """Whether estimands lie where the density may be positive; costs no elastic solve."""
@@ -194,27 +154,8 @@ class Posterior:
         return data._replace(skull_distance=None)
 
     def continuation(self) -> Iterator[tuple[RegistrationData, bool]]:
-        """Problems of growing difficulty that lead to this one, and whether each moves λ, μ and the temperatures.
-
-        Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement
-        of many times its posterior standard deviation is found step by step. The last two are the
-        posterior itself, first in the displacements alone. Where no node is sampled, the last is all there is.
-        """
-        for sigma, similarity, elastic in SMOOTHING if len(self.sampled) else ():
-            fixed, moving = (image.smoothed(sigma) for image in (self.fixed, self.moving))
-            data = self.data
-            yield (
-                data._replace(
-                    moving=moving.interpolator(self.options.interpolation),
-                    fixed_values=fixed.interpolate(data.positions, self.options.interpolation),
-                    t_similarity=similarity * data.t_similarity,
-                    t_elastic=elastic * data.t_elastic,
-                ),
-                False,
-            )
-        if len(self.sampled):
-            yield self.data, False
-        yield self.data, True
+        """Problems of growing difficulty that lead to this one, and whether each moves more than displacements."""
+        return continuation(self.data, self.fixed, self.moving, self.options.interpolation)
 
     def conditioned(self, estimands: Values) -> RegistrationData:
         """The data of the same problem, the solves preconditioned at these λ, μ and field: faster near them."""
@@ -304,7 +245,7 @@ class Posterior:
 
     def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """f(x_q) − m(x_q + u(x_q)) at the quadrature points."""
-        return _residuals(self.data, jnp.asarray(u))
+        return evaluation.residuals(self.data, jnp.asarray(u))
 
     def noise_sd(self, t_similarity: float) -> float:
         """The noise that a temperature T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
@@ -344,7 +285,7 @@ class Posterior:
             "log_prior_field" of those inferred.
         """
         self._require_shapes(values)
-        return _terms(self.data, dict(values), self.options.similarity)
+        return evaluation.terms(self.data, dict(values), self.options.similarity)
 
     def _require_shapes(self, values: Values) -> None:
         expected = {"u_boundary": (len(self.sampled), 3), **{n: getattr(self.data, n).low.shape for n in LAME}}
@@ -400,40 +341,3 @@ def build_posterior(
 @lru_cache(maxsize=2)
 def _conditioned_system(posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...]) -> ElasticSystem:
     return elastic_system(posterior.mesh, np.asarray(posterior.data.system.prescribed), np.array(lam), np.array(mu))
-
-
-@partial(jax.jit, static_argnames="similarity")
-def _evaluate(
-    data: RegistrationData,
-    values: dict[str, AnyArray],
-    similarity: str,
-    guess: Float[AnyArray, "nodes 3"] | None = None,
-) -> Evaluation:
-    total, trace = log_density(registration, (data, similarity, guess), {}, values)
-    found = {name: trace[name]["value"] for name in Evaluation._fields if name != "logdensity"}
-    # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
-    return Evaluation(logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), **found)
-
-
-@partial(jax.jit, static_argnames="similarity")
-def _terms(data: RegistrationData, values: dict[str, AnyArray], similarity: str) -> dict[str, Scalar]:
-    _, trace = log_density(registration, (data, similarity), {}, values)
-    terms = {name: trace[name]["value"] for name in ("similarity_energy", "strain_energy")}
-    for name in (name for name in trace if name.startswith("log_")):
-        terms[name] = trace[name]["fn"].log_prob(trace[name]["value"])
-    for name in (name for name in (*LAME, *data.scales, "field") if name in values):
-        terms[f"log_prior_{name}"] = trace[name]["fn"].log_prob(values[name])
-    return terms
-
-
-@jax.jit
-def _log_normaliser(data: RegistrationData, values: dict[str, AnyArray]) -> Scalar:
-    field = {name: values[name] for name in FIELD if name in values}
-    t_elastic = values.get("t_elastic", data.t_elastic)
-    return log_elastic_normaliser(data, values["lam"], values["mu"], t_elastic, **field)
-
-
-@jax.jit
-def _residuals(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
-    displacement = displacement_at(data.system.elements, data.quadrature, u)
-    return data.fixed_values - data.moving(data.positions + displacement)

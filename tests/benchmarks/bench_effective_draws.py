@@ -18,8 +18,8 @@ import numpy as np
 import xarray as xr
 
 import bayesreg as br
+from bayesreg.assembly import posterior_of
 from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.pipeline import posterior_of
 from tests.inference.random_walk import ess_per_step, gaussian_walk
 
 CONFIG = Path(__file__).parents[2] / "configs" / "converged_tissues.yaml"

@@ -17,7 +17,7 @@ import bayesreg as br
 from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
 from bayesreg.inference.diagnostics import convergence, dataset
-from bayesreg.inference.run import StopRule
+from bayesreg.inference.stopping import StopRule
 from bayesreg.io.datasets import mni152
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain, save_mesh
 from bayesreg.model.simulation import SyntheticPair, make_pair

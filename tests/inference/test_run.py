@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.diagnostics import convergence, open_posterior, save_posterior
 from bayesreg.inference.initialise import starting_points
-from bayesreg.inference.run import checkpoint_from_arrays, checkpoint_to_arrays
+from bayesreg.inference.run import checkpoint_from_arrays
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)

@@ -10,9 +10,10 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.laplace import Reference
 from bayesreg.inference.modes import distance, search_modes
-from bayesreg.inference.run import checkpoint_from_arrays, checkpoint_to_arrays
+from bayesreg.inference.run import checkpoint_from_arrays
 from bayesreg.inference.samplers import SAMPLERS
 from bayesreg.inference.whitened import setup_about
 from tests.inference.gaussians import DIMENSION, GaussianTarget

@@ -65,7 +65,7 @@ def assert_same_density(found, expected, tolerance=1e-9):
     assert np.ptp(found - expected) < tolerance * spread
 
 
-def compare(post, paper, trial, tolerance=1e-9):
+def assert_densities_agree(post, paper, trial, tolerance=1e-9):
     found = [float(post.logdensity_constrained(s.values)) for s in trial]
     assert_same_density(found, [paper.logdensity(*s) for s in trial], tolerance)
 
@@ -75,7 +75,7 @@ def compare(post, paper, trial, tolerance=1e-9):
 def test_density_is_the_papers(elasticity, interpolation):
     paper = oracle(MESH.boundary, interpolation=interpolation)
     post = posterior(elasticity=elasticity, interpolation=interpolation)
-    compare(post, paper, states(len(MESH.boundary), elasticity))
+    assert_densities_agree(post, paper, states(len(MESH.boundary), elasticity))
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -83,7 +83,7 @@ def test_density_far_off_the_moving_images_grid(interpolation):
     """Tens of mm: many points leave the grid, where the image continues with its nearest value."""
     trial = [s._replace(u=20 * s.u) for s in states(len(MESH.boundary), "tissue")]
     paper = oracle(MESH.boundary, interpolation=interpolation)
-    compare(posterior(interpolation=interpolation), paper, trial)
+    assert_densities_agree(posterior(interpolation=interpolation), paper, trial)
     reached = MOVING.world_to_voxel(MESH.points[MESH.boundary] + trial[-1].u)
     assert ((reached < 0) | (reached > np.array(MOVING.shape) - 1)).any(axis=1).mean() > 0.1
 
@@ -122,16 +122,18 @@ def test_chains_side_by_side_do_not_disturb_one_another():
 @pytest.mark.parametrize("quadrature", ["gauss32", "voxels"])
 def test_density_with_other_quadratures(quadrature):
     paper = oracle(MESH.boundary, quadrature=quadrature)
-    compare(posterior(quadrature=quadrature), paper, states(len(MESH.boundary), "tissue"))
+    assert_densities_agree(posterior(quadrature=quadrature), paper, states(len(MESH.boundary), "tissue"))
 
 
 def test_density_at_the_papers_contrast():
     trial = [s._replace(lam=PAPER_LAM * s.lam, mu=PAPER_MU * s.mu) for s in states(len(MESH.boundary), "tissue")]
-    compare(posterior(), oracle(MESH.boundary), trial)
+    assert_densities_agree(posterior(), oracle(MESH.boundary), trial)
 
 
 def test_density_with_a_rigid_prior():
-    compare(posterior(rigid_sd=0.4), oracle(MESH.boundary, rigid_sd=0.4), states(len(MESH.boundary), "tissue"))
+    assert_densities_agree(
+        posterior(rigid_sd=0.4), oracle(MESH.boundary, rigid_sd=0.4), states(len(MESH.boundary), "tissue")
+    )
     weak, strong = (oracle(MESH.boundary, rigid_sd=sd) for sd in (4.0, 0.4))
     state = states(len(MESH.boundary), "tissue")[0]
     assert abs(weak.logdensity(*state) - strong.logdensity(*state)) > 0.1
@@ -169,7 +171,7 @@ def test_density_with_beta_priors_and_a_fixed_parameter(elasticity):
     trial = states(len(MESH.boundary), elasticity)
     for state in trial:
         state.mu[known] = 0.8
-    compare(posterior(elasticity=elasticity, fixed=fixed, priors=priors), paper, trial)
+    assert_densities_agree(posterior(elasticity=elasticity, fixed=fixed, priors=priors), paper, trial)
 
 
 def test_density_with_one_prior_for_each_tissue():
@@ -188,7 +190,7 @@ def test_density_of_other_sampled_nodes(sampled, held):
     nodes = {"boundary": MESH.boundary, "all": np.arange(len(MESH.points)), "some": np.sort(SUBSET)}[sampled]
     nodes = np.setdiff1d(nodes, list(held))
     post = posterior(sampled=SUBSET[::-1] if sampled == "some" else sampled, held=held)
-    compare(post, oracle(nodes, held=held), states(len(nodes), "tissue"))
+    assert_densities_agree(post, oracle(nodes, held=held), states(len(nodes), "tissue"))
 
 
 def test_held_nodes_matter():
@@ -215,7 +217,7 @@ def test_incompressibility_may_vanish():
     trial = states(len(MESH.boundary), "tissue")
     for state in trial:
         state.lam[1] = 0.0
-    compare(posterior(), oracle(MESH.boundary), trial)
+    assert_densities_agree(posterior(), oracle(MESH.boundary), trial)
 
 
 @pytest.mark.parametrize("name", ["u_boundary", "lam", "mu"])

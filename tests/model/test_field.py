@@ -152,10 +152,11 @@ def test_gradient_against_differences():
         assert float((gradient[name] * direction).sum()) == pytest.approx(difference, rel=1e-5), name
 
 
-def test_curvature_is_gauss_newtons():
-    """dᵀHd = 2/T_s Σ w (∂r/∂d)² + |d_z|² + 2 E_r(d_u)/T_r, the derivative of the residual by central differences."""
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_curvature_is_gauss_newtons(share):
+    """dᵀHd = 2s/T_s Σ w (∂r/∂d)² + |d_z|² + 2 E_r(d_u)/T_r with a share s of independent points; ∂r by differences."""
     post, place = example(), values(u_sd=0.3)
-    data, estimands = post.data, post.estimands(place)
+    data, estimands = post.data._replace(independent_share=jnp.asarray(share)), post.estimands(place)
     H = post.displacement_precision(data, estimands)
     assert H.shape == (MODES + 3 * len(MESH.boundary),) * 2
     assert np.linalg.eigvalsh(H).min() > -1e-6 * np.trace(H)
@@ -171,7 +172,7 @@ def test_curvature_is_gauss_newtons():
         # E_r is quadratic in u_B.
         still = {"u_boundary": d["u_boundary"]}
         energy = post.evaluate(place | still).strain_energy
-        expected = 2 / 5.0 * (data.quadrature.weights @ slope**2) + (d["field"] ** 2).sum() + 2 * energy / 100.0
+        expected = 2 * share / 5.0 * (data.quadrature.weights @ slope**2) + (d["field"] ** 2).sum() + 2 * energy / 100.0
         flat = np.concatenate([np.ravel(d[name]) for name in KEYS])
         assert flat @ H @ flat == pytest.approx(float(expected), rel=1e-5)
 
