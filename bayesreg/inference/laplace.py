@@ -15,14 +15,17 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 from bayesreg.inference.hierarchy import balanced, is_scale
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
 # The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
 SOFTNESS, GAP = 0.05, 0.02
 # The logarithm z of a parameter that only its flat prior and the elastic energy see has the density exp(z − e^z): its
-# variance π²/6 is more than the inverse of its curvature, one, at the mode.
-LEAST_CURVATURE, UNSEEN, INFLATION = 1.0, 4.0, np.pi**2 / 6
+# variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
+# Gaussian crosses its exponential tail.
+LEAST_CURVATURE, UNSEEN, INFLATION = 1.0, 4.0, np.pi**2 / 3
+# Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
+LEAST_RATIO = 0.25
 
 
 class Reference(NamedTuple):
@@ -145,16 +148,49 @@ def laplace(
     return _gaussian(flat, precision_at(target, flat, data, joint))
 
 
-def averaged(
-    target: SmoothTarget, centre: Float[np.ndarray, "dimension"], places: Sequence[Float[np.ndarray, "dimension"]]
-) -> Reference:
-    """The Gaussian about a centre whose precision is the mean of those there and at other places.
+def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+    """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `pulled` by all.
 
-    Where the images say little at the mode and much beside it, the curvature at the mode alone makes the reference too
-    wide, and trajectories meet forces in it that ask for short steps.
+    Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
+    wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
+    large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with the parameter,
+    and its mean over places would be that of the largest.
     """
-    found = [precision_at(target, flat) for flat in (centre, *places)]
-    return _gaussian(centre, np.mean(found, axis=0))
+    curvatures = [_curvature(target, target.data, flat) for flat in flats]
+    approximate = np.mean([found.gauss_newton for found in curvatures], axis=0)
+    curvature = _convex(_regular(approximate), np.mean([found.remainder for found in curvatures], axis=0))
+    return pulled(target, _gaussian(flats[0], _jointly(target, target.data, flats[0], curvature, joint=True)), flats)
+
+
+def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+    """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
+
+    Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
+    Gaussian's own, whose motion is reflected exactly; kicks are left with what is beyond second order.
+    """
+    data = target.without_walls(target.data)
+    slopes = np.mean([np.asarray(_slope(target, data, jnp.asarray(flat))) for flat in flats], axis=0)
+    factor = np.asarray(reference.factor)
+    return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + factor @ (factor.T @ slopes)))
+
+
+@partial(jax.jit, static_argnums=0)
+def _slope(target: SmoothTarget, data: Any, flat: AnyArray) -> AnyArray:
+    return jax.grad(lambda x: target.logdensity_of(data, unravel(target)(x)))(flat)
+
+
+def _convex(
+    approximate: Float[np.ndarray, "rows rows"], remainder: Float[np.ndarray, "rows rows"]
+) -> Float[np.ndarray, "rows rows"]:
+    """The sum of a positive definite curvature and another, made positive definite.
+
+    In coordinates that whiten the first, eigenvalues of the sum count by their size, and as no less than `LEAST_RATIO`.
+    """
+    lower = np.linalg.cholesky(approximate)
+    half = scipy.linalg.solve_triangular(lower, remainder, lower=True)
+    values, vectors = np.linalg.eigh(scipy.linalg.solve_triangular(lower, half.T, lower=True))
+    vectors = lower @ vectors
+    return (vectors * np.maximum(np.abs(1 + values), LEAST_RATIO)) @ vectors.T
 
 
 def _gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]) -> Reference:
@@ -181,16 +217,33 @@ def precision_at(
         Whether the other coordinates are given curvature; else they are left uncorrelated.
     """
     data = target.data if data is None else data
+    return _jointly(target, data, flat, _regular(_curvature(target, data, flat).gauss_newton), joint)
+
+
+def _curvature(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
+    return target.displacement_curvature(data, target.constrain_of(data, unravel(target)(jnp.asarray(flat))))
+
+
+def _regular(curvature: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
+    """A trace of the identity keeps directions finite that neither images nor elasticity see."""
+    return curvature + 1e-9 * np.trace(curvature) * np.eye(len(curvature))
+
+
+def _jointly(
+    target: SmoothTarget,
+    data: Any,
+    flat: Float[np.ndarray, "dimension"],
+    curvature: Float[np.ndarray, "rows rows"],
+    joint: bool,
+) -> Float[np.ndarray, "dimension dimension"]:
+    """The curvature in all coordinates, given that in the displacements and, jointly, the field."""
     curved = _curved(target, joint)
     count = int((~curved).sum())
-    # The coordinates whose curvature is Gauss–Newton's come last.
+    # The coordinates whose curvature is given come last; a field may be among those given and not among them.
     order = np.argsort(curved, kind="stable")
     precision = np.zeros((len(flat), len(flat)))
-    estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
-    curvature = np.asarray(target.displacement_precision(data, estimands))
-    curvature = curvature[len(curvature) + count - len(flat) :, len(curvature) + count - len(flat) :]
-    # A trace of the identity keeps directions finite that neither images nor elasticity see.
-    precision[count:, count:] = curvature + 1e-9 * np.trace(curvature) * np.eye(len(curvature))
+    first = len(curvature) - int(curved.sum())
+    precision[count:, count:] = curvature[first:, first:]
     if joint and count:
         directions = jnp.eye(len(flat))[order[:count]]
         rows = -np.asarray(_hessian_rows(target, target.without_walls(data), jnp.asarray(flat), directions))[:, order]

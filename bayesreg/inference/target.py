@@ -24,6 +24,14 @@ class Evaluation(Protocol):
 
 
 @runtime_checkable
+class Curvature(Protocol):
+    """Of minus a log density: a positive semidefinite part, and what the exact one has besides."""
+
+    gauss_newton: AnyArray
+    remainder: AnyArray
+
+
+@runtime_checkable
 class Target(Protocol):
     """A posterior as the samplers see it; `bayesreg.Posterior` is one.
 
@@ -109,5 +117,5 @@ class SmoothTarget(Target, Protocol):
     def continuation(self) -> Iterable[tuple[Any, bool]]:
         """Data of ever harder problems that end with this one, and whether each moves more than displacements."""
 
-    def displacement_precision(self, data: Any, estimands: Estimands) -> AnyArray:
-        """Positive semidefinite curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""
+    def displacement_curvature(self, data: Any, estimands: Estimands) -> Curvature:
+        """Curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""

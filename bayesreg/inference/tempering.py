@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
+from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.hamiltonian import hmc
 from bayesreg.inference.kernel import Sampler, Say
@@ -18,6 +19,7 @@ from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.whitened import (
     Setup,
     clearance_of,
+    whitened,
     whitened_density,
     whitened_position,
 )
@@ -61,10 +63,13 @@ def smc(
         chains = len(next(iter(points.values())))
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
-        setup, _ = chains_of.prepare(points, key, say)
+        setup, starts = chains_of.prepare(points, key, say)
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
-        first = _broad(target, data, setup, spread, jax.random.split(key_first, particles))
+        begin = whitened(
+            setup.reference, ravel_pytree(target.unconstrain_of(data, jax.tree.map(lambda x: x[0], starts)))[0]
+        )
+        first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
         found, weights = _tempered(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
@@ -74,8 +79,10 @@ def smc(
 
 
 @partial(jax.jit, static_argnums=0)
-def _broad(target: SmoothTarget, data: Any, setup: Setup, spread: AnyArray | float, keys: AnyArray) -> AnyArray:
-    """Draws of N(0, spread² I) cut off by the skull: from the mode, by quarter turns about it."""
+def _broad(
+    target: SmoothTarget, data: Any, setup: Setup, begin: AnyArray, spread: AnyArray | float, keys: AnyArray
+) -> AnyArray:
+    """Draws of N(0, spread² I) cut off by the skull: from a place in the support, by quarter turns."""
     clearance = clearance_of(target, data, setup)
 
     def draw(key: AnyArray) -> AnyArray:
@@ -84,7 +91,7 @@ def _broad(target: SmoothTarget, data: Any, setup: Setup, spread: AnyArray | flo
             turned, _ = rotated(setup.walls, clearance, position, momentum, jnp.pi / 2)
             return jnp.where(jnp.isfinite(turned).all(), turned, position), None
 
-        return jax.lax.scan(turn, jnp.zeros_like(setup.reference.centre), jax.random.split(key, _TURNS))[0]
+        return jax.lax.scan(turn, begin, jax.random.split(key, _TURNS))[0]
 
     return jax.lax.map(draw, keys, batch_size=_BATCH)
 

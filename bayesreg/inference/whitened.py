@@ -17,7 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
-from bayesreg.inference.laplace import Reference, averaged, unravel
+from bayesreg.inference.laplace import Reference, averaged, pulled, unravel
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
 from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
@@ -170,9 +170,11 @@ def about_reference(
         found = search_modes(target, points, mode_search == "per_chain", say)
         key_start, key_tune = jax.random.split(key)
         keys = jax.random.split(key_start, len(found.chains))
-        setups = [setup_about(target, reference) for reference in found.references]
+        modes = [np.asarray(reference.centre) for reference in found.references]
+        about = [pulled(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
+        setups = [setup_about(target, reference) for reference in about]
         setups[0] = setups[0]._replace(stand_in=stand_in(target, setups[0].reference))
-        starts = [_overdispersed(target, setup, keys) for setup in setups]
+        starts = [_overdispersed(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
@@ -182,7 +184,7 @@ def about_reference(
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
         key_settle, key_tune = jax.random.split(key_tune)
         _, points = tuned(data, kernel, setup, points, key_settle, stage)
-        return tuned(data, kernel, _averaged(target, setup, points), points, key_tune, stage, say)
+        return tuned(data, kernel, _averaged(target, setup, modes[0], points), points, key_tune, stage, say)
 
     def conditioned(setup: Setup) -> Any:
         return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.reference.centre)))
@@ -213,15 +215,14 @@ def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _averaged(target: SmoothTarget, setup: Setup, points: Any) -> Setup:
-    """The setup whitened by the mean of the curvatures at the mode and where the chains are."""
+def _averaged(target: SmoothTarget, setup: Setup, mode: AnyArray, points: Any) -> Setup:
+    """The setup about the Gaussian averaged over the mode and where the chains are."""
     flats = jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points)
     sound = [flat for flat in np.asarray(flats) if np.isfinite(flat).all()]
-    reference = averaged(target, np.asarray(setup.reference.centre), sound)
-    return setup_about(target, reference)._replace(stand_in=setup.stand_in)
+    return setup_about(target, averaged(target, [mode, *sound]))._replace(stand_in=setup.stand_in)
 
 
-def _overdispersed(target: SmoothTarget, setup: Setup, keys: AnyArray) -> Any:
+def _overdispersed(target: SmoothTarget, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
     """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support.
 
     Raises
@@ -229,9 +230,9 @@ def _overdispersed(target: SmoothTarget, setup: Setup, keys: AnyArray) -> Any:
     InputError
         If a chain finds no place in the support.
     """
-    width = np.full(len(keys), OVERDISPERSION)
+    width, begin = np.full(len(keys), OVERDISPERSION), whitened(setup.reference, jnp.asarray(mode))
     for _ in range(10):
-        points, done = jax.vmap(partial(_start, target, target.data, setup))(keys, jnp.asarray(width))
+        points, done = jax.vmap(partial(_start, target, target.data, setup, begin))(keys, jnp.asarray(width))
         if done.all():
             return points
         # A flight that is caught in a corner of the skull does not end; a shorter one may.
@@ -240,9 +241,10 @@ def _overdispersed(target: SmoothTarget, setup: Setup, keys: AnyArray) -> Any:
 
 
 @partial(jax.jit, static_argnums=0)
-def _start(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, width: AnyArray) -> tuple[Any, AnyArray]:
+def _start(
+    target: SmoothTarget, data: Any, setup: Setup, begin: AnyArray, key: AnyArray, width: AnyArray
+) -> tuple[Any, AnyArray]:
     """Estimands, and whether the flight there was over in time."""
-    d = len(setup.reference.centre)
-    momentum = width * jax.random.normal(key, (d,))
-    xi, _ = rotated(setup.walls, clearance_of(target, data, setup), jnp.zeros(d), momentum, jnp.pi / 2)
+    momentum = width * jax.random.normal(key, begin.shape)
+    xi, _ = rotated(setup.walls, clearance_of(target, data, setup), begin, momentum, jnp.pi / 2)
     return target.constrain_of(data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()

@@ -1,6 +1,9 @@
-"""Gauss–Newton curvature of the posterior in the displacements, assembled on the host."""
+"""Curvature of the posterior in the displacements, Gauss–Newton and exact, assembled on the host."""
 
 from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,28 +15,48 @@ from jaxtyping import Float
 from bayesreg.fem.elasticity import element_stiffness, stiffness
 from bayesreg.mesh import TetMesh
 from bayesreg.model.program import RegistrationData
+from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray
 
 
-def displacement_precision(
+class Curvature(NamedTuple):
+    """Of minus a log density.
+
+    Attributes
+    ----------
+    gauss_newton : (r, r) array
+        Positive semidefinite.
+    remainder : (r, r) array
+        What the exact one has besides: residuals times second derivatives. Small where the images agree.
+    """
+
+    gauss_newton: Float[np.ndarray, "rows rows"]
+    remainder: Float[np.ndarray, "rows rows"]
+
+
+def displacement_curvature(
     mesh: TetMesh,
     data: RegistrationData,
+    similarity: str,
     lam: Float[AnyArray, "cells"],
     mu: Float[AnyArray, "cells"],
     u: Float[AnyArray, "nodes 3"],
     field_sd: float = 0.0,
-) -> Float[np.ndarray, "rows rows"]:
+) -> Curvature:
     """Curvature of E_s/T_s + E_r/T_r in the field's components z, if any, and the sampled displacements.
 
     With u_I = W u_B of eq. (7), W = −K_II⁻¹ K_IB, the elastic energy has the Hessian K_BB + K_BI W, and the sum of
-    squared residuals r the Gauss–Newton approximation 2 Jᵀ J of its own, J = ∂r/∂u [1; W]. The field multiplies the
-    stiffness of element e by exp(s_e), s = sd · basis · z, so that ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I; z has the prior
-    N(0, I), and E_r, small beside E_s in z and not convex, is left out there.
+    squared residuals r the Gauss–Newton approximation 2 Jᵀ J of its own, J = ∂r/∂u [1; W]; the remainder is that of
+    [1; W]ᵀ ∇²E_s [1; W]. The field multiplies the stiffness of element e by exp(s_e), s = sd · basis · z, so that
+    ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I; z has the prior N(0, I), and E_r, small beside E_s in z and not convex, is left out
+    there, as are the second derivatives of u_I.
 
     Parameters
     ----------
     mesh, data
+    similarity : str
+        Name of the similarity.
     lam, mu : (m,) array
         With the field's factor.
     u : (n, 3) array
@@ -43,13 +66,12 @@ def displacement_precision(
 
     Returns
     -------
-    (k + 3b, k + 3b) array
-        First z, then row 3 · node + axis, 1/mm²; positive semidefinite.
+    Curvature
+        First z, then row 3 · node + axis, 1/mm².
     """
     sampled = _degrees(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
     free = _degrees(np.asarray(data.system.free))
     K = stiffness(mesh, lam, mu)
-    normal = _normal_matrix(mesh, data, u)
     coupling = K[free][:, sampled]
     load = np.zeros((len(free), 0))
     if data.field is not None:
@@ -61,11 +83,20 @@ def displacement_precision(
     schur = K[sampled][:, sampled] + coupling.T @ W[:, modes:]
     # ∂u/∂(z, u_B): what is sampled moves by itself, the rest by W.
     unit = np.hstack([np.zeros((len(sampled), modes)), np.eye(len(sampled))])
-    cross = unit.T @ (normal[sampled][:, free] @ W)
-    precision = unit.T @ (normal[sampled][:, sampled] @ unit) + cross + cross.T + W.T @ (normal[free][:, free] @ W)
-    precision[modes:, modes:] += np.asarray(schur) / float(data.t_elastic)
-    precision[:modes, :modes] += np.eye(modes)
-    return (precision + precision.T) / 2
+
+    def reduced(points: np.ndarray) -> np.ndarray:
+        """The curvature in (z, u_B) of one in the places of the quadrature points."""
+        nodal = _assembled(mesh, data, points)
+        cross = unit.T @ (nodal[sampled][:, free] @ W)
+        found = unit.T @ (nodal[sampled][:, sampled] @ unit) + cross + cross.T + W.T @ (nodal[free][:, free] @ W)
+        return (found + found.T) / 2
+
+    approximate, exact = (np.asarray(found) for found in _point_curvature(similarity, data, jnp.asarray(u)))
+    gauss_newton, remainder = reduced(approximate), reduced(exact - approximate)
+    schur = np.asarray(schur) / float(data.t_elastic)
+    gauss_newton[modes:, modes:] += (schur + schur.T) / 2
+    gauss_newton[:modes, :modes] += np.eye(modes)
+    return Curvature(gauss_newton, remainder)
 
 
 def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:
@@ -83,21 +114,42 @@ def _degrees(nodes: np.ndarray) -> np.ndarray:
     return (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def _normal_matrix(mesh: TetMesh, data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
-    """2/T_s Σ_q w_q ∇m ∇mᵀ N_a N_b at x_q + u(x_q), tempered: the curvature of the log likelihood in all nodes."""
-    gradient = np.asarray(_image_gradient(data, jnp.asarray(u)))
+def _assembled(
+    mesh: TetMesh, data: RegistrationData, points: Float[np.ndarray, "points 3 3"]
+) -> scipy.sparse.csr_matrix:
+    """Σ_q C_q N_a N_b: a curvature in the places of the quadrature points as one in all nodes."""
     quadrature = data.quadrature
-    count, share = len(gradient), float(data.independent_share)
-    weighted = np.sqrt(2 * share * np.asarray(quadrature.weights) / float(data.t_similarity))[:, None] * gradient
-    entries = np.asarray(quadrature.barycentric)[:, :, None] * weighted[:, None]
-    columns = _degrees(mesh.cells[np.asarray(quadrature.cells)].ravel()).reshape(count, 12)
-    rows = np.repeat(np.arange(count), 12)
-    J = scipy.sparse.csr_matrix((entries.ravel(), (rows, columns.ravel())), shape=(count, 3 * len(mesh.points)))
-    return (J.T @ J).tocsr()
+    count = len(points)
+    weights = np.broadcast_to(np.asarray(quadrature.barycentric)[:, None], (count, 3, 4))
+    columns = 3 * mesh.cells[np.asarray(quadrature.cells)][:, None] + np.arange(3)[:, None]
+    shape, starts = (3 * count, 3 * len(mesh.points)), np.arange(0, 12 * count + 1, 4)
+    P = scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=shape)
+    C = scipy.sparse.bsr_matrix((points, np.arange(count), np.arange(count + 1)))
+    return (P.T @ (C.tocsr() @ P)).tocsr()
 
 
-@jax.jit
-def _image_gradient(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
-    """∇m(x_q + u(x_q)), 1/mm."""
-    moved = data.positions + displacement_at(data.system.elements, data.quadrature, u)
-    return jax.grad(lambda x: data.moving(x).sum())(moved)
+@partial(jax.jit, static_argnums=0)
+def _point_curvature(
+    similarity: str, data: RegistrationData, u: Float[AnyArray, "nodes 3"]
+) -> tuple[Float[AnyArray, "points 3 3"], Float[AnyArray, "points 3 3"]]:
+    """Curvature of E_s/T_s in every place x_q + u(x_q), tempered, 1/mm²: 2 w ∇m ∇mᵀ/T_s, and the exact one.
+
+    With e(m) the energy of a point, e″ ∇m ∇mᵀ + e′ ∇²m.
+    """
+    quadrature = data.quadrature
+    moved = data.positions + displacement_at(data.system.elements, quadrature, u)
+
+    def slope(x: AnyArray) -> AnyArray:
+        return jax.grad(lambda x: data.moving(x).sum())(x)
+
+    def energy_slope(values: AnyArray) -> AnyArray:
+        noise = Noise(data.t_similarity, data.degrees_of_freedom)
+        energy = SIMILARITIES[similarity].energy
+        return jax.grad(lambda m: energy(data.fixed_values, m, quadrature.weights, noise))(values)
+
+    gradient, values = slope(moved), data.moving(moved)
+    columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
+    first, second = jax.jvp(energy_slope, (values,), (jnp.ones_like(values),))
+    outer, scale = gradient[:, :, None] * gradient[:, None], data.independent_share / data.t_similarity
+    exact = second[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
+    return scale * 2 * quadrature.weights[:, None, None] * outer, scale * exact

@@ -18,7 +18,7 @@ from bayesreg.model import evaluation
 from bayesreg.model.constraint import is_allowed
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import FIELD, LAME, Values, complete, lame_by_cell, to_estimands, transform, whitened
-from bayesreg.model.curvature import displacement_precision
+from bayesreg.model.curvature import Curvature, displacement_curvature
 from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.problem import registration_data
@@ -166,25 +166,25 @@ class Posterior:
         lam, mu = (tuple(by_cell.tolist()) for by_cell in lame_by_cell(self.data, {**values, **near}))
         return self.data._replace(system=_conditioned_system(self, lam, mu))
 
-    def displacement_precision(self, data: RegistrationData, estimands: Values) -> Float[np.ndarray, "rows rows"]:
-        """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary": Gauss–Newton.
+    def displacement_curvature(self, data: RegistrationData, estimands: Values) -> Curvature:
+        """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".
 
         Returns
         -------
-        (k + 3b, k + 3b) array
-            Positive semidefinite; first the k components of the field, then row k + 3 · node + axis, 1/mm². Of the
-            elastic energy the curvature in the displacements alone is counted.
+        Curvature
+            First the k components of the field, then row k + 3 · node + axis, 1/mm². Of the elastic energy the
+            curvature in the displacements alone is counted.
         """
         values = complete(data, estimands, self.free)
         lam, mu = lame_by_cell(data, values)
         u = self.evaluate_estimands(self.without_normaliser(data), estimands).u
         data = data._replace(**{name: values[name] for name in data.temperature_log_sd})
-        precision = displacement_precision(self.mesh, data, lam, mu, u, float(values.get("field_sd", 0.0)))
-        if not len(self.sampled):
-            return precision
-        weight, rows = 1 / (len(self.sampled) * float(data.rigid_sd) ** 2), 3 * len(self.sampled)
-        precision[-rows:, -rows:] += weight * np.asarray(data.rigid_modes @ data.rigid_modes.T)
-        return precision
+        sd = float(values.get("field_sd", 0.0))
+        found = displacement_curvature(self.mesh, data, self.options.similarity, lam, mu, u, sd)
+        if len(self.sampled):
+            weight, rows = 1 / (len(self.sampled) * float(data.rigid_sd) ** 2), 3 * len(self.sampled)
+            found.gauss_newton[-rows:, -rows:] += weight * np.asarray(data.rigid_modes @ data.rigid_modes.T)
+        return found
 
     def constrain_of(self, data: RegistrationData, position: Values) -> dict[str, AnyArray]:
         """Estimands of an unconstrained position, as a pure function of the data."""

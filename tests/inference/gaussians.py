@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayesreg.model.curvature import Curvature
+
 NODES, WALL = 2, 0.6
 DIMENSION = 3 * NODES
 
@@ -97,8 +99,8 @@ class GaussianTarget:
     def continuation(self):
         yield self.data, True
 
-    def displacement_precision(self, data, estimands):
-        return np.asarray(data.precision)
+    def displacement_curvature(self, data, estimands):
+        return Curvature(np.asarray(data.precision), np.zeros((DIMENSION, DIMENSION)))
 
     def exact_draws(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """(count, nodes, 3), by rejection."""

@@ -6,7 +6,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.laplace import find_mode, laplace, unravel
+from bayesreg.inference.laplace import _convex, find_mode, laplace, pulled, unravel
 from tests.inference.test_closed_form import LAM, MESH, MU, problem, walled
 from tests.phantoms import smooth_image
 
@@ -34,6 +34,15 @@ def test_the_mode_is_in_the_support():
     assert np.isfinite(posterior.logdensity_constrained({"u_boundary": mode.reshape(-1, 3), **values}))
 
 
+def test_a_gaussian_behind_a_wall_is_found_from_the_wall():
+    """The wall holds the mode 3 mm off, where the force is not zero; Newton's step that forgets the wall gives the mean."""
+    exact = problem().exact
+    place = exact.mean + np.tile([3.0, 0, 0], len(exact.mean) // 3)
+    centre = np.asarray(pulled(walled(), laplace(walled(), place), [place]).centre)
+    sd = np.sqrt(np.diag(np.linalg.inv(exact.precision)))
+    assert (abs(centre - exact.mean) / sd).max() < 0.02 < (abs(place - exact.mean) / sd).max()
+
+
 @pytest.mark.slow
 def test_curvature_of_parameters_is_the_hessian():
     images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
@@ -50,3 +59,14 @@ def test_curvature_of_parameters_is_the_hessian():
         step = 1e-5 * np.eye(len(flat))[k]
         row = np.asarray(gradient(flat + step) - gradient(flat - step)) / 2e-5
         np.testing.assert_allclose(precision[k, count:], row[count:], rtol=1e-4, atol=1e-4 * abs(row).max())
+
+
+def test_a_curvature_with_its_remainder_is_made_convex():
+    """The sum itself where it is convex; along one direction it is not, and there its size counts."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 4))
+    convex = root @ root.T + np.eye(4)
+    for size, expected in ((0.5, 1.5), (-0.5, 0.5), (-0.9, 0.25), (-3.0, 2.0), (6.0, 7.0)):
+        lower = np.linalg.cholesky(convex)
+        first = np.outer(lower[:, 0], lower[:, 0])
+        np.testing.assert_allclose(_convex(convex, size * first), convex + (expected - 1) * first, atol=1e-12)

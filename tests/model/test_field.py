@@ -157,7 +157,7 @@ def test_curvature_is_gauss_newtons(share):
     """dᵀHd = 2s/T_s Σ w (∂r/∂d)² + |d_z|² + 2 E_r(d_u)/T_r with a share s of independent points; ∂r by differences."""
     post, place = example(), values(u_sd=0.3)
     data, estimands = post.data._replace(independent_share=jnp.asarray(share)), post.estimands(place)
-    H = post.displacement_precision(data, estimands)
+    H = post.displacement_curvature(data, estimands).gauss_newton
     assert H.shape == (MODES + 3 * len(MESH.boundary),) * 2
     assert np.linalg.eigvalsh(H).min() > -1e-6 * np.trace(H)
     residuals = jax.jit(lambda v: post.residuals(post.evaluate(v).u))

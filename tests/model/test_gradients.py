@@ -14,6 +14,10 @@ MESH = ball_mesh(spacing=24.0)
 SETTINGS = {"t_similarity": 5.0, "t_elastic": 100.0, "interpolation": "cubic", "fixed": {}}
 
 
+def by_tissue(values):
+    return {name: float(value) for name, value in zip(MESH.names, values, strict=True)}
+
+
 def posterior(**options):
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
     return br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(**(SETTINGS | options)))
@@ -112,3 +116,17 @@ def test_jacobian_of_the_unconstrained_density():
         log_determinant += np.linalg.slogdet(jacobian)[1]
     expected = float(post.logdensity_constrained(values)) + log_determinant
     assert float(post.logdensity(position)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("similarity", ["ssd", "student_t"])
+def test_curvature_in_the_displacements_is_the_hessian(similarity):
+    """With its remainder, against differences of the gradient; the images differ, so that it is more than rounding."""
+    post = posterior(similarity=similarity, rigid_sd=0.5, fixed={"lam": by_tissue(LAM), "mu": by_tissue(MU)})
+    u = state(LAM, MU)["u_boundary"]
+    found = post.displacement_curvature(post.data, {"u_boundary": u})
+    slope = jax.jit(jax.grad(lambda u: -post.logdensity({"u_boundary": u})))
+    for direction in np.random.default_rng(1).normal(size=(3, *u.shape)):
+        expected = (slope(u + 1e-4 * direction) - slope(u - 1e-4 * direction)) / 2e-4
+        product, rest = (matrix @ direction.ravel() for matrix in found)
+        np.testing.assert_allclose(product + rest, np.ravel(expected), atol=1e-4 * float(abs(expected).max()))
+        assert abs(rest).max() > 0.01 * abs(product).max()
