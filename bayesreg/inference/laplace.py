@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 
 from bayesreg.inference.hierarchy import balanced, is_scale
@@ -24,6 +24,8 @@ SOFTNESS, GAP = 0.05, 0.02
 # variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
 # Gaussian crosses its exponential tail.
 LEAST_CURVATURE, UNSEEN, INFLATION = 1.0, 4.0, np.pi**2 / 3
+# Of differences between gradients, in logarithmic coordinates.
+STEP = 1e-4
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25
 
@@ -166,12 +168,14 @@ def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.
     """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
 
     Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
-    Gaussian's own, whose motion is reflected exactly; kicks are left with what is beyond second order.
+    Gaussian's own, whose motion is reflected exactly; kicks are left with what is beyond second order. A scale stays
+    where it is: its force at the mode of what it scales is no hint (see `hierarchy`).
     """
     data = target.without_walls(target.data)
     slopes = np.mean([np.asarray(_slope(target, data, jnp.asarray(flat))) for flat in flats], axis=0)
-    factor = np.asarray(reference.factor)
-    return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + factor @ (factor.T @ slopes)))
+    factor, moving = np.asarray(reference.factor), 1 - is_scale(target)
+    shift = moving * (factor @ (factor.T @ (moving * slopes)))
+    return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -204,8 +208,8 @@ def precision_at(
 ) -> Float[np.ndarray, "dimension dimension"]:
     """A positive definite curvature of minus the log density.
 
-    The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are exact; directions in
-    which the latter are not convex are given the least curvature of a logarithmic parameter.
+    The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are differences of the
+    gradient; directions in which these are not convex are given the least curvature of a logarithmic parameter.
 
     Parameters
     ----------
@@ -245,8 +249,7 @@ def _jointly(
     first = len(curvature) - int(curved.sum())
     precision[count:, count:] = curvature[first:, first:]
     if joint and count:
-        directions = jnp.eye(len(flat))[order[:count]]
-        rows = -np.asarray(_hessian_rows(target, target.without_walls(data), jnp.asarray(flat), directions))[:, order]
+        rows = -_hessian_rows(target, target.without_walls(data), flat, order[:count])[:, order]
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]
@@ -270,13 +273,20 @@ def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
     return np.asarray(ravel_pytree(marked)[0]) > 0
 
 
-def _hessian_rows_of(target: SmoothTarget, data: Any, flat: AnyArray, directions: AnyArray) -> AnyArray:
-    """The Hessian of the log density of a flat position times some directions."""
-    gradient = jax.grad(lambda x: target.logdensity_of(data, unravel(target)(x)))
-    return jax.lax.map(lambda direction: jax.jvp(gradient, (flat,), (direction,))[1], directions)
+def _hessian_rows(
+    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
+) -> Float[np.ndarray, "rows dimension"]:
+    """Rows of the Hessian of the log density, by differences of its gradient.
 
-
-_hessian_rows = jax.jit(_hessian_rows_of, static_argnums=0)
+    The coordinates are logarithms, so that one step suits all. Exact rows would cost more to compile than the search.
+    """
+    rows = []
+    for entry in entries:
+        step = np.zeros(len(flat))
+        step[entry] = STEP
+        ahead, behind = (np.asarray(_slope(target, data, jnp.asarray(flat + way * step))) for way in (1, -1))
+        rows.append((ahead - behind) / (2 * STEP))
+    return np.array(rows)
 
 
 def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -177,7 +177,7 @@ class Posterior:
         """
         values = complete(data, estimands, self.free)
         lam, mu = lame_by_cell(data, values)
-        u = self.evaluate_estimands(self.without_normaliser(data), estimands).u
+        u = _settled(self, self.without_normaliser(data), dict(estimands))
         data = data._replace(**{name: values[name] for name in data.temperature_log_sd})
         sd = float(values.get("field_sd", 0.0))
         found = displacement_curvature(self.mesh, data, self.options.similarity, lam, mu, u, sd)
@@ -336,6 +336,11 @@ def build_posterior(
     model = model or ModelConfig()
     data, sampled = registration_data(fixed, moving, mesh, model, skull, reference)
     return Posterior(data, mesh, model, sampled, fixed, moving)
+
+
+@partial(jax.jit, static_argnums=0)
+def _settled(posterior: Posterior, data: RegistrationData, estimands: Values) -> Float[AnyArray, "nodes 3"]:
+    return posterior.evaluate_estimands(data, estimands).u
 
 
 @lru_cache(maxsize=2)

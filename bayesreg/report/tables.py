@@ -60,7 +60,7 @@ def squared_error_table(metrics: Mapping[str, Mapping[str, Any]], tissues: Seque
     """Table 2 of runs (name -> metrics) beside the paper's."""
     errors = {name: one["mean_squared_error"] for name, one in metrics.items()}
     columns = (WHOLE, *tissues)
-    ours = [[label, *(fixed(found.get(key), 3) for key in columns)] for label, found in _stages(errors)]
+    ours = [[label, *(number(found.get(key)) for key in columns)] for label, found in _stages(errors)]
     paper = [[name, *(fixed(row.get(key), 3) for key in columns)] for name, row in PAPER_TABLE_2.items()]
     caption = "Mean squared error of the displacement over the domain and each tissue (exact for linear elements), mm²."
     header = ["", "Ω", *(f"Ω {name.upper() if len(name) <= 3 else name}" for name in tissues)]

@@ -7,6 +7,7 @@ no noise explains, and whose neighbours agree.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
 from bayesreg.inference.diagnostics import convergence, dataset
 from bayesreg.inference.stopping import StopRule
+from bayesreg.io.atomic import write_text
 from bayesreg.io.datasets import mni152
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain, save_mesh
 from bayesreg.model.simulation import SyntheticPair, make_pair
@@ -130,11 +132,17 @@ def truth() -> dict[str, float]:
 
 
 def register_pairs(out: Path, say: Say = print, count: int = COUNT) -> dict[str, Any]:
-    """All pairs, and whether enough intervals contain the truth, for GM and for WM."""
+    """All pairs, and whether enough intervals contain the truth, for GM and for WM.
+
+    Each pair is a file of its own, so that what was cut short goes on where it was.
+    """
     shared, found = anatomy(out), []
     for seed in range(1, count + 1):
-        pair, direction = make(shared, seed)
-        found.append(register(shared, pair, seed) | {"direction": direction, "seed": seed})
+        path = out / f"pair_{seed:02d}.json"
+        if not path.exists():
+            pair, direction = make(shared, seed)
+            write_text(path, json.dumps(register(shared, pair, seed) | {"direction": direction, "seed": seed}) + "\n")
+        found.append(json.loads(path.read_text()))
         inside = ", ".join(f"{name} {'in' if covers(found[-1], name) else 'OUT'}" for name in TISSUES)
         say(f"pair {seed} of {count}: {inside}; R̂ of λ {found[-1]['rhat_of_ratio']:.3f}")
     figures.intervals(found, truth(), out / "pairs.png")
