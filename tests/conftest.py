@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import pytest
 from jaxtyping import install_import_hook
 
 _ROOT = Path(__file__).parent.parent
@@ -16,3 +17,17 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # Not for the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
 _MODULES = [f"bayesreg.{path.stem}" for path in (_ROOT / "bayesreg").iterdir() if path.stem[0] not in "_."]
 install_import_hook([name for name in _MODULES if name != "bayesreg.config"], "beartype.beartype")
+
+
+# Every compiled program maps memory; past the 65,530 maps that Linux allows a process the next one crashes it.
+_MOST_MAPS = 30_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_memory_maps():
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > _MOST_MAPS:
+        import jax
+
+        jax.clear_caches()
