@@ -121,7 +121,7 @@ def _response(
         return inverse_diagonal * r if reference is None else reference(r)
 
     def solve(apply: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
-        first = jnp.zeros_like(load) if guess is None else guess[free]
+        first = None if guess is None else guess[free]
         return _conjugate_gradients(apply, load, first, precondition, inverse_diagonal, tolerance)
 
     if guess is None:
@@ -168,12 +168,12 @@ _differentiable.defvjp(_forward, _backward)
 def _conjugate_gradients(
     apply: LinearMap,
     load: AnyArray,
-    first: AnyArray,
+    first: AnyArray | None,
     precondition: LinearMap,
     inverse_diagonal: AnyArray,
     tolerance: float,
 ) -> tuple[AnyArray, SolverInfo]:
-    """Preconditioned conjugate gradients from `first`; NaN anywhere ends the iteration unconverged."""
+    """Preconditioned conjugate gradients from `first`, else from zero; NaN anywhere ends the iteration unconverged."""
 
     def norm(r: AnyArray) -> Scalar:
         return jnp.sqrt((inverse_diagonal * r**2).sum())
@@ -194,9 +194,9 @@ def _conjugate_gradients(
         rho, previous = (residual * z).sum(), rho
         return x, residual, z + (rho / previous) * direction, rho, iteration + 1
 
-    residual = load - apply(first)
+    x, residual = (jnp.zeros_like(load), load) if first is None else (first, load - apply(first))
     z = precondition(residual)
-    start = first, residual, z, (residual * z).sum(), jnp.zeros((), int)
+    start = x, residual, z, (residual * z).sum(), jnp.zeros((), int)
     x, residual, _, _, iterations = jax.lax.while_loop(unfinished, iterate, start)
     relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
     return x, SolverInfo(relative, iterations, relative <= tolerance)
