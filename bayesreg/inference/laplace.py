@@ -243,7 +243,7 @@ def _jointly(
     """The curvature in all coordinates, given that in the displacements and, jointly, the field."""
     curved = _curved(target, joint)
     count = int((~curved).sum())
-    # The coordinates whose curvature is given come last; a field may be among those given and not among them.
+    # The coordinates whose curvature counts come last. Where not jointly, the field's share of the given is left out.
     order = np.argsort(curved, kind="stable")
     precision = np.zeros((len(flat), len(flat)))
     first = len(curvature) - int(curved.sum())

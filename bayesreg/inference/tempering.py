@@ -66,9 +66,8 @@ def smc(
         setup, starts = chains_of.prepare(points, key, say)
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
-        begin = whitened(
-            setup.reference, ravel_pytree(target.unconstrain_of(data, jax.tree.map(lambda x: x[0], starts)))[0]
-        )
+        one = target.unconstrain_of(data, jax.tree.map(lambda x: x[0], starts))
+        begin = whitened(setup.reference, ravel_pytree(one)[0])
         first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
         found, weights = _tempered(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)

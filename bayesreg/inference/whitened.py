@@ -172,8 +172,7 @@ def about_reference(
         keys = jax.random.split(key_start, len(found.chains))
         modes = [np.asarray(reference.centre) for reference in found.references]
         about = [pulled(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
-        setups = [setup_about(target, reference) for reference in about]
-        setups[0] = setups[0]._replace(stand_in=stand_in(target, setups[0].reference))
+        setups = [_whole(target, about[0]), *(setup_about(target, reference) for reference in about[1:])]
         starts = [_overdispersed(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
@@ -184,7 +183,7 @@ def about_reference(
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
         key_settle, key_tune = jax.random.split(key_tune)
         _, points = tuned(data, kernel, setup, points, key_settle, stage)
-        return tuned(data, kernel, _averaged(target, setup, modes[0], points), points, key_tune, stage, say)
+        return tuned(data, kernel, _averaged(target, modes[0], points), points, key_tune, stage, say)
 
     def conditioned(setup: Setup) -> Any:
         return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.reference.centre)))
@@ -215,11 +214,16 @@ def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _averaged(target: SmoothTarget, setup: Setup, mode: AnyArray, points: Any) -> Setup:
+def _whole(target: SmoothTarget, reference: Reference) -> Setup:
+    """A setup before its tuning, with the stand-in about this reference's centre."""
+    return setup_about(target, reference)._replace(stand_in=stand_in(target, reference))
+
+
+def _averaged(target: SmoothTarget, mode: AnyArray, points: Any) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are."""
     flats = jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points)
     sound = [flat for flat in np.asarray(flats) if np.isfinite(flat).all()]
-    return setup_about(target, averaged(target, [mode, *sound]))._replace(stand_in=setup.stand_in)
+    return _whole(target, averaged(target, [mode, *sound]))
 
 
 def _overdispersed(target: SmoothTarget, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:

@@ -13,6 +13,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.inference.hamiltonian import hmc
+from bayesreg.inference.initialise import starting_points
 from bayesreg.inference.kernel import Info
 from bayesreg.inference.laplace import Reference
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, stand_in
@@ -128,3 +129,13 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     expected = jax.vmap(lambda estimands: post.evaluate_estimands(post.data, estimands).logdensity)(found.estimands)
     np.testing.assert_allclose(found.evaluation.logdensity, expected, rtol=1e-9)
     assert (found.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
+
+
+@pytest.mark.slow
+def test_the_stand_in_is_about_the_centre_that_the_warm_up_ends_with():
+    post = posterior()
+    points = starting_points(post, br.Start(), 2, jax.random.key(0))
+    setup, _ = hmc(post, warm_up=2).prepare(points, jax.random.key(1), lambda text: None)
+    expected = stand_in(post, setup.reference)
+    np.testing.assert_allclose(setup.stand_in.slope, expected.slope, rtol=1e-9)
+    np.testing.assert_allclose(setup.stand_in.curvature, expected.curvature, rtol=1e-6, atol=1e-9)
