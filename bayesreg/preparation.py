@@ -15,6 +15,7 @@ from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
 from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
+from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.store import Inputs, Truth
 from bayesreg.io.volumes import load_image
@@ -50,6 +51,8 @@ def prepare(config: Config) -> Prepared:
     clock = _Clock()
     _require_start(config)
     anatomy, moving = _anatomy(config)
+    if anatomy.intracranial is not None:
+        anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
     clock.lap("anatomy")
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain))

@@ -224,7 +224,7 @@ def skull_distance(skull: Image, points: Float[np.ndarray, "points 3"]) -> Float
     Only the voxels about the points are looked at: the distance map of a whole image takes seconds.
     """
     indices = skull.world_to_voxel(points)
-    reach = REACH / skull.voxel_sizes + 1
+    reach = REACH / skull.voxel_sizes + 9
     low = np.clip(np.floor(indices.min(axis=0) - reach), 0, skull.shape).astype(int)
     high = np.clip(np.ceil(indices.max(axis=0) + reach) + 1, 0, skull.shape).astype(int)
     window = np.asarray(skull.voxels)[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]

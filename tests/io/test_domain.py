@@ -5,7 +5,7 @@ import logging
 import numpy as np
 import pytest
 
-from bayesreg.io.domain import MeshError, domain_labels, mesh_domain
+from bayesreg.io.domain import MeshError, domain_labels, mesh_domain, without_ridges
 from tests.io.balls import balls, grid, offset_from_centre
 
 
@@ -77,3 +77,23 @@ class TestDomain:
         tissue, inside = phantom
         hollow = tissue.with_voxels(np.where(tissue.voxels == 1, 0, tissue.voxels))
         np.testing.assert_array_equal(domain_labels(hollow, mesh_domain(hollow, inside)).voxels, tissue.voxels)
+
+
+class TestWithoutRidges:
+    def test_takes_ridges_and_pits_of_a_voxel_and_leaves_the_rest(self, phantom):
+        _, inside = phantom
+        middle = np.array(inside.shape) // 2
+        smooth = without_ridges(inside)
+        top = np.flatnonzero(smooth.voxels[middle[0], middle[1]])[-1]
+        rough = smooth.voxels.copy()
+        rough[middle[0], :, top + 1] = 1
+        rough[middle[0] + 5, middle[1], top - 4 : top + 1] = 0
+        found = without_ridges(smooth.with_voxels(rough)).voxels
+        assert found[middle[0], 1, top + 1] == 0
+        assert found[middle[0] + 5, middle[1], top - 1] == 1
+        assert (found != smooth.voxels).mean() < 1e-3
+
+    def test_moves_a_flat_wall_nowhere(self, phantom):
+        _, inside = phantom
+        half = inside.with_voxels((offset_from_centre(inside)[0] < 7).astype(np.uint8))
+        np.testing.assert_array_equal(without_ridges(half).voxels, half.voxels)

@@ -40,8 +40,8 @@ def test_sign_is_that_of_the_nearest_voxel_away_from_the_interface(left_handed):
     found = np.asarray(is_allowed(distance.interpolator("linear"), points))
     np.testing.assert_array_equal(found[away], expected[away])
     assert 100 < expected[away].sum() < away.sum() - 100
-    # Near the interface the two may differ, by a fraction of a voxel.
-    assert (found == expected).mean() > 0.97
+    # Near the interface the two may differ, by a fraction of a voxel: so many more, the more it is curved.
+    assert (found == expected).mean() > 0.95
 
 
 def test_every_voxel_centre_has_its_own_sign():
@@ -79,3 +79,22 @@ def test_nothing_is_allowed_off_the_grid():
     # Edges and corners of the allowed box are rounded off a little, as the interface lies between centres.
     assert allowed[inside].mean() > 0.9
     assert allowed[((indices >= 0) & (indices <= 9)).all(axis=1)].all()
+
+
+def test_a_slanted_wall_has_no_steps():
+    # A staircase of one voxel in five: the distance's gradient, along the wall half a voxel inside, hardly turns.
+    normal = np.array([1.0, 0.0, 5.0]) / np.sqrt(26)
+    empty = Image(np.zeros((60, 20, 40), np.uint8), np.diag([1.0, 1.0, 1.0, 1.0]))
+    wall = 25.3 * normal[2]
+    skull = empty.with_voxels((empty.grid_points() @ normal > wall).astype(np.uint8))
+    x = np.random.default_rng(6).uniform((10, 5, 0), (50, 15, 0), (300, 3))
+    x[:, 2] = (wall - 0.5 - x[:, 0] * normal[0]) / normal[2]
+    np.testing.assert_allclose(signed_distance(skull).interpolate(x), 0.5, atol=0.15)
+
+
+def test_a_sheet_of_one_voxel_stays_closed():
+    voxels = np.zeros((20, 20, 20), np.uint8)
+    voxels[:, :, 10] = 1
+    distance = signed_distance(Image(voxels, np.eye(4))).interpolator("linear")
+    across = np.random.default_rng(7).uniform((2, 2, 10), (17, 17, 10), (500, 3))
+    assert not np.asarray(is_allowed(distance, across)).any()
