@@ -74,7 +74,7 @@ def _path(target: SmoothTarget, data: Any, reference: Reference, start: AnyArray
     """Evidence bound, mean and covariance in whitened coordinates."""
 
     def density(xi: AnyArray) -> AnyArray:
-        return -softened(target, data, reference, xi)
+        return -softened(target, data, reference, xi)[0]
 
     best, _ = approximate(key, density, start, JUDGES, maxiter=ITERATIONS)
     covariance = lbfgs_inverse_hessian_formula_1(best.alpha, best.beta, best.gamma)

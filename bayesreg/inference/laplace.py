@@ -26,6 +26,8 @@ SOFTNESS, GAP = 0.05, 0.02
 LEAST_CURVATURE, UNSEEN, INFLATION = 1.0, 4.0, np.pi**2 / 3
 # Of differences between gradients, in logarithmic coordinates.
 STEP = 1e-4
+# The last stage of a search for a mode is repeated so often, at most, or until no coordinate moves by more.
+REPEATS, SETTLED = 10, 1e-3
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25
 
@@ -66,7 +68,7 @@ def find_mode(
     say : callable
         Told of each stage.
     iterations : int
-        Most iterations of a stage; the last is repeated up to five times, whitened anew.
+        Most iterations of a stage; the last is repeated, whitened anew, until it moves nothing.
 
     Returns
     -------
@@ -82,13 +84,37 @@ def find_mode(
     *way, last = target.continuation()
     for data, moves in way:
         flat = _improved(target, data, flat, moves, iterations, say)
-    for _ in range(5):
-        before = flat
-        flat = _improved(target, last[0], flat, last[1], iterations, say)
+    return _admissible(target, nearby_mode(target, last[0], flat, say, iterations))
+
+
+def nearby_mode(
+    target: SmoothTarget,
+    data: Any,
+    flat: Float[np.ndarray, "dimension"],
+    say: Callable[[str], None] = lambda text: None,
+    iterations: int = 40,
+) -> Float[np.ndarray, "dimension"]:
+    """A mode for the target's data, or others of its kind, near a flat position: without a way that leads there.
+
+    The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
+    (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
+    skull and not in it, however great the force that presses.
+    """
+    shift = np.zeros(len(target.sampled))
+    for _ in range(REPEATS):
+        before, pressed = flat, shift
+        flat = _improved(target, data, flat, True, iterations, say, shift)
         flat = balanced(target, flat, partial(_factor, target, flat))
-        if np.abs(flat - before).max() < 1e-3:
+        shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
+        if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
             break
-    return _admissible(target, flat)
+    return flat
+
+
+def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
+    """Signed distance of every sampled node to the forbidden region, mm; infinite where there is none."""
+    u = unravel(target)(jnp.asarray(flat))["u_boundary"]
+    return np.asarray(target.clearance(target.data, u, jnp.arange(len(target.sampled))))
 
 
 def _factor(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
@@ -102,8 +128,10 @@ def _improved(
     moves: bool,
     iterations: int,
     say: Callable[[str], None],
+    shift: Float[np.ndarray, "sampled"] | None = None,
 ) -> Float[np.ndarray, "dimension"]:
-    """L-BFGS in the coordinates whitened where it starts, the skull softened."""
+    """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
+    shift = np.zeros(len(target.sampled)) if shift is None else shift
     reference = laplace(target, flat, data, moves)
     if not moves:
         # The same for all displacements.
@@ -111,36 +139,39 @@ def _improved(
     moving = 1 - is_scale(target)
     if not moves:
         moving[: len(flat) - 3 * len(target.sampled)] = 0.0
-    best: list[tuple[Any, float, Any]] = []
+    best: list[tuple[Any, float, Any, float]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _softened_with_slope(target, data, reference, moving * xi)
+        (value, penalty), gradient = _softened_with_slope(target, data, reference, moving * xi, shift)
         value, gradient = float(value), moving * np.asarray(gradient)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
             # A wall for the line search: uphill from the best place so far, sloping back to it.
-            place, least, slope = best[-1]
+            place, least, slope, _ = best[-1]
             return least + 2 * abs(slope @ (xi - place)), -slope
         if not best or value < best[-1][1]:
-            best[:] = [(xi.copy(), value, gradient)]
+            best[:] = [(xi.copy(), value, gradient, float(penalty))]
         return value, gradient
 
     options = {"maxiter": iterations, "maxcor": 20, "ftol": 1e-10, "gtol": 1e-2}
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
-    say(f"mode: log density {-best[-1][1]:.1f}")
-    return flat + np.asarray(reference.factor) @ (moving * best[-1][0])
+    place, least, _, penalty = best[-1]
+    say(f"mode: log density {penalty - least:.1f}")
+    return flat + np.asarray(reference.factor) @ (moving * place)
 
 
-def softened(target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray) -> AnyArray:
-    """Minus the log density of whitened coordinates, the hard skull replaced by a penalty."""
+def softened(
+    target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray, shift: AnyArray | float = 0.0
+) -> tuple[AnyArray, AnyArray]:
+    """Minus the log density of whitened coordinates plus a penalty for the hard skull, and that penalty alone."""
     position = unravel(target)(reference.centre + reference.factor @ xi)
     gap = target.clearance(data, position["u_boundary"], jnp.arange(len(target.sampled)))
-    penalty = 0.5 * (jnp.minimum(gap - GAP, 0.0) ** 2).sum() / SOFTNESS**2
-    return penalty - target.logdensity_of(target.without_walls(data), position)
+    penalty = 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
+    return penalty - target.logdensity_of(target.without_walls(data), position), penalty
 
 
-_softened_with_slope = jax.jit(jax.value_and_grad(softened, argnums=3), static_argnums=0)
+_softened_with_slope = jax.jit(jax.value_and_grad(softened, argnums=3, has_aux=True), static_argnums=0)
 
 
 def laplace(

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from scipy.optimize import lsq_linear
 
 import bayesreg as br
-from bayesreg.inference.laplace import _convex, find_mode, laplace, pulled, unravel
+from bayesreg.inference.laplace import GAP, _convex, find_mode, laplace, pulled, unravel
 from tests.inference.test_closed_form import LAM, MESH, MU, problem, walled
-from tests.phantoms import smooth_image
+from tests.phantoms import flat_skull, smooth_image
 
 
 def test_a_gaussian_posterior_is_its_own_approximation():
@@ -33,6 +34,23 @@ def test_the_mode_is_in_the_support():
     mode = find_mode(posterior, start + np.tile([3.0, 0, 0], len(start) // 3))
     assert posterior.allowed(mode.reshape(-1, 3)).all()
     assert np.isfinite(posterior.logdensity_constrained({"u_boundary": mode.reshape(-1, 3), **values}))
+
+
+def test_the_mode_at_a_wall_is_that_of_the_quadratic_program():
+    """However hard the Gaussian presses: nodes rest at the wall, and those beside them where that leaves them."""
+    found, wall = problem(), float(MESH.points[:, 0].max()) + 0.1
+    exact, skull = found.exact, flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
+    images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
+    # A hundred times colder than the Gaussian of the problem, and as much steeper at the wall.
+    cold = {name: getattr(found.posterior.options, name) / 100 for name in ("t_similarity", "t_elastic")}
+    options = {**dict(found.posterior.options), **cold, "rigid_sd": found.posterior.options.rigid_sd / 10}
+    posterior = br.build_posterior(*images, MESH, model=br.ModelConfig(**options), skull=skull)
+    mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
+    root = np.linalg.cholesky(exact.precision).T
+    highest = np.full(len(mode), np.inf)
+    highest[::3] = wall - GAP - MESH.points[posterior.sampled][:, 0]
+    expected = lsq_linear(root, root @ exact.mean, (-np.inf, highest), tol=1e-12).x
+    assert abs(mode - expected).max() < 2e-3 < 0.1 < abs(mode - exact.mean).max()
 
 
 def test_a_gaussian_behind_a_wall_is_found_from_the_wall():
