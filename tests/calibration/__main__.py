@@ -1,6 +1,6 @@
 """`make calibrate`: simulation-based calibration and Geweke's test, with figures and a JSON file.
 
-python -m tests.calibration -o DIR [--parts sbc geweke pairs]; status 1 where a part fails.
+python -m tests.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share]; status 1 where a part fails.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import bayesreg as br
-from tests.calibration import figures, geweke, pairs, sbc
+from tests.calibration import figures, geweke, mesh_share, pairs, sbc
 from tests.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, posterior_of
 
 # Wrong on purpose, and to be found out: T_s held at 1.5 times its true value, the elastic prior without its normaliser.
@@ -28,7 +28,7 @@ SETTINGS = {"temperatures": sbc.Settings(step_size=0.25, steps=6)}
 # How many steps of each kernel: as many as move its chains by about one standard deviation.
 GEWEKE_STEPS = {"hmc": 10, "nuts": 10, "rwmh": 60}
 
-# The pairs take most of an hour, and are asked for by name.
+# The pairs take most of an hour, and they and what explains them are asked for by name.
 DEFAULT = ["sbc", "geweke"]
 
 BEGAN = time.perf_counter()
@@ -102,11 +102,27 @@ def compare_simulators(out: Path) -> dict[str, Any]:
 
 
 def register_pairs(out: Path) -> dict[str, Any]:
-    """The calibrated pairs."""
-    return pairs.register_pairs(out, say)
+    """The calibrated pairs, made on a finer mesh."""
+    return pairs.register_pairs(out, same_mesh=False, say=say)
 
 
-PARTS = {"sbc": calibrate_by_simulation, "geweke": compare_simulators, "pairs": register_pairs}
+def register_on_one_mesh(out: Path) -> dict[str, Any]:
+    """The same, made on the mesh that registers them."""
+    return pairs.register_pairs(out, same_mesh=True, say=say)
+
+
+def share_of_the_mesh(out: Path) -> dict[str, Any]:
+    """λ/μ without images, on meshes other than the body's own."""
+    return mesh_share.measure(out, say)
+
+
+PARTS = {
+    "sbc": calibrate_by_simulation,
+    "geweke": compare_simulators,
+    "pairs": register_pairs,
+    "same_mesh": register_on_one_mesh,
+    "mesh_share": share_of_the_mesh,
+}
 
 
 def main() -> int:
