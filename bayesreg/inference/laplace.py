@@ -84,31 +84,18 @@ def find_mode(
     *way, last = target.continuation()
     for data, moves in way:
         flat = _improved(target, data, flat, moves, iterations, say)
-    return _admissible(target, nearby_mode(target, last[0], flat, say, iterations))
-
-
-def nearby_mode(
-    target: SmoothTarget,
-    data: Any,
-    flat: Float[np.ndarray, "dimension"],
-    say: Callable[[str], None] = lambda text: None,
-    iterations: int = 40,
-) -> Float[np.ndarray, "dimension"]:
-    """A mode for the target's data, or others of its kind, near a flat position: without a way that leads there.
-
-    The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
-    (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
-    skull and not in it, however great the force that presses.
-    """
+    # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
+    # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
+    # skull and not in it, however great the force that presses.
     shift = np.zeros(len(target.sampled))
     for _ in range(REPEATS):
         before, pressed = flat, shift
-        flat = _improved(target, data, flat, True, iterations, say, shift)
+        flat = _improved(target, last[0], flat, last[1], iterations, say, shift)
         flat = balanced(target, flat, partial(_factor, target, flat))
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
             break
-    return flat
+    return _admissible(target, flat)
 
 
 def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:

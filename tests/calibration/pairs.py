@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from bayesreg.io.datasets import Anatomy as AnatomyOfData
 from bayesreg.io.datasets import mni152
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain, save_mesh
-from bayesreg.model.deformation import Deformation, Direction, push_patch
+from bayesreg.model.deformation import Direction
 from bayesreg.model.simulation import SyntheticPair, make_pair
 from bayesreg.types import InputError
 from tests.calibration import figures
@@ -45,6 +45,7 @@ MODEL = {
 }
 
 Say = Callable[[str], None]
+Made = TypeVar("Made")
 
 
 class Anatomy(NamedTuple):
@@ -90,8 +91,8 @@ def anatomy(folder: Path, same_mesh: bool) -> Anatomy:
     return Anatomy(fixed, domain_labels(found.tissue, domain), skull(), making, registering)
 
 
-def pushed(mesh: br.TetMesh, seed: int) -> tuple[Deformation, Direction]:
-    """A patch in a random direction of the upper half, the first that inverts nothing."""
+def upwards(seed: int, attempt: Callable[[Direction], Made]) -> tuple[Made, Direction]:
+    """What is made of a random direction in the upper half, the first that inverts nothing, and that direction."""
     rng = np.random.default_rng(seed)
     while True:
         direction = rng.normal(size=3)
@@ -99,31 +100,22 @@ def pushed(mesh: br.TetMesh, seed: int) -> tuple[Deformation, Direction]:
         if direction[2] < 0.2:
             continue
         chosen = tuple(float(x) for x in direction)
-        # As large a patch on every mesh.
-        nodes = round(PATCH_SHARE * len(mesh.boundary))
         try:
-            found = push_patch(
-                mesh, skull(), lam=TRUE_LAM, mu=TRUE_MU, displacement=DISPLACEMENT, patch_nodes=nodes, direction=chosen
-            )
+            return attempt(chosen), chosen
         except InputError:
             continue
-        return found, chosen
+
+
+def push(mesh: br.TetMesh) -> dict[str, Any]:
+    """How a patch is pushed: as large a one on every mesh."""
+    patch_nodes = round(PATCH_SHARE * len(mesh.boundary))
+    return {"lam": TRUE_LAM, "mu": TRUE_MU, "displacement": DISPLACEMENT, "patch_nodes": patch_nodes}
 
 
 def make(shared: Anatomy, seed: int) -> tuple[SyntheticPair, Direction]:
     """A pair with a patch of its own."""
-    found, direction = pushed(shared.making, seed)
-    pair = make_pair(
-        *shared[:4],
-        lam=TRUE_LAM,
-        mu=TRUE_MU,
-        displacement=DISPLACEMENT,
-        patch_nodes=len(found.patch),
-        direction=direction,
-        noise_sd=0.01,
-        seed=seed,
-    )
-    return pair, direction
+    options = push(shared.making) | {"noise_sd": 0.01, "seed": seed}
+    return upwards(seed, lambda direction: make_pair(*shared[:4], direction=direction, **options))
 
 
 def register(shared: Anatomy, pair: SyntheticPair, seed: int, **options: Any) -> dict[str, Any]:
