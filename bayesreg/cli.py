@@ -56,6 +56,7 @@ Resume = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 Samplers = Annotated[str | None, typer.Option(metavar="NAME,NAME...", help="Which ones; all of them if left out.")]
 Minutes = Annotated[float, typer.Option(help="Budget of each sampler.")]
+Bodies = Annotated[int, typer.Option(help="How many to simulate in all.")]
 Page = Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="HTML file to write.")]
 
 
@@ -151,6 +152,19 @@ def compare_samplers(
     chosen = {} if samplers is None else {"samplers": [name.strip() for name in samplers.split(",")]}
     comparison.compare_samplers(settings, out, minutes=minutes, progress=not quiet, **chosen)
     typer.echo(f"Comparison: {out / 'samplers.html'}")
+
+
+@app.command()
+def mesh_error(folder: RunFolder, bodies: Bodies = 24, quiet: Quiet = False) -> None:
+    """Widen the λ/μ of a run by what its mesh does to them: bodies made on a finer mesh are registered on it."""
+    from bayesreg import discretisation
+    from bayesreg.report.tables import in_terminal
+
+    found = discretisation.mesh_error(folder, bodies, progress=not quiet)
+    from rich.console import Console
+
+    Console().print(in_terminal(found))
+    typer.echo(f"Report: {folder / 'report.html'}")
 
 
 @app.command()

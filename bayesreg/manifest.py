@@ -21,6 +21,7 @@ from bayesreg.inference.diagnostics import Convergence, dataset
 from bayesreg.inference.moments import greatest_rhat
 from bayesreg.inference.run import Samples
 from bayesreg.io.store import Inputs
+from bayesreg.mesh import signed_volumes
 from bayesreg.model.posterior import Posterior
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
@@ -85,6 +86,7 @@ def manifest(
         },
         "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
         "contact_nodes": _contact_nodes(inputs, posterior, samples),
+        "inverted_elements": _inverted_elements(posterior, samples),
         "solver": {
             "failed": int(tally.solver_failed.sum()),
             "iterations_mean": float(tally.solver_iterations.sum()) / steps,
@@ -122,6 +124,11 @@ def _versions() -> dict[str, str]:
 def _extreme(figures: Any, choose: Callable[[np.ndarray], float]) -> float | None:
     values = np.concatenate([np.ravel(figures[name]) for name in figures])
     return float(choose(values)) if np.isfinite(values).any() else None
+
+
+def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
+    mesh = posterior.mesh
+    return int((signed_volumes(mesh.points + samples.u_mean, mesh.cells) <= 0).sum())
 
 
 def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:

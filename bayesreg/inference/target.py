@@ -27,8 +27,13 @@ class Evaluation(Protocol):
 class Curvature(Protocol):
     """Of minus a log density: a positive semidefinite part, and what the exact one has besides."""
 
-    gauss_newton: AnyArray
-    remainder: AnyArray
+    @property
+    def gauss_newton(self) -> AnyArray:
+        """The former."""
+
+    @property
+    def remainder(self) -> AnyArray:
+        """The latter."""
 
 
 @runtime_checkable

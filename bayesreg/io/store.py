@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from bayesreg.io.volumes import load_image, save_displacement, save_image
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError
 
+BODIES = "bodies.json"
 RESULTS = ("config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html")
 
 
@@ -149,6 +150,8 @@ class Run:
         The content of metrics.json, where the truth is known.
     predicted : Predicted or None
         The content of predicted.npz; None for runs of versions that wrote none.
+    bodies : list of dict or None
+        The content of bodies.json, simulated registrations on this mesh; None where there were none.
     """
 
     config: str
@@ -165,6 +168,7 @@ class Run:
     boundary: AnyArray | None = None
     metrics: dict[str, Any] | None = None
     predicted: Predicted | None = None
+    bodies: list[dict[str, Any]] | None = None
 
 
 def require_fresh(folder: str | Path) -> None:
@@ -272,8 +276,14 @@ def read_run(folder: str | Path) -> Run:
         warped=warped,
         metrics=metrics,
         predicted=predicted,
+        bodies=read_json(folder / BODIES) if (folder / BODIES).exists() else None,
         **inputs._asdict(),
     )
+
+
+def write_bodies(folder: str | Path, bodies: Sequence[Mapping[str, Any]]) -> None:
+    """Write bodies.json of a run: simulated registrations on its mesh."""
+    write_json(Path(folder) / BODIES, list(bodies))
 
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:

@@ -17,7 +17,7 @@ from bayesreg.io.atomic import write_json, write_text
 from bayesreg.report import style
 from bayesreg.report.html import render
 from bayesreg.report.style import Drawing
-from bayesreg.report.tables import Table
+from bayesreg.report.tables import Table, in_terminal
 from bayesreg.report.verdict import NONE, number, rhat_text
 
 HEADER = (
@@ -87,15 +87,12 @@ def efficiency_table(found: Sequence[Efficiency], setting: Setting) -> Table:
 
 def terminal_table(table: Table) -> TerminalTable:
     """What matters most of the same table, for a terminal."""
-    columns = [0, *(HEADER.index(name) for name in IN_TERMINAL)]
-    shown = TerminalTable(title=table.title)
-    for column in columns:
-        shown.add_column(table.header[column], justify="right" if column else "left")
+    columns = [HEADER.index(name) for name in IN_TERMINAL]
+    groups = []
     for title, rows in table.groups:
-        for row in rows:
-            name = row[0] + (" (approximate)" if title == "Approximate" else "")
-            shown.add_row(name, *(row[column] for column in columns[1:]))
-    return shown
+        mark = " (approximate)" if title == "Approximate" else ""
+        groups.append((title, [[row[0] + mark, *(row[column] for column in columns)] for row in rows]))
+    return in_terminal(Table(table.title, table.caption, [table.header[0], *IN_TERMINAL], groups))
 
 
 def _ranked(found: Sequence[Efficiency]) -> list[Efficiency]:

@@ -19,6 +19,7 @@ from bayesreg.io.store import Run
 from bayesreg.report import (
     adequacy,
     anatomy,
+    bodies,
     convergence,
     identifiability,
     marginals,
@@ -95,6 +96,7 @@ def write_report(
         uncertainty.landmarks(view, predicted) if predicted else None,
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
+        bodies.scatter(run, posterior) if run.bodies else None,
         anatomy.element_stiffness(view, posterior),
         anatomy.stiffness_field(view, predicted) if predicted else None,
         marginals.temperatures(run, posterior),
@@ -118,6 +120,7 @@ def write_report(
         "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
         "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),
         "ratios": identifiability.ratio_table(run.mesh, posterior),
+        "own": bodies.mesh_table(run.mesh, posterior, run.bodies) if run.bodies else None,
         "widths": identifiability.width_table(run.mesh, posterior, diagnosed, run.manifest),
         "parameters": tables.parameter_table(run, posterior, diagnosed),
         "checks": adequacy.check_table(predicted) if predicted else None,

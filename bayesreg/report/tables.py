@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from rich.table import Table as TerminalTable
 
 from bayesreg.io.store import Run
 from bayesreg.report.estimands import SYMBOLS, Diagnosed, Estimand, Group, parameter_groups, worst
@@ -42,6 +43,17 @@ class Table(NamedTuple):
     caption: str
     header: list[str]
     groups: list[tuple[str, list[list[str]]]]
+
+
+def in_terminal(table: Table) -> TerminalTable:
+    """The same table for a terminal, without its caption."""
+    shown = TerminalTable(title=table.title)
+    for index, name in enumerate(table.header):
+        shown.add_column(name, justify="right" if index else "left")
+    for _, rows in table.groups:
+        for row in rows:
+            shown.add_row(*row)
+    return shown
 
 
 def boundary_error_table(metrics: Mapping[str, Mapping[str, Any]]) -> Table:

@@ -225,13 +225,13 @@ def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Datase
     Parameters
     ----------
     manifest : mapping
-        Of which `warnings`, `solver`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
+        Of which `warnings`, `solver`, `inverted_elements`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
     mesh : TetMesh
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.
     """
     found = list(part(manifest, "warnings") or [])
-    found += _solver(manifest) + _noise(manifest) + _locking(mesh, posterior)
+    found += _solver(manifest) + _folding(manifest) + _noise(manifest) + _locking(mesh, posterior)
     return list(dict.fromkeys(found))
 
 
@@ -242,6 +242,16 @@ def _solver(manifest: Mapping[str, Any]) -> list[str]:
     return [
         f"{int(failed):,} elastic solves failed and counted as density zero: the posterior near those states is "
         "under-explored. Allow more iterations or a stronger preconditioner."
+    ]
+
+
+def _folding(manifest: Mapping[str, Any]) -> list[str]:
+    inverted = part(manifest, "inverted_elements")
+    if not inverted:
+        return []
+    return [
+        f"{inverted:,} tetrahedra are turned inside out by the mean displacement, as no tissue can be: the chains may "
+        "sit in a false mode, with nodes far from where they belong. Start from a field (start.field), and compare."
     ]
 
 

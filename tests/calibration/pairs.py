@@ -3,7 +3,8 @@
 Each pair has its own patch and noise (sd 0.01 on each image), of the MNI152 brain; T_s is inferred. The mesh that makes
 them is finer than the one that registers them, or, to tell what of an error is the mesh's, the same. A node of the
 coarser mesh may lie a millimetre or two outside the body that was pushed, and where that slides along the skull, the
-truth takes the node into it: between different meshes the registration is therefore without a skull.
+truth takes the node into it: between different meshes the registration is therefore without a skull. Intervals of pairs
+between different meshes allow for the registering one, by bodies that are made on a third (`bayesreg.discretisation`).
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 import bayesreg as br
+from bayesreg.discretisation import Subject, register_body
 from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
 from bayesreg.inference.diagnostics import convergence, dataset
+from bayesreg.inference.recalibration import Response, recalibrated, response
 from bayesreg.inference.stopping import StopRule
 from bayesreg.io.atomic import write_text
 from bayesreg.io.datasets import Anatomy as AnatomyOfData
@@ -34,15 +37,13 @@ from tests.calibration import figures
 COUNT, ENOUGH = 20, 17
 TRUE_LAM, TRUE_MU = np.array([1e-6, 10.0, 30.0]), np.array([1e-6, 1.0, 1.0])
 TISSUES = {"gm": 1, "wm": 2}
-EDGE, MAKING_EDGE = 22.0, 12.0
-DISPLACEMENT, PATCH_SHARE = 10.0, 0.045
+# The pairs are made on the second mesh, the bodies that tell what the first does to λ/μ on the third.
+EDGE, MAKING_EDGE, BODIES_EDGE = 22.0, 12.0, 13.0
+BODIES = 30
+DISPLACEMENT, PATCH_SHARE, NOISE_SD = 10.0, 0.045, 0.01
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 SECONDS = 90.0
-
-MODEL = {
-    "t_similarity": {"median": 0.1, "log_sd": 1.0},
-    "interpolation": "cubic",
-}
+MODEL = br.ModelConfig(t_similarity={"median": 0.1, "log_sd": 1.0}, interpolation="cubic")
 
 Say = Callable[[str], None]
 Made = TypeVar("Made")
@@ -114,22 +115,40 @@ def push(mesh: br.TetMesh) -> dict[str, Any]:
 
 def make(shared: Anatomy, seed: int) -> tuple[SyntheticPair, Direction]:
     """A pair with a patch of its own."""
-    options = push(shared.making) | {"noise_sd": 0.01, "seed": seed}
+    options = push(shared.making) | {"noise_sd": NOISE_SD, "seed": seed}
     return upwards(seed, lambda direction: make_pair(*shared[:4], direction=direction, **options))
 
 
-def register(shared: Anatomy, pair: SyntheticPair, seed: int, **options: Any) -> dict[str, Any]:
-    """Intervals of λ/μ, and how well the sampling and the model do."""
+def register_bodies(folder: Path, say: Say = print) -> Response:
+    """What the registering mesh does to λ/μ, by bodies of a third mesh; each is a file of its own."""
+    shared = anatomy(folder, same_mesh=False)
+    (making,) = meshes(folder, [BODIES_EDGE])
+    lam, mu = (dict(zip(making.names, values.tolist(), strict=True)) for values in (TRUE_LAM, TRUE_MU))
+    subject = Subject(*shared[:3], making, shared.registering, MODEL, lam, mu, DISPLACEMENT, NOISE_SD)
+    found = []
+    for seed in range(1, BODIES + 1):
+        path = folder / f"body_{seed:02d}.json"
+        if not path.exists():
+            write_text(path, json.dumps(register_body(subject, seed)._asdict()) + "\n")
+        found.append(json.loads(path.read_text()))
+        say(f"body {seed} of {BODIES}: λ/μ {found[-1]['true']}, found {found[-1]['found']}")
+    sound = [body for body in found if not body["inverted"]]
+    return response(*(np.array([list(body[key].values()) for body in sound]) for key in ("true", "found")))
+
+
+def register(shared: Anatomy, pair: SyntheticPair, seed: int, known: Response | None = None) -> dict[str, Any]:
+    """Intervals of λ/μ, allowing for the mesh where it is known what that does, and how well the sampling does."""
     skull = shared.skull if shared.making.digest == shared.registering.digest else None
-    model = br.ModelConfig(**MODEL | options)
-    posterior = br.build_posterior(pair.fixed, pair.moving, shared.registering, model, skull)
+    posterior = br.build_posterior(pair.fixed, pair.moving, shared.registering, MODEL, skull)
     rule = StopRule(rhat=1.01, ess=400, max_seconds=SECONDS)
     samples = br.sample(posterior, "hmc", chains=4, draws=1500, seed=seed, stop=rule, progress=False)
     draws, judged = dataset(samples.idata, "posterior"), convergence(samples.idata)
     u_true = transfer(pair.u, pair.mesh, shared.registering.points)
-    ratio = {name: draws["ratio"].values[..., entry].ravel() for name, entry in TISSUES.items()}
+    found = np.column_stack([draws["ratio"].values[..., entry].ravel() for entry in TISSUES.values()])
+    own = found if known is None else recalibrated(known, found, seed)
     return {
-        "ratio": {name: np.quantile(values, QUANTILES).tolist() for name, values in ratio.items()},
+        "ratio": dict(zip(TISSUES, np.quantile(own, QUANTILES, axis=0).T.tolist(), strict=True)),
+        "ratio_on_the_mesh": dict(zip(TISSUES, np.quantile(found, QUANTILES, axis=0).T.tolist(), strict=True)),
         "t_similarity": float(draws["t_similarity"].mean()),
         "noise_sd_of_t_similarity": posterior.noise_sd(float(draws["t_similarity"].mean())),
         "residual_sd_at_truth": pair.residual_sd,
@@ -160,11 +179,13 @@ def register_pairs(out: Path, same_mesh: bool = False, say: Say = print, count: 
     Each pair is a file of its own, so that what was cut short goes on where it was.
     """
     shared, found, name = anatomy(out, same_mesh), [], "same_mesh" if same_mesh else "pair"
+    known = None if same_mesh else register_bodies(out, say)
     for seed in range(1, count + 1):
         path = out / f"{name}_{seed:02d}.json"
         if not path.exists():
             pair, direction = make(shared, seed)
-            write_text(path, json.dumps(register(shared, pair, seed) | {"direction": direction, "seed": seed}) + "\n")
+            one = register(shared, pair, seed, known) | {"direction": direction, "seed": seed}
+            write_text(path, json.dumps(one) + "\n")
         found.append(json.loads(path.read_text()))
         inside = ", ".join(f"{name} {'in' if covers(found[-1], name) else 'OUT'}" for name in TISSUES)
         say(f"pair {seed} of {count}: {inside}; R̂ of λ {found[-1]['rhat_of_ratio']:.3f}")

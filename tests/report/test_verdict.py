@@ -128,6 +128,13 @@ def test_failed_solves_are_warned_of_and_nothing_is_said_twice():
     assert warnings_of(manifest | {"warnings": first}, box_mesh(), quiet) == first
 
 
+def test_folded_tetrahedra_are_warned_of():
+    quiet = elastic([1.0] * 3, [1.0] * 3)
+    assert warnings_of({"inverted_elements": 0}, box_mesh(), quiet) == []
+    (text,) = warnings_of({"inverted_elements": 3}, box_mesh(), quiet)
+    assert text.startswith("3 tetrahedra are turned inside out")
+
+
 def test_only_an_approximate_sampler_is_called_so():
     text = approximation({"exact": False, "sampler": {"name": "laplace"}})
     assert "laplace" in text

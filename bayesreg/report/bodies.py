@@ -1,0 +1,131 @@
+"""λ/μ allowing for the mesh: what simulated bodies tell of a registration on it (see `bayesreg.discretisation`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from bayesreg.inference.recalibration import RANGE, Response, recalibrated, response
+from bayesreg.io.store import Run
+from bayesreg.mesh import TetMesh
+from bayesreg.report import style
+from bayesreg.report.estimands import parameter_groups
+from bayesreg.report.identifiability import RATIO_LEVELS
+from bayesreg.report.places import tissue_label
+from bayesreg.report.style import Drawing
+from bayesreg.report.tables import Table
+from bayesreg.report.verdict import number
+
+
+class Allowed(NamedTuple):
+    """λ/μ of tissues as a run has it and allowing for its mesh.
+
+    Attributes
+    ----------
+    names : list of str
+        Tissues, without CSF.
+    true, found : (k, t) arrays
+        Of the simulated bodies whose search has not failed.
+    response : Response
+    draws : (n, t) array
+        Of the run's posterior.
+    allowed : (m, t) array
+        Draws of the body's own λ/μ.
+    failed : int
+        Bodies that are left out.
+    """
+
+    names: list[str]
+    true: Float[np.ndarray, "bodies tissues"]
+    found: Float[np.ndarray, "bodies tissues"]
+    response: Response
+    draws: Float[np.ndarray, "draws tissues"]
+    allowed: Float[np.ndarray, "candidates tissues"]
+    failed: int
+
+
+def allowing(mesh: TetMesh, posterior: xr.Dataset, bodies: Sequence[Mapping[str, Any]]) -> Allowed:
+    """Draws of λ/μ widened, and shifted, by what the mesh does to it.
+
+    Raises
+    ------
+    InputError
+        If too few of the bodies were registered well.
+    """
+    sound = [body for body in bodies if not body["inverted"]]
+    names = list(bodies[0]["true"])
+    true, found = (np.array([[body[key][name] for name in names] for body in sound]) for key in ("true", "found"))
+    groups = {group.name: group.ratio.ravel() for group in parameter_groups(mesh, posterior)}
+    draws = np.column_stack([groups[name] for name in names])
+    draws = draws[np.isfinite(draws).all(axis=1) & (draws > 0).all(axis=1)]
+    known = response(true.reshape(-1, len(names)), found.reshape(-1, len(names)))
+    return Allowed(names, true, found, known, draws, recalibrated(known, draws), len(bodies) - len(sound))
+
+
+def mesh_table(mesh: TetMesh, posterior: xr.Dataset, bodies: Sequence[Mapping[str, Any]]) -> Table:
+    """Quantiles of λ/μ by tissue, as the posterior has it and allowing for the mesh."""
+    it = allowing(mesh, posterior, bodies)
+    rows = []
+    for index, name in enumerate(it.names):
+        for label, draws in (("on this mesh", it.draws), ("allowing for it", it.allowed)):
+            levels = np.quantile(draws[:, index], RATIO_LEVELS)
+            rows.append([f"{tissue_label(name)}, {label}", *map(number, levels)])
+    header = ["", *(f"{level:.0%}".replace("%", " %") for level in RATIO_LEVELS)]
+    caption = (
+        f"{len(it.true)} bodies of known λ/μ, pushed on a finer mesh and registered on this one, tell how far what is "
+        "found differs from the body's own. Intervals of what is found on this mesh do not know of that. Those that "
+        f"allow for it have a prior that is log-uniform from {RANGE[0]:g} to {RANGE[1]:g}; near the ends it is all "
+        "they hold." + _left_out(it.failed)
+    )
+    return Table("λ/μ, allowing for the mesh", caption, header, [("", rows)])
+
+
+def _left_out(failed: int) -> str:
+    if not failed:
+        return ""
+    which = "1 more is" if failed == 1 else f"{failed} more are"
+    return f" {which} left out: there the search turned tetrahedra inside out."
+
+
+def scatter(run: Run, posterior: xr.Dataset) -> Drawing:
+    """λ/μ that is found of the bodies over their own, with this run's and what it stands for."""
+    assert run.bodies
+    it = allowing(run.mesh, posterior, run.bodies)
+    with style.look():
+        figure = style.new_figure(3.4)
+        for index, panel in enumerate(figure.subplots(1, len(it.names), squeeze=False)[0]):
+            _panel(panel, it, index)
+        uri = style.data_uri(figure, "svg")
+    caption = (
+        "λ/μ as registrations on this mesh find it of simulated bodies (dots), over the bodies’ own; dashed: what a "
+        "mesh without error would find; line: what this one finds on average, the other tissues as in the run. Band: "
+        "this run’s central 95 % interval; bar at the foot: the interval of the body’s own λ/μ that it stands for, "
+        "with its median."
+    )
+    alternative = f"Scatter of found over true λ/μ for {', '.join(map(tissue_label, it.names))}."
+    return Drawing("bodies", "What the mesh does to λ/μ", caption, alternative, uri)
+
+
+def _panel(panel: Axes, it: Allowed, index: int) -> None:
+    low, high = np.quantile(it.draws[:, index], (0.025, 0.975))
+    ends = (RANGE[0], float(2 * max(it.true[:, index].max(), it.found[:, index].max(), high)))
+    panel.axhspan(low, high, color=style.ACCENT, alpha=0.2, linewidth=0)
+    panel.plot(ends, ends, "--", color=style.MUTED, linewidth=1)
+    own_low, own, own_high = np.quantile(it.allowed[:, index], (0.025, 0.5, 0.975))
+    reach = (ends[0], max(ends[1], 1.1 * float(own_high)))
+    grid = np.geomspace(*reach, 100)
+    others = np.tile(1 / np.median(it.allowed, axis=0), (len(grid), 1))
+    others[:, index] = 1 / grid
+    panel.plot(grid, np.exp(-it.response(others)[:, index]), color=style.INK, linewidth=1)
+    panel.scatter(it.true[:, index], it.found[:, index], s=16, color=style.INK, zorder=3)
+    panel.plot([own_low, own_high], [1.15 * ends[0]] * 2, color=style.ACCENT, linewidth=4, solid_capstyle="butt")
+    panel.plot([own], [1.15 * ends[0]], "o", color="white", markeredgecolor=style.ACCENT, markersize=6, zorder=4)
+    panel.set(xscale="log", yscale="log", xlim=reach, ylim=ends)
+    panel.set(title=tissue_label(it.names[index]), xlabel="λ/μ of the body")
+    if index == 0:
+        panel.set_ylabel("λ/μ found")
