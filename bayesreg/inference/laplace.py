@@ -237,13 +237,28 @@ def precision_at(
         Of a problem other than the target's own.
     joint : bool
         Whether the other coordinates are given curvature; else they are left uncorrelated.
+
+    Raises
+    ------
+    InputError
+        If a parameter or its curvature is not finite.
     """
     data = target.data if data is None else data
     return _jointly(target, data, flat, _regular(_curvature(target, data, flat).gauss_newton), joint)
 
 
 def _curvature(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
-    return target.displacement_curvature(data, target.constrain_of(data, unravel(target)(jnp.asarray(flat))))
+    estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
+    _require_finite(ravel_pytree(estimands)[0])
+    return target.displacement_curvature(data, estimands)
+
+
+def _require_finite(numbers: AnyArray) -> None:
+    if not np.isfinite(np.asarray(numbers)).all():
+        raise InputError(
+            "the search for the mode has no end: λ, μ or a temperature runs away; fix one more of them, or give each a "
+            "prior with a finite high"
+        )
 
 
 def _regular(curvature: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
@@ -268,6 +283,7 @@ def _jointly(
     precision[count:, count:] = curvature[first:, first:]
     if joint and count:
         rows = -_hessian_rows(target, target.without_walls(data), flat, order[:count])[:, order]
+        _require_finite(rows)
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]

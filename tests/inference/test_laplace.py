@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import lsq_linear
 
 import bayesreg as br
-from bayesreg.inference.laplace import GAP, _convex, find_mode, laplace, pulled, unravel
+from bayesreg.inference.laplace import GAP, _convex, find_mode, laplace, precision_at, pulled, unravel
 from tests.inference.test_closed_form import LAM, MESH, MU, problem, walled
 from tests.phantoms import flat_skull, smooth_image
 
@@ -89,3 +89,12 @@ def test_a_curvature_with_its_remainder_is_made_convex():
         lower = np.linalg.cholesky(convex)
         first = np.outer(lower[:, 0], lower[:, 0])
         np.testing.assert_allclose(_convex(convex, size * first), convex + (expected - 1) * first, atol=1e-12)
+
+
+def test_a_parameter_that_runs_away_is_told():
+    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    posterior = br.build_posterior(*images, MESH, model=br.ModelConfig(interpolation="cubic", rigid_sd=1.0))
+    away = posterior.unconstrain(posterior.reference())
+    away["lam"] = away["lam"].at[1].set(800.0)
+    with pytest.raises(br.InputError, match="λ, μ or a temperature runs away"):
+        precision_at(posterior, np.asarray(ravel_pytree(away)[0]))
