@@ -1,6 +1,7 @@
 """Bodies that tell what a mesh does to λ/μ, and the command that widens a run's by them."""
 
-import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ import bayesreg as br
 from bayesreg import discretisation, pipeline
 from bayesreg.cli import app
 from bayesreg.discretisation import Body, Subject, mesh_error, register_body
-from bayesreg.inference.recalibration import response
+from bayesreg.io import store
+from bayesreg.report.html import write_report
 from tests.model.test_simulation import head
 from tests.phantoms import PAPER_LAM, PAPER_MU, ball_mesh
-from tests.test_pipeline import anatomy, finished, folder  # noqa: F401
+from tests.report.conftest import make_study
 
 NAMES = ("csf", "gm", "wm")
+CONFIG = br.load_config(Path(__file__).parent.parent / "configs" / "quickstart.yaml")
 
 
 def fake(_subject: Subject, seed: int) -> Body:
@@ -26,13 +29,37 @@ def fake(_subject: Subject, seed: int) -> Body:
     return Body(seed, dict(zip(NAMES[1:], true, strict=True)), dict(zip(NAMES[1:], found, strict=True)), int(seed == 3))
 
 
+@pytest.fixture(scope="module")
+def study():
+    return make_study(draws=100, spacing=18.0)
+
+
+def result_of(folder, run, study):
+    """A result whose draws stand in no file."""
+    result = pipeline.Result(folder, run)
+    result.__dict__["idata"] = study.idata
+    return result
+
+
 @pytest.fixture
-def run(finished, folder, tmp_path):  # noqa: F811
-    """A run of one's own, with a finer mesh at hand."""
-    copy = tmp_path / "run"
-    shutil.copytree(folder / "out", copy)
-    br.save_mesh(ball_mesh(radius=38, spacing=13.0), copy / "inputs" / "finer.vtu")
-    return copy
+def folder(study, tmp_path, monkeypatch):
+    """The folder of a run with a finer mesh at hand, as far as the command looks at it."""
+    (tmp_path / "inputs").mkdir()
+    br.save_mesh(ball_mesh(spacing=13.0), tmp_path / "inputs" / "finer.vtu")
+
+    def load_result(folder):
+        path = folder / store.BODIES
+        run = replace(study.run, bodies=store.read_json(path) if path.exists() else None)
+        return result_of(folder, run, study)
+
+    def report(folder):
+        write_report(load_result(folder).run, *study[1:], folder / "report.html")
+
+    monkeypatch.setattr(pipeline, "load_result", load_result)
+    monkeypatch.setattr(pipeline, "report", report)
+    monkeypatch.setattr(discretisation, "load_config", lambda path: CONFIG)
+    monkeypatch.setattr(discretisation, "register_body", fake)
+    return tmp_path
 
 
 def subject_of(**options) -> Subject:
@@ -68,45 +95,51 @@ def test_bodies_have_the_parameters_that_the_registration_knows(known, monkeypat
     assert 2 <= lam["gm"] / mu["gm"] <= 100
 
 
-def test_the_report_of_a_run_allows_for_its_mesh(run, monkeypatch):
-    monkeypatch.setattr(discretisation, "register_body", fake)
-    done = CliRunner().invoke(app, ["mesh-error", str(run), "--bodies", "20", "-q"])
+def test_the_report_of_a_run_allows_for_its_mesh(folder):
+    done = CliRunner().invoke(app, ["mesh-error", str(folder), "--bodies", "20", "-q"])
     assert done.exit_code == 0, done.output
     assert "GM, allowing for it" in done.output
-    page = (run / "report.html").read_text()
+    page = (folder / "report.html").read_text()
     assert "λ/μ, allowing for the mesh" in page
+    assert "What the mesh does to λ/μ" in page
     assert "19 bodies of known λ/μ" in page
     assert "1 more is left out" in page
-    assert len(br.load_result(run).run.bodies) == 20
 
 
-def test_bodies_are_kept_and_more_are_added(run, monkeypatch):
+def test_bodies_are_kept_and_more_are_added(folder, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        discretisation, "register_body", lambda subject, seed: asked.append(seed) or fake(subject, seed)
-    )
-    mesh_error(run, 8, progress=False)
-    table = mesh_error(run, 12, progress=False)
-    assert asked == list(range(12))
+
+    def asking(subject: Subject, seed: int) -> Body:
+        asked.append(seed)
+        return fake(subject, seed)
+
+    monkeypatch.setattr(discretisation, "register_body", asking)
+    monkeypatch.setattr(pipeline, "report", lambda folder: None)
+    mesh_error(folder, 8, progress=False)
+    table = mesh_error(folder, 24, progress=False)
+    assert asked == list(range(24))
     ((_, rows),) = table.groups
-    own, wide = (np.array([float(x) for x in row[1:]]) for row in rows[2:])
-    known = [fake(None, seed) for seed in range(12) if seed != 3]
-    curve = response(*(np.array([list(getattr(body, key).values()) for body in known]) for key in ("true", "found")))
-    assert (curve.slope.diagonal() > 1).all()
-    assert wide[2] > own[2]
+    on_it, allowing = ({row[0][:2]: float(row[3]) for row in rows[first::2]} for first in (0, 1))
+    for tissue in ("GM", "WM"):
+        # The mesh halves what it finds.
+        assert allowing[tissue] == pytest.approx(2 * on_it[tissue], rel=0.15)
 
 
-def test_what_has_no_ratio_of_its_own_is_refused(run, monkeypatch):
+def test_what_has_no_ratio_of_its_own_is_refused(folder, study, monkeypatch):
     with pytest.raises(br.InputError, match="bodies must be at least 6, got 5"):
-        mesh_error(run, 5, progress=False)
-    (run / "inputs" / "skull.nii.gz").unlink()
+        mesh_error(folder, 5, progress=False)
+    without = result_of(folder, replace(study.run, skull=None), study)
+    monkeypatch.setattr(pipeline, "load_result", lambda folder: without)
     with pytest.raises(br.InputError, match="inside the skull"):
-        mesh_error(run, progress=False)
-    with pytest.raises(br.InputError, match="holds no finished run"):
-        mesh_error(run / "inputs", progress=False)
-    config = br.load_config(run / "config.yaml", ["model.elasticity=uniform"])
-    monkeypatch.setattr(discretisation, "load_config", lambda _: config)
+        mesh_error(folder, progress=False)
+    mesh = study.run.mesh
+    other = br.TetMesh.from_arrays(mesh.points, mesh.cells, mesh.tissue, ("water", "gm", "wm"))
+    renamed = result_of(folder, replace(study.run, mesh=other), study)
+    monkeypatch.setattr(pipeline, "load_result", lambda folder: renamed)
+    with pytest.raises(br.InputError, match="and a CSF"):
+        mesh_error(folder, progress=False)
+    uniform = CONFIG.model_copy(update={"model": br.ModelConfig(elasticity="uniform")})
+    monkeypatch.setattr(discretisation, "load_config", lambda path: uniform)
     with pytest.raises(br.InputError, match="elasticity: tissue"):
-        mesh_error(run, progress=False)
-    assert not (run / "bodies.json").exists()
-    assert pipeline.load_result(run).run.bodies is None
+        mesh_error(folder, progress=False)
+    assert not (folder / store.BODIES).exists()
