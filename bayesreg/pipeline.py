@@ -135,7 +135,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         posterior = posterior_of(config, inputs)
         if (out / "run.json").exists():
             store.reopen(out, to_block(posterior, load_result(out).idata))
-        inputs = inputs._replace(config=resolved_yaml(config))
+        inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
         write_text(out / "config.yaml", inputs.config)
         reached = _reached(config, inputs, posterior, out, progress)
         sampled = float(reached[0].seconds)

@@ -299,3 +299,5 @@ def test_simulate_writes_the_pair(synthetic, folder):
     assert inputs.truth is not None
     assert inputs.moving.shape == inputs.fixed.shape
     assert json.loads((out / "inputs" / "provenance.json").read_text())["pair"]["residual_sd_at_truth"] > 0
+    begun = br.run(synthetic("paper"), out, resume=True, progress=False)
+    np.testing.assert_allclose(begun.run.truth.initial, 0.5 * inputs.truth.u)
