@@ -327,18 +327,17 @@ def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> F
     """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
     count = 3 * len(target.sampled)
     u = np.array(flat[len(flat) - count :].reshape(-1, 3))
-    nodes = jnp.arange(len(u))
-
-    @jax.jit
-    def distance(u: AnyArray) -> tuple[AnyArray, AnyArray]:
-        gap, pullback = jax.vjp(lambda u: target.clearance(target.data, u, nodes), u)
-        return gap, pullback(jnp.ones_like(gap))[0]
-
     for _ in range(100):
-        gap, slope = (np.asarray(found) for found in distance(jnp.asarray(u)))
+        gap, slope = (np.asarray(found) for found in _clearance_with_slope(target, target.data, jnp.asarray(u)))
         inside = gap < GAP / 2
         if not inside.any():
             return np.concatenate([flat[: len(flat) - count], u.ravel()])
         steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
         u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
     raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")
+
+
+@partial(jax.jit, static_argnums=0)
+def _clearance_with_slope(target: SmoothTarget, data: Any, u: AnyArray) -> tuple[AnyArray, AnyArray]:
+    gap, pullback = jax.vjp(lambda u: target.clearance(data, u, jnp.arange(len(u))), u)
+    return gap, pullback(jnp.ones_like(gap))[0]

@@ -44,7 +44,7 @@ class Target(Protocol):
     """
 
     def __hash__(self) -> int:
-        """One object, one hash: what is compiled for a target is kept for it."""
+        """Of all but the values in `data`, as for equality: what is compiled for a target serves its equals."""
 
     @property
     def data(self) -> Any:

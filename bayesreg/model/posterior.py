@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -55,6 +55,11 @@ class Posterior:
         The nodes whose displacements are sampled, sorted.
     fixed, moving : Image
         f and m, as they were given.
+
+    Notes
+    -----
+    Two are equal if they differ in the values of their arrays alone: what is compiled for one pair of images then
+    serves all others on the mesh.
     """
 
     data: RegistrationData
@@ -63,6 +68,19 @@ class Posterior:
     sampled: Int[np.ndarray, "sampled"]
     fixed: Image
     moving: Image
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Posterior) and self._structure == other._structure
+
+    def __hash__(self) -> int:
+        return hash(self._structure)
+
+    @cached_property
+    def _structure(self) -> tuple[Hashable, ...]:
+        leaves, tree = jax.tree.flatten(self.data)
+        shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        entries = tuple((name, tuple(free.tolist())) for name, free in self.free.items())
+        return self.mesh.digest, self.options.model_dump_json(), tuple(self.sampled.tolist()), entries, tree, shapes
 
     @cached_property
     def free(self) -> dict[str, Int[np.ndarray, "free"]]:

@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
 import bayesreg as br
@@ -186,6 +187,8 @@ def register_pairs(out: Path, same_mesh: bool = False, say: Say = print, count: 
             pair, direction = make(shared, seed)
             one = register(shared, pair, seed, known) | {"direction": direction, "seed": seed}
             write_text(path, json.dumps(one) + "\n")
+            # Compiled samplers are never freed, and some forty of them exhaust a process's memory maps.
+            jax.clear_caches()
         found.append(json.loads(path.read_text()))
         inside = ", ".join(f"{name} {'in' if covers(found[-1], name) else 'OUT'}" for name in TISSUES)
         say(f"pair {seed} of {count}: {inside}; R̂ of λ {found[-1]['rhat_of_ratio']:.3f}")
