@@ -156,7 +156,7 @@ def compare_samplers(
 
 @app.command()
 def mesh_error(folder: RunFolder, bodies: Bodies = 24, quiet: Quiet = False) -> None:
-    """Widen the λ/μ of a run by what its mesh does to them: bodies made on a finer mesh are registered on it."""
+    """Tell what its mesh does to the λ/μ of a run: bodies of known stiffness are registered on it."""
     from bayesreg import discretisation
     from bayesreg.report.tables import in_terminal
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,29 +13,29 @@ from jaxtyping import Float
 from rich.progress import track
 
 from bayesreg import pipeline
-from bayesreg.config import Config, load_config
+from bayesreg.config import model_of
 from bayesreg.image import Image
 from bayesreg.inference.diagnostics import dataset
 from bayesreg.inference.laplace import find_mode, unravel
-from bayesreg.inference.recalibration import least_bodies
+from bayesreg.inference.recalibration import RANGE, least_bodies
 from bayesreg.io import store
 from bayesreg.io.meshing import MeshOptions, build_mesh, load_mesh, save_mesh
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.options import ModelConfig, of_tissue
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.simulation import SyntheticPair, make_pair
-from bayesreg.report.bodies import mesh_table
+from bayesreg.report.bodies import allowing, mesh_table, sound
 from bayesreg.report.tables import Table
 from bayesreg.types import InputError
 
-# λ/μ of the bodies, log-uniform, and how far their μ may lie from that of the registration, as a factor.
-LOG_RATIOS, FACTOR = (math.log(2), math.log(100)), 1.5
+# How far the μ of a body may lie from that of the run, as a factor, and its push, as a share of the run's.
+FACTOR, PUSH = 1.5, (0.85, 1.15)
 # Of the finer mesh's edges to those of the registering one.
 FINER = 0.6
 # Directions that are tried for one body: along some a tetrahedron inverts, or the skull is in the way.
 ATTEMPTS = 30
-# Least displacement of a patch, mm, and its share of the nodes on the boundary.
-LEAST_PUSH, PATCH_SHARE = 5.0, 0.045
+# Share of the nodes on the boundary that are pushed.
+PATCH_SHARE = 0.045
 CSF = "csf"
 
 
@@ -53,8 +52,8 @@ class Subject(NamedTuple):
         Of the registration.
     lam, mu : mapping
         Tissue name to the value of CSF, and to one about which those of the other tissues lie.
-    displacement, noise_sd : float
-        How far a patch moves at most, mm, and at least half as far; the noise on each image.
+    displacement, noise_sd, smoothing_mm : float
+        How far a patch moves, mm; the noise on each image; the width of a smoothing of `fixed` beforehand.
     """
 
     fixed: Image
@@ -67,6 +66,7 @@ class Subject(NamedTuple):
     mu: Mapping[str, float]
     displacement: float
     noise_sd: float
+    smoothing_mm: float = 0.75
 
 
 class Body(NamedTuple):
@@ -76,41 +76,54 @@ class Body(NamedTuple):
     ----------
     seed : int
     true, found : dict
-        Tissue name (but CSF) to λ/μ: of the body, and at the mode of its posterior on the registering mesh.
-    inverted : int
-        Tetrahedra turned inside out at that mode. If any, the search has failed.
+        Tissue to λ/μ, of the body and at the mode of its posterior on the registering mesh; of tissues whose λ/μ the
+        registration has to find. CSF is none of them.
+    failed : str
+        Why the registration cannot be counted; empty if it can.
     """
 
     seed: int
     true: dict[str, float]
     found: dict[str, float]
-    inverted: int
+    failed: str = ""
+
+
+def sought(model: ModelConfig, names: tuple[str, ...]) -> list[str]:
+    """Tissues but CSF of which λ or μ is free."""
+    known = model.known(names)
+    both = [name for name in names if all(of_tissue(model, known.get(key), name) for key in ("lam", "mu"))]
+    return [name for name in names if name != CSF and name not in both]
 
 
 def register_body(subject: Subject, seed: int) -> Body:
     """A body of random λ/μ, pushed somewhere, and what its registration finds.
 
     Without a skull: where a body slides along it, it may hold nodes of the registering mesh that lie a little outside.
-
-    Raises
-    ------
-    InputError
-        If no direction is found along which the body can be pushed.
     """
     rng = np.random.default_rng(seed)
     names, model = subject.registering.names, subject.model
-    solid, known = [name for name in names if name != CSF], model.known(names)
-    true = dict(zip(solid, np.exp(rng.uniform(*LOG_RATIOS, len(solid))).tolist(), strict=True))
-    lam, mu = dict(subject.lam), dict(subject.mu)
-    for name in solid:
+    lam, mu, known = dict(subject.lam), dict(subject.mu), model.known(names)
+    low, high = np.log(RANGE)
+    for name in names:
+        ratio, factor = float(np.exp(rng.uniform(low, high))), FACTOR ** float(rng.uniform(-1, 1))
         lam_known, mu_known = (of_tissue(model, known.get(parameter), name) for parameter in ("lam", "mu"))
-        mu[name] *= FACTOR ** rng.uniform(-1, 1)
-        mu[name] = mu_known or (lam_known / true[name] if lam_known else mu[name])
-        lam[name] = true[name] * mu[name]
-    pair = _pushed(subject, rng, *(np.array([values[name] for name in names]) for values in (lam, mu)))
-    values, inverted = _mode(build_posterior(pair.fixed, pair.moving, subject.registering, model))
-    ratio = np.asarray(values["lam"]) / np.asarray(values["mu"])
-    return Body(seed, true, {name: float(ratio[names.index(name)]) for name in solid}, inverted)
+        if name != CSF:
+            mu[name] = mu_known or (lam_known / ratio if lam_known else mu[name] * factor)
+            lam[name] = lam_known or ratio * mu[name]
+    tissues = sought(model, names)
+    true = {name: lam[name] / mu[name] for name in tissues}
+    try:
+        pair = _pushed(subject, rng, *(np.array([values[name] for name in names]) for values in (lam, mu)))
+        values, inverted = _mode(build_posterior(pair.fixed, pair.moving, subject.registering, model))
+    except InputError as error:
+        return Body(seed, true, {}, str(error))
+    ratios = np.asarray(values["lam"]) / np.asarray(values["mu"])
+    found = {name: float(ratios[names.index(name)]) for name in tissues}
+    if inverted:
+        return Body(seed, true, found, f"the search turned {inverted} tetrahedra inside out")
+    if not all(0 < ratio < np.inf for ratio in found.values()):
+        return Body(seed, true, {}, "the search has no end")
+    return Body(seed, true, found)
 
 
 def _pushed(
@@ -129,9 +142,10 @@ def _pushed(
                 *subject[:4],
                 lam=lam,
                 mu=mu,
-                displacement=subject.displacement * rng.uniform(0.5, 1),
+                displacement=subject.displacement * rng.uniform(*PUSH),
                 patch_nodes=patch_nodes,
                 direction=tuple(direction.tolist()),
+                smoothing_mm=subject.smoothing_mm,
                 noise_sd=subject.noise_sd,
                 seed=int(rng.integers(2**31)),
             )
@@ -157,7 +171,7 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
     Parameters
     ----------
     folder : path
-        Of a finished run with elasticity by tissue and an intracranial mask.
+        Of a finished run with elasticity by tissue, a boundary that is sampled, and an intracranial mask.
     bodies : int
         How many to simulate in all.
     progress : bool
@@ -171,53 +185,60 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
     Raises
     ------
     InputError
-        If the folder holds no such run, or there are too few bodies.
+        If the folder holds no such run, there are too few bodies, or the registrations of too many fail.
     """
     result = pipeline.load_result(folder)
-    config = load_config(Path(folder) / "config.yaml")
-    _require_ratios(result, config)
-    least = least_bodies(len(result.mesh.names) - 1)
+    _require_ratios(result)
+    least = least_bodies(len(sought(model_of(result.run.config), result.mesh.names)))
     if bodies < least:
         raise InputError(f"bodies must be at least {least}, got {bodies}")
     found = list(result.run.bodies or [])
-    subject = _subject(result, config)
+    subject = _subject(result)
     for seed in track(range(len(found), bodies), "bodies", disable=not progress):
         found.append(register_body(subject, seed)._asdict())
         store.write_bodies(folder, found)
+    if len(sound(found)) < least:
+        why = next(body["failed"] for body in reversed(found) if body["failed"])
+        raise InputError(f"only {len(sound(found))} of {len(found)} bodies are registered, {least} are needed; {why}")
     pipeline.report(folder)
-    return mesh_table(result.mesh, dataset(result.idata, "posterior"), found)
+    return mesh_table(allowing(result.mesh, dataset(result.idata, "posterior"), found))
 
 
-def _require_ratios(result: pipeline.Result, config: Config) -> None:
+def _require_ratios(result: pipeline.Result) -> None:
     """Raise InputError where a run has no λ/μ by tissue that could be the mesh's, or no body can be pushed."""
-    names = result.mesh.names
-    if config.model.elasticity != "tissue" or CSF not in names:
+    run, model = result.run, model_of(result.run.config)
+    if model.elasticity != "tissue" or CSF not in run.mesh.names or not sought(model, run.mesh.names):
         raise InputError("the mesh's share is that of λ/μ by tissue: the run needs elasticity: tissue, and a CSF")
-    if result.run.skull is None:
+    if run.boundary is not None or model.held or model.is_elastography:
+        raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
+    if run.skull is None:
         raise InputError("bodies are pushed inside the skull: the run needs an intracranial mask (data.intracranial)")
+    if run.manifest.get("inverted_elements"):
+        raise InputError("the run's own mean displacement turns tetrahedra inside out: its λ/μ cannot be mended")
 
 
-def _subject(result: pipeline.Result, config: Config) -> Subject:
+def _subject(result: pipeline.Result) -> Subject:
     run, draws = result.run, dataset(result.idata, "posterior")
     assert run.skull is not None
     median = {name: draws[name].median(("chain", "draw")).to_numpy() for name in ("lam", "mu")}
     lam, mu = (dict(zip(run.mesh.names, median[name].tolist(), strict=True)) for name in ("lam", "mu"))
-    moved = np.linalg.norm(np.asarray(run.u_mean)[run.mesh.boundary], axis=1).max()
     return Subject(
         fixed=run.fixed,
         tissue=run.tissue,
         skull=run.skull,
-        making=_finer(result, config),
+        making=_finer(result),
         registering=run.mesh,
-        model=config.model,
+        model=model_of(result.run.config),
         lam=lam,
         mu=mu,
-        displacement=max(float(moved), LEAST_PUSH),
+        displacement=float(np.linalg.norm(np.asarray(run.u_mean)[run.mesh.boundary], axis=1).max()),
         noise_sd=float(run.manifest["implied_noise_sd"]) / np.sqrt(2),
+        # The image of a synthetic pair has been smoothed already.
+        smoothing_mm=0.0 if run.manifest.get("pair") else 0.75,
     )
 
 
-def _finer(result: pipeline.Result, config: Config) -> TetMesh:
+def _finer(result: pipeline.Result) -> TetMesh:
     """The mesh that makes the bodies; kept with the run, since none is made twice alike."""
     path = Path(result.folder) / "inputs" / "finer.vtu"
     if not path.exists():
@@ -225,6 +246,12 @@ def _finer(result: pipeline.Result, config: Config) -> TetMesh:
         assert run.skull is not None
         domain = run.tissue.with_voxels((np.asarray(run.tissue.voxels) != 0).astype(np.uint8))
         intracranial = run.skull.with_voxels((np.asarray(run.skull.voxels) == 0).astype(np.uint8))
-        options = MeshOptions(edge_length=FINER * config.mesh.edge_length, skull_gap=config.mesh.skull_gap)
+        options = MeshOptions(edge_length=FINER * _edge_length(run.mesh))
         save_mesh(build_mesh(run.tissue, intracranial, options, domain), path)
     return load_mesh(path)
+
+
+def _edge_length(mesh: TetMesh) -> float:
+    """Median length of an edge on the boundary, mm."""
+    corners = mesh.points[mesh.boundary_faces]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))

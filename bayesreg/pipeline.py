@@ -366,6 +366,7 @@ def _finish(
         warped=warp_image(inputs.moving, mean_field, inputs.fixed),
         metrics=metrics,
         predicted=predicted,
+        bodies=store.read_bodies(out),
         **inputs._asdict(),
     )
     store.write_results(out, finished, mean_field, sd_field)

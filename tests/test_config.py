@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from bayesreg.config import Config, ConfigError, load_config, resolved_yaml, schema
+from bayesreg.config import Config, ConfigError, load_config, model_of, resolved_yaml, schema
 from bayesreg.types import InputError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -308,6 +308,14 @@ def test_start_values_by_entry(write):
     assert start.entries("lam", ["gm", "wm"]) == {"gm": 3, "wm": 3}
     assert start.entries("mu", ["csf", "gm", "wm"]) == {"csf": 1, "gm": 2, "wm": 3}
     assert load_config(write(SMALL)).start.entries("lam", ["all"]) is None
+
+
+def test_the_model_of_a_resolved_configuration_needs_no_files(write):
+    model = (
+        "model: {priors: {lam: {high: .inf}, mu: {gm: {high: 3}}}, held: {7: [0, 0.5, 0]}, t_similarity: {median: 1}}"
+    )
+    config = load_config(write(SMALL + model))
+    assert model_of(resolved_yaml(config)) == config.model
 
 
 def test_schema_describes_every_section_and_forbids_unknown_keys():

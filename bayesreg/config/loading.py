@@ -17,6 +17,7 @@ from ruamel.yaml.representer import RoundTripRepresenter
 from bayesreg.config.errors import ConfigError, Keys, explain
 from bayesreg.config.sections import Config
 from bayesreg.config.values import search_folders
+from bayesreg.model.options import ModelConfig
 
 # A section of another kind replaces the one that it extends: their keys have nothing in common.
 _KINDS = ("source", "kind", "name")
@@ -68,6 +69,11 @@ def resolved_yaml(config: Config) -> str:
     yaml.width = 120
     yaml.dump(config.model_dump(mode="json"), text)
     return text.getvalue()
+
+
+def model_of(text: str) -> ModelConfig:
+    """The model of a configuration as `resolved_yaml` writes it; the files that it names need not be there any more."""
+    return ModelConfig.model_validate(_parse(text, "config.yaml")[0]["model"])
 
 
 def schema() -> dict[str, Any]:

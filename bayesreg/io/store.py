@@ -21,7 +21,10 @@ from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError
 
 BODIES = "bodies.json"
-RESULTS = ("config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html")
+RESULTS = (
+    "config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html", BODIES,
+)  # fmt: skip
+_BODY = {"seed", "true", "found", "failed"}
 
 
 class Truth(NamedTuple):
@@ -276,7 +279,7 @@ def read_run(folder: str | Path) -> Run:
         warped=warped,
         metrics=metrics,
         predicted=predicted,
-        bodies=read_json(folder / BODIES) if (folder / BODIES).exists() else None,
+        bodies=read_bodies(folder),
         **inputs._asdict(),
     )
 
@@ -284,6 +287,18 @@ def read_run(folder: str | Path) -> Run:
 def write_bodies(folder: str | Path, bodies: Sequence[Mapping[str, Any]]) -> None:
     """Write bodies.json of a run: simulated registrations on its mesh."""
     write_json(Path(folder) / BODIES, list(bodies))
+
+
+def read_bodies(folder: str | Path) -> list[dict[str, Any]] | None:
+    """Read what `write_bodies` wrote; None where nothing was, InputError where it is damaged."""
+    path = Path(folder) / BODIES
+    if not path.exists():
+        return None
+    bodies = read_json(path)
+    whole = isinstance(bodies, list) and all(isinstance(body, dict) and body.keys() >= _BODY for body in bodies)
+    if not whole:
+        raise InputError(f"{path} holds no simulated bodies; remove it, and they are simulated anew")
+    return bodies
 
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:

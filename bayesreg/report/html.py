@@ -88,6 +88,8 @@ def write_report(
     view, predicted, groups = View.of(run), run.predicted, grouping(posterior)
     apart = groups.groups > 1
     nodes = posterior.sizes["node"]
+    simulated = run.bodies or []
+    allowed = bodies.allowing(run.mesh, posterior, simulated) if bodies.enough(simulated) else None
     shown = {"groups": apart, "trust": predicted, "fit": predicted, "one-node": nodes}
     left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
@@ -96,7 +98,7 @@ def write_report(
         uncertainty.landmarks(view, predicted) if predicted else None,
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
-        bodies.scatter(run, posterior) if run.bodies else None,
+        bodies.scatter(allowed) if allowed else None,
         anatomy.element_stiffness(view, posterior),
         anatomy.stiffness_field(view, predicted) if predicted else None,
         marginals.temperatures(run, posterior),
@@ -120,7 +122,7 @@ def write_report(
         "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
         "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),
         "ratios": identifiability.ratio_table(run.mesh, posterior),
-        "own": bodies.mesh_table(run.mesh, posterior, run.bodies) if run.bodies else None,
+        "own": bodies.mesh_table(allowed) if allowed else None,
         "widths": identifiability.width_table(run.mesh, posterior, diagnosed, run.manifest),
         "parameters": tables.parameter_table(run, posterior, diagnosed),
         "checks": adequacy.check_table(predicted) if predicted else None,

@@ -249,8 +249,9 @@ def _folding(manifest: Mapping[str, Any]) -> list[str]:
     inverted = part(manifest, "inverted_elements")
     if not inverted:
         return []
+    which = "1 tetrahedron is" if inverted == 1 else f"{inverted:,} tetrahedra are"
     return [
-        f"{inverted:,} tetrahedra are turned inside out by the mean displacement, as no tissue can be: the chains may "
+        f"{which} turned inside out by the mean displacement, as no tissue can be: the chains may "
         "sit in a false mode, with nodes far from where they belong. Start from a field (start.field), and compare."
     ]
 

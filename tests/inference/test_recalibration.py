@@ -36,8 +36,21 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         assert stats.binomtest(int(covered), count, 0.9).pvalue > 0.01, inside
 
 
+def test_a_better_mesh_gives_as_good_an_interval():
+    """However narrow: the candidates follow."""
+    sharp = MESH._replace(scatter=np.diag([0.02, 0.02]) ** 2, degrees_of_freedom=10_000)
+    ends = [np.quantile(recalibrated(sharp, np.array([[8.0, 9.0]]), seed), (0.05, 0.95), axis=0) for seed in range(4)]
+    np.testing.assert_allclose(ends, np.broadcast_to(np.mean(ends, axis=0), (4, 2, 2)), rtol=0.01)
+    grid = np.exp(np.linspace(*np.log(RANGE), 2000))
+    high = 1 / grid
+    # Of WM alone, whose row of the slope knows nothing of GM.
+    weight = stats.norm.pdf(np.log(0.05 + 0.9 * high) + np.log(9.0), scale=0.02)
+    levels = np.interp((0.05, 0.95), np.cumsum(weight) / weight.sum(), grid)
+    np.testing.assert_allclose(np.mean(ends, axis=0)[:, 1], levels, rtol=0.01)
+
+
 def test_a_mesh_without_error_leaves_the_posterior_as_it_is():
-    exact = Response(np.zeros(2), np.eye(2), 1e-4 * np.eye(2), 100)
+    exact = Response(np.zeros(2), np.eye(2), 1e-4 * np.eye(2), 1000)
     draws = np.exp(np.log([10.0, 30.0]) + 0.2 * np.random.default_rng(5).normal(size=(2000, 2)))
     levels = (0.1, 0.5, 0.9)
     np.testing.assert_allclose(
@@ -62,8 +75,19 @@ def test_the_same_seed_gives_the_same_draws():
 def test_too_few_bodies_and_broken_ones_are_refused():
     true, found = bodies(24, seed=6)
     few = least_bodies(2) - 1
-    with pytest.raises(InputError, match=f"6 simulated bodies or more, got {few}"):
+    with pytest.raises(InputError, match=f"12 simulated bodies or more, got {few}"):
         response(true[:few], found[:few])
     found[3, 1] = np.inf
     with pytest.raises(InputError, match="positive and finite"):
         response(true, found)
+    with pytest.raises(InputError, match="no draw"):
+        recalibrated(MESH, np.zeros((0, 2)))
+
+
+def test_bodies_that_are_all_found_alike_tell_nothing():
+    """The scatter that they lack is not taken for certainty of what is true."""
+    true, _ = bodies(24, seed=7)
+    own = recalibrated(response(true, np.full_like(true, 10.0)), np.full((5, 2), 10.0))
+    low, high = np.quantile(own, (0.05, 0.95), axis=0)
+    assert (low < 2).all()
+    assert (high > 100).all()
