@@ -120,7 +120,7 @@ def register_body(subject: Subject, seed: int) -> Body:
     ratios = np.asarray(values["lam"]) / np.asarray(values["mu"])
     found = {name: float(ratios[names.index(name)]) for name in tissues}
     if inverted:
-        return Body(seed, true, found, f"the search turned {inverted} tetrahedra inside out")
+        return Body(seed, true, found, f"the search for the mode turned tetrahedra inside out ({inverted})")
     if not all(0 < ratio < np.inf for ratio in found.values()):
         return Body(seed, true, {}, "the search has no end")
     return Body(seed, true, found)

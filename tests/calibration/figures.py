@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from scipy import stats
 
 from bayesreg.report.style import ACCENT, FAINT, INK, MUTED, look, new_figure
@@ -57,19 +58,22 @@ def coverage(runs: dict[str, Ranks], path: Path) -> None:
 
 
 def intervals(pairs: list[dict[str, Any]], truth: dict[str, float], path: Path) -> None:
-    """95 % and 50 % intervals of λ/μ, pair by pair."""
+    """95 % and 50 % intervals of λ/μ, pair by pair; beside them those that do not allow for the mesh, if there are."""
     with look():
         figure = new_figure(2.6)
         axes = figure.subplots(1, len(truth), squeeze=False)[0]
         for axis, (tissue, true) in zip(axes, truth.items(), strict=True):
-            for row, pair in enumerate(pairs):
-                low, lower, middle, upper, high = pair["ratio"][tissue]
-                colour = INK if low <= true <= high else ACCENT
-                axis.plot([row, row], [low, high], color=colour, lw=1)
-                axis.plot([row, row], [lower, upper], color=colour, lw=3)
-                axis.plot(row, middle, "o", ms=2.5, color="white", mec=colour)
+            for place, key, colour in ((0.0, "ratio", INK), (0.35, "ratio_on_the_mesh", ACCENT)):
+                for number, pair in enumerate(pairs, start=1):
+                    if key in pair:
+                        _bar(axis, number + place, pair[key][tissue], colour)
             axis.axhline(true, color=MUTED, lw=0.8, ls="--")
-            axis.set_yscale("log")
-            axis.set_title(f"λ/μ of {tissue.upper()}")
-            axis.set_xlabel("pair")
+            axis.set(yscale="log", title=f"λ/μ of {tissue.upper()}", xlabel="pair", xticks=[1, 5, 10, 15, 20])
         figure.savefig(path, dpi=DPI)
+
+
+def _bar(axis: Axes, place: float, quantiles: list[float], colour: str) -> None:
+    low, lower, middle, upper, high = quantiles
+    axis.plot([place, place], [low, high], color=colour, lw=1)
+    axis.plot([place, place], [lower, upper], color=colour, lw=3)
+    axis.plot(place, middle, "o", ms=2.5, color="white", mec=colour)
