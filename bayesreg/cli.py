@@ -157,13 +157,12 @@ def compare_samplers(
 @app.command()
 def mesh_error(folder: RunFolder, bodies: Bodies = 24, quiet: Quiet = False) -> None:
     """Tell what its mesh does to the λ/μ of a run: bodies of known stiffness are registered on it."""
+    from rich.console import Console
+
     from bayesreg import discretisation
     from bayesreg.report.tables import in_terminal
 
-    found = discretisation.mesh_error(folder, bodies, progress=not quiet)
-    from rich.console import Console
-
-    Console().print(in_terminal(found))
+    Console().print(in_terminal(discretisation.mesh_error(folder, bodies, progress=not quiet)))
     typer.echo(f"Report: {folder / 'report.html'}")
 
 

@@ -24,7 +24,7 @@ from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.options import ModelConfig, of_tissue
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.simulation import SyntheticPair, make_pair
-from bayesreg.report.bodies import allowing, mesh_table, sound
+from bayesreg.report.bodies import allowing, enough, mesh_table, sound
 from bayesreg.report.tables import Table
 from bayesreg.types import InputError
 
@@ -90,9 +90,8 @@ class Body(NamedTuple):
 
 def sought(model: ModelConfig, names: tuple[str, ...]) -> list[str]:
     """Tissues but CSF of which λ or μ is free."""
-    known = model.known(names)
-    both = [name for name in names if all(of_tissue(model, known.get(key), name) for key in ("lam", "mu"))]
-    return [name for name in names if name != CSF and name not in both]
+    known = [model.known(names).get(parameter) for parameter in ("lam", "mu")]
+    return [name for name in names if name != CSF and not all(of_tissue(model, given, name) for given in known)]
 
 
 def register_body(subject: Subject, seed: int) -> Body:
@@ -197,7 +196,7 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
     for seed in track(range(len(found), bodies), "bodies", disable=not progress):
         found.append(register_body(subject, seed)._asdict())
         store.write_bodies(folder, found)
-    if len(sound(found)) < least:
+    if not enough(found):
         why = next(body["failed"] for body in reversed(found) if body["failed"])
         raise InputError(f"only {len(sound(found))} of {len(found)} bodies are registered, {least} are needed; {why}")
     pipeline.report(folder)

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 import bayesreg as br
-from bayesreg.discretisation import Subject, register_body
+from bayesreg.discretisation import PATCH_SHARE, Subject, register_body
 from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
 from bayesreg.inference.diagnostics import convergence, dataset
@@ -42,7 +42,7 @@ TISSUES = {"gm": 1, "wm": 2}
 # The pairs are made on the second mesh, the bodies that tell what the first does to λ/μ on the third.
 EDGE, MAKING_EDGE, BODIES_EDGE = 22.0, 12.0, 13.0
 BODIES = 30
-DISPLACEMENT, PATCH_SHARE, NOISE_SD = 10.0, 0.045, 0.01
+DISPLACEMENT, NOISE_SD = 10.0, 0.01
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 SECONDS = 90.0
 MODEL = br.ModelConfig(t_similarity={"median": 0.1, "log_sd": 1.0}, interpolation="cubic")
