@@ -271,6 +271,21 @@ def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
 
 
 @pytest.mark.slow
+def test_a_field_of_stiffness_is_mapped(synthetic, folder):
+    field = ["model.elasticity=field", "model.field={modes: 20, correlation: 40}", "model.interpolation=cubic"]
+    laplace = ["sampler={name: laplace, chains: 2}", "start.field=identity"]
+    result = br.run(synthetic("calibrated", PROPER, *field, *laplace), folder / "field", progress=False)
+    assert result.idata.posterior["field"].shape[::2] == (2, 20)
+    cells = meshio.read(folder / "field" / "mesh.vtu").cell_data
+    mean, sd, stiffer = (cells[name][0] for name in ("stiffness_mean", "stiffness_sd", "stiffer_probability"))
+    assert mean.shape == (len(result.mesh.cells),)
+    assert (mean > 0).all()
+    assert (sd > 0).all()
+    assert ((stiffer >= 0) & (stiffer <= 1)).all()
+    assert "stiffness" in result.report.read_text()
+
+
+@pytest.mark.slow
 def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeypatch, capsys):
     """On a phantom in place of MNI152, from a quickstart made small."""
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -34,12 +33,16 @@ class ElasticSystem(NamedTuple):
         A partition of the nodes.
     preconditioner : ReferenceInverse or None
         See `bayesreg.fem.preconditioners`.
+    tolerance : scalar
+        On the relative residual in the norm of the inverse diagonal of K, so that it also speaks for tissues a million
+        times softer than their neighbours.
     """
 
     elements: Elements
     prescribed: Int[AnyArray, "prescribed"]
     free: Int[AnyArray, "free"]
     preconditioner: ReferenceInverse | None
+    tolerance: Scalar | float = TOLERANCE
 
 
 class SolverInfo(NamedTuple):
@@ -55,6 +58,7 @@ def elastic_system(
     prescribed: Int[AnyArray, "prescribed"],
     lam_reference: Float[AnyArray, "entries"],
     mu_reference: Float[AnyArray, "entries"],
+    tolerance: float = TOLERANCE,
 ) -> ElasticSystem:
     """Prepare the solves on a mesh whose `prescribed` nodes have given displacements.
 
@@ -67,7 +71,9 @@ def elastic_system(
     degrees = (3 * free[:, None] + np.arange(3)).ravel()
     reference = stiffness(mesh, lam_reference, mu_reference)[degrees][:, degrees]
     preconditioner = reference_inverse(reference) if len(free) else None
-    return ElasticSystem(elements_of(mesh), jnp.asarray(prescribed), jnp.asarray(free), preconditioner)
+    return ElasticSystem(
+        elements_of(mesh), jnp.asarray(prescribed), jnp.asarray(free), preconditioner, jnp.asarray(tolerance)
+    )
 
 
 def equilibrium(
@@ -75,22 +81,20 @@ def equilibrium(
     lam: Float[AnyArray, "cells"],
     mu: Float[AnyArray, "cells"],
     u_prescribed: Float[AnyArray, "prescribed 3"],
-    tolerance: float = TOLERANCE,
     guess: Float[AnyArray, "nodes 3"] | None = None,
 ) -> Equilibrium:
     """Displacement of every node, λ and μ given by cell; differentiable in λ, μ and u (implicitly).
 
-    The residual is measured in the norm of the inverse diagonal of K, so that it also speaks for tissues a
-    million times softer than their neighbours. A `guess` (mm, the equilibrium of a state near by) saves
-    iterations, and costs the derivative: reverse-mode differentiation then raises.
+    A `guess` (mm, the equilibrium of a state near by) saves iterations, and costs the derivative: reverse-mode
+    differentiation then raises.
     """
     if guess is None:
-        return _differentiable(system, lam, mu, u_prescribed, tolerance)
-    return _settled(system, lam, mu, u_prescribed, tolerance, guess)
+        return _differentiable(system, lam, mu, u_prescribed)
+    return _settled(system, lam, mu, u_prescribed, guess)
 
 
 def _settled(
-    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, tolerance: float, guess: AnyArray | None
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, guess: AnyArray | None = None
 ) -> Equilibrium:
     nodes = len(system.prescribed) + len(system.free)
     u_given = jnp.zeros((nodes, 3)).at[system.prescribed].set(u_prescribed)
@@ -98,17 +102,17 @@ def _settled(
         fine = jnp.isfinite(u_given).all()
         return Equilibrium(u_given, jnp.zeros(()), jnp.zeros((), int), fine)
     load = -internal_force(system.elements, lam, mu, u_given)[system.free]
-    u_free, info = _response(system, lam, mu, load, tolerance, guess)
+    u_free, info = _response(system, lam, mu, load, guess)
     u = u_given.at[system.free].set(u_free)
     # A node whose cells have no free node never enters the solve, but must be finite all the same.
     return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
 
 
 def _response(
-    system: ElasticSystem, lam: AnyArray, mu: AnyArray, load: AnyArray, tolerance: float, guess: AnyArray | None = None
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, load: AnyArray, guess: AnyArray | None = None
 ) -> tuple[AnyArray, SolverInfo]:
     """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
-    elements, prescribed, free, reference = system
+    elements, prescribed, free, reference, tolerance = system
     nodes = len(prescribed) + len(free)
 
     def apply(u_free: AnyArray) -> AnyArray:
@@ -129,22 +133,20 @@ def _response(
     return solve(apply, load)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(4,))
-def _differentiable(
-    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, tolerance: float
-) -> Equilibrium:
-    return _settled(system, lam, mu, u_prescribed, tolerance, None)
+@jax.custom_vjp
+def _differentiable(system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray) -> Equilibrium:
+    return _settled(system, lam, mu, u_prescribed)
 
 
 def _forward(
-    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, tolerance: float
+    system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray
 ) -> tuple[Equilibrium, tuple[ElasticSystem, AnyArray, AnyArray, AnyArray]]:
-    state = _settled(system, lam, mu, u_prescribed, tolerance, None)
+    state = _settled(system, lam, mu, u_prescribed)
     return state, (system, lam, mu, state.u)
 
 
 def _backward(
-    tolerance: float, kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
+    kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
 ) -> tuple[None, AnyArray, AnyArray, AnyArray]:
     """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
 
@@ -154,7 +156,7 @@ def _backward(
     bar = cotangent.u
     if len(system.free) == 0:
         return None, jnp.zeros_like(lam), jnp.zeros_like(mu), bar[system.prescribed]
-    w_free, _ = _response(system, lam, mu, bar[system.free], tolerance)
+    w_free, _ = _response(system, lam, mu, bar[system.free])
     w = jnp.zeros_like(u).at[system.free].set(w_free)
     dilatation, distortion = strain_products(system.elements, u, w)
     reaction = internal_force(system.elements, lam, mu, w)
@@ -171,7 +173,7 @@ def _conjugate_gradients(
     first: AnyArray | None,
     precondition: LinearMap,
     inverse_diagonal: AnyArray,
-    tolerance: float,
+    tolerance: Scalar | float,
 ) -> tuple[AnyArray, SolverInfo]:
     """Preconditioned conjugate gradients from `first`, else from zero; NaN anywhere ends the iteration unconverged."""
 
@@ -233,8 +235,8 @@ def solve_interior(
     """
     if np.shape(u_boundary) != (len(mesh.boundary), 3):
         raise InputError(f"u_boundary must have shape ({len(mesh.boundary)}, 3), got {np.shape(u_boundary)}")
-    system = elastic_system(mesh, mesh.boundary, *_reference(lam, mu))
-    return equilibrium(system, lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u_boundary), tolerance)
+    system = elastic_system(mesh, mesh.boundary, *_reference(lam, mu), tolerance)
+    return equilibrium(system, lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u_boundary))
 
 
 def _reference(

@@ -64,7 +64,8 @@ def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
         if not np.isfinite(elbo):
             raise InputError("pathfinder found no Gaussian with a finite evidence bound; use the sampler laplace")
         say(f"pathfinder: evidence bound {elbo:.1f}, mean {np.sqrt((mean**2).mean()):.2f} sd from the mode")
-        return setup_about(target, _pushed(setup.reference, mean, covariance)), starts
+        reference = _pushed(setup.reference, mean, covariance)
+        return setup_about(target, reference, reference.centre), starts
 
     return about_mode._replace(prepare=prepare)
 

@@ -26,7 +26,7 @@ MOST_CURVED = 20
 
 
 class StandIn(NamedTuple):
-    """The normaliser to second order about the centre of the reference, less its value there (a pytree).
+    """The normaliser to second order about the middle of the chains, less its value there (a pytree).
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class StandIn(NamedTuple):
     curvature: Float[AnyArray, "parameters parameters"]
 
     def __call__(self, away: Float[AnyArray, "dimension"]) -> Scalar:
-        """Its value at a flat position, given less the centre."""
+        """Its value at a flat position, given less the middle."""
         x = away[: len(self.slope)]
         return self.slope @ x + 0.5 * (x @ self.curvature @ x)
 
@@ -69,21 +69,21 @@ def no_stand_in(target: SmoothTarget, reference: Reference) -> StandIn:
     return StandIn(jnp.zeros(count), jnp.zeros((count, count)))
 
 
-def stand_in(target: SmoothTarget, reference: Reference) -> StandIn:
-    """The normaliser's slope at the centre, and its curvature by differences over one standard deviation each way."""
+def stand_in(target: SmoothTarget, reference: Reference, middle: AnyArray) -> StandIn:
+    """The normaliser's slope at a flat position, and its curvature by differences over one sd of the reference."""
     found = no_stand_in(target, reference)
     count = len(found.slope)
     if not target.costly_normaliser or not count:
         return found
     slope_at = partial(_slope, target, target.data)
-    found = found._replace(slope=slope_at(reference.centre)[:count])
+    found = found._replace(slope=slope_at(middle)[:count])
     if count > MOST_CURVED:
         return found
     sd = np.minimum(np.linalg.norm(np.asarray(reference.factor[:count]), axis=1), 1.0)
     rows = []
     for index, h in enumerate(sd):
-        step = jnp.zeros_like(reference.centre).at[index].set(h)
-        rows.append((slope_at(reference.centre + step) - slope_at(reference.centre - step))[:count] / (2 * h))
+        step = jnp.zeros_like(middle).at[index].set(h)
+        rows.append((slope_at(middle + step) - slope_at(middle - step))[:count] / (2 * h))
     curvature = jnp.stack(rows)
     return found._replace(curvature=(curvature + curvature.T) / 2)
 
@@ -106,7 +106,7 @@ def delayed(
     Parameters
     ----------
     step : callable
-        (data, setup, key, state) → (state, info); reversible, and setup with fields `reference` and `stand_in`.
+        (data, setup, key, state) → (state, info); reversible, and setup with fields `middle` and `stand_in`.
     flat_of : callable
         (setup, state) → flat position.
     log_normaliser : callable
@@ -118,8 +118,8 @@ def delayed(
         proposed, info = step(data, setup, key_step, state.kernel)
         here, there = flat_of(setup, state.kernel), flat_of(setup, proposed)
         true = log_normaliser(data, there)
-        centre, approximate = setup.reference.centre, setup.stand_in
-        gain = true - state.log_normaliser - approximate(there - centre) + approximate(here - centre)
+        middle, approximate = setup.middle, setup.stand_in
+        gain = true - state.log_normaliser - approximate(there - middle) + approximate(here - middle)
         probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
         accepted = jax.random.uniform(key_accept) < probability
         moved = Delayed(proposed, true)

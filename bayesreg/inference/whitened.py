@@ -37,6 +37,9 @@ class Setup(NamedTuple):
     Attributes
     ----------
     reference : Reference
+    middle : (d,) array
+        Flat position that the chains are about: the mode, or the mean of where they are. Not the reference's centre,
+        which may lie behind a wall. Solves are preconditioned there.
     walls : Walls
         Of every sampled node.
     step_size : scalar
@@ -48,6 +51,7 @@ class Setup(NamedTuple):
     """
 
     reference: Reference
+    middle: AnyArray
     walls: Walls
     step_size: Scalar
     steps: AnyArray
@@ -70,14 +74,15 @@ Transition = Callable[[Any, Setup, AnyArray, Any], tuple[Any, Moved]]
 Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
-def setup_about(target: SmoothTarget, reference: Reference) -> Setup:
+def setup_about(target: SmoothTarget, reference: Reference, middle: AnyArray) -> Setup:
     """A setup before its tuning."""
     nodes = len(target.sampled)
     first = len(reference.centre) - 3 * nodes
     centre = reference.centre[first:].reshape(nodes, 3)
     rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
     nothing = no_stand_in(target, reference)
-    return Setup(reference, walls(centre, rows, jnp.arange(nodes)), jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing)
+    held = walls(centre, rows, jnp.arange(nodes))
+    return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing)
 
 
 def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
@@ -96,9 +101,12 @@ def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[
     if not target.costly_normaliser:
         return lambda xi: target.logdensity_of(data, whitened_position(target, reference, xi))
     plain = target.without_normaliser(data)
-    return lambda xi: (
-        target.logdensity_of(plain, whitened_position(target, reference, xi)) + setup.stand_in(reference.factor @ xi)
-    )
+
+    def density(xi: AnyArray) -> AnyArray:
+        flat = reference.centre + reference.factor @ xi
+        return target.logdensity_of(plain, unravel(target)(flat)) + setup.stand_in(flat - setup.middle)
+
+    return density
 
 
 def clearance_of(target: SmoothTarget, data: Any, setup: Setup) -> Clearance:
@@ -172,25 +180,26 @@ def about_reference(
         keys = jax.random.split(key_start, len(found.chains))
         modes = [np.asarray(reference.centre) for reference in found.references]
         about = [pulled(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
-        setups = [_whole(target, about[0]), *(setup_about(target, reference) for reference in about[1:])]
+        setups = [_about(target, reference, mode) for reference, mode in zip(about, modes, strict=True)]
         starts = [_overdispersed(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
             return setups[0], points
-        kernel, data, setup = (init, step, estimands_of), conditioned(setups[0]), setups[0]
+        kernel = init, step, estimands_of
         # Two stages of one length, compiled once: the first leads the chains to where the second is whitened.
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
         key_settle, key_tune = jax.random.split(key_tune)
-        _, points = tuned(data, kernel, setup, points, key_settle, stage)
-        return tuned(data, kernel, _averaged(target, modes[0], points), points, key_tune, stage, say)
+        _, points = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
+        setup = _averaged(target, modes[0], points)
+        return tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
 
     def conditioned(setup: Setup) -> Any:
-        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.reference.centre)))
+        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)))
 
     def blank() -> Setup:
         d = len(ravel_pytree(target.unconstrain(target.reference()))[0])
-        return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))))
+        return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))), jnp.zeros(d))
 
     sampler = Sampler(prepare, conditioned, blank, init, step, observe, exact)
     # What is approximate anyway does without the normaliser's own value.
@@ -214,16 +223,17 @@ def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _whole(target: SmoothTarget, reference: Reference) -> Setup:
-    """A setup before its tuning, with the stand-in about this reference's centre."""
-    return setup_about(target, reference)._replace(stand_in=stand_in(target, reference))
+def _about(target: SmoothTarget, reference: Reference, middle: AnyArray) -> Setup:
+    """A setup before its tuning, with the stand-in about the middle."""
+    return setup_about(target, reference, middle)._replace(stand_in=stand_in(target, reference, jnp.asarray(middle)))
 
 
 def _averaged(target: SmoothTarget, mode: AnyArray, points: Any) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are."""
     flats = jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points)
     sound = [flat for flat in np.asarray(flats) if np.isfinite(flat).all()]
-    return _whole(target, averaged(target, [mode, *sound]))
+    places = [mode, *sound]
+    return _about(target, averaged(target, places), np.mean(places, axis=0))
 
 
 def _overdispersed(target: SmoothTarget, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:

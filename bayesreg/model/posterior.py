@@ -29,6 +29,9 @@ from bayesreg.types import AnyArray, InputError, Scalar
 # Up to this many nodes the elastic prior's normaliser may stand in every step of a trajectory.
 CHEAP_NODES = 200
 
+# Of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance can tell.
+CHAIN_TOLERANCE = 1e-6
+
 # Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
 NEAR = 1e3
 
@@ -176,13 +179,16 @@ class Posterior:
         return continuation(self.data, self.fixed, self.moving, self.options.interpolation)
 
     def conditioned(self, estimands: Values) -> RegistrationData:
-        """The data of the same problem, the solves preconditioned at these λ, μ and field: faster near them."""
+        """The data of the same problem for chains: faster near these λ, μ and field, where solves are preconditioned.
+
+        Solves end at `CHAIN_TOLERANCE`.
+        """
         values = complete(self.data, estimands, self.free)
         # A tissue that is next to nothing leaves K_II without a factor.
         reference = {name: np.asarray(getattr(self.data, name).reference) for name in LAME}
         near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
         lam, mu = (tuple(by_cell.tolist()) for by_cell in lame_by_cell(self.data, {**values, **near}))
-        return self.data._replace(system=_conditioned_system(self, lam, mu))
+        return self.data._replace(system=_conditioned_system(self, lam, mu, CHAIN_TOLERANCE))
 
     def displacement_curvature(self, data: RegistrationData, estimands: Values) -> Curvature:
         """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".
@@ -362,5 +368,8 @@ def _settled(posterior: Posterior, data: RegistrationData, estimands: Values) ->
 
 
 @lru_cache(maxsize=2)
-def _conditioned_system(posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...]) -> ElasticSystem:
-    return elastic_system(posterior.mesh, np.asarray(posterior.data.system.prescribed), np.array(lam), np.array(mu))
+def _conditioned_system(
+    posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...], tolerance: float
+) -> ElasticSystem:
+    prescribed = np.asarray(posterior.data.system.prescribed)
+    return elastic_system(posterior.mesh, prescribed, np.array(lam), np.array(mu), tolerance)

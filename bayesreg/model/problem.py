@@ -22,6 +22,9 @@ from bayesreg.model.options import FieldConfig, Lame, ModelConfig, PriorConfig, 
 from bayesreg.model.program import LameParameter, RegistrationData
 from bayesreg.types import AnyArray, InputError
 
+# The solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
+TOLERANCE = 1e-10
+
 
 def registration_data(
     fixed: Image,
@@ -45,7 +48,9 @@ def registration_data(
     displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
     distance = None if skull is None or not len(sampled) else skull_distance(skull, mesh, sampled)
     data = RegistrationData(
-        system=elastic_system(mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry]),
+        system=elastic_system(
+            mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry], TOLERANCE
+        ),
         cell_entry=jnp.asarray(entry),
         lam=lam,
         mu=mu,

@@ -23,9 +23,6 @@ from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, Scalar
 
-# The implicit solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
-SOLVER_TOLERANCE = 1e-10
-
 
 class LameParameter(NamedTuple):
     """Prior and known entries of λ or of μ (a pytree).
@@ -142,7 +139,7 @@ def registration(
     field = _field(data)
     lam_cells, mu_cells = _by_cell(data, lam, mu, **field)
     u_prescribed = data.held.at[data.slots].set(u_boundary)
-    state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, SOLVER_TOLERANCE, guess)
+    state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, guess)
 
     elements, quadrature = data.system.elements, data.quadrature
     moved = data.positions + displacement_at(elements, quadrature, state.u)

@@ -20,6 +20,7 @@ import xarray as xr
 import bayesreg as br
 from bayesreg.assembly import posterior_of
 from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.io import store
 from tests.inference.random_walk import ess_per_step, gaussian_walk
 
 CONFIG = Path(__file__).parents[2] / "configs" / "converged_tissues.yaml"
@@ -37,7 +38,7 @@ def bench_effective_draws():
         result = br.run(br.load_config(CONFIG, overrides), Path(folder) / "run", progress=False)
         convergence = result.run.manifest["convergence"]
         seconds = result.run.manifest["timings"]["sampling"]
-        posterior = posterior_of(br.load_config(CONFIG, overrides), result.run)
+        posterior = posterior_of(br.load_config(CONFIG, overrides), store.read_inputs(result.folder))
         draws = result.idata.posterior.load()
         effective = float(np.median(np.asarray(result.convergence.ess_bulk.u_boundary)))
     covariance, variances = covariance_and_steps(draws)

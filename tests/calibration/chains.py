@@ -71,7 +71,7 @@ def setups_about(posterior: br.Posterior, references: list[Reference], step_size
     """The setups of all replications, stacked."""
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
-    found = {id(reference): stand_in(posterior, reference) for reference in references}
+    found = {id(reference): stand_in(posterior, reference, reference.centre) for reference in references}
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(found[id(reference)] for reference in references))
-    setups = jax.vmap(lambda reference: setup_about(posterior, reference)._replace(**size))(stacked)
+    setups = jax.vmap(lambda reference: setup_about(posterior, reference, reference.centre)._replace(**size))(stacked)
     return setups._replace(stand_in=normalisers)

@@ -236,7 +236,9 @@ class TestEverySamplerFromExactDraws:
         factor = np.linalg.cholesky(spread)[::-1, ::-1]
         about = Reference(jnp.asarray(exact.mean + 0.1 * factor.sum(axis=1)), jnp.asarray(factor))
         size, steps = STEPS[name]
-        setup = setup_about(posterior, about)._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps))
+        setup = setup_about(posterior, about, about.centre)._replace(
+            step_size=jnp.asarray(size), steps=jnp.asarray(steps)
+        )
         kernel = SAMPLERS[name](posterior)
 
         @jax.jit

@@ -50,7 +50,9 @@ def after_steps(name: str) -> np.ndarray:
     if name == "rwmh":
         kernel, setup = SAMPLERS[name](target(), sigma_u=size), None
     else:
-        setup = setup_about(target(), poor_reference())._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps))
+        setup = setup_about(target(), poor_reference(), poor_reference().centre)._replace(
+            step_size=jnp.asarray(size), steps=jnp.asarray(steps)
+        )
         kernel = SAMPLERS[name](target())
 
     @jax.jit

@@ -1,0 +1,63 @@
+"""Chains solve less exactly than the density by itself: no acceptance, and no draw, may tell."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+import bayesreg as br
+from bayesreg.inference.laplace import laplace
+from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.whitened import setup_about
+from tests.phantoms import ball_mesh, smooth_image
+
+MESH = ball_mesh(spacing=24.0)
+
+
+@cache
+def posterior():
+    """One image twice, so that the mode is at rest."""
+    image = smooth_image(MESH.points, seed=1)
+    model = br.ModelConfig(t_similarity=5.0, t_elastic=100.0, interpolation="cubic", rigid_sd=2.0)
+    return br.build_posterior(image, image, MESH, model=model)
+
+
+def test_the_density_of_chains_is_the_density_to_a_hundredth():
+    post = posterior()
+    conditioned = post.conditioned(post.estimands(post.reference()))
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        values = post.reference() | {"u_boundary": jnp.asarray(0.3 * rng.normal(size=(len(MESH.boundary), 3)))}
+        values |= {name: values[name] * np.exp(0.4 * rng.normal(size=3)) for name in ("lam", "mu")}
+        exact, near = (post.evaluate_estimands(data, post.estimands(values)) for data in (post.data, conditioned))
+        assert near.solver_iterations < exact.solver_iterations
+        assert 0 < abs(near.logdensity - exact.logdensity) < 0.01
+
+
+def test_solves_a_hundred_times_as_exact_give_the_same_draws():
+    post, chains = posterior(), 4
+    estimands = post.estimands(post.reference())
+    flat = np.asarray(ravel_pytree(post.unconstrain_of(post.data, estimands))[0])
+    setup = setup_about(post, laplace(post, flat), flat)._replace(step_size=jnp.asarray(0.3), steps=jnp.asarray(5))
+    kernel = SAMPLERS["hmc"](post)
+    conditioned = post.conditioned(estimands)
+
+    @jax.jit
+    def draws(data):
+        def step(states, keys):
+            states, info = jax.vmap(partial(kernel.step, data, setup))(keys, states)
+            return states, (states.position, info.acceptance_rate)
+
+        states = jax.vmap(lambda _: kernel.init(data, setup, estimands))(jnp.arange(chains))
+        return jax.lax.scan(step, states, jax.random.split(jax.random.key(0), (60, chains)))[1]
+
+    system = conditioned.system
+    found, rate = draws(conditioned)
+    expected, _ = draws(conditioned._replace(system=system._replace(tolerance=system.tolerance / 100)))
+    assert 0.5 < rate.mean() < 0.999
+    # In standard deviations of the reference.
+    assert 0 < abs(found - expected).max() < 0.01
