@@ -156,7 +156,7 @@ def test_pathfinder_is_near_a_gaussian_and_called_approximate():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mala", "mclmc", "smc", "pathfinder"])
+@pytest.mark.parametrize("name", ["hmc", "mala", "mclmc", "smc", "pathfinder"])
 def test_a_resumed_run_is_the_run_that_was_not_cut_off(name):
     blocks = []
     settings = SETTINGS.get(name, {})

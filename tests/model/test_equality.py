@@ -27,11 +27,10 @@ def test_what_was_compiled_for_one_finds_the_mode_of_the_other():
     assert first == second
     assert hash(first) == hash(second)
     compiled = laplace._softened_with_slope._cache_size
-    found = mode(first), mode(second)
+    found = [mode(first)]
     before = compiled()
-    again = mode(posterior(seed=3))
+    found.append(mode(second))
     assert compiled() == before
-    np.testing.assert_array_equal(again, found[1])
     assert abs(found[0] - found[1]).max() > 0.1
     # Downhill to the other's mode.
     towards = found[1] + 0.05 * (found[0] - found[1])
