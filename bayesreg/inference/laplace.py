@@ -22,8 +22,9 @@ from bayesreg.types import AnyArray, InputError
 SOFTNESS, GAP = 0.05, 0.02
 # The logarithm z of a parameter that only its flat prior and the elastic energy see has the density exp(z − e^z): its
 # variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
-# Gaussian crosses its exponential tail.
-LEAST_CURVATURE, UNSEEN, INFLATION = 1.0, 4.0, np.pi**2 / 3
+# Gaussian crosses its exponential tail. The more the images say, the greater is the curvature κ and the lighter that
+# tail (the variance of exp(κz − e^z) times κ falls to one): what the variance gains falls as 1/κ².
+LEAST_CURVATURE, INFLATION = 1.0, np.pi**2 / 3
 # Of differences between gradients, in logarithmic coordinates.
 STEP = 1e-4
 # The last stage of a search for a mode is repeated so often, at most, or until no coordinate moves by more.
@@ -291,7 +292,7 @@ def _jointly(
         schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
         values, vectors = np.linalg.eigh(schur)
         values = np.maximum(np.abs(values), LEAST_CURVATURE)
-        convex = (vectors * np.where(values < UNSEEN, values / INFLATION, values)) @ vectors.T
+        convex = (vectors * values / (1 + (INFLATION - 1) / values**2)) @ vectors.T
         precision[:count, :count] = convex + cross @ inner
     else:
         precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
