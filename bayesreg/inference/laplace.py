@@ -20,10 +20,7 @@ from bayesreg.types import AnyArray, InputError
 
 # The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
 SOFTNESS, GAP = 0.05, 0.02
-# The logarithm z of a parameter that only its flat prior and the elastic energy see has the density exp(z − e^z): its
-# variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
-# Gaussian crosses its exponential tail. The more the images say, the greater is the curvature κ and the lighter that
-# tail (the variance of exp(κz − e^z) times κ falls to one): what the variance gains falls as 1/κ².
+# See `_with_tails`.
 LEAST_CURVATURE, INFLATION = 1.0, np.pi**2 / 3
 # Of differences between gradients, in logarithmic coordinates.
 STEP = 1e-4
@@ -291,13 +288,25 @@ def _jointly(
         inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[count:, count:]), cross.T)
         schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
         values, vectors = np.linalg.eigh(schur)
-        values = np.maximum(np.abs(values), LEAST_CURVATURE)
-        convex = (vectors * values / (1 + (INFLATION - 1) / values**2)) @ vectors.T
+        convex = (vectors * _with_tails(values)) @ vectors.T
         precision[:count, :count] = convex + cross @ inner
     else:
         precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
     precision[np.ix_(order, order)] = (precision + precision.T) / 2
     return precision
+
+
+def _with_tails(curvature: Float[np.ndarray, "directions"]) -> Float[np.ndarray, "directions"]:
+    """Precisions of logarithms of parameters whose density has some curvatures at the mode.
+
+    The logarithm z of a parameter that only its flat prior and the elastic energy see has the density exp(z − e^z): its
+    variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
+    Gaussian crosses its exponential tail. The more the images say, the greater is the curvature κ and the lighter that
+    tail: exp(κz − e^z) has the variance ψ′(κ), and κ ψ′(κ) falls to one. What the variance gains therefore falls, as
+    1/κ²; where it did not, steps became half as long.
+    """
+    curvature = np.maximum(np.abs(curvature), LEAST_CURVATURE)
+    return curvature / (1 + (INFLATION - 1) / curvature**2)
 
 
 def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import lsq_linear
+from scipy.special import polygamma
 
 import bayesreg as br
-from bayesreg.inference.laplace import GAP, _convex, find_mode, laplace, precision_at, pulled, unravel
+from bayesreg.inference.laplace import GAP, _convex, _with_tails, find_mode, laplace, precision_at, pulled, unravel
 from tests.inference.test_closed_form import LAM, MESH, MU, problem, walled
 from tests.phantoms import flat_skull, smooth_image
 
@@ -89,6 +90,16 @@ def test_a_curvature_with_its_remainder_is_made_convex():
         lower = np.linalg.cholesky(convex)
         first = np.outer(lower[:, 0], lower[:, 0])
         np.testing.assert_allclose(_convex(convex, size * first), convex + (expected - 1) * first, atol=1e-12)
+
+
+def test_tails_of_logarithms_are_covered_and_no_more():
+    """exp(κz − e^z) has the variance ψ′(κ)."""
+    curvature = np.array([1.0, 1.5, 2.0, 4.0, 8.0, 30.0])
+    wider = 1 / _with_tails(curvature) / polygamma(1, curvature)
+    assert wider[0] == pytest.approx(2.0)
+    assert (np.diff(wider[:4]) < 0).all()
+    np.testing.assert_allclose(wider[3:], 1.0, atol=0.04)
+    assert (_with_tails(np.array([-0.3, 0.1, 0.9])) == _with_tails(np.ones(1))).all()
 
 
 def test_a_parameter_that_runs_away_is_told():
