@@ -28,6 +28,9 @@ from bayesreg.types import AnyArray, InputError, Scalar
 # Chains start that much wider than Laplace's approximation.
 OVERDISPERSION = 1.5
 
+# Laplace's approximation and the reflections keep eight dense matrices of the square of this: 9 GB.
+MOST_UNKNOWNS = 12_000
+
 MODE_SEARCHES = ("once", "per_chain")
 
 
@@ -143,12 +146,19 @@ def about_reference(
     Raises
     ------
     InputError
-        If an option is out of range.
+        If an option is out of range, or the target has more than `MOST_UNKNOWNS` unknowns.
     """
     if mode_search not in MODE_SEARCHES:
         raise InputError(f"mode_search must be {' or '.join(MODE_SEARCHES)}, got {mode_search!r}")
     if tuning is not None:
         require_sound(tuning)
+    unknowns = len(ravel_pytree(target.unconstrain(target.reference()))[0])
+    if unknowns > MOST_UNKNOWNS:
+        raise InputError(
+            f"the posterior has {unknowns} unknowns; samplers about the mode keep dense matrices of their square and "
+            f"take up to {MOST_UNKNOWNS}: use a coarser mesh (mesh.edge_length), sample fewer nodes (model.sampled), "
+            "or sampler.name: rwmh"
+        )
 
     def init(data: Any, setup: Setup, estimands: Estimands) -> Any:
         flat = ravel_pytree(target.unconstrain_of(data, estimands))[0]
@@ -198,8 +208,8 @@ def about_reference(
         return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)))
 
     def blank() -> Setup:
-        d = len(ravel_pytree(target.unconstrain(target.reference()))[0])
-        return setup_about(target, Reference(jnp.zeros(d), jnp.zeros((d, d))), jnp.zeros(d))
+        nothing = jnp.zeros(unknowns)
+        return setup_about(target, Reference(nothing, jnp.zeros((unknowns, unknowns))), nothing)
 
     sampler = Sampler(prepare, conditioned, blank, init, step, observe, exact)
     # What is approximate anyway does without the normaliser's own value.

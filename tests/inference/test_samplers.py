@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference import whitened
 from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.laplace import Reference
 from bayesreg.inference.modes import distance, search_modes
@@ -230,3 +231,9 @@ def test_tempered_particles_find_both_modes():
 def test_wrong_settings_are_told(name, wrong, message):
     with pytest.raises(br.InputError, match=message):
         br.sample(target(), name, 3, 2, progress=False, **wrong)
+
+
+def test_more_unknowns_than_memory_are_told(monkeypatch):
+    monkeypatch.setattr(whitened, "MOST_UNKNOWNS", 5)
+    with pytest.raises(br.InputError, match=r"6 unknowns.*up to 5.*coarser mesh"):
+        br.sample(target(), "hmc", 2, 4, progress=False)
