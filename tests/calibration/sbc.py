@@ -59,11 +59,11 @@ class Settings(NamedTuple):
     """
 
     replications: int = 200
-    approach: int = 30
-    warm_up: int = 20
+    approach: int = 60
+    warm_up: int = 40
     draws: int = 60
-    step_size: float = 0.55
-    steps: int = 3
+    step_size: float = 0.3
+    steps: int = 5
 
 
 SETTINGS = Settings()
