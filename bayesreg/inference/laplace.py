@@ -303,7 +303,7 @@ def _with_tails(curvature: Float[np.ndarray, "directions"]) -> Float[np.ndarray,
     variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
     Gaussian crosses its exponential tail. The more the images say, the greater is the curvature κ and the lighter that
     tail: exp(κz − e^z) has the variance ψ′(κ), and κ ψ′(κ) falls to one. What the variance gains therefore falls, as
-    1/κ²; where it did not, steps became half as long.
+    1/κ²; where it did not, steps were a third shorter.
     """
     curvature = np.maximum(np.abs(curvature), LEAST_CURVATURE)
     return curvature / (1 + (INFLATION - 1) / curvature**2)
