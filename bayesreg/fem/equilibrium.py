@@ -42,7 +42,7 @@ class ElasticSystem(NamedTuple):
     prescribed: Int[AnyArray, "prescribed"]
     free: Int[AnyArray, "free"]
     preconditioner: ReferenceInverse | None
-    tolerance: Scalar | float = TOLERANCE
+    tolerance: Scalar
 
 
 class SolverInfo(NamedTuple):

@@ -43,6 +43,10 @@ class Reference(NamedTuple):
     centre: Float[AnyArray, "dimension"]
     factor: Float[AnyArray, "dimension dimension"]
 
+    def place(self, xi: AnyArray) -> AnyArray:
+        """The flat position at whitened coordinates ξ."""
+        return self.centre + self.factor @ xi
+
 
 @lru_cache(maxsize=8)
 def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
@@ -150,7 +154,7 @@ def softened(
     target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray, shift: AnyArray | float = 0.0
 ) -> tuple[AnyArray, AnyArray]:
     """Minus the log density of whitened coordinates plus a penalty for the hard skull, and that penalty alone."""
-    position = unravel(target)(reference.centre + reference.factor @ xi)
+    position = unravel(target)(reference.place(xi))
     gap = target.clearance(data, position["u_boundary"], jnp.arange(len(target.sampled)))
     penalty = 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
     return penalty - target.logdensity_of(target.without_walls(data), position), penalty
@@ -303,7 +307,7 @@ def _with_tails(curvature: Float[np.ndarray, "directions"]) -> Float[np.ndarray,
     variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
     Gaussian crosses its exponential tail. The more the images say, the greater is the curvature κ and the lighter that
     tail: exp(κz − e^z) has the variance ψ′(κ), and κ ψ′(κ) falls to one. What the variance gains therefore falls, as
-    1/κ²; where it did not, steps were a third shorter.
+    1/κ²; where it did not, steps were shorter.
     """
     curvature = np.maximum(np.abs(curvature), LEAST_CURVATURE)
     return curvature / (1 + (INFLATION - 1) / curvature**2)

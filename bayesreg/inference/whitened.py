@@ -95,7 +95,7 @@ def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
 
 def whitened_position(target: SmoothTarget, reference: Reference, xi: AnyArray) -> dict[str, AnyArray]:
     """The position at ξ."""
-    return unravel(target)(reference.centre + reference.factor @ xi)
+    return unravel(target)(reference.place(xi))
 
 
 def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
@@ -106,7 +106,7 @@ def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[
     plain = target.without_normaliser(data)
 
     def density(xi: AnyArray) -> AnyArray:
-        flat = reference.centre + reference.factor @ xi
+        flat = reference.place(xi)
         return target.logdensity_of(plain, unravel(target)(flat)) + setup.stand_in(flat - setup.middle)
 
     return density
@@ -227,7 +227,7 @@ def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
         return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
 
     def flat_of(setup: Setup, state: Any) -> AnyArray:
-        return setup.reference.centre + setup.reference.factor @ state.position
+        return setup.reference.place(state.position)
 
     step = delayed(sampler.step, flat_of, partial(log_normaliser_at, target))
     return sampler._replace(init=init, step=step, observe=observe)
