@@ -58,7 +58,7 @@ class Settings(NamedTuple):
         Of the trajectories about it.
     """
 
-    replications: int = 200
+    replications: int = 400
     approach: int = 60
     warm_up: int = 40
     draws: int = 60
