@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from bayesreg.inference.kernel import Sampler
+from bayesreg.inference.loose import LOOSE
 from bayesreg.inference.reflection import reflective_microcanonical, reflective_rotation
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.warm_up import Tuning
@@ -38,7 +39,8 @@ def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75
         state, info = kernel(key_move, state, density, size, jnp.ones_like(state.position), setup.steps)
         return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
-    return about_reference(target, transition, Tuning(warm_up, target_acceptance), mode_search=mode_search)
+    tuning = Tuning(warm_up, target_acceptance)
+    return about_reference(target, transition, tuning, mode_search=mode_search, alone=LOOSE)
 
 
 def nuts(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from bayesreg.types import AnyArray
@@ -113,8 +113,22 @@ class SmoothTarget(Target, Protocol):
     def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
         """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
 
-    def conditioned(self, estimands: Estimands) -> Any:
-        """The data of the same problem, prepared for fast densities near these estimands."""
+    def conditioned(self, estimands: Estimands, alone: AnyArray) -> Any:
+        """The data of the same problem, prepared for fast densities near these estimands.
+
+        And for `local_logdensity` of the nodes in the rows `alone` of "u_boundary".
+        """
+
+    @property
+    def knows_neighbourhoods(self) -> bool:
+        """Whether there is a `local_logdensity`."""
+
+    def local_logdensity(self, data: Any, estimands: Estimands, which: AnyArray) -> Callable[[AnyArray], AnyArray]:
+        """Approximate log density, up to a constant, as a function of the displacement (3,) of one node, mm.
+
+        The node is that one of those that `data` was conditioned for. The sum over all of these is one function of
+        where they are: it must not matter to any of them where another one is.
+        """
 
     def without_walls(self, data: Any) -> Any:
         """The data of the same problem in which a node may be anywhere."""

@@ -47,8 +47,8 @@ def require_sound(tuning: Tuning) -> None:
 def tuned(
     data: Any, kernel: tuple[Callable, Callable, Callable], setup: Any, starts: Any, key: AnyArray, tuning: Tuning,
     say: Say = lambda text: None,
-) -> tuple[Any, Any]:  # fmt: skip
-    """The setup with its step size, and where the chains then are.
+) -> tuple[Any, Any, AnyArray]:  # fmt: skip
+    """The setup with its step size, where the chains then are, and how their "u_boundary" came there.
 
     Parameters
     ----------
@@ -64,17 +64,17 @@ def tuned(
         Told of what was found.
     """
     keys = jax.random.split(key, tuning.warm_up)
-    points, size, rates = _run(kernel, tuning, data, setup, starts, keys)
+    points, size, rates, path = _run(kernel, tuning, data, setup, starts, keys)
     setup, late = _sized(tuning, setup, size), float(rates[len(rates) // 2 :].mean())
     say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a quarter turn, acceptance {late:.0%}")
-    return setup, points
+    return setup, points, path
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(
     kernel: tuple[Callable, Callable, Callable], tuning: Tuning, data: Any, setup: Any, starts: Any, keys: AnyArray
-) -> tuple[Any, Scalar, AnyArray]:
-    """Estimands, step size, and the acceptance of every transition."""
+) -> tuple[Any, Scalar, AnyArray, AnyArray]:
+    """Estimands, step size, and of every transition the acceptance and the displacements (draw, chain, node, axis)."""
     init, step, estimands_of = kernel
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(next(iter(starts.values())))
@@ -84,11 +84,12 @@ def _run(
         now = _sized(tuning, setup, jnp.exp(averaging.log_step_size))
         states, info = jax.vmap(partial(step, data, now))(jax.random.split(key, chains), states)
         rate = jnp.nan_to_num(info.acceptance_rate).mean()
-        return (states, update(averaging, rate)), rate
+        u = jax.vmap(partial(estimands_of, data, setup))(states)["u_boundary"]
+        return (states, update(averaging, rate)), (rate, u)
 
     first = jax.vmap(partial(init, data, setup))(starts), begin(setup.step_size)
-    (states, averaging), rates = jax.lax.scan(one, first, keys)
-    return jax.vmap(partial(estimands_of, data, setup))(states), final(averaging), rates
+    (states, averaging), (rates, path) = jax.lax.scan(one, first, keys)
+    return jax.vmap(partial(estimands_of, data, setup))(states), final(averaging), rates, path
 
 
 def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:

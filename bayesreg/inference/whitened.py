@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
 from bayesreg.inference.laplace import Reference, averaged, pulled, unravel
+from bayesreg.inference.loose import Loose, loose, moved_alone, slowest
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
 from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
@@ -51,6 +52,8 @@ class Setup(NamedTuple):
         Steps of a trajectory of fixed length: those of a quarter turn.
     stand_in : StandIn
         Of the density's normaliser, where it has one.
+    loose : Loose
+        Nodes that are moved alone, too.
     """
 
     reference: Reference
@@ -59,6 +62,7 @@ class Setup(NamedTuple):
     step_size: Scalar
     steps: AnyArray
     stand_in: StandIn
+    loose: Loose
 
 
 class Moved(NamedTuple):
@@ -77,15 +81,18 @@ Transition = Callable[[Any, Setup, AnyArray, Any], tuple[Any, Moved]]
 Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
-def setup_about(target: SmoothTarget, reference: Reference, middle: AnyArray) -> Setup:
-    """A setup before its tuning."""
+def setup_about(
+    target: SmoothTarget, reference: Reference, middle: AnyArray, moved_alone: AnyArray | tuple[int, ...] = ()
+) -> Setup:
+    """A setup before its tuning; some nodes are moved alone."""
     nodes = len(target.sampled)
     first = len(reference.centre) - 3 * nodes
     centre = reference.centre[first:].reshape(nodes, 3)
     rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
     nothing = no_stand_in(target, reference)
     held = walls(centre, rows, jnp.arange(nodes))
-    return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing)
+    alone = loose(reference, nodes, jnp.asarray(moved_alone, int))
+    return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing, alone)
 
 
 def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
@@ -125,6 +132,7 @@ def about_reference(
     density: Density = whitened_density,
     mode_search: str = "once",
     exact: bool = True,
+    alone: int = 0,
 ) -> Sampler:
     """A sampler of the whitened coordinates.
 
@@ -142,6 +150,9 @@ def about_reference(
     mode_search : str
         "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
     exact : bool
+    alone : int
+        Number of nodes, those that were the slowest in the warm-up, of which some are moved alone after each
+        transition.
 
     Raises
     ------
@@ -152,6 +163,7 @@ def about_reference(
         raise InputError(f"mode_search must be {' or '.join(MODE_SEARCHES)}, got {mode_search!r}")
     if tuning is not None:
         require_sound(tuning)
+    alone = min(alone, len(target.sampled)) if target.knows_neighbourhoods else 0
     unknowns = len(ravel_pytree(target.unconstrain(target.reference()))[0])
     if unknowns > MOST_UNKNOWNS:
         raise InputError(
@@ -200,20 +212,50 @@ def about_reference(
         # Two stages of one length, compiled once: the first leads the chains to where the second is whitened.
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
         key_settle, key_tune = jax.random.split(key_tune)
-        _, points = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
+        _, points, _ = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
         setup = _averaged(target, modes[0], points)
-        return tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
+        setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
+        nodes = slowest(np.asarray(path[len(path) // 2 :]), alone)
+        if alone:
+            say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
+        return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes)), points
 
     def conditioned(setup: Setup) -> Any:
-        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)))
+        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)), setup.loose.nodes)
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
-        return setup_about(target, Reference(nothing, jnp.zeros((unknowns, unknowns))), nothing)
+        return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
 
     sampler = Sampler(prepare, conditioned, blank, init, step, observe, exact)
     # What is approximate anyway does without the normaliser's own value.
-    return _with_normaliser(target, sampler) if target.costly_normaliser and exact else sampler
+    if target.costly_normaliser and exact:
+        sampler = _with_normaliser(target, sampler)
+    return _with_loose_nodes(target, sampler, begin, density) if alone else sampler
+
+
+def _with_loose_nodes(target: SmoothTarget, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
+    """A sampler that after each step moves some nodes alone.
+
+    The normaliser, the same wherever they are, has no part in that. Nor would the move have a place in the step that
+    the normaliser's test sees: one after the other, two reversible kernels are not.
+    """
+
+    def step(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
+        key_step, key_move = jax.random.split(key)
+        state, info = sampler.step(data, setup, key_step, state)
+        if not len(setup.loose.nodes):
+            return state, info
+        kernel = state.kernel if isinstance(state, Delayed) else state
+
+        def beginning(xi: AnyArray) -> Any:
+            return begin(xi, density(target, data, setup))
+
+        kernel, _ = moved_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
+        state = state._replace(kernel=kernel) if isinstance(state, Delayed) else kernel
+        return state, info._replace(gradients=info.gradients + 1)
+
+    return sampler._replace(step=step)
 
 
 def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -20,9 +20,10 @@ from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import FIELD, LAME, Values, complete, lame_by_cell, to_estimands, transform, whitened
 from bayesreg.model.curvature import Curvature, displacement_curvature
 from bayesreg.model.evaluation import Evaluation
+from bayesreg.model.neighbourhood import neighbourhoods
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.problem import registration_data
-from bayesreg.model.program import RegistrationData, in_support, stiffness_factor
+from bayesreg.model.program import RegistrationData, in_support, local_logdensity, stiffness_factor
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -178,17 +179,34 @@ class Posterior:
         """Problems of growing difficulty that lead to this one, and whether each moves more than displacements."""
         return continuation(self.data, self.fixed, self.moving, self.options.interpolation)
 
-    def conditioned(self, estimands: Values) -> RegistrationData:
+    def conditioned(self, estimands: Values, alone: Int[AnyArray, "k"] | None = None) -> RegistrationData:
         """The data of the same problem for chains: faster near these λ, μ and field, where solves are preconditioned.
 
-        Solves end at `CHAIN_TOLERANCE`.
+        Solves end at `CHAIN_TOLERANCE`. The nodes in these rows of "u_boundary" may be moved alone, see
+        `local_logdensity`.
         """
         values = complete(self.data, estimands, self.free)
         # A tissue that is next to nothing leaves K_II without a factor.
         reference = {name: np.asarray(getattr(self.data, name).reference) for name in LAME}
         near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
         lam, mu = (tuple(by_cell.tolist()) for by_cell in lame_by_cell(self.data, {**values, **near}))
-        return self.data._replace(system=_conditioned_system(self, lam, mu, CHAIN_TOLERANCE))
+        system = _conditioned_system(self, lam, mu, CHAIN_TOLERANCE)
+        rows = np.zeros(0, int) if alone is None else np.asarray(alone)
+        slots, at = np.asarray(self.data.slots)[rows], np.asarray(estimands["u_boundary"])[rows]
+        quadrature = self.data.quadrature
+        around = neighbourhoods(self.mesh, system, quadrature, np.array(lam), np.array(mu), slots, rows, at)
+        return self.data._replace(system=system, neighbourhoods=around)
+
+    @property
+    def knows_neighbourhoods(self) -> bool:
+        """Whether data can be conditioned for `local_logdensity`: a dense preconditioner says what follows a node."""
+        return self.data.system.preconditioner is not None or not len(self.data.system.free)
+
+    def local_logdensity(
+        self, data: RegistrationData, estimands: Values, which: Int[AnyArray, ""]
+    ) -> Callable[[Float[AnyArray, "3"]], Scalar]:
+        """Approximate log density of one node's displacement; see `bayesreg.model.program.local_logdensity`."""
+        return local_logdensity(data, self.options.similarity, complete(data, estimands, self.free), which)
 
     def displacement_curvature(self, data: RegistrationData, estimands: Values) -> Curvature:
         """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".

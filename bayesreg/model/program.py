@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
 from bayesreg.image import Interpolator
 from bayesreg.model.constraint import is_allowed
 from bayesreg.model.field import StiffnessField
+from bayesreg.model.neighbourhood import Neighbourhoods
 from bayesreg.model.priors import ScaledBeta
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.model.warp import displacement_at
@@ -88,6 +90,8 @@ class RegistrationData(NamedTuple):
         Effective number of independent quadrature points over that of all: tempers the likelihood.
     determinant : SchurDeterminant or None
         Of the elastic prior; None leaves its normaliser out.
+    neighbourhoods : Neighbourhoods or None
+        Of some nodes that are moved alone, see `local_logdensity`.
     """
 
     system: ElasticSystem
@@ -111,6 +115,7 @@ class RegistrationData(NamedTuple):
     degrees_of_freedom: Scalar
     independent_share: Scalar
     determinant: SchurDeterminant | None
+    neighbourhoods: Neighbourhoods | None = None
 
     @property
     def scales(self) -> tuple[str, ...]:
@@ -169,6 +174,50 @@ def registration(
     numpyro.deterministic("solver_iterations", state.iterations)
     numpyro.deterministic("solver_failed", ~state.converged)
     numpyro.deterministic("outside_support", ~inside)
+
+
+def local_logdensity(
+    data: RegistrationData, similarity: str, values: Mapping[str, AnyArray], which: Int[AnyArray, ""]
+) -> Callable[[Float[AnyArray, "3"]], Scalar]:
+    """The log density as a function of the displacement of one node, up to a constant and approximately.
+
+    Parameters
+    ----------
+    data : RegistrationData
+        With neighbourhoods.
+    similarity : str
+    values : mapping
+        Where the other nodes are. Those that have neighbourhoods count as if they were in the middle of theirs, so that
+        the sum over these is one function of them all.
+    which : scalar integer
+        Of the neighbourhoods.
+    """
+    near, quadrature, likelihood = data.neighbourhoods, data.quadrature, SIMILARITIES[similarity]
+    assert near is not None
+    t_similarity, t_elastic = (values.get(name, getattr(data, name)) for name in ("t_similarity", "t_elastic"))
+    noise = Noise(t_similarity, data.degrees_of_freedom)
+    u_boundary = values["u_boundary"].at[near.rows].set(near.at)
+    u_prescribed = data.held.at[data.slots].set(u_boundary)
+    around = jnp.tensordot(near.response, u_prescribed, 2)
+
+    row, points, follows, at = near.rows[which], near.points[which], near.follows[which], near.at[which]
+    base = (quadrature.barycentric[points][:, :, None] * around[near.corners[which]]).sum(axis=1)
+    places, fixed, weights = data.positions[points] + base, data.fixed_values[points], quadrature.weights[points]
+    force = jnp.tensordot(near.force[which], u_prescribed, 2)
+    stiffness = near.force[which][:, data.slots[row]]
+
+    def log(u: Float[AnyArray, "3"]) -> Scalar:
+        away = u - at
+        moved = data.moving(places + follows @ away)
+        similarity_energy = likelihood.energy(fixed, moved, weights, noise)
+        strain_energy = away @ force + 0.5 * away @ stiffness @ away
+        total = -data.independent_share * similarity_energy / t_similarity - strain_energy / t_elastic
+        total += _log_rigid_prior(data, u_boundary.at[row].set(u))
+        if data.skull_distance is None:
+            return total
+        return jnp.where(is_allowed(data.skull_distance, data.points_sampled[row] + u), total, -jnp.inf)
+
+    return log
 
 
 def log_elastic_normaliser(

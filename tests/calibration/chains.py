@@ -24,6 +24,9 @@ NODES = np.arange(0, len(MESH.boundary), 3)
 
 # So many data sets at a time: what they need together stays in the cache, four times as fast as all at once.
 BATCH = 20
+# Rows of "u_boundary" that a sampler which moves single nodes moves alone.
+ALONE = np.array([0, 8, 16, 24])
+
 PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic")
 
 Estimands = dict[str, Any]
@@ -73,5 +76,13 @@ def setups_about(posterior: br.Posterior, references: list[Reference], step_size
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
     found = {id(reference): stand_in(posterior, reference, reference.centre) for reference in references}
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(found[id(reference)] for reference in references))
-    setups = jax.vmap(lambda reference: setup_about(posterior, reference, reference.centre)._replace(**size))(stacked)
-    return setups._replace(stand_in=normalisers)
+
+    def about(reference: Reference) -> Setup:
+        return setup_about(posterior, reference, reference.centre, ALONE)._replace(**size)
+
+    return jax.vmap(about)(stacked)._replace(stand_in=normalisers)
+
+
+def conditioned(posterior: br.Posterior) -> Any:
+    """The data for chains: for all of them about rest."""
+    return posterior.conditioned(posterior.estimands(posterior.reference()), ALONE)

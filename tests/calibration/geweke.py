@@ -22,6 +22,7 @@ from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers import SAMPLERS
 from tests.calibration.chains import (
     BATCH,
+    conditioned,
     of_posterior,
     prior_reference,
     quantities,
@@ -76,12 +77,13 @@ def compare(
     posterior = simulator.posterior if posterior is None else posterior
     first = of_posterior(posterior, simulator.draw_prior(np.random.default_rng(seed), chains))
     kernel = SAMPLERS[sampler](posterior, **(RANDOM_WALK if sampler == "rwmh" else {}))
-    setup = None
+    setup, data = None, posterior.data
     if sampler != "rwmh":
+        data = conditioned(posterior)
         shared = setups_about(posterior, [prior_reference(simulator, posterior)], STEP_SIZE, STEPS)
         setup = jax.tree.map(lambda x: x[0], shared)
     run = partial(_successive, kernel, simulator.posterior, steps)
-    found = run(simulator.posterior.data, posterior.data, setup, jax.random.key(seed), first)
+    found = run(simulator.posterior.data, data, setup, jax.random.key(seed), first)
     start, successive, acceptance = (np.asarray(x) for x in found)
     names = quantity_names(posterior)
     difference = _moments(successive).mean(axis=1) - _moments(start)

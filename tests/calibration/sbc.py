@@ -9,10 +9,12 @@ Gaussian reference about which the sampler moves.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
@@ -20,14 +22,14 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.laplace import laplace
+from bayesreg.inference.laplace import laplace, settled, unravel
 from bayesreg.inference.samplers import SAMPLERS
 from bayesreg.inference.whitened import Setup
 from tests.calibration.chains import (
     BATCH,
     Estimands,
+    conditioned,
     of_posterior,
-    prior_reference,
     quantities,
     quantities_at,
     quantity_names,
@@ -49,9 +51,9 @@ class Settings(NamedTuple):
     Attributes
     ----------
     replications : int
-    approach : int
-        Transitions about a reference that all replications share, from a draw of the prior; their second half says
-        where each replication's own reference goes.
+    stages, approach : int
+        How often a chain makes so many transitions to come from its mode to where the posterior is: about a reference
+        there, then about where the second half of them was.
     warm_up, draws : int
         Transitions about that, not kept and kept.
     step_size, steps : float, int
@@ -59,7 +61,8 @@ class Settings(NamedTuple):
     """
 
     replications: int = 400
-    approach: int = 60
+    stages: int = 3
+    approach: int = 20
     warm_up: int = 40
     draws: int = 60
     step_size: float = 0.3
@@ -146,14 +149,13 @@ def calibrate(
     key_data, key_chains = jax.random.split(jax.random.key(seed))
     observed = simulated(simulator.posterior, simulator.posterior.data, truths, key_data)
     starts = of_posterior(posterior, simulator.draw_prior(rng, settings.replications))
-    draws, acceptance = _chains(simulator, posterior, observed, starts, key_chains, settings, sampler, say)
+    draws, acceptance = _chains(posterior, observed, starts, key_chains, settings, sampler, say)
     at_truth = jax.jit(jax.vmap(partial(quantities_at, posterior), in_axes=(None, 0, 0)))
     true = np.asarray(at_truth(posterior.data, observed, of_posterior(posterior, truths)))
     return _ranks(quantity_names(posterior), true, draws, acceptance, rng)
 
 
 def _chains(
-    simulator: Simulator,
     posterior: br.Posterior,
     observed: Any,
     starts: Estimands,
@@ -164,21 +166,38 @@ def _chains(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Quantities (draw, r, k) after the warm-up, and the mean acceptance of each replication."""
     kernel = SAMPLERS[sampler](posterior)
-    shared = setups_about(
-        posterior, [prior_reference(simulator, posterior)] * len(observed), settings.step_size, settings.steps
-    )
-    states, places, _, _ = _run(kernel, posterior, shared, observed, starts, key, settings.approach, say)
-    middle = places[settings.approach // 2 :].mean(axis=0)
-    say("a reference for each replication")
-    references = [
-        laplace(posterior, place, posterior.data._replace(fixed_values=f))
-        for place, f in zip(middle, observed, strict=True)
-    ]
-    setup = setups_about(posterior, references, settings.step_size, settings.steps)
-    key, starts = jax.random.fold_in(key, 1), states
-    steps = settings.warm_up + settings.draws
-    _, _, found, acceptance = _run(kernel, posterior, setup, observed, starts, key, steps, say)
+    say("a mode for each replication")
+    states = _modes(posterior, observed, starts)
+    flat_of = jax.jit(jax.vmap(lambda start: ravel_pytree(posterior.unconstrain_of(posterior.data, start))[0]))
+    middle, typical = np.asarray(flat_of(states)), np.asarray(flat_of(starts))
+    for stage in range(settings.stages + 1):
+        say(f"a reference for each replication, {stage + 1} of {settings.stages + 1}")
+        # Curvatures in T_s and T_r are the energies over them, which are less at a mode or a mean than at any draw.
+        references = [
+            laplace(posterior, place, posterior.data._replace(fixed_values=f))._replace(centre=jnp.asarray(centre))
+            for centre, place, f in zip(middle, typical, observed, strict=True)
+        ]
+        setup = setups_about(posterior, references, settings.step_size, settings.steps)
+        last = stage == settings.stages
+        steps = settings.warm_up + settings.draws if last else settings.approach
+        key_stage = jax.random.fold_in(key, stage)
+        states, places, found, acceptance = _run(kernel, posterior, setup, observed, states, key_stage, steps, say)
+        middle, typical = places[steps // 2 :].mean(axis=0), places[-1]
     return found[settings.warm_up :], acceptance[settings.warm_up :].mean(axis=0)
+
+
+def _modes(posterior: br.Posterior, observed: Any, starts: Estimands) -> Estimands:
+    """The modes of all replications, from where their chains start; T_r stays there, for it has no mode but at zero."""
+    inferred = {name: sd for name, sd in posterior.data.temperature_log_sd.items() if name != "t_elastic"}
+    found = []
+    for k, f in enumerate(observed):
+        # Equal to the others: all share what is compiled.
+        here = replace(posterior, data=posterior.data._replace(fixed_values=f, temperature_log_sd=inferred))
+        start = here.unconstrain_of(here.data, of_posterior(here, {name: x[k] for name, x in starts.items()}))
+        flat = settled(here, here.data, np.asarray(ravel_pytree(start)[0]))
+        found.append(here.constrain_of(here.data, unravel(here)(flat)))
+    modes = {name: jnp.stack([one[name] for one in found]) for name in found[0]}
+    return {name: modes.get(name, start) for name, start in starts.items()}
 
 
 @partial(jax.jit, static_argnums=0)
@@ -216,11 +235,12 @@ def _run(
     say: Say,
 ) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray]:
     """Where the chains end; flat positions, quantities and acceptances, the steps leading, then the replications."""
-    states = _begin(kernel, posterior.data, setup, observed, starts)
+    data = conditioned(posterior)
+    states = _begin(kernel, data, setup, observed, starts)
     kept = []
     for step in range(steps):
         keys = jax.random.split(jax.random.fold_in(key, step), len(observed))
-        states, ends, *found = _advance(kernel, posterior, posterior.data, setup, observed, keys, states)
+        states, ends, *found = _advance(kernel, posterior, data, setup, observed, keys, states)
         kept.append([np.asarray(x) for x in found])
         if step % 20 == 0:
             say(f"transition {step} of {steps}, acceptance {kept[-1][2].mean():.0%}")

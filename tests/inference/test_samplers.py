@@ -10,19 +10,20 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference import whitened
+from bayesreg.inference import loose, whitened
 from bayesreg.inference.checkpoint import checkpoint_to_arrays
+from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.laplace import Reference
 from bayesreg.inference.modes import distance, search_modes
 from bayesreg.inference.run import checkpoint_from_arrays
 from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.inference.whitened import setup_about
+from bayesreg.inference.whitened import Moved, about_reference, setup_about
 from tests.inference.gaussians import DIMENSION, GaussianTarget
 
 # Steps at which a good part of the proposals is refused: only then does the test of acceptance matter.
 STEPS = {
     "rwmh": (0.5, 1), "hmc": (1.0, 2), "nuts": (1.0, 1), "mclmc": (2.0, 2), "mala": (0.9, 1), "barker": (0.9, 1),
-    "rwmh_adaptive": (0.8, 1), "pcn": (0.9, 1),
+    "rwmh_adaptive": (0.8, 1), "pcn": (0.9, 1), "nodes alone": (0.0, 1),
 }  # fmt: skip
 CHAINS, TRANSITIONS = 2500, 6
 
@@ -45,16 +46,25 @@ def poor_reference() -> Reference:
     return Reference(jnp.full(DIMENSION, -0.2), jnp.asarray(factor @ stretch))
 
 
+def nodes_alone() -> Sampler:
+    """The moves of single nodes that follow on those of others, without these."""
+
+    def stay(data, setup, key, state):
+        return state, Moved(jnp.ones(()))
+
+    return about_reference(target(), stay, alone=len(target().sampled))
+
+
 def after_steps(name: str) -> np.ndarray:
     """Where chains from exact draws are after some transitions."""
     size, steps = STEPS[name]
     if name == "rwmh":
         kernel, setup = SAMPLERS[name](target(), sigma_u=size), None
     else:
-        setup = setup_about(target(), poor_reference(), poor_reference().centre)._replace(
+        setup = setup_about(target(), poor_reference(), poor_reference().centre, target().sampled)._replace(
             step_size=jnp.asarray(size), steps=jnp.asarray(steps)
         )
-        kernel = SAMPLERS[name](target())
+        kernel = nodes_alone() if name == "nodes alone" else SAMPLERS[name](target())
 
     @jax.jit
     def run(data, setup, points, keys):
@@ -93,7 +103,7 @@ def test_the_statistics_tell_a_slightly_different_distribution():
 
 def test_every_exact_sampler_is_looked_at():
     """All but smc, which moves by hmc's kernel."""
-    assert {name for name, make in SAMPLERS.items() if make(target()).exact} == {*STEPS, "smc"}
+    assert {name for name, make in SAMPLERS.items() if make(target()).exact} == {*STEPS, "smc"} - {"nodes alone"}
 
 
 @pytest.mark.slow
@@ -108,7 +118,7 @@ def test_exact_draws_stay_exact(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STEPS)
 def test_a_wrong_sign_in_the_acceptance_is_found(name, monkeypatch):
-    """exp(−Δ) for exp(Δ) where BlackJAX accepts."""
+    """exp(−Δ) for exp(Δ) where BlackJAX accepts, or where a move of a single node is."""
 
     class Wrong:
         def __getattr__(self, name):
@@ -117,7 +127,7 @@ def test_a_wrong_sign_in_the_acceptance_is_found(name, monkeypatch):
         def exp(self, x):
             return jnp.exp(-x)
 
-    monkeypatch.setattr(blackjax.mcmc.proposal, "jnp", Wrong())
+    monkeypatch.setattr(loose if name == "nodes alone" else blackjax.mcmc.proposal, "jnp", Wrong())
     assert least_p(after_steps(name)) < 1e-6
 
 
@@ -237,3 +247,14 @@ def test_more_unknowns_than_memory_are_told(monkeypatch):
     monkeypatch.setattr(whitened, "MOST_UNKNOWNS", 5)
     with pytest.raises(br.InputError, match=r"6 unknowns.*up to 5.*coarser mesh"):
         br.sample(target(), "hmc", 2, 4, progress=False)
+
+
+def test_the_nodes_that_hardly_move_are_found():
+    rng = np.random.default_rng(0)
+    path = rng.normal(size=(30, 4, 12, 3)) * 10.0 ** rng.uniform(-2, 1, 12)[:, None]
+    path[:, :, 7] = np.cumsum(path[:, :, 7], axis=0)
+    path[:, 1:, 3] = path[:1, 1:, 3]
+    path[:, :, 10] = 0.2
+    np.testing.assert_array_equal(loose.slowest(path, 3), [3, 7, 10])
+    assert len(loose.slowest(path[:1], 4)) == 4
+    assert len(loose.slowest(path, 0)) == 0

@@ -1,0 +1,130 @@
+"""How the log density changes where one sampled node moves and what follows it follows linearly.
+
+The free nodes are those of a fixed (λ, μ), and only the quadrature points near by are looked at: an approximation of
+the density of eq. (9) in one node, for moves that are tested with the density itself.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+
+from bayesreg.fem.elasticity import stiffness
+from bayesreg.fem.elements import Quadrature
+from bayesreg.fem.equilibrium import ElasticSystem
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray
+
+# Quadrature points near a node that are looked at: those of so many average cells.
+CELLS = 128
+
+
+class Neighbourhoods(NamedTuple):
+    """What lies near k sampled nodes (a pytree).
+
+    Attributes
+    ----------
+    rows : (k,) int array
+        The nodes' rows of "u_boundary".
+    at : (k, 3) array
+        Their displacements about which the neighbours' follow, mm.
+    response : (n, 3, prescribed, 3) array
+        Displacement of the nodes near any of them for one of a prescribed node.
+    points : (k, p) int array
+        Quadrature points nearest to each.
+    corners : (k, p, 4) int array
+        The corners of the cells of these points, as rows of `response`.
+    follows : (k, p, 3, 3) array
+        Displacement of these points for one of the node.
+    force : (k, 3, prescribed, 3) array
+        Force on the node, the gradient of E_r, for a displacement of a prescribed node.
+    """
+
+    rows: Int[AnyArray, "k"]
+    at: Float[AnyArray, "k 3"]
+    response: Float[AnyArray, "near 3 prescribed 3"]
+    points: Int[AnyArray, "k points"]
+    corners: Int[AnyArray, "k points 4"]
+    follows: Float[AnyArray, "k points 3 3"]
+    force: Float[AnyArray, "k 3 prescribed 3"]
+
+
+def neighbourhoods(
+    mesh: TetMesh,
+    system: ElasticSystem,
+    quadrature: Quadrature,
+    lam: Float[np.ndarray, "cells"],
+    mu: Float[np.ndarray, "cells"],
+    slots: Int[np.ndarray, "k"],
+    rows: Int[np.ndarray, "k"],
+    at: Float[np.ndarray, "k 3"],
+) -> Neighbourhoods | None:
+    """The neighbourhoods of some prescribed nodes; None if there are none or the system has no preconditioner.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    system : ElasticSystem
+        Preconditioned at λ and μ.
+    quadrature : Quadrature
+    lam, mu : (m,) array
+        By cell.
+    slots : (k,) int array
+        Where the nodes stand among `system.prescribed`.
+    rows, at
+        See `Neighbourhoods`.
+    """
+    prescribed = np.asarray(system.prescribed)
+    if not len(rows) or (len(system.free) and system.preconditioner is None):
+        return None
+    nodes = prescribed[slots]
+    cell_of = np.asarray(quadrature.cells)
+    places = quadrature.positions(mesh)
+    count = min(len(cell_of), round(CELLS * len(cell_of) / len(mesh.cells)))
+    away = np.linalg.norm(places - mesh.points[nodes][:, None], axis=2)
+    points = np.sort(np.argpartition(away, count - 1, axis=1)[:, :count], axis=1)
+    touching = np.isin(mesh.cells, nodes).any(axis=1)
+    near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
+
+    matrix = stiffness(mesh, lam, mu).tocsr()
+    response = _response(system, matrix, near)
+    corners = np.searchsorted(near, mesh.cells[cell_of[points]])
+    own = response.reshape(len(near), 3, len(prescribed), 3)[:, :, slots]
+    barycentric = np.asarray(quadrature.barycentric)[points]
+    follows = np.stack([np.einsum("pa,paij->pij", barycentric[k], own[corners[k], :, k]) for k in range(len(rows))])
+    force = matrix[_degrees(nodes)][:, _degrees(near)] @ response
+    return Neighbourhoods(
+        jnp.asarray(rows),
+        jnp.asarray(at),
+        jnp.asarray(response.reshape(len(near), 3, len(prescribed), 3)),
+        jnp.asarray(points),
+        jnp.asarray(corners),
+        jnp.asarray(follows),
+        jnp.asarray(force.reshape(len(rows), 3, len(prescribed), 3)),
+    )
+
+
+def _response(system: ElasticSystem, matrix: scipy.sparse.csr_matrix, near: AnyArray) -> np.ndarray:
+    """Rows of −K_II⁻¹ K_IB, and of the identity for the prescribed nodes among those near."""
+    prescribed, free = np.asarray(system.prescribed), np.asarray(system.free)
+    response = np.zeros((len(near), 3, 3 * len(prescribed)))
+    fixed = np.isin(near, prescribed)
+    slots = np.searchsorted(prescribed, near[fixed])
+    for axis in range(3):
+        response[np.flatnonzero(fixed), axis, 3 * slots + axis] = 1.0
+    if not fixed.all():
+        assert system.preconditioner is not None
+        scale = np.asarray(system.preconditioner.scale)
+        wanted = _degrees(np.searchsorted(free, near[~fixed]))
+        coupling = matrix[_degrees(free)][:, _degrees(prescribed)]
+        inverse = np.asarray(system.preconditioner.inverse[wanted], float) * scale[wanted, None] * scale
+        response[~fixed] = -(coupling.T @ inverse.T).T.reshape(-1, 3, 3 * len(prescribed))
+    return response.reshape(3 * len(near), 3 * len(prescribed))
+
+
+def _degrees(nodes: AnyArray) -> np.ndarray:
+    return (3 * np.asarray(nodes)[:, None] + np.arange(3)).ravel()

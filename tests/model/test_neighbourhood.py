@@ -1,0 +1,91 @@
+"""The approximate density of single nodes against the density itself."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import bayesreg as br
+from bayesreg.model import neighbourhood
+from tests.phantoms import ball_mesh, flat_skull, smooth_image
+
+MESH = ball_mesh(spacing=24.0)
+# Rows of "u_boundary", which lacks the first boundary node; the last is next to the skull.
+LOOSE = np.array([3, 17, int(MESH.points[MESH.boundary[1:], 0].argmax())])
+
+
+@cache
+def posterior(similarity: str = "ssd", interpolation: str = "cubic") -> br.Posterior:
+    """One node is held, so that rows of "u_boundary" are not those of prescribed nodes."""
+    fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    top = MESH.points[:, 0].max()
+    skull = flat_skull(MESH.points, axis=0, wall=top + 1.5, voxel=2.0)
+    model = br.ModelConfig(
+        similarity=similarity,
+        t_similarity={"median": 5.0, "log_sd": 0.5},
+        t_elastic=10.0,
+        interpolation=interpolation,
+        rigid_sd=0.5,
+        held={int(MESH.boundary[0]): (0.5, -0.3, 0.2)},
+    )
+    return br.build_posterior(fixed, moving, MESH, model=model, skull=skull)
+
+
+def state(post: br.Posterior) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    u = jnp.asarray(0.4 * rng.normal(size=(len(post.sampled), 3)))
+    return post.reference() | {"u_boundary": u, "lam": jnp.array([2.0, 5.0, 8.0]), "mu": jnp.array([0.5, 1.0, 1.5])}
+
+
+def changes(post: br.Posterior, moved_from: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Of the density where one of `LOOSE` moves, approximately and exactly; λ, μ away from where the rest follows."""
+    values, step = state(post), 2.0 * np.random.default_rng(1).normal(size=(len(LOOSE), 12, 3))
+    away = values | {name: values[name] * np.exp(moved_from) for name in ("lam", "mu")}
+    data = post.conditioned(post.estimands(values), LOOSE)
+    u = values["u_boundary"][LOOSE][:, None] + jnp.asarray(step).at[:, 0].set(0.0)
+    found = np.asarray(post.local_logdensity(data, post.estimands(away), jnp.arange(len(LOOSE)), u))
+    at = values["u_boundary"]
+    exact = np.array(
+        [
+            [post.evaluate(away | {"u_boundary": at.at[row].set(place)}).logdensity for place in places]
+            for row, places in zip(LOOSE, u, strict=True)
+        ]
+    )
+    return found - found[:, :1], exact - exact[:, :1]
+
+
+@pytest.mark.parametrize("similarity", ["ssd", "student_t"])
+def test_it_is_the_density_where_the_neighbourhood_is_everything(similarity, monkeypatch):
+    monkeypatch.setattr(neighbourhood, "CELLS", len(MESH.cells))
+    found, exact = changes(posterior(similarity))
+    inside = np.isfinite(exact)
+    assert 0 < (~inside).sum() < inside.sum()
+    np.testing.assert_array_equal(np.isfinite(found), inside)
+    assert abs(exact[inside]).max() > 5
+    np.testing.assert_allclose(found[inside], exact[inside], atol=2e-3)
+
+
+def test_it_is_near_the_density_where_part_of_it_is_seen(monkeypatch):
+    monkeypatch.setattr(neighbourhood, "CELLS", 60)
+    found, exact = changes(posterior(), moved_from=0.1)
+    inside = np.isfinite(exact)
+    assert 0 < abs(found - exact)[inside].max() < 0.2 * abs(exact[inside]).max()
+
+
+def test_the_sum_over_the_nodes_is_one_function_of_them():
+    """Where one of them is changes nothing in what is said of another."""
+    post = posterior()
+    values = state(post)
+    data = post.conditioned(post.estimands(values), LOOSE)
+    u = values["u_boundary"][LOOSE[1]] + jnp.linspace(0, 1, 5)[None, :, None]
+    elsewhere = values | {"u_boundary": values["u_boundary"].at[LOOSE[0]].add(3.0)}
+    here, there = (post.local_logdensity(data, post.estimands(v), jnp.array([1]), u) for v in (values, elsewhere))
+    np.testing.assert_array_equal(here, there)
+
+
+def test_without_nodes_there_are_no_neighbourhoods():
+    post = posterior()
+    assert post.conditioned(post.estimands(state(post))).neighbourhoods is None
