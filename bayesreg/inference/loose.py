@@ -3,8 +3,8 @@
 A node that few elements of little contrast hold has a wide and bent density of its own, which no Gaussian follows; all
 others of a mesh converge many times sooner. How the density changes with one node is cheap to say approximately. A move
 follows a trajectory of Hamiltonian Monte Carlo in the approximate density of that node alone, where it is reversible,
-and where it ends is tested with the ratio of the true density to the approximate one: exact (the surrogate transition
-method, Liu 2001; delayed acceptance, Christen and Fox 2005).
+reflected at the skull as other trajectories are. Where it ends is tested with the ratio of the true density to the
+approximate one, which is exact (the surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005).
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.reflection import reflective_leapfrog, walls
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.types import AnyArray
 
-# Nodes that are moved alone, and how many of them at a time.
-LOOSE, TOGETHER = 4, 2
+# Nodes that are moved alone. With each more the true density refuses more often what the approximate ones propose.
+LOOSE = 2
 # Of the trajectory of each: steps and their sizes, in standard deviations of the node where the others stay.
 STEPS, SHORTEST, LONGEST = 20, 0.2, 0.7
 
@@ -74,7 +75,7 @@ def moved_alone(
     key: AnyArray,
     state: Any,
 ) -> tuple[Any, AnyArray]:
-    """A move of some of the nodes, each alone, and the probability with which it was accepted.
+    """A move of the nodes, each in its own density, and the probability with which it was accepted.
 
     Parameters
     ----------
@@ -88,27 +89,28 @@ def moved_alone(
     key : PRNG key
     state : state of the kernel
     """
-    key_nodes, key_walk, key_test = jax.random.split(key, 3)
-    together = min(TOGETHER, len(nodes.nodes))
-    chosen = jax.random.choice(key_nodes, len(nodes.nodes), (together,), replace=False)
+    key_walk, key_test = jax.random.split(key)
     estimands = target.constrain_of(data, unravel(target)(reference.place(state.position)))
 
     def walk(key: AnyArray, which: AnyArray) -> tuple[AnyArray, AnyArray]:
         """The way of one node in its own density, and what it gained there."""
-        here, spread = estimands["u_boundary"][nodes.nodes[which]], nodes.spread[which]
-        log = target.local_logdensity(data, estimands, which)
+        row, spread = nodes.nodes[which], nodes.spread[which]
+        here, log = estimands["u_boundary"][row], target.local_logdensity(data, estimands, which)
+        wall = walls(here[None], spread[None], jnp.zeros(1, int))
+        flight = reflective_leapfrog(wall, lambda u: target.clearance(data, u, row[None]))
 
         def density(y: AnyArray) -> AnyArray:
             return log(here + spread @ y)
 
         key_size, key_move = jax.random.split(key)
         size = jax.random.uniform(key_size, minval=SHORTEST, maxval=LONGEST)
-        kernel, first = blackjax.mcmc.hmc.build_kernel(), blackjax.mcmc.hmc.init(jnp.zeros(3), density)
+        kernel, first = blackjax.mcmc.hmc.build_kernel(flight), blackjax.mcmc.hmc.init(jnp.zeros(3), density)
         last, _ = kernel(key_move, first, density, size, jnp.ones(3), STEPS)
         return spread @ last.position, last.logdensity - first.logdensity
 
-    steps, gains = jax.vmap(walk)(jax.random.split(key_walk, together), chosen)
-    proposed = begin(state.position + jnp.einsum("kdi,ki->d", nodes.columns[chosen], steps))
+    count = len(nodes.nodes)
+    steps, gains = jax.vmap(walk)(jax.random.split(key_walk, count), jnp.arange(count))
+    proposed = begin(state.position + jnp.einsum("kdi,ki->d", nodes.columns, steps))
     gain = proposed.logdensity - state.logdensity - gains.sum()
     probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
     accepted = jax.random.uniform(key_test) < probability

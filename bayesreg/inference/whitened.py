@@ -151,8 +151,7 @@ def about_reference(
         "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
     exact : bool
     alone : int
-        Number of nodes, those that were the slowest in the warm-up, of which some are moved alone after each
-        transition.
+        Number of nodes, those that were the slowest in the warm-up, that are moved each alone after a transition.
 
     Raises
     ------
