@@ -214,7 +214,7 @@ def about_reference(
         _, points, _ = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
         setup = _averaged(target, modes[0], points)
         setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
-        nodes = slowest(np.asarray(path[len(path) // 2 :]), alone)
+        nodes = slowest(np.asarray(path[len(path) // 4 :]), alone)
         if alone:
             say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
         return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes)), points
