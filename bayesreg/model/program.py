@@ -215,7 +215,8 @@ def local_logdensity(
         total += _log_rigid_prior(data, u_boundary.at[row].set(u))
         if data.skull_distance is None:
             return total
-        return jnp.where(is_allowed(data.skull_distance, data.points_sampled[row] + u), total, -jnp.inf)
+        clear = is_allowed(data.skull_distance, (data.points_sampled[row] + u)[None])[0]
+        return jnp.where(clear, total, -jnp.inf)
 
     return log
 
