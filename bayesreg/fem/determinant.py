@@ -24,7 +24,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Float, Int
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from bayesreg.fem.elasticity import element_stiffness, rigid_modes
+from bayesreg.fem.elasticity import element_stiffness, rigid_modes, unknowns_of
 from bayesreg.fem.elements import Elements, elements_of
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -86,9 +86,9 @@ def schur_determinant(
     null = rigid_freedom(mesh.points[sampled], mesh.points[held])
     isostatic = scipy.linalg.qr(null.T, pivoting=True, mode="r")[1][: null.shape[1]]
     prescribed = np.union1d(sampled, held)
-    supported = _degrees(np.setdiff1d(np.arange(len(mesh.points)), held))
-    supported = np.setdiff1d(supported, _degrees(sampled)[isostatic])
-    free = _degrees(np.setdiff1d(np.arange(len(mesh.points)), prescribed))
+    supported = unknowns_of(np.setdiff1d(np.arange(len(mesh.points)), held))
+    supported = np.setdiff1d(supported, unknowns_of(sampled)[isostatic])
+    free = unknowns_of(np.setdiff1d(np.arange(len(mesh.points)), prescribed))
     found = SchurDeterminant(
         supported=band_layout(mesh, supported),
         free=band_layout(mesh, free) if len(free) else None,
@@ -113,7 +113,7 @@ def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLay
     """Order some unknowns (3 · node + axis) of K into a narrow band, cut into block columns."""
     rank = np.full(3 * len(mesh.points), -1)
     rank[_narrow_order(mesh, unknowns)] = np.arange(len(unknowns))
-    degrees = rank[_degrees(mesh.cells).reshape(-1, 12)].T
+    degrees = rank[unknowns_of(mesh.cells).reshape(-1, 12)].T
     row, column = np.repeat(degrees, 12, axis=0), np.tile(degrees, (12, 1))
     kept = (row >= 0) & (column >= 0)
     width = -(-int(np.abs(row - column)[kept].max()) // BLOCKS_BELOW)
@@ -131,12 +131,8 @@ def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[n
     nodes, count = np.unique(unknowns // 3), len(mesh.points)
     pairs = np.repeat(mesh.cells, 4, axis=1).ravel(), np.tile(mesh.cells, (1, 4)).ravel()
     graph = scipy.sparse.csr_matrix((np.ones(len(pairs[0])), pairs), shape=(count, count))[nodes][:, nodes]
-    ordered = _degrees(nodes[reverse_cuthill_mckee(graph, symmetric_mode=True)])
+    ordered = unknowns_of(nodes[reverse_cuthill_mckee(graph, symmetric_mode=True)])
     return ordered[np.isin(ordered, unknowns)]
-
-
-def _degrees(nodes: Int[np.ndarray, "*shape"]) -> Int[np.ndarray, "unknowns"]:
-    return (3 * nodes[..., None] + np.arange(3)).ravel()
 
 
 def _require_definite(mesh: TetMesh, determinant: SchurDeterminant) -> None:

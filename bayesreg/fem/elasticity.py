@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayesreg.fem.elements import Elements, displacement_gradient, elements_of, shape_gradients
 from bayesreg.mesh import TetMesh
@@ -149,6 +149,11 @@ def strain_energy(
     return total_strain_energy(elements_of(mesh), lame_by_cell(lam, mesh), lame_by_cell(mu, mesh), jnp.asarray(u))
 
 
+def unknowns_of(nodes: Int[AnyArray, "*shape"]) -> Int[np.ndarray, "unknowns"]:
+    """Rows of K that belong to nodes: 3 · node + axis, axes fastest."""
+    return (3 * np.asarray(nodes)[..., None] + np.arange(3)).ravel()
+
+
 def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_matrix:
     """Global stiffness matrix K of eq. (7), assembled on the host.
 
@@ -172,7 +177,7 @@ def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_ma
     inner = np.einsum("mak,mbk,ij->maibj", gradients, gradients, np.eye(3))
     shear = np.einsum("majbi->maibj", outer) + inner
     blocks = lam_volume[:, None, None, None, None] * outer + mu_volume[:, None, None, None, None] * shear
-    degrees = (3 * mesh.cells[:, :, None] + np.arange(3)).reshape(-1, 12)
+    degrees = unknowns_of(mesh.cells).reshape(-1, 12)
     rows, columns = np.repeat(degrees, 12, axis=1), np.tile(degrees, (1, 12))
     size = 3 * len(mesh.points)
     return scipy.sparse.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size))

@@ -8,9 +8,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.fem.elasticity import internal_force, lame_by_cell, stiffness, stiffness_diagonal, strain_products
+from bayesreg.fem.elasticity import (
+    internal_force,
+    lame_by_cell,
+    stiffness,
+    stiffness_diagonal,
+    strain_products,
+    unknowns_of,
+)
 from bayesreg.fem.elements import Elements, elements_of
 from bayesreg.fem.preconditioners import ReferenceInverse, reference_inverse
 from bayesreg.mesh import TetMesh
@@ -68,7 +76,7 @@ def elastic_system(
         If the prescribed nodes do not hold the mesh in place.
     """
     free = np.setdiff1d(np.arange(len(mesh.points)), np.asarray(prescribed))
-    degrees = (3 * free[:, None] + np.arange(3)).ravel()
+    degrees = unknowns_of(free)
     reference = stiffness(mesh, lam_reference, mu_reference)[degrees][:, degrees]
     preconditioner = reference_inverse(reference) if len(free) else None
     return ElasticSystem(
@@ -202,6 +210,38 @@ def _conjugate_gradients(
     x, residual, _, _, iterations = jax.lax.while_loop(unfinished, iterate, start)
     relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
     return x, SolverInfo(relative, iterations, relative <= tolerance)
+
+
+def linear_response(
+    system: ElasticSystem, matrix: scipy.sparse.csr_matrix, nodes: Int[np.ndarray, "k"]
+) -> Float[np.ndarray, "rows columns"]:
+    """Displacements of some nodes for those of the prescribed ones, as a matrix; to single precision.
+
+    Parameters
+    ----------
+    system : ElasticSystem
+        With a preconditioner, or without free nodes.
+    matrix : (3n, 3n) sparse matrix
+        K, at the λ and μ that the system is preconditioned at.
+    nodes : (k,) int array
+        Free or prescribed.
+
+    Returns
+    -------
+    (3k, 3 prescribed) array
+        Rows of −K_II⁻¹ K_IB, and of the identity for prescribed nodes.
+    """
+    prescribed, free = np.asarray(system.prescribed), np.asarray(system.free)
+    response = (unknowns_of(nodes)[:, None] == unknowns_of(prescribed)).astype(float)
+    if np.isin(nodes, prescribed).all():
+        return response
+    assert system.preconditioner is not None
+    scale = np.asarray(system.preconditioner.scale)
+    wanted = unknowns_of(np.searchsorted(free, nodes[np.isin(nodes, free)]))
+    inverse = np.asarray(system.preconditioner.inverse[wanted], float) * scale[wanted, None] * scale
+    coupling = matrix[unknowns_of(free)][:, unknowns_of(prescribed)]
+    response[np.repeat(np.isin(nodes, free), 3)] = -(coupling.T @ inverse.T).T
+    return response
 
 
 def solve_interior(

@@ -12,7 +12,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from bayesreg.fem.elasticity import element_stiffness, stiffness
+from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
 from bayesreg.mesh import TetMesh
 from bayesreg.model.program import RegistrationData
 from bayesreg.model.similarity import SIMILARITIES, Noise
@@ -69,8 +69,8 @@ def displacement_curvature(
     Curvature
         First z, then row 3 · node + axis, 1/mm².
     """
-    sampled = _degrees(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
-    free = _degrees(np.asarray(data.system.free))
+    sampled = unknowns_of(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
+    free = unknowns_of(np.asarray(data.system.free))
     K = stiffness(mesh, lam, mu)
     coupling = K[free][:, sampled]
     load = np.zeros((len(free), 0))
@@ -108,10 +108,6 @@ def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyA
     columns = np.broadcast_to(np.arange(rows.shape[-1]), rows.shape)
     shape = (3 * len(u), rows.shape[-1])
     return scipy.sparse.csr_matrix((np.asarray(forces).ravel(), (rows.ravel(), columns.ravel())), shape=shape)
-
-
-def _degrees(nodes: np.ndarray) -> np.ndarray:
-    return (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
 def _assembled(

@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jaxtyping import Float, Int
 
-from bayesreg.fem.elasticity import stiffness
+from bayesreg.fem.elasticity import stiffness, unknowns_of
 from bayesreg.fem.elements import Quadrature
-from bayesreg.fem.equilibrium import ElasticSystem
+from bayesreg.fem.equilibrium import ElasticSystem, linear_response
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 
@@ -91,12 +90,12 @@ def neighbourhoods(
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
 
     matrix = stiffness(mesh, lam, mu).tocsr()
-    response = _response(system, matrix, near)
+    response = linear_response(system, matrix, near)
     corners = np.searchsorted(near, mesh.cells[cell_of[points]])
     own = response.reshape(len(near), 3, len(prescribed), 3)[:, :, slots]
     barycentric = np.asarray(quadrature.barycentric)[points]
     follows = np.stack([np.einsum("pa,paij->pij", barycentric[k], own[corners[k], :, k]) for k in range(len(rows))])
-    force = matrix[_degrees(nodes)][:, _degrees(near)] @ response
+    force = matrix[unknowns_of(nodes)][:, unknowns_of(near)] @ response
     return Neighbourhoods(
         jnp.asarray(rows),
         jnp.asarray(at),
@@ -106,25 +105,3 @@ def neighbourhoods(
         jnp.asarray(follows),
         jnp.asarray(force.reshape(len(rows), 3, len(prescribed), 3)),
     )
-
-
-def _response(system: ElasticSystem, matrix: scipy.sparse.csr_matrix, near: AnyArray) -> np.ndarray:
-    """Rows of −K_II⁻¹ K_IB, and of the identity for the prescribed nodes among those near."""
-    prescribed, free = np.asarray(system.prescribed), np.asarray(system.free)
-    response = np.zeros((len(near), 3, 3 * len(prescribed)))
-    fixed = np.isin(near, prescribed)
-    slots = np.searchsorted(prescribed, near[fixed])
-    for axis in range(3):
-        response[np.flatnonzero(fixed), axis, 3 * slots + axis] = 1.0
-    if not fixed.all():
-        assert system.preconditioner is not None
-        scale = np.asarray(system.preconditioner.scale)
-        wanted = _degrees(np.searchsorted(free, near[~fixed]))
-        coupling = matrix[_degrees(free)][:, _degrees(prescribed)]
-        inverse = np.asarray(system.preconditioner.inverse[wanted], float) * scale[wanted, None] * scale
-        response[~fixed] = -(coupling.T @ inverse.T).T.reshape(-1, 3, 3 * len(prescribed))
-    return response.reshape(3 * len(near), 3 * len(prescribed))
-
-
-def _degrees(nodes: AnyArray) -> np.ndarray:
-    return (3 * np.asarray(nodes)[:, None] + np.arange(3)).ravel()
