@@ -1,10 +1,11 @@
 """Moves of single nodes that little holds: what trajectories about a Gaussian reference mix worst.
 
 A node that few elements of little contrast hold has a wide and bent density of its own, which no Gaussian follows; all
-others of a mesh converge many times sooner. How the density changes with one node is cheap to say approximately. A move
-follows a trajectory of Hamiltonian Monte Carlo in the approximate density of that node alone, where it is reversible,
-reflected at the skull as other trajectories are. Where it ends is tested with the ratio of the true density to the
-approximate one, which is exact (the surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005).
+others of a mesh often converge many times sooner. How the density changes with one node is cheap to say approximately.
+A move follows a trajectory of Hamiltonian Monte Carlo in the approximate density of that node alone, where it is
+reversible, reflected at the skull as other trajectories are. Where the nodes end is tested, for all of them at once,
+with the ratio of the true density to the approximate ones, which is exact (the surrogate transition method, Liu
+2001; delayed acceptance, Christen and Fox 2005).
 """
 
 from __future__ import annotations
@@ -74,8 +75,8 @@ def moved_alone(
     nodes: Loose,
     key: AnyArray,
     state: Any,
-) -> tuple[Any, AnyArray]:
-    """A move of the nodes, each in its own density, and the probability with which it was accepted.
+) -> Any:
+    """The state after a move of the nodes, each in its own density, accepted or refused together.
 
     Parameters
     ----------
@@ -114,4 +115,4 @@ def moved_alone(
     gain = proposed.logdensity - state.logdensity - gains.sum()
     probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
     accepted = jax.random.uniform(key_test) < probability
-    return jax.tree.map(lambda new, old: jnp.where(accepted, new, old), proposed, state), probability
+    return jax.tree.map(lambda new, old: jnp.where(accepted, new, old), proposed, state)

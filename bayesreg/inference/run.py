@@ -179,7 +179,10 @@ def checkpoint_from_arrays(
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
     if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
-        raise InputError("the stored state belongs to another problem: other nodes, parameters or number of chains")
+        raise InputError(
+            "the stored state belongs to another problem: other nodes, parameters or number of chains, or a run that "
+            "another version of bayesreg began"
+        )
     return jax.tree.unflatten(structure, leaves)
 
 

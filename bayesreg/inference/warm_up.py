@@ -28,12 +28,15 @@ class Tuning(NamedTuple):
         Between 0 and 1, averaged over chains.
     least, greatest : float
         Bounds of the step. Beyond a quarter turn, the default, there is nothing to gain.
+    watched : bool
+        Whether displacements of all transitions are wanted.
     """
 
     warm_up: int
     acceptance: float
     least: float = 0.01
     greatest: float = float(jnp.pi / 2)
+    watched: bool = False
 
 
 def require_sound(tuning: Tuning) -> None:
@@ -47,8 +50,8 @@ def require_sound(tuning: Tuning) -> None:
 def tuned(
     data: Any, kernel: tuple[Callable, Callable, Callable], setup: Any, starts: Any, key: AnyArray, tuning: Tuning,
     say: Say = lambda text: None,
-) -> tuple[Any, Any, AnyArray]:  # fmt: skip
-    """The setup with its step size, where the chains then are, and how their "u_boundary" came there.
+) -> tuple[Any, Any, AnyArray | None]:  # fmt: skip
+    """The setup with its step size, where the chains then are, and if watched how their "u_boundary" came there.
 
     Parameters
     ----------
@@ -73,8 +76,8 @@ def tuned(
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(
     kernel: tuple[Callable, Callable, Callable], tuning: Tuning, data: Any, setup: Any, starts: Any, keys: AnyArray
-) -> tuple[Any, Scalar, AnyArray, AnyArray]:
-    """Estimands, step size, and of every transition the acceptance and the displacements (draw, chain, node, axis)."""
+) -> tuple[Any, Scalar, AnyArray, AnyArray | None]:
+    """Estimands, step size, and of every transition the acceptance and, if watched, the (chain, node, axis) array u."""
     init, step, estimands_of = kernel
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(next(iter(starts.values())))
@@ -84,7 +87,7 @@ def _run(
         now = _sized(tuning, setup, jnp.exp(averaging.log_step_size))
         states, info = jax.vmap(partial(step, data, now))(jax.random.split(key, chains), states)
         rate = jnp.nan_to_num(info.acceptance_rate).mean()
-        u = jax.vmap(partial(estimands_of, data, setup))(states)["u_boundary"]
+        u = jax.vmap(partial(estimands_of, data, setup))(states)["u_boundary"] if tuning.watched else None
         return (states, update(averaging, rate)), (rate, u)
 
     first = jax.vmap(partial(init, data, setup))(starts), begin(setup.step_size)

@@ -82,17 +82,17 @@ Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
 def setup_about(
-    target: SmoothTarget, reference: Reference, middle: AnyArray, moved_alone: AnyArray | tuple[int, ...] = ()
+    target: SmoothTarget, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
 ) -> Setup:
-    """A setup before its tuning; some nodes are moved alone."""
+    """A setup before its tuning; the nodes in the rows `alone` of "u_boundary" are moved alone."""
     nodes = len(target.sampled)
     first = len(reference.centre) - 3 * nodes
     centre = reference.centre[first:].reshape(nodes, 3)
     rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
     nothing = no_stand_in(target, reference)
     held = walls(centre, rows, jnp.arange(nodes))
-    alone = loose(reference, nodes, jnp.asarray(moved_alone, int))
-    return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing, alone)
+    nodes_alone = loose(reference, nodes, jnp.asarray(alone, int))
+    return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing, nodes_alone)
 
 
 def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
@@ -151,7 +151,8 @@ def about_reference(
         "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
     exact : bool
     alone : int
-        Number of nodes, those that were the slowest in the warm-up, that are moved each alone after a transition.
+        Number of nodes, those that were the slowest in the warm-up, that are moved each alone after a transition. Their
+        moves are tested with `density`, which must then be the target's own.
 
     Raises
     ------
@@ -209,14 +210,15 @@ def about_reference(
             return setups[0], points
         kernel = init, step, estimands_of
         # Two stages of one length, compiled once: the first leads the chains to where the second is whitened.
-        stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
+        stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
         key_settle, key_tune = jax.random.split(key_tune)
-        _, points, _ = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
+        points = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)[1]
         setup = _averaged(target, modes[0], points)
         setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
+        if path is None:
+            return setup, points
         nodes = slowest(np.asarray(path[len(path) // 4 :]), alone)
-        if alone:
-            say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
+        say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
         return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes)), points
 
     def conditioned(setup: Setup) -> Any:
@@ -250,7 +252,7 @@ def _with_loose_nodes(target: SmoothTarget, sampler: Sampler, begin: Callable, d
         def beginning(xi: AnyArray) -> Any:
             return begin(xi, density(target, data, setup))
 
-        kernel, _ = moved_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
+        kernel = moved_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
         state = state._replace(kernel=kernel) if isinstance(state, Delayed) else kernel
         return state, info._replace(gradients=info.gradients + 1)
 

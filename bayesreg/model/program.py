@@ -162,7 +162,7 @@ def registration(
     # E_r / T_r is minus the log prior of u_B. Where u_B is given there is none: u_I follows from it and θ.
     if len(data.slots):
         numpyro.factor("log_elastic", -strain_energy / t_elastic)
-        numpyro.factor("log_rigid", _log_rigid_prior(data, u_boundary))
+        numpyro.factor("log_rigid", _log_rigid_prior(data, data.rigid_modes.T @ u_boundary.reshape(-1)))
     if data.determinant is not None:
         numpyro.factor("log_normaliser", log_elastic_normaliser(data, lam, mu, t_elastic, **field))
     numpyro.factor("log_support", jnp.where(inside, 0.0, -jnp.inf))
@@ -205,6 +205,8 @@ def local_logdensity(
     places, fixed, weights = data.positions[points] + base, data.fixed_values[points], quadrature.weights[points]
     force = jnp.tensordot(near.force[which], u_prescribed, 2)
     stiffness = near.force[which][:, data.slots[row]]
+    rigid = data.rigid_modes.T @ u_boundary.reshape(-1)
+    rigid_modes = jax.lax.dynamic_slice_in_dim(data.rigid_modes, 3 * row, 3)
 
     def log(u: Float[AnyArray, "3"]) -> Scalar:
         away = u - at
@@ -212,7 +214,7 @@ def local_logdensity(
         similarity_energy = likelihood.energy(fixed, moved, weights, noise)
         strain_energy = away @ force + 0.5 * away @ stiffness @ away
         total = -data.independent_share * similarity_energy / t_similarity - strain_energy / t_elastic
-        total += _log_rigid_prior(data, u_boundary.at[row].set(u))
+        total += _log_rigid_prior(data, rigid + rigid_modes.T @ away)
         if data.skull_distance is None:
             return total
         clear = is_allowed(data.skull_distance, (data.points_sampled[row] + u)[None])[0]
@@ -314,8 +316,7 @@ def _clear_of_skull(data: RegistrationData, u_boundary: Float[AnyArray, "boundar
     return is_allowed(data.skull_distance, data.points_sampled + u_boundary).all()
 
 
-def _log_rigid_prior(data: RegistrationData, u_boundary: Float[AnyArray, "boundary 3"]) -> Scalar:
+def _log_rigid_prior(data: RegistrationData, coefficients: Float[AnyArray, "6"]) -> Scalar:
     """Gaussian on the root-mean-square displacement of each rigid mode over the sampled nodes."""
-    coefficients = data.rigid_modes.T @ u_boundary.reshape(-1)
     mean_square = coefficients**2 / len(data.points_sampled)
     return -0.5 * (mean_square / data.rigid_sd**2).sum()

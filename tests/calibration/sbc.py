@@ -187,7 +187,10 @@ def _chains(
 
 
 def _modes(posterior: br.Posterior, observed: Any, starts: Estimands) -> Estimands:
-    """The modes of all replications, from where their chains start; T_r stays there, for it has no mode but at zero."""
+    """The modes of all replications, from draws of the prior.
+
+    T_r has no mode but at zero: it is held at its median meanwhile, and stays at the draw.
+    """
     inferred = {name: sd for name, sd in posterior.data.temperature_log_sd.items() if name != "t_elastic"}
     found = []
     for k, f in enumerate(observed):

@@ -115,7 +115,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     estimands = post.estimands(post.reference())
     flat = jax.flatten_util.ravel_pytree(post.unconstrain_of(post.data, estimands))[0]
     reference = Reference(flat, 0.05 * jnp.eye(len(flat)))
-    setup = setup_about(post, reference, flat)
+    setup = setup_about(post, reference, flat, np.array([0, 5]))
     setup = setup._replace(stand_in=stand_in(post, reference, flat), step_size=jnp.asarray(0.3))
 
     @jax.jit
@@ -123,10 +123,12 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
         states = jax.vmap(lambda key: sampler.init(data, setup, estimands))(jax.random.split(key, 2))
         for number in range(3):
             keys = jax.random.split(jax.random.fold_in(key, number), 2)
-            states, _ = jax.vmap(lambda key, state: sampler.step(data, setup, key, state))(keys, states)
-        return jax.vmap(lambda state: sampler.observe(data, setup, state))(states)
+            states, info = jax.vmap(lambda key, state: sampler.step(data, setup, key, state))(keys, states)
+        return jax.vmap(lambda state: sampler.observe(data, setup, state))(states), info.gradients
 
-    found = moved(post.data, setup, jax.random.key(0))
+    found, gradients = moved(sampler.data(setup), setup, jax.random.key(0))
+    # One of a trajectory of one step, one where two nodes were moved alone.
+    assert (gradients == 2).all()
     expected = jax.vmap(lambda estimands: post.evaluate_estimands(post.data, estimands).logdensity)(found.estimands)
     np.testing.assert_allclose(found.evaluation.logdensity, expected, rtol=1e-9)
     assert (found.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
