@@ -1,4 +1,4 @@
-"""How the log density changes where one sampled node moves and what follows it follows linearly.
+"""How the log density changes where one sampled node moves and the free nodes near by follow linearly.
 
 The free nodes are those of a fixed (λ, μ), and only the quadrature points near by are looked at: an approximation of
 the density of eq. (9) in one node, for moves that are tested with the density itself.
@@ -62,13 +62,13 @@ def neighbourhoods(
     rows: Int[np.ndarray, "k"],
     at: Float[np.ndarray, "k 3"],
 ) -> Neighbourhoods | None:
-    """The neighbourhoods of some prescribed nodes; None if there are none or the system has no preconditioner.
+    """The neighbourhoods of some prescribed nodes; None if there are none.
 
     Parameters
     ----------
     mesh : TetMesh
     system : ElasticSystem
-        Preconditioned at λ and μ.
+        Preconditioned at λ and μ, or without free nodes.
     quadrature : Quadrature
     lam, mu : (m,) array
         By cell.
@@ -78,7 +78,7 @@ def neighbourhoods(
         See `Neighbourhoods`.
     """
     prescribed = np.asarray(system.prescribed)
-    if not len(rows) or (len(system.free) and system.preconditioner is None):
+    if not len(rows):
         return None
     nodes = prescribed[slots]
     cell_of = np.asarray(quadrature.cells)
