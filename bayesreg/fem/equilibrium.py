@@ -213,9 +213,12 @@ def _conjugate_gradients(
 
 
 def linear_response(
-    system: ElasticSystem, matrix: scipy.sparse.csr_matrix, nodes: Int[np.ndarray, "k"]
+    system: ElasticSystem,
+    matrix: scipy.sparse.csr_matrix,
+    nodes: Int[np.ndarray, "k"],
+    moved: Int[np.ndarray, "moved"],
 ) -> Float[np.ndarray, "rows columns"]:
-    """Displacements of some nodes for those of the prescribed ones, as a matrix; to single precision.
+    """Displacements of some nodes for those of some prescribed ones, as a matrix; to single precision.
 
     Parameters
     ----------
@@ -225,22 +228,24 @@ def linear_response(
         K, at the λ and μ that the system is preconditioned at.
     nodes : (k,) int array
         Free or prescribed.
+    moved : (moved,) int array
+        Prescribed.
 
     Returns
     -------
-    (3k, 3 prescribed) array
-        Rows of −K_II⁻¹ K_IB, and of the identity for prescribed nodes.
+    (3k, 3 moved) array
+        Entries of −K_II⁻¹ K_IB, and of the identity for prescribed nodes.
     """
-    prescribed, free = np.asarray(system.prescribed), np.asarray(system.free)
-    response = (unknowns_of(nodes)[:, None] == unknowns_of(prescribed)).astype(float)
-    if np.isin(nodes, prescribed).all():
+    free = np.asarray(system.free)
+    response = (unknowns_of(nodes)[:, None] == unknowns_of(moved)).astype(float)
+    if not np.isin(nodes, free).any():
         return response
     assert system.preconditioner is not None
     scale = np.asarray(system.preconditioner.scale)
     wanted = unknowns_of(np.searchsorted(free, nodes[np.isin(nodes, free)]))
-    inverse = np.asarray(system.preconditioner.inverse[wanted], float) * scale[wanted, None] * scale
-    coupling = matrix[unknowns_of(free)][:, unknowns_of(prescribed)]
-    response[np.repeat(np.isin(nodes, free), 3)] = -(coupling.T @ inverse.T).T
+    inverse = np.asarray(system.preconditioner.inverse)[wanted]
+    coupling = (matrix[unknowns_of(free)][:, unknowns_of(moved)]).multiply(scale[:, None]).T.tocsr()
+    response[np.repeat(np.isin(nodes, free), 3)] = -scale[wanted, None] * (coupling @ inverse.T).T
     return response
 
 

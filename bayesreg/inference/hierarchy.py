@@ -1,8 +1,12 @@
-"""The scale of a field of many components, where a mode would mislead.
+"""Scales of what has many components, where a mode would mislead.
 
-With s = sd · B z, z ~ N(0, I), the joint mode of (z, log sd) lies at a great sd and small z: it ignores how much less
-room z has the greater sd is. The reference is better placed where the evidence of sd has its maximum, by MacKay's fixed
-point (1992): |z|² = γ, the number of components that the data determine.
+With a field s = sd · B z, z ~ N(0, I), the joint mode of (z, log sd) lies at a great sd and small z: it ignores how
+much less room z has the greater sd is. The reference is better placed where the evidence of sd has its maximum, by
+MacKay's fixed point (1992): |z|² = γ, the number of components that the data determine.
+
+T_r is such a scale of u_B, whose prior's curvature P falls as 1 / T_r: the joint mode lies next to T_r = 0, where
+nothing moves. With u_B integrated out by Laplace's approximation, C its covariance, ∂ log p / ∂ log T_r gains
+½ tr(C P), which makes 2 E_r / T_r = γ where the prior of T_r says nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from jaxtyping import Float
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
 
-SCALE, COMPONENTS = "field_sd", "field"
+SCALE, COMPONENTS, TEMPERATURE = "field_sd", "field", "t_elastic"
 _MOST = 1.0
 
 
@@ -33,8 +37,13 @@ class Placed(Protocol):
 
 
 def is_scale(target: Placed) -> Float[np.ndarray, "dimension"]:
-    """One at the entry of a flat position that holds log sd, zero elsewhere."""
-    return _marked(target, SCALE)
+    """One at the entries of a flat position that hold log sd or log T_r, zero elsewhere."""
+    return _marked(target, SCALE) + is_temperature(target)
+
+
+def is_temperature(target: Placed) -> Float[np.ndarray, "dimension"]:
+    """One at the entry of a flat position that holds log T_r, zero elsewhere."""
+    return _marked(target, TEMPERATURE)
 
 
 def balanced(
@@ -52,7 +61,7 @@ def balanced(
     factor : callable
         () → F, where F Fᵀ is the covariance there; not asked for where there is no field.
     """
-    scale = np.flatnonzero(is_scale(target))
+    scale = np.flatnonzero(_marked(target, SCALE))
     if not len(scale):
         return flat
     components = np.flatnonzero(_marked(target, COMPONENTS))
@@ -66,6 +75,33 @@ def balanced(
     change = float(np.clip(0.5 * np.log((z @ z + 1) / determined), -_MOST, _MOST))
     moved = np.array(flat)
     moved[components], moved[scale] = z * np.exp(-change), flat[scale] + change
+    return moved
+
+
+def tempered(
+    target: Placed,
+    flat: Float[np.ndarray, "dimension"],
+    slope: float,
+    curvature: float,
+    shares: Float[np.ndarray, "rows rows"],
+) -> Float[np.ndarray, "dimension"]:
+    """A flat position with T_r nearer to the maximum of its evidence.
+
+    Parameters
+    ----------
+    target : Placed
+    flat : (d,) array
+        A mode given T_r.
+    slope, curvature : float
+        Of the log density and of minus it in log T_r, there.
+    shares : (r, r) array
+        C P: in its eigenvectors, how much of what holds a component of u_B is the prior's. As T_r rises it falls, as
+        C P − (C P)² does.
+    """
+    moved = np.array(flat)
+    falling = np.trace(shares) - (shares * shares.T).sum()
+    change = (slope + np.trace(shares) / 2) / (curvature + falling / 2)
+    moved[is_temperature(target) > 0] += np.clip(change, -_MOST, _MOST)
     return moved
 
 

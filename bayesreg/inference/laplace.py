@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 
-from bayesreg.inference.hierarchy import balanced, is_scale
+from bayesreg.inference.hierarchy import balanced, is_scale, is_temperature, tempered
 from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
@@ -108,11 +108,27 @@ def settled(
     for _ in range(REPEATS):
         before, pressed = flat, shift
         flat = _improved(target, data, flat, moves, iterations, say, shift)
-        flat = balanced(target, flat, partial(_factor, target, flat))
+        flat = _tempered(target, balanced(target, flat, partial(_factor, target, flat)))
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
             break
     return _admissible(target, flat)
+
+
+def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    entry = np.flatnonzero(is_temperature(target))
+    if not len(entry):
+        return flat
+    slope = np.asarray(_slope(target, target.data, jnp.asarray(flat)))[entry]
+    curvature = -_hessian_rows(target, target.data, flat, entry)[0, entry]
+    return tempered(target, flat, float(slope[0]), float(curvature[0]), _shares(target, target.data, flat))
+
+
+def _shares(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
+    """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
+    colder = flat - np.log(2) * is_temperature(target)
+    here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
+    return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
 
 
 def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
@@ -136,7 +152,7 @@ def _improved(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
     shift = np.zeros(len(target.sampled)) if shift is None else shift
-    reference = laplace(target, flat, data, moves)
+    reference = _gaussian(flat, _apart(precision_at(target, flat, data, moves), is_scale(target) > 0))
     if not moves:
         # The same for all displacements.
         data = target.without_normaliser(data)
@@ -163,6 +179,16 @@ def _improved(
     place, least, _, penalty = best[-1]
     say(f"mode: log density {penalty - least:.1f}")
     return flat + np.asarray(reference.factor) @ (moving * place)
+
+
+def _apart(
+    precision: Float[np.ndarray, "dimension dimension"], held: Bool[np.ndarray, "dimension"]
+) -> Float[np.ndarray, "dimension dimension"]:
+    """Without what couples some entries to the others: along any other direction they stay."""
+    precision = np.array(precision)
+    precision[held] = precision[:, held] = 0.0
+    precision[held, held] = 1.0
+    return precision
 
 
 def softened(
@@ -301,6 +327,10 @@ def _jointly(
     if joint and count:
         rows = -_hessian_rows(target, target.without_walls(data), flat, order[:count])[:, order]
         _require_finite(rows)
+        temperature = np.flatnonzero(is_temperature(target)[order[:count]])
+        if len(temperature):
+            # E_r / T_r, which is minus that curvature, is greater by so much at a typical draw than at the mode.
+            rows[temperature, temperature] += np.trace(_shares(target, data, flat)) / 2
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
 from bayesreg.inference.laplace import Reference, averaged, pulled, unravel
-from bayesreg.inference.loose import Loose, loose, moved_alone, slowest
+from bayesreg.inference.loose import Loose, loose, moved_alone, searched, slowest
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
 from bayesreg.inference.reflection import Clearance, Walls, rotated, walls
@@ -91,7 +91,8 @@ def setup_about(
     rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
     nothing = no_stand_in(target, reference)
     held = walls(centre, rows, jnp.arange(nodes))
-    nodes_alone = loose(reference, nodes, jnp.asarray(alone, int))
+    at = middle[first:].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
+    nodes_alone = loose(reference, nodes, jnp.asarray(alone, int), at)
     return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing, nodes_alone)
 
 
@@ -211,15 +212,20 @@ def about_reference(
         kernel = init, step, estimands_of
         # Two stages of one length, compiled once: the first leads the chains to where the second is whitened.
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
-        key_settle, key_tune = jax.random.split(key_tune)
-        points = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)[1]
+        key_settle, key_tune, key_search = jax.random.split(key_tune, 3)
+        _, points, settling = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
         setup = _averaged(target, modes[0], points)
         setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
-        if path is None:
+        if settling is None or path is None:
             return setup, points
-        nodes = slowest(np.asarray(path[len(path) // 4 :]), alone)
+        late = np.concatenate([np.asarray(part[len(part) // 4 :]) for part in (settling, path)], axis=1)
+        nodes = slowest(late, alone)
         say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
-        return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes)), points
+        seen = np.moveaxis(late[:, :, nodes].reshape(-1, alone, 3), 1, 0)
+        setup = setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen))
+        beyond = searched(target, conditioned(setup), setup.loose, points, key_search)
+        seen = np.concatenate([seen, beyond], axis=1)
+        return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen)), points
 
     def conditioned(setup: Setup) -> Any:
         return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)), setup.loose.nodes)

@@ -1,7 +1,7 @@
 """How the log density changes where one sampled node moves and the free nodes near by follow linearly.
 
-The free nodes are those of a fixed (λ, μ), and only the quadrature points near by are looked at: an approximation of
-the density of eq. (9) in one node, for moves that are tested with the density itself.
+The free nodes are those of a fixed (λ, μ), and only the quadrature points that follow most are looked at: an
+approximation of the density of eq. (9) in one node, for moves that are tested with the density itself.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bayesreg.fem.equilibrium import ElasticSystem, linear_response
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 
-# Quadrature points near a node that are looked at: those of so many average cells.
+# Quadrature points that are looked at: as many as so many average cells have, those that follow a node the furthest.
 CELLS = 128
 
 
@@ -34,7 +34,7 @@ class Neighbourhoods(NamedTuple):
     response : (n, 3, prescribed, 3) array
         Displacement of the nodes near any of them for one of a prescribed node.
     points : (k, p) int array
-        Quadrature points nearest to each.
+        Quadrature points that follow each.
     corners : (k, p, 4) int array
         The corners of the cells of these points, as rows of `response`.
     follows : (k, p, 3, 3) array
@@ -81,20 +81,21 @@ def neighbourhoods(
     if not len(rows):
         return None
     nodes = prescribed[slots]
-    cell_of = np.asarray(quadrature.cells)
-    places = quadrature.positions(mesh)
+    cell_of, barycentric = np.asarray(quadrature.cells), np.asarray(quadrature.barycentric)
     count = min(len(cell_of), round(CELLS * len(cell_of) / len(mesh.cells)))
-    away = np.linalg.norm(places - mesh.points[nodes][:, None], axis=2)
-    points = np.sort(np.argpartition(away, count - 1, axis=1)[:, :count], axis=1)
+    matrix = stiffness(mesh, lam, mu).tocsr()
+    own = linear_response(system, matrix, np.arange(len(mesh.points)), nodes).reshape(-1, 3, len(nodes), 3)
+
+    def following(which: int) -> tuple[np.ndarray, np.ndarray]:
+        every = np.einsum("pa,paij->pij", barycentric, own[mesh.cells[cell_of], :, which])
+        points = np.sort(np.argpartition(-(every**2).sum(axis=(1, 2)), count - 1)[:count])
+        return points, every[points]
+
+    points, follows = (np.stack(found) for found in zip(*map(following, range(len(nodes))), strict=True))
     touching = np.isin(mesh.cells, nodes).any(axis=1)
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
-
-    matrix = stiffness(mesh, lam, mu).tocsr()
-    response = linear_response(system, matrix, near)
+    response = linear_response(system, matrix, near, prescribed)
     corners = np.searchsorted(near, mesh.cells[cell_of[points]])
-    own = response.reshape(len(near), 3, len(prescribed), 3)[:, :, slots]
-    barycentric = np.asarray(quadrature.barycentric)[points]
-    follows = np.stack([np.einsum("pa,paij->pij", barycentric[k], own[corners[k], :, k]) for k in range(len(rows))])
     force = matrix[unknowns_of(nodes)][:, unknowns_of(near)] @ response
     return Neighbourhoods(
         jnp.asarray(rows),

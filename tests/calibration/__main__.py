@@ -23,8 +23,6 @@ PLANTED: dict[str, dict[str, Any]] = {
     "T_s 1.5 times too high": {"t_similarity": 1.5 * T_SIMILARITY},
     "not normalised": {"normalised": False},
 }
-# T_s and T_r scale the whole density: with the step of the others the chains of that variant hardly move.
-SETTINGS = {"temperatures": sbc.Settings(step_size=0.25, steps=6)}
 # How many steps of each kernel: as many as move its chains by about one standard deviation. A wrong one drifts from
 # where it starts as long as it goes on.
 GEWEKE_STEPS = {"hmc": 10, "nuts": 10, "rwmh": 60}
@@ -46,7 +44,7 @@ def calibrate_by_simulation(out: Path) -> dict[str, Any]:
     runs: dict[str, sbc.Ranks] = {}
     for name, variant in VARIANTS.items():
         say(f"calibration: {name}")
-        runs[name] = sbc.calibrate(Simulator(variant), settings=SETTINGS.get(name, sbc.SETTINGS), say=say)
+        runs[name] = sbc.calibrate(Simulator(variant), say=say)
     for name, options in PLANTED.items():
         say(f"calibration, planted error: {name}")
         variant = VARIANTS["no skull"]

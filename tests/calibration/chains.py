@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.inference.laplace import Reference, laplace
+from bayesreg.inference.loose import loose
 from bayesreg.inference.normaliser import stand_in
 from bayesreg.inference.whitened import Setup, setup_about
 from tests.calibration.simulator import MESH, Simulator, draw_data
@@ -70,17 +71,25 @@ def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Reference:
     return laplace(posterior, np.asarray(at_rest), posterior.data._replace(fixed_values=observed))
 
 
-def setups_about(posterior: br.Posterior, references: list[Reference], step_size: float, steps: int) -> Setup:
-    """The setups of all replications, stacked."""
+def setups_about(
+    posterior: br.Posterior,
+    references: list[Reference],
+    middles: np.ndarray,
+    seen: np.ndarray,
+    step_size: float,
+    steps: int,
+) -> Setup:
+    """The setups of all replications, stacked; the nodes `ALONE` have been seen at (replication, node, place, axis)."""
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
-    found = {id(reference): stand_in(posterior, reference, reference.centre) for reference in references}
-    normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(found[id(reference)] for reference in references))
+    found = [stand_in(posterior, *each) for each in zip(references, middles, strict=True)]
+    normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
-    def about(reference: Reference) -> Setup:
-        return setup_about(posterior, reference, reference.centre, ALONE)._replace(**size)
+    def about(reference: Reference, middle: Any, seen: Any) -> Setup:
+        alone = loose(reference, len(posterior.sampled), ALONE, seen)
+        return setup_about(posterior, reference, middle)._replace(loose=alone, **size)
 
-    return jax.vmap(about)(stacked)._replace(stand_in=normalisers)
+    return jax.vmap(about)(stacked, jnp.asarray(middles), jnp.asarray(seen))._replace(stand_in=normalisers)
 
 
 def conditioned(posterior: br.Posterior) -> Any:

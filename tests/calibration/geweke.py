@@ -21,6 +21,7 @@ import bayesreg as br
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers import SAMPLERS
 from tests.calibration.chains import (
+    ALONE,
     BATCH,
     conditioned,
     of_posterior,
@@ -80,7 +81,9 @@ def compare(
     setup, data = None, posterior.data
     if sampler != "rwmh":
         data = conditioned(posterior)
-        shared = setups_about(posterior, [prior_reference(simulator, posterior)], STEP_SIZE, STEPS)
+        reference = prior_reference(simulator, posterior)
+        centre, seen = np.asarray(reference.centre)[None], np.moveaxis(first["u_boundary"][:, ALONE], 1, 0)[None]
+        shared = setups_about(posterior, [reference], centre, seen, STEP_SIZE, STEPS)
         setup = jax.tree.map(lambda x: x[0], shared)
     run = partial(_successive, kernel, simulator.posterior, steps)
     found = run(simulator.posterior.data, data, setup, jax.random.key(seed), first)

@@ -16,16 +16,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from blackjax.adaptation.step_size import dual_averaging_adaptation
 from jax.flatten_util import ravel_pytree
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.laplace import laplace, settled, unravel
+from bayesreg.inference.laplace import averaged, settled
+from bayesreg.inference.reflection import rotated
 from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.inference.whitened import Setup
+from bayesreg.inference.whitened import Setup, clearance_of, whitened, whitened_position
 from tests.calibration.chains import (
+    ALONE,
     BATCH,
     Estimands,
     conditioned,
@@ -52,21 +55,24 @@ class Settings(NamedTuple):
     ----------
     replications : int
     stages, approach : int
-        How often a chain makes so many transitions to come from its mode to where the posterior is: about a reference
-        there, then about where the second half of them was.
+        How often a chain makes so many transitions to come to where the posterior is, about a reference taken at its
+        mode and, from the second time on, where it came to the time before.
     warm_up, draws : int
         Transitions about that, not kept and kept.
     step_size, steps : float, int
-        Of the trajectories about it.
+        Of the trajectories about it; the step is the greatest that a chain takes, and where its tuning starts.
+    target_acceptance : float
+        To which each chain's step is tuned in all transitions that are not kept.
     """
 
     replications: int = 400
-    stages: int = 3
+    stages: int = 2
     approach: int = 20
     warm_up: int = 40
-    draws: int = 60
+    draws: int = 150
     step_size: float = 0.3
     steps: int = 5
+    target_acceptance: float = 0.8
 
 
 SETTINGS = Settings()
@@ -167,40 +173,53 @@ def _chains(
     """Quantities (draw, r, k) after the warm-up, and the mean acceptance of each replication."""
     kernel = SAMPLERS[sampler](posterior)
     say("a mode for each replication")
-    states = _modes(posterior, observed, starts)
-    flat_of = jax.jit(jax.vmap(lambda start: ravel_pytree(posterior.unconstrain_of(posterior.data, start))[0]))
-    middle, typical = np.asarray(flat_of(states)), np.asarray(flat_of(starts))
+    problems = [replace(posterior, data=posterior.data._replace(fixed_values=f)) for f in observed]
+    modes = _modes(problems, starts)
+    visited = modes[:, None]
     for stage in range(settings.stages + 1):
         say(f"a reference for each replication, {stage + 1} of {settings.stages + 1}")
-        # Curvatures in T_s and T_r are the energies over them, which are less at a mode or a mean than at any draw.
-        references = [
-            laplace(posterior, place, posterior.data._replace(fixed_values=f))._replace(centre=jnp.asarray(centre))
-            for centre, place, f in zip(middle, typical, observed, strict=True)
-        ]
-        setup = setups_about(posterior, references, settings.step_size, settings.steps)
-        last = stage == settings.stages
-        steps = settings.warm_up + settings.draws if last else settings.approach
+        about = visited[:, [0, -1]]
+        references = [averaged(*each) for each in zip(problems, about, strict=True)]
+        u = visited[:, :, -3 * len(posterior.sampled) :].reshape(*visited.shape[:2], -1, 3)
+        seen = np.moveaxis(u[:, :, ALONE], 2, 1)
+        setup = setups_about(posterior, references, about.mean(axis=1), seen, settings.step_size, settings.steps)
+        if stage == 0:
+            states = _flown(posterior, posterior.data, setup, observed, modes, jax.random.split(key, len(modes)))
         key_stage = jax.random.fold_in(key, stage)
-        states, places, found, acceptance = _run(kernel, posterior, setup, observed, states, key_stage, steps, say)
-        middle, typical = places[steps // 2 :].mean(axis=0), places[-1]
+        states, places, found, acceptance = _run(
+            kernel, posterior, setup, observed, states, key_stage, settings, stage == settings.stages, say
+        )
+        visited = np.concatenate([modes[:, None], np.moveaxis(places[len(places) // 2 :], 0, 1)], axis=1)
     return found[settings.warm_up :], acceptance[settings.warm_up :].mean(axis=0)
 
 
-def _modes(posterior: br.Posterior, observed: Any, starts: Estimands) -> Estimands:
-    """The modes of all replications, from draws of the prior.
-
-    T_r has no mode but at zero: it is held at its median meanwhile, and stays at the draw.
-    """
-    inferred = {name: sd for name, sd in posterior.data.temperature_log_sd.items() if name != "t_elastic"}
+def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
+    """Flat positions (r, d) of the modes of all replications, from draws of the prior."""
     found = []
-    for k, f in enumerate(observed):
-        # Equal to the others: all share what is compiled.
-        here = replace(posterior, data=posterior.data._replace(fixed_values=f, temperature_log_sd=inferred))
-        start = here.unconstrain_of(here.data, of_posterior(here, {name: x[k] for name, x in starts.items()}))
-        flat = settled(here, here.data, np.asarray(ravel_pytree(start)[0]))
-        found.append(here.constrain_of(here.data, unravel(here)(flat)))
-    modes = {name: jnp.stack([one[name] for one in found]) for name in found[0]}
-    return {name: modes.get(name, start) for name, start in starts.items()}
+    for k, problem in enumerate(problems):
+        start = problem.unconstrain_of(problem.data, {name: x[k] for name, x in starts.items()})
+        found.append(settled(problem, problem.data, np.asarray(ravel_pytree(start)[0])))
+    return np.stack(found)
+
+
+@partial(jax.jit, static_argnums=0)
+def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, modes: Any, keys: Any) -> Estimands:
+    """A quarter turn away from each mode, as chains start in production; the mode itself where the skull catches them.
+
+    At a mode the elastic energy is far less than at any draw, and a T_r that comes from there is slow to recover.
+    """
+
+    def one(given: Any) -> Estimands:
+        setup, observed, mode, key = given
+        here = data._replace(fixed_values=observed)
+        begin = whitened(setup.reference, mode)
+        xi, _ = rotated(
+            setup.walls, clearance_of(posterior, here, setup), begin, jax.random.normal(key, begin.shape), jnp.pi / 2
+        )
+        place = whitened_position(posterior, setup.reference, jnp.where(jnp.isfinite(xi).all(), xi, begin))
+        return posterior.constrain_of(here, place)
+
+    return jax.lax.map(one, (setup, observed, modes, keys), batch_size=BATCH)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -234,19 +253,31 @@ def _run(
     observed: Any,
     starts: Estimands,
     key: Any,
-    steps: int,
+    settings: Settings,
+    last: bool,
     say: Say,
 ) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray]:
-    """Where the chains end; flat positions, quantities and acceptances, the steps leading, then the replications."""
+    """Where the chains end; flat positions, quantities and acceptances, the steps leading, then the replications.
+
+    Each chain has its own step, tuned as production tunes that of its chains: where one step served all replications,
+    some chains stood still.
+    """
     data = conditioned(posterior)
+    tuned, steps = (settings.warm_up, settings.warm_up + settings.draws) if last else (settings.approach,) * 2
+    begin, update, final = dual_averaging_adaptation(settings.target_acceptance)
+    averaging = jax.vmap(begin)(setup.step_size)
     states = _begin(kernel, data, setup, observed, starts)
     kept = []
     for step in range(steps):
+        size = jnp.exp(averaging.log_step_size) if step < tuned else final(averaging)
+        setup = setup._replace(step_size=jnp.minimum(size, settings.step_size))
         keys = jax.random.split(jax.random.fold_in(key, step), len(observed))
         states, ends, *found = _advance(kernel, posterior, data, setup, observed, keys, states)
         kept.append([np.asarray(x) for x in found])
+        if step < tuned:
+            averaging = jax.vmap(update)(averaging, jnp.nan_to_num(found[2]))
         if step % 20 == 0:
-            say(f"transition {step} of {steps}, acceptance {kept[-1][2].mean():.0%}")
+            say(f"transition {step} of {steps}, acceptance {kept[-1][2].mean():.0%}, step {np.median(size):.2g}")
     return ends, *(np.stack(x) for x in zip(*kept, strict=True))
 
 

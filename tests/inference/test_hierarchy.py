@@ -1,11 +1,17 @@
-"""The scale of a field, where its evidence is known: y_i = sd z_i + σ e_i, marginally N(0, sd² + σ²)."""
+"""Scales whose evidence is known.
+
+Of a field y_i = sd z_i + σ e_i, marginally N(0, sd² + σ²), and of displacements y_i = u_i + σ e_i with precisions
+p_i / T_r, marginally N(0, T_r / p_i + σ²).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.optimize import minimize_scalar
 
-from bayesreg.inference.hierarchy import balanced, is_scale
+from bayesreg.inference.hierarchy import balanced, is_scale, tempered
 
 COUNT, NOISE = 100, 0.5
 
@@ -62,3 +68,27 @@ def test_without_a_field_nothing_is_asked_for():
     np.testing.assert_array_equal(balanced(target, flat, never), flat)
     assert not is_scale(target).any()
     np.testing.assert_array_equal(np.flatnonzero(is_scale(TARGET)), [COUNT])
+
+
+@pytest.mark.parametrize("first", [1e-4, 1e3])
+@pytest.mark.parametrize("truth", [0.2, 3.0])
+def test_a_temperature_comes_to_the_maximum_of_its_evidence(truth, first):
+    """From far below, where the joint mode lies, and from far above."""
+    rng = np.random.default_rng(0)
+    precision = 10 ** rng.uniform(-1, 2, COUNT)
+    y = np.sqrt(truth / precision) * rng.normal(size=COUNT) + NOISE * rng.normal(size=COUNT)
+    target = Field(t_elastic=np.array(0.0), lam=np.zeros(2))
+    log_t = np.log(first)
+    for _ in range(60):
+        prior = precision / np.exp(log_t)
+        mode = y / (1 + NOISE**2 * prior)
+        energy, shares = 0.5 * (prior * mode**2).sum(), np.diag(prior / (prior + NOISE**-2))
+        moved = tempered(target, np.array([1.0, 2.0, log_t]), energy - COUNT / 2, energy, shares)
+        np.testing.assert_array_equal(moved[:2], [1.0, 2.0])
+        log_t = moved[2]
+
+    def evidence(log_t):
+        return stats.norm.logpdf(y, scale=np.sqrt(np.exp(log_t) / precision + NOISE**2)).sum()
+
+    best = minimize_scalar(lambda log_t: -evidence(log_t), bounds=(-12, 8), method="bounded").x
+    assert log_t == pytest.approx(best, abs=1e-3)

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from scipy.optimize import lsq_linear
+from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.special import polygamma
 
 import bayesreg as br
 from bayesreg.inference.laplace import GAP, _convex, _with_tails, find_mode, laplace, precision_at, pulled, unravel
-from tests.inference.test_closed_form import LAM, MESH, MU, problem, walled
+from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem, walled
+from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image
 
 
@@ -23,6 +24,27 @@ def test_a_gaussian_posterior_is_its_own_approximation():
     assert (abs(mode - exact.mean) / sd).max() < 0.02
     covariance = np.asarray(reference.factor @ reference.factor.T)
     np.testing.assert_allclose(covariance @ exact.precision, np.eye(len(mode)), atol=1e-6)
+
+
+def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
+    """Known in closed form at each T_r; the joint mode of T_r and the displacements lies next to T_r = 0."""
+    found = problem()
+    options = {**dict(found.posterior.options), "t_elastic": {"median": 20.0, "log_sd": 1.0}, "normalised": True}
+    arrays = found.oracle.fixed, found.oracle.moving
+    posterior = br.build_posterior(*(br.Image(*each) for each in arrays), MESH, model=br.ModelConfig(**options))
+
+    def minus_evidence(log_t):
+        oracle = paper.Paper(
+            MESH.points, MESH.cells, MESH.tissue, *arrays, MESH.boundary, **TEMPERATURES | {"t_elastic": np.exp(log_t)}
+        )
+        exact = paper.gaussian_posterior(oracle, LAM, MU, OFFSET, GRADIENT)
+        place = {"t_elastic": jnp.asarray(log_t), "u_boundary": jnp.asarray(exact.mean.reshape(-1, 3))}
+        return 0.5 * np.linalg.slogdet(exact.precision)[1] - float(posterior.logdensity(place))
+
+    best = minimize_scalar(minus_evidence, bounds=(-3, 8), method="bounded", options={"xatol": 1e-3}).x
+    mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
+    assert abs(best - np.log(20.0)) > 0.1
+    assert unravel(posterior)(mode)["t_elastic"] == pytest.approx(best, abs=0.01)
 
 
 def test_the_mode_is_in_the_support():
