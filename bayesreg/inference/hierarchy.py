@@ -6,7 +6,8 @@ MacKay's fixed point (1992): |z|² = γ, the number of components that the data 
 
 T_r is such a scale of u_B, whose prior's curvature P falls as 1 / T_r: the joint mode lies next to T_r = 0, where
 nothing moves. With u_B integrated out by Laplace's approximation, C its covariance, ∂ log p / ∂ log T_r gains
-½ tr(C P), which makes 2 E_r / T_r = γ where the prior of T_r says nothing.
+½ tr(C P), which makes 2 E_r / T_r = γ where the prior of T_r says nothing, and its curvature ½ tr(C P − (C P)²). At a
+typical draw of u_B, where E_r / T_r is greater by ½ tr(C P) than at the mode, the curvature is greater by as much.
 """
 
 from __future__ import annotations
@@ -95,14 +96,17 @@ def tempered(
     slope, curvature : float
         Of the log density and of minus it in log T_r, there.
     shares : (r, r) array
-        C P: in its eigenvectors, how much of what holds a component of u_B is the prior's. As T_r rises it falls, as
-        C P − (C P)² does.
+        C P: in its eigenvectors, how much of what holds a component of u_B is the prior's.
     """
     moved = np.array(flat)
-    falling = np.trace(shares) - (shares * shares.T).sum()
-    change = (slope + np.trace(shares) / 2) / (curvature + falling / 2)
+    change = (slope + np.trace(shares) / 2) / (curvature + gained(shares))
     moved[is_temperature(target) > 0] += np.clip(change, -_MOST, _MOST)
     return moved
+
+
+def gained(shares: Float[np.ndarray, "rows rows"]) -> float:
+    """By how much the evidence of log T_r is more curved than the log density: ½ tr(C P − (C P)²)."""
+    return float(np.trace(shares) - (shares * shares.T).sum()) / 2
 
 
 def _marked(target: Placed, wanted: str) -> Float[np.ndarray, "dimension"]:

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 
-from bayesreg.inference.hierarchy import balanced, is_scale, is_temperature, tempered
+from bayesreg.inference.hierarchy import balanced, gained, is_scale, is_temperature, tempered
 from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
@@ -25,7 +25,7 @@ LEAST_CURVATURE, INFLATION = 1.0, np.pi**2 / 3
 # Of differences between gradients, in logarithmic coordinates.
 STEP = 1e-4
 # The last stage of a search for a mode is repeated so often, at most, or until no coordinate moves by more.
-REPEATS, SETTLED = 10, 1e-3
+REPEATS, SETTLED = 20, 1e-3
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25
 
@@ -112,6 +112,8 @@ def settled(
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
             break
+    else:
+        say("mode: not settled")
     return _admissible(target, flat)
 
 
@@ -217,12 +219,14 @@ def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"
     Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
     wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
     large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with the parameter,
-    and its mean over places would be that of the largest.
+    and its mean over places would be that of the largest. In log T_r it is that at draws about the mode, which
+    trajectories meet, though the posterior of T_r is wider.
     """
     curvatures = [_curvature(target, target.data, flat) for flat in flats]
     approximate = np.mean([found.gauss_newton for found in curvatures], axis=0)
     curvature = _convex(_regular(approximate), np.mean([found.remainder for found in curvatures], axis=0))
-    return pulled(target, _gaussian(flats[0], _jointly(target, target.data, flats[0], curvature, joint=True)), flats)
+    precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
+    return pulled(target, _gaussian(flats[0], precision), flats)
 
 
 def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
@@ -315,8 +319,12 @@ def _jointly(
     flat: Float[np.ndarray, "dimension"],
     curvature: Float[np.ndarray, "rows rows"],
     joint: bool,
+    at_draws: bool = False,
 ) -> Float[np.ndarray, "dimension dimension"]:
-    """The curvature in all coordinates, given that in the displacements and, jointly, the field."""
+    """The curvature in all coordinates, given that in the displacements and, jointly, the field.
+
+    In log T_r it is that of its evidence, or that at draws of the displacements (see `hierarchy`).
+    """
     curved = _curved(target, joint)
     count = int((~curved).sum())
     # The coordinates whose curvature counts come last. Where not jointly, the field's share of the given is left out.
@@ -329,8 +337,8 @@ def _jointly(
         _require_finite(rows)
         temperature = np.flatnonzero(is_temperature(target)[order[:count]])
         if len(temperature):
-            # E_r / T_r, which is minus that curvature, is greater by so much at a typical draw than at the mode.
-            rows[temperature, temperature] += np.trace(_shares(target, data, flat)) / 2
+            shares = _shares(target, data, flat)
+            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else gained(shares)
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]

@@ -35,8 +35,6 @@ WIDE_PLACES, SEARCHES = 64, 40
 # Degrees of freedom of Student's t, and its scale in standard deviations of the node: of the kernels, and of the wide
 # places.
 NARROW, WIDE = (4.0, 0.7), (2.0, 2.0)
-# Places that are looked at at a time.
-AT_A_TIME = 16
 
 
 class Kernels(NamedTuple):
@@ -82,7 +80,7 @@ class Loose(NamedTuple):
     seen : (k, kernels, 3) array
         Displacements about which places are drawn for each, mm.
     spread : (k, 3, 3) array
-        Lower triangular: of the covariance of each, mm.
+        Lower triangular: the factor of the covariance of each, mm.
     """
 
     nodes: Int[AnyArray, "k"]
@@ -167,7 +165,8 @@ def _resampled(
     """A place by its weight among so many and the one here, and by how much it is higher."""
     key_places, key_choice = jax.random.split(key)
     drawn = jnp.concatenate([here[None], places.sample(key_places, count)])
-    heights = jax.lax.map(height, drawn, batch_size=AT_A_TIME)
+    # One after the other: what they need together would leave the cache.
+    heights = jax.lax.map(height, drawn)
     weights = jnp.nan_to_num(heights - places.log_density(drawn), nan=-jnp.inf)
     chosen = jax.random.categorical(key_choice, weights)
     return drawn[chosen], heights[chosen] - heights[0]

@@ -20,6 +20,8 @@ from bayesreg.types import AnyArray
 
 # Quadrature points that are looked at: as many as so many average cells have, those that follow a node the furthest.
 CELLS = 128
+# Quadrature points that are ranked at a time: there may be millions.
+AT_A_TIME = 100_000
 
 
 class Neighbourhoods(NamedTuple):
@@ -86,12 +88,16 @@ def neighbourhoods(
     matrix = stiffness(mesh, lam, mu).tocsr()
     own = linear_response(system, matrix, np.arange(len(mesh.points)), nodes).reshape(-1, 3, len(nodes), 3)
 
-    def following(which: int) -> tuple[np.ndarray, np.ndarray]:
-        every = np.einsum("pa,paij->pij", barycentric, own[mesh.cells[cell_of], :, which])
-        points = np.sort(np.argpartition(-(every**2).sum(axis=(1, 2)), count - 1)[:count])
-        return points, every[points]
+    def following(points: np.ndarray, which: int) -> np.ndarray:
+        return np.einsum("pa,paij->pij", barycentric[points], own[mesh.cells[cell_of[points]], :, which])
 
-    points, follows = (np.stack(found) for found in zip(*map(following, range(len(nodes))), strict=True))
+    def furthest(which: int) -> np.ndarray:
+        parts = np.array_split(np.arange(len(cell_of)), -(-len(cell_of) // AT_A_TIME))
+        reach = np.concatenate([(following(part, which) ** 2).sum(axis=(1, 2)) for part in parts])
+        return np.sort(np.argpartition(-np.asarray(quadrature.weights) * reach, count - 1)[:count])
+
+    points = np.stack([furthest(which) for which in range(len(nodes))])
+    follows = np.stack([following(points[which], which) for which in range(len(nodes))])
     touching = np.isin(mesh.cells, nodes).any(axis=1)
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
     response = linear_response(system, matrix, near, prescribed)

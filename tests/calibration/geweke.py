@@ -82,7 +82,10 @@ def compare(
     if sampler != "rwmh":
         data = conditioned(posterior)
         reference = prior_reference(simulator, posterior)
-        centre, seen = np.asarray(reference.centre)[None], np.moveaxis(first["u_boundary"][:, ALONE], 1, 0)[None]
+        centre = np.asarray(reference.centre)[None]
+        # Not where the chains start: a kernel must not know its starts.
+        others = simulator.draw_prior(np.random.default_rng(2000), chains)
+        seen = np.moveaxis(others["u_boundary"][:, ALONE], 1, 0)[None]
         shared = setups_about(posterior, [reference], centre, seen, STEP_SIZE, STEPS)
         setup = jax.tree.map(lambda x: x[0], shared)
     run = partial(_successive, kernel, simulator.posterior, steps)

@@ -176,6 +176,7 @@ def _chains(
     problems = [replace(posterior, data=posterior.data._replace(fixed_values=f)) for f in observed]
     modes = _modes(problems, starts)
     visited = modes[:, None]
+    key, key_flight = jax.random.split(key)
     for stage in range(settings.stages + 1):
         say(f"a reference for each replication, {stage + 1} of {settings.stages + 1}")
         about = visited[:, [0, -1]]
@@ -184,7 +185,7 @@ def _chains(
         seen = np.moveaxis(u[:, :, ALONE], 2, 1)
         setup = setups_about(posterior, references, about.mean(axis=1), seen, settings.step_size, settings.steps)
         if stage == 0:
-            states = _flown(posterior, posterior.data, setup, observed, modes, jax.random.split(key, len(modes)))
+            states = _flown(posterior, posterior.data, setup, observed, modes, jax.random.split(key_flight, len(modes)))
         key_stage = jax.random.fold_in(key, stage)
         states, places, found, acceptance = _run(
             kernel, posterior, setup, observed, states, key_stage, settings, stage == settings.stages, say
@@ -204,7 +205,7 @@ def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
 
 @partial(jax.jit, static_argnums=0)
 def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, modes: Any, keys: Any) -> Estimands:
-    """A quarter turn away from each mode, as chains start in production; the mode itself where the skull catches them.
+    """A quarter turn away from each mode; the mode itself where the skull catches the flight.
 
     At a mode the elastic energy is far less than at any draw, and a T_r that comes from there is slow to recover.
     """
@@ -259,7 +260,7 @@ def _run(
 ) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray]:
     """Where the chains end; flat positions, quantities and acceptances, the steps leading, then the replications.
 
-    Each chain has its own step, tuned as production tunes that of its chains: where one step served all replications,
+    Each chain's step is tuned on its own, by dual averaging as in production: where one step served all replications,
     some chains stood still.
     """
     data = conditioned(posterior)
@@ -277,7 +278,8 @@ def _run(
         if step < tuned:
             averaging = jax.vmap(update)(averaging, jnp.nan_to_num(found[2]))
         if step % 20 == 0:
-            say(f"transition {step} of {steps}, acceptance {kept[-1][2].mean():.0%}, step {np.median(size):.2g}")
+            size, rate = np.median(setup.step_size), kept[-1][2].mean()
+            say(f"transition {step} of {steps}, acceptance {rate:.0%}, step {size:.2g}")
     return ends, *(np.stack(x) for x in zip(*kept, strict=True))
 
 

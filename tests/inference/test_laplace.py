@@ -45,6 +45,9 @@ def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
     mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
     assert abs(best - np.log(20.0)) > 0.1
     assert unravel(posterior)(mode)["t_elastic"] == pytest.approx(best, abs=0.01)
+    factor, step = np.asarray(laplace(posterior, mode).factor), 0.1
+    curvature = sum(way * minus_evidence(best + at * step) for at, way in ((-1, 1), (0, -2), (1, 1))) / step**2
+    assert 1 / (factor[0] @ factor[0]) == pytest.approx(float(_with_tails(np.array([curvature]))[0]), rel=0.03)
 
 
 def test_the_mode_is_in_the_support():

@@ -62,8 +62,10 @@ def after_steps(name: str, alone: Any = ()) -> np.ndarray:
     if name == "rwmh":
         kernel, setup = SAMPLERS[name](target(), sigma_u=size), None
     else:
-        setup = setup_about(target(), poor_reference(), poor_reference().centre, alone)
-        setup = setup._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps))
+        setup = setup_about(target(), poor_reference(), poor_reference().centre)
+        seen = np.moveaxis(exact()[CHAINS:][:300, alone], 1, 0)
+        nodes = loose.loose(poor_reference(), len(target().sampled), np.asarray(alone, int), seen)
+        setup = setup._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps), loose=nodes)
         kernel = nodes_alone() if name == "nodes alone" else SAMPLERS[name](target())
 
     @jax.jit
@@ -256,6 +258,23 @@ def test_the_nodes_that_hardly_move_are_found():
     path[:, :, 7] = np.cumsum(path[:, :, 7], axis=0)
     path[:, 1:, 3] = path[:1, 1:, 3]
     path[:, :, 10] = 0.2
-    np.testing.assert_array_equal(loose.slowest(path, 3), [3, 7, 10])
+    # What alternates about its mean comes far, and nowhere in two transitions.
+    path[:, :, 5] = np.linspace(0, 1, 30)[:, None, None] + 2.0 * (-1.0) ** np.arange(30)[:, None, None]
+    np.testing.assert_array_equal(loose.slowest(path, 4), [3, 5, 7, 10])
     assert len(loose.slowest(path[:1], 4)) == 4
     assert len(loose.slowest(path, 0)) == 0
+
+
+def test_places_have_the_density_that_is_said():
+    """The share of the places in a ball is the integral of the density over it; both on a grid."""
+    rng = np.random.default_rng(0)
+    middles, scale = 2.0 * rng.normal(size=(40, 3)), np.array([[0.9, 0, 0], [0.3, 0.6, 0], [-0.2, 0.4, 0.5]])
+    kernels = loose.Kernels(jnp.asarray(middles), jnp.asarray(scale), 4.0)
+    axis = np.linspace(-30, 30, 121)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    density = np.exp(np.concatenate([kernels.log_density(jnp.asarray(part)) for part in np.array_split(grid, 40)]))
+    places = np.asarray(kernels.sample(jax.random.key(0), 40_000))
+    for centre, radius in ((0, 1.5), (0, 3), (0, 6), ((2, 0, -1), 2)):
+        expected = density[np.linalg.norm(grid - centre, axis=1) < radius].sum() / density.sum()
+        found = (np.linalg.norm(places - centre, axis=1) < radius).mean()
+        assert found == pytest.approx(expected, abs=0.015)
