@@ -118,6 +118,7 @@ def settled(
 
 
 def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """The flat position with T_r, if it is inferred, nearer to the maximum of its evidence."""
     entry = np.flatnonzero(is_temperature(target))
     if not len(entry):
         return flat
@@ -186,7 +187,7 @@ def _improved(
 def _apart(
     precision: Float[np.ndarray, "dimension dimension"], held: Bool[np.ndarray, "dimension"]
 ) -> Float[np.ndarray, "dimension dimension"]:
-    """Without what couples some entries to the others: along any other direction they stay."""
+    """Without what couples the held entries to the others: no move of the whitened others moves the held then."""
     precision = np.array(precision)
     precision[held] = precision[:, held] = 0.0
     precision[held, held] = 1.0
