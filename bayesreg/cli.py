@@ -1,15 +1,21 @@
 """The command line. Heavy imports stand inside the commands, so that help comes at once."""
 
 import errno
+import os
+import platform
+import zlib
 from pathlib import Path
 from typing import Annotated, Any
 
+import platformdirs
 import typer
 from typer.core import TyperGroup
 
 from bayesreg import __version__
 
 NOT_CONVERGED = 3
+# Some fifty runs on different meshes; what was not used for longest then goes.
+CACHE_BYTES = 2 * 2**30
 STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
@@ -74,6 +80,31 @@ def _options(
     ] = False,
 ) -> None:
     """Registration of two images with posterior distributions of displacement and stiffness."""
+    keep_compiled_programs()
+
+
+def keep_compiled_programs() -> None:
+    """Have JAX keep compiled programs in the user's cache for later runs, unless its own variable names a folder.
+
+    Each kind of processor has a folder of its own there: homes are shared on clusters, and what is compiled for one
+    kind may not run on another.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    information = Path("/proc/cpuinfo")
+    processor = platform.processor() or platform.machine()
+    if information.exists():
+        lines = information.read_text(encoding="utf-8", errors="replace").splitlines()
+        processor = "\n".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
+    kind = f"{zlib.crc32(processor.encode()):08x}"
+    folder = platformdirs.user_cache_path("bayesreg") / "programs" / kind
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # A home that cannot be written to costs compilation anew, no more.
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(CACHE_BYTES))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 
 @app.command()

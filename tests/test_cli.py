@@ -3,6 +3,7 @@
 import errno
 import inspect
 import json
+import os
 import subprocess
 import sys
 import time
@@ -179,3 +180,28 @@ def test_help_loads_nothing_heavy_and_comes_at_once():
         subprocess.run([PROGRAM, "--help"], capture_output=True, check=True)
         durations.append(time.perf_counter() - start)
     assert min(durations) < 1.5
+
+
+def test_compiled_programs_are_kept_in_the_users_cache_unless_a_folder_is_named(tmp_path):
+    code = (
+        "from bayesreg.cli import keep_compiled_programs; keep_compiled_programs();"
+        "import jax, jax.numpy as jnp; jax.block_until_ready(jax.jit(lambda x: jnp.linalg.eigh(x)[1])(jnp.eye(3)));"
+        "print(jax.config.jax_compilation_cache_dir)"
+    )
+
+    def named(**variables: str) -> str:
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+        environment = {**kept, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", **variables}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+        return done.stdout.strip()
+
+    home, own, blocked = tmp_path / "home", tmp_path / "own", tmp_path / "a_file"
+    folder = named(XDG_CACHE_HOME=str(home))
+    assert folder.startswith(str(home / "bayesreg"))
+    programs = sorted(path.name for path in Path(folder).glob("*-cache"))
+    assert programs
+    assert named(XDG_CACHE_HOME=str(home)) == folder
+    assert sorted(path.name for path in Path(folder).glob("*-cache")) == programs
+    assert named(XDG_CACHE_HOME=str(home), JAX_COMPILATION_CACHE_DIR=str(own)) == str(own)
+    blocked.touch()
+    assert named(XDG_CACHE_HOME=str(blocked)) == "None"

@@ -1,4 +1,4 @@
-"""Preconditioners of the interior system, built once on the host.
+"""Dense factors of the interior stiffness on the host, and the preconditioners made of them.
 
 A factor of K_II at *one* reference (λ, μ) serves all others: K is affine in the parameters, so the
 preconditioned spectrum lies between the least and the greatest ratio of a parameter to its reference.
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+import scipy.sparse.linalg
 from jaxtyping import Float
 
 from bayesreg.types import AnyArray, InputError
@@ -64,11 +65,39 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse | Non
     """
     if matrix.shape[0] > DENSE_LIMIT:
         return None
-    scale = 1 / np.sqrt(matrix.diagonal())
-    scaled = matrix.toarray() * scale[:, None] * scale
-    try:
-        factor = scipy.linalg.cho_factor(scaled, lower=True)
-    except scipy.linalg.LinAlgError as error:
-        raise InputError("the interior stiffness is singular: sample at least three non-collinear nodes") from error
-    inverse = scipy.linalg.cho_solve(factor, np.eye(len(scaled)))
+    scale, factor = _scaled_factor(matrix)
+    inverse = scipy.linalg.cho_solve(factor, np.eye(len(scale)))
     return ReferenceInverse(jnp.asarray(scale), jnp.asarray((inverse + inverse.T) / 2, jnp.float32))
+
+
+def solved(
+    matrix: scipy.sparse.csr_matrix, right: Float[np.ndarray, "unknowns columns"]
+) -> Float[np.ndarray, "unknowns columns"]:
+    """K_II⁻¹ times many columns, to double precision.
+
+    Up to `DENSE_LIMIT` unknowns by a dense factor: a thousand columns are five times as fast as by a sparse one, whose
+    solves are not products of matrices.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not positive definite.
+    """
+    if matrix.shape[0] > DENSE_LIMIT:
+        return scipy.sparse.linalg.splu(matrix.tocsc()).solve(right)
+    scale, factor = _scaled_factor(matrix)
+    return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right)
+
+
+def _scaled_factor(
+    matrix: scipy.sparse.csr_matrix,
+) -> tuple[Float[np.ndarray, "unknowns"], tuple[Float[np.ndarray, "unknowns unknowns"], bool]]:
+    """diag(K)^(−1/2), and the Cholesky factor of K scaled by it from both sides, for `scipy.linalg.cho_solve`."""
+    scale = 1 / np.sqrt(matrix.diagonal())
+    try:
+        return scale, scipy.linalg.cho_factor(matrix.toarray() * scale[:, None] * scale, lower=True)
+    except (scipy.linalg.LinAlgError, ValueError) as error:
+        raise InputError(
+            "the interior stiffness is singular: sample or hold at least three non-collinear nodes, and keep λ and μ "
+            "from extremes by narrower priors"
+        ) from error

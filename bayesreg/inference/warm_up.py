@@ -11,10 +11,12 @@ import jax.numpy as jnp
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 
 from bayesreg.inference.kernel import Say
-from bayesreg.types import AnyArray, InputError, Scalar
+from bayesreg.types import AnyArray, InputError
 
 # The tuning of the step starts here, and is drawn to ten times as much.
 FIRST_STEP = 0.05
+# Of a trajectory while chains are tuned apart: it ends when the slowest of them does.
+FEW_STEPS = 8
 
 
 class Tuning(NamedTuple):
@@ -49,7 +51,7 @@ def require_sound(tuning: Tuning) -> None:
 
 def tuned(
     data: Any, kernel: tuple[Callable, Callable, Callable], setup: Any, starts: Any, key: AnyArray, tuning: Tuning,
-    say: Say = lambda text: None,
+    apart: bool = False, say: Say = lambda text: None,
 ) -> tuple[Any, Any, AnyArray | None]:  # fmt: skip
     """The setup with its step size, where the chains then are, and if watched how their "u_boundary" came there.
 
@@ -63,36 +65,51 @@ def tuned(
         Estimands, chains as the leading axis.
     key : PRNG key
     tuning : Tuning
+    apart : bool
+        Tune each chain's step by itself, and let no trajectory have more than `FEW_STEPS`. A chain that starts where
+        the density is steep, such as far out in log λ, takes short steps until it is back; with one step for all it
+        would stand still for as long as the others take longer ones, or shorten theirs.
     say : callable
         Told of what was found.
     """
     keys = jax.random.split(key, tuning.warm_up)
-    points, size, rates, path = _run(kernel, tuning, data, setup, starts, keys)
-    setup, late = _sized(tuning, setup, size), float(rates[len(rates) // 2 :].mean())
+    points, sizes, rates, path = _run(kernel, tuning, data, setup, starts, keys, jnp.asarray(apart))
+    setup, late = _sized(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a quarter turn, acceptance {late:.0%}")
     return setup, points, path
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(
-    kernel: tuple[Callable, Callable, Callable], tuning: Tuning, data: Any, setup: Any, starts: Any, keys: AnyArray
-) -> tuple[Any, Scalar, AnyArray, AnyArray | None]:
-    """Estimands, step size, and of every transition the acceptance and, if watched, the (chain, node, axis) array u."""
+    kernel: tuple[Callable, Callable, Callable],
+    tuning: Tuning,
+    data: Any,
+    setup: Any,
+    starts: Any,
+    keys: AnyArray,
+    apart: AnyArray,
+) -> tuple[Any, AnyArray, AnyArray, AnyArray | None]:
+    """Estimands, step size by chain, and of every transition the acceptance and, if watched, the array u by chain."""
     init, step, estimands_of = kernel
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(next(iter(starts.values())))
 
+    def moved(state: Any, size: AnyArray, key: AnyArray) -> Any:
+        now = _sized(tuning, setup, size)
+        few = jnp.minimum(now.steps, FEW_STEPS)
+        return step(data, now._replace(steps=jnp.where(apart, few, now.steps)), key, state)
+
     def one(carry: Any, key: AnyArray) -> Any:
         states, averaging = carry
-        now = _sized(tuning, setup, jnp.exp(averaging.log_step_size))
-        states, info = jax.vmap(partial(step, data, now))(jax.random.split(key, chains), states)
-        rate = jnp.nan_to_num(info.acceptance_rate).mean()
+        states, info = jax.vmap(moved)(states, jnp.exp(averaging.log_step_size), jax.random.split(key, chains))
+        rates = jnp.nan_to_num(info.acceptance_rate)
+        averaging = jax.vmap(update)(averaging, jnp.where(apart, rates, rates.mean()))
         u = jax.vmap(partial(estimands_of, data, setup))(states)["u_boundary"] if tuning.watched else None
-        return (states, update(averaging, rate)), (rate, u)
+        return (states, averaging), (rates.mean(), u)
 
-    first = jax.vmap(partial(init, data, setup))(starts), begin(setup.step_size)
+    first = jax.vmap(partial(init, data, setup))(starts), jax.vmap(begin)(jnp.full(chains, setup.step_size))
     (states, averaging), (rates, path) = jax.lax.scan(one, first, keys)
-    return jax.vmap(partial(estimands_of, data, setup))(states), final(averaging), rates, path
+    return jax.vmap(partial(estimands_of, data, setup))(states), jax.vmap(final)(averaging), rates, path
 
 
 def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:

@@ -29,6 +29,9 @@ from bayesreg.types import AnyArray, InputError, Scalar
 # Chains start that much wider than Laplace's approximation.
 OVERDISPERSION = 1.5
 
+# A reference is averaged over the mode and the places of so many chains at most: each costs a curvature.
+AVERAGED = 16
+
 # Laplace's approximation and the reflections keep eight dense matrices of the square of this: 9 GB.
 MOST_UNKNOWNS = 12_000
 
@@ -210,12 +213,15 @@ def about_reference(
         if tuning is None:
             return setups[0], points
         kernel = init, step, estimands_of
-        # Two stages of one length, compiled once: the first leads the chains to where the second is whitened.
+        # Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already
+        # the first is whitened by the curvature where they start: that at the mode alone can be so much less that no
+        # step is short enough for a chain to leave.
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
         key_settle, key_tune, key_search = jax.random.split(key_tune, 3)
-        _, points, settling = tuned(conditioned(setups[0]), kernel, setups[0], points, key_settle, stage)
+        begun = _averaged(target, modes[0], points)
+        _, points, settling = tuned(conditioned(begun), kernel, begun, points, key_settle, stage, apart=True)
         setup = _averaged(target, modes[0], points)
-        setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say)
+        setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say=say)
         if settling is None or path is None:
             return setup, points
         late = np.concatenate([np.asarray(part[len(part) // 4 :]) for part in (settling, path)], axis=1)
@@ -291,7 +297,7 @@ def _averaged(target: SmoothTarget, mode: AnyArray, points: Any) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are."""
     flats = jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points)
     sound = [flat for flat in np.asarray(flats) if np.isfinite(flat).all()]
-    places = [mode, *sound]
+    places = [mode, *sound[:AVERAGED]]
     return _about(target, averaged(target, places), np.mean(places, axis=0))
 
 

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-import scipy.sparse.linalg
 from jaxtyping import Float
 
 from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
+from bayesreg.fem.preconditioners import solved
 from bayesreg.mesh import TetMesh
 from bayesreg.model.program import RegistrationData
 from bayesreg.model.similarity import SIMILARITIES, Noise
@@ -79,7 +79,7 @@ def displacement_curvature(
     modes = load.shape[1]
     W = np.zeros((0, modes + len(sampled)))
     if len(free):
-        W = -scipy.sparse.linalg.splu(K[free][:, free].tocsc()).solve(np.hstack([load, coupling.toarray()]))
+        W = -solved(K[free][:, free], np.hstack([load, coupling.toarray()]))
     schur = K[sampled][:, sampled] + coupling.T @ W[:, modes:]
     # ∂u/∂(z, u_B): what is sampled moves by itself, the rest by W.
     unit = np.hstack([np.zeros((len(sampled), modes)), np.eye(len(sampled))])
