@@ -33,16 +33,16 @@ ITERATIONS, JUDGES = 30, 8
 def laplace_sampler(target: SmoothTarget, mode_search: str = "once") -> Sampler:
     """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        momentum = jax.random.normal(key, state.position.shape)
-        clearance = clearance_of(target, data, setup)
-        position, _ = rotated(setup.walls, clearance, state.position, momentum, jnp.pi / 2)
-        # A turn that was not over in time is refused, as everywhere.
-        done = jnp.isfinite(position).all()
-        moved = state._replace(position=jnp.where(done, position, state.position))
-        return moved, Moved(done.astype(float), diverging=~done)
+    return about_reference(target, _turn, mode_search=mode_search, exact=False)
 
-    return about_reference(target, transition, mode_search=mode_search, exact=False)
+
+def _turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    momentum = jax.random.normal(key, state.position.shape)
+    position, _ = rotated(setup.walls, clearance_of(target, data, setup), state.position, momentum, jnp.pi / 2)
+    # A turn that was not over in time is refused, as everywhere.
+    done = jnp.isfinite(position).all()
+    moved = state._replace(position=jnp.where(done, position, state.position))
+    return moved, Moved(done.astype(float), diverging=~done)
 
 
 def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:

@@ -31,29 +31,31 @@ def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75
         "once" or "per_chain".
     """
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        key_step, key_move = jax.random.split(key)
-        kernel = blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
-        density = whitened_density(target, data, setup)
-        size = setup.step_size * _jitter(key_step)
-        state, info = kernel(key_move, state, density, size, jnp.ones_like(state.position), setup.steps)
-        return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
-
     tuning = Tuning(warm_up, target_acceptance)
-    return about_reference(target, transition, tuning, mode_search=mode_search, alone=LOOSE)
+    return about_reference(target, _quarter_turn, tuning, mode_search=mode_search, alone=LOOSE)
+
+
+def _quarter_turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    key_step, key_move = jax.random.split(key)
+    kernel = blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
+    density = whitened_density(target, data, setup)
+    size = setup.step_size * _jitter(key_step)
+    state, info = kernel(key_move, state, density, size, jnp.ones_like(state.position), setup.steps)
+    return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
 
 def nuts(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:
     """The No-U-Turn sampler about the Gaussian reference; its settings are those of `hmc`."""
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        kernel = blackjax.mcmc.nuts.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
-        density = whitened_density(target, data, setup)
-        unit = jnp.ones_like(state.position)
-        state, info = kernel(key, state, density, setup.step_size, unit, max_num_doublings=6)
-        return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
+    return about_reference(target, _no_u_turn, Tuning(warm_up, target_acceptance), mode_search=mode_search)
 
-    return about_reference(target, transition, Tuning(warm_up, target_acceptance), mode_search=mode_search)
+
+def _no_u_turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    kernel = blackjax.mcmc.nuts.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
+    density = whitened_density(target, data, setup)
+    unit = jnp.ones_like(state.position)
+    state, info = kernel(key, state, density, setup.step_size, unit, max_num_doublings=6)
+    return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
 
 def mclmc(
@@ -64,18 +66,19 @@ def mclmc(
     The speed is one whatever the density, so that a time of √d does what a time of one does in `hmc`.
     """
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        key_step, key_move = jax.random.split(key)
-        kernel = blackjax.mcmc.adjusted_mclmc.build_kernel(
-            reflective_microcanonical(setup.walls, clearance_of(target, data, setup))
-        )
-        density = whitened_density(target, data, setup)
-        size = jnp.sqrt(len(state.position)) * setup.step_size * _jitter(key_step)
-        state, info = kernel(key_move, state, density, size, (setup.steps,))
-        # McLachlan's integrator has two stages.
-        return state, Moved(info.acceptance_rate, info.is_divergent, gradients=2 * setup.steps)
+    return about_reference(target, _microcanonical, Tuning(warm_up, target_acceptance), mode_search=mode_search)
 
-    return about_reference(target, transition, Tuning(warm_up, target_acceptance), mode_search=mode_search)
+
+def _microcanonical(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    key_step, key_move = jax.random.split(key)
+    kernel = blackjax.mcmc.adjusted_mclmc.build_kernel(
+        reflective_microcanonical(setup.walls, clearance_of(target, data, setup))
+    )
+    density = whitened_density(target, data, setup)
+    size = jnp.sqrt(len(state.position)) * setup.step_size * _jitter(key_step)
+    state, info = kernel(key_move, state, density, size, (setup.steps,))
+    # McLachlan's integrator has two stages.
+    return state, Moved(info.acceptance_rate, info.is_divergent, gradients=2 * setup.steps)
 
 
 def _jitter(key: AnyArray) -> AnyArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import blackjax
@@ -14,7 +15,15 @@ from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.reflection import reflective_leapfrog, rotated, shifted
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.warm_up import Tuning
-from bayesreg.inference.whitened import Density, Moved, Setup, about_reference, clearance_of, whitened_density
+from bayesreg.inference.whitened import (
+    Density,
+    Moved,
+    Setup,
+    Transition,
+    about_reference,
+    clearance_of,
+    whitened_density,
+)
 from bayesreg.types import AnyArray
 
 # Steps of a random walk shrink with the square root of the dimension, and with what refuses them.
@@ -39,13 +48,14 @@ def mala(
         "once" or "per_chain".
     """
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        kernel = blackjax.mcmc.hmc.build_kernel(reflective_leapfrog(setup.walls, clearance_of(target, data, setup)))
-        density = whitened_density(target, data, setup)
-        state, info = kernel(key, state, density, setup.step_size, jnp.ones_like(state.position), 1)
-        return state, Moved(info.acceptance_rate, info.is_divergent, gradients=1)
+    return about_reference(target, _leapfrog, Tuning(warm_up, target_acceptance, LEAST), mode_search=mode_search)
 
-    return about_reference(target, transition, Tuning(warm_up, target_acceptance, LEAST), mode_search=mode_search)
+
+def _leapfrog(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    kernel = blackjax.mcmc.hmc.build_kernel(reflective_leapfrog(setup.walls, clearance_of(target, data, setup)))
+    density = whitened_density(target, data, setup)
+    state, info = kernel(key, state, density, setup.step_size, jnp.ones_like(state.position), 1)
+    return state, Moved(info.acceptance_rate, info.is_divergent, gradients=1)
 
 
 def barker(
@@ -56,15 +66,16 @@ def barker(
     It has no momentum: a proposal in the skull is refused.
     """
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
-        density = whitened_density(target, data, setup)
-        state, info = blackjax.mcmc.barker.build_kernel()(key, state, density, setup.step_size)
-        # Outside the support the gradient, and with it the acceptance, may be NaN, which the kernel refuses.
-        outside = ~jnp.isfinite(info.proposal.logdensity)
-        return state, Moved(jnp.nan_to_num(info.acceptance_rate), outside_support=outside, gradients=1)
-
     tuning = Tuning(warm_up, target_acceptance, LEAST)
-    return about_reference(target, transition, tuning, blackjax.mcmc.barker.init, mode_search=mode_search)
+    return about_reference(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=mode_search)
+
+
+def _barker(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    density = whitened_density(target, data, setup)
+    state, info = blackjax.mcmc.barker.build_kernel()(key, state, density, setup.step_size)
+    # Outside the support the gradient, and with it the acceptance, may be NaN, which the kernel refuses.
+    outside = ~jnp.isfinite(info.proposal.logdensity)
+    return state, Moved(jnp.nan_to_num(info.acceptance_rate), outside_support=outside, gradients=1)
 
 
 def rwmh_adaptive(
@@ -76,8 +87,8 @@ def rwmh_adaptive(
     takes the same way, so that the proposal is symmetric.
     """
 
-    tuning = Tuning(warm_up, target_acceptance, LEAST)
-    return _symmetric(target, shifted, whitened_density, tuning, mode_search)
+    tuning, transition = Tuning(warm_up, target_acceptance, LEAST), _symmetric(shifted, whitened_density)
+    return about_reference(target, transition, tuning, random_walk.init, whitened_density, mode_search)
 
 
 def pcn(
@@ -89,14 +100,15 @@ def pcn(
     unchanged and is reversible, so that the test sees only the ratio of the posterior to the reference.
     """
 
-    tuning = Tuning(warm_up, target_acceptance, LEAST)
-    return _symmetric(target, rotated, against_reference, tuning, mode_search)
+    tuning, transition = Tuning(warm_up, target_acceptance, LEAST), _symmetric(rotated, against_reference)
+    return about_reference(target, transition, tuning, random_walk.init, against_reference, mode_search)
 
 
-def _symmetric(target: SmoothTarget, motion: Callable, density: Density, tuning: Tuning, mode_search: str) -> Sampler:
+@cache
+def _symmetric(motion: Callable, density: Density) -> Transition:
     """A motion with a Normal momentum for the time of a step, accepted with the ratio of a density."""
 
-    def transition(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    def transition(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
         def proposal(key: AnyArray, position: AnyArray) -> AnyArray:
             momentum = jax.random.normal(key, position.shape)
             return motion(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
@@ -104,7 +116,7 @@ def _symmetric(target: SmoothTarget, motion: Callable, density: Density, tuning:
         state, info = random_walk.build_rmh()(key, state, density(target, data, setup), proposal)
         return state, Moved(info.acceptance_rate, densities=1)
 
-    return about_reference(target, transition, tuning, random_walk.init, density, mode_search)
+    return transition
 
 
 def against_reference(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:

@@ -14,10 +14,10 @@ import numpy as np
 from bayesreg.inference.checkpoint import Block, Checkpoint, Tally, counted, no_steps
 from bayesreg.inference.diagnostics import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, starting_points
-from bayesreg.inference.kernel import Draw, Sampler
+from bayesreg.inference.kernel import Draw
 from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
-from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.samplers import SAMPLERS, Chosen, chosen_sampler
 from bayesreg.inference.stopping import StopRule, converged, out_of_time, reason
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
@@ -116,7 +116,7 @@ def sample(
         if value < 1:
             raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
-    kernel = SAMPLERS[sampler](posterior, **settings)
+    chosen = chosen_sampler(sampler, posterior, settings)
     began = time.perf_counter()
     _, key_chains = jax.random.split(jax.random.key(seed))
     if resume is None:
@@ -126,13 +126,13 @@ def sample(
         checkpoint, blocks = resume[0], list(resume[1])
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
-        advance = _advance(kernel, chain_keys, thin, block, draws, checkpoint, began)
+        advance = _advance(chosen, chain_keys, thin, block, draws, checkpoint, began)
         for found, reached in _until(stop, advance, checkpoint, blocks, bar):
             blocks.append(found)
             checkpoint = reached
             if on_block is not None:
                 on_block(len(blocks) - 1, found, checkpoint)
-    return _samples(posterior, kernel, blocks, checkpoint, stop, draws)
+    return _samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, draws)
 
 
 def first_checkpoint(
@@ -156,10 +156,11 @@ def first_checkpoint(
     began = time.perf_counter()
     key_start, _ = jax.random.split(jax.random.key(seed))
     points = starting_points(posterior, start or Start(), chains, key_start)
-    kernel = SAMPLERS[sampler](posterior, **settings)
-    setup, points = kernel.prepare(points, jax.random.fold_in(key_start, 1), say)
-    checkpoint = _first(kernel, kernel.data(setup), setup, points)
-    require_density(_observed(kernel, checkpoint).evaluation)
+    chosen = chosen_sampler(sampler, posterior, settings)
+    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), say)
+    data = chosen.sampler.data(setup)
+    checkpoint = _first(chosen, data, setup, points)
+    require_density(_observed(chosen, data, setup, checkpoint.state).evaluation)
     return checkpoint._replace(seconds=np.array(time.perf_counter() - began))
 
 
@@ -173,9 +174,9 @@ def checkpoint_from_arrays(
     InputError
         If the arrays belong to another problem.
     """
-    kernel = SAMPLERS[sampler](posterior, **settings)
+    chosen = chosen_sampler(sampler, posterior, settings)
     points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.estimands(posterior.reference()))
-    expected = jax.eval_shape(partial(_first, kernel, posterior.data), kernel.blank(), points)
+    expected = jax.eval_shape(partial(_first, chosen, posterior.data), chosen.sampler.blank(), points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
     if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
@@ -186,17 +187,22 @@ def checkpoint_from_arrays(
     return jax.tree.unflatten(structure, leaves)
 
 
-def _first(kernel: Sampler, data: Any, setup: Any, points: Any) -> Checkpoint:
-    state = jax.jit(jax.vmap(kernel.init, in_axes=(None, None, 0)))(data, setup, points)
+def _first(chosen: Chosen, data: Any, setup: Any, points: Any) -> Checkpoint:
+    state = _begun(chosen, data, setup, points)
     chains = len(next(iter(points.values())))
-    shapes = jax.eval_shape(jax.vmap(partial(kernel.observe, data, setup)), state)
+    shapes = jax.eval_shape(partial(_observed, chosen), data, setup, state)
     moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), _watched(shapes)))
     return Checkpoint(np.array(0), setup, state, moments, no_steps((chains,)), np.array(0.0))
 
 
-def _observed(kernel: Sampler, checkpoint: Checkpoint) -> Draw:
-    observe = jax.jit(jax.vmap(kernel.observe, in_axes=(None, None, 0)))
-    return observe(kernel.data(checkpoint.setup), checkpoint.setup, checkpoint.state)
+@partial(jax.jit, static_argnums=0)
+def _begun(chosen: Chosen, data: Any, setup: Any, points: Any) -> Any:
+    return jax.vmap(partial(chosen.sampler.init, data, setup))(points)
+
+
+@partial(jax.jit, static_argnums=0)
+def _observed(chosen: Chosen, data: Any, setup: Any, state: Any) -> Draw:
+    return jax.vmap(partial(chosen.sampler.observe, data, setup))(state)
 
 
 def _watched(draw: Draw) -> dict[str, Any]:
@@ -204,7 +210,7 @@ def _watched(draw: Draw) -> dict[str, Any]:
 
 
 def _advance(
-    kernel: Sampler,
+    chosen: Chosen,
     chain_keys: AnyArray,
     thin: int,
     block: int,
@@ -214,11 +220,11 @@ def _advance(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """Blocks of draws, until there are `draws` of them."""
     spent = float(checkpoint.seconds)
-    data = kernel.data(checkpoint.setup)
+    data = chosen.sampler.data(checkpoint.setup)
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
         state, moments, tally, found = _run_block(
-            kernel, length, thin, data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
+            chosen, length, thin, data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
         )
         found = {name: np.asarray(value) for name, value in found.items()}
         seconds = np.array(spent + time.perf_counter() - began)
@@ -229,7 +235,7 @@ def _advance(
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _run_block(  # type: ignore[no-untyped-def]
-    kernel: Sampler,
+    chosen: Chosen,
     length: int,
     thin: int,
     data: Any,
@@ -240,6 +246,8 @@ def _run_block(  # type: ignore[no-untyped-def]
     moments: Moments,
     tally: Tally,
 ):
+    kernel = chosen.sampler
+
     def chain(key: AnyArray, state: Any, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
         def one_draw(carry, draw):  # type: ignore[no-untyped-def]
             state, moments, tally = carry
@@ -296,7 +304,7 @@ def _until(
 
 
 def _samples(
-    posterior: Target, kernel: Sampler, blocks: list[Block], checkpoint: Checkpoint, stop: StopRule, draws: int
+    posterior: Target, exact: bool, blocks: list[Block], checkpoint: Checkpoint, stop: StopRule, draws: int
 ) -> Samples:
     mean, sd = pooled(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
@@ -310,5 +318,5 @@ def _samples(
         converged=holds,
         reason=reason(stop, checkpoint, blocks, holds, draws),
         seconds=float(checkpoint.seconds),
-        exact=kernel.exact,
+        exact=exact,
     )

@@ -8,12 +8,15 @@ approximation is N(0, I) (`bayesreg.inference.whitened`), most of them reflected
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
 
 from bayesreg.inference.approximations import laplace_sampler, pathfinder
 from bayesreg.inference.hamiltonian import hmc, mclmc, nuts
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.local import barker, mala, pcn, rwmh_adaptive
 from bayesreg.inference.random_walk import rwmh
+from bayesreg.inference.target import Target
 from bayesreg.inference.tempering import smc
 
 SAMPLERS: dict[str, Callable[..., Sampler]] = {
@@ -29,3 +32,30 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "laplace": laplace_sampler,
     "pathfinder": pathfinder,
 }
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A sampler of the registry, made for a target.
+
+    Two are equal if name, target and settings are: what is compiled for one serves the other, such as a second run with
+    another seed, or for another pair of images on the same mesh.
+
+    Raises
+    ------
+    InputError
+        If a setting is out of range, or the target is not for this sampler.
+    """
+
+    name: str
+    target: Target
+    settings: tuple[tuple[str, Any], ...]
+    sampler: Sampler = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sampler", SAMPLERS[self.name](self.target, **dict(self.settings)))
+
+
+def chosen_sampler(name: str, target: Target, settings: dict[str, Any]) -> Chosen:
+    """The sampler of that name, with these settings."""
+    return Chosen(name, target, tuple(sorted(settings.items())))

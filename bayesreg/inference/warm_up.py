@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 
-from bayesreg.inference.kernel import Say
+from bayesreg.inference.kernel import Info, Say
+from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray, InputError
 
 # The tuning of the step starts here, and is drawn to ten times as much.
@@ -41,6 +41,20 @@ class Tuning(NamedTuple):
     watched: bool = False
 
 
+@runtime_checkable
+class Walking(Protocol):
+    """What moves the chains, hashable (`bayesreg.inference.whitened.Walk`)."""
+
+    def init(self, data: Any, setup: Any, estimands: Estimands) -> Any:
+        """See `Sampler`."""
+
+    def step(self, data: Any, setup: Any, key: AnyArray, state: Any) -> tuple[Any, Info]:
+        """See `Sampler`."""
+
+    def estimands(self, data: Any, setup: Any, state: Any) -> dict[str, AnyArray]:
+        """Where a chain is."""
+
+
 def require_sound(tuning: Tuning) -> None:
     """Raise InputError where an option is out of range."""
     if not 0 < tuning.acceptance < 1:
@@ -50,16 +64,15 @@ def require_sound(tuning: Tuning) -> None:
 
 
 def tuned(
-    data: Any, kernel: tuple[Callable, Callable, Callable], setup: Any, starts: Any, key: AnyArray, tuning: Tuning,
-    apart: bool = False, say: Say = lambda text: None,
+    data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False,
+    say: Say = lambda text: None,
 ) -> tuple[Any, Any, AnyArray | None]:  # fmt: skip
     """The setup with its step size, where the chains then are, and if watched how their "u_boundary" came there.
 
     Parameters
     ----------
     data : pytree
-    kernel : (callable, callable, callable)
-        `Sampler.init` and `Sampler.step`, and (data, setup, state) → estimands.
+    walk : Walking
     setup : Setup
     starts : pytree
         Estimands, chains as the leading axis.
@@ -73,7 +86,7 @@ def tuned(
         Told of what was found.
     """
     keys = jax.random.split(key, tuning.warm_up)
-    points, sizes, rates, path = _run(kernel, tuning, data, setup, starts, keys, jnp.asarray(apart))
+    points, sizes, rates, path = _run(walk, tuning, data, setup, starts, keys, jnp.asarray(apart))
     setup, late = _sized(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a quarter turn, acceptance {late:.0%}")
     return setup, points, path
@@ -81,7 +94,7 @@ def tuned(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(
-    kernel: tuple[Callable, Callable, Callable],
+    walk: Walking,
     tuning: Tuning,
     data: Any,
     setup: Any,
@@ -90,26 +103,25 @@ def _run(
     apart: AnyArray,
 ) -> tuple[Any, AnyArray, AnyArray, AnyArray | None]:
     """Estimands, step size by chain, and of every transition the acceptance and, if watched, the array u by chain."""
-    init, step, estimands_of = kernel
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(next(iter(starts.values())))
 
     def moved(state: Any, size: AnyArray, key: AnyArray) -> Any:
         now = _sized(tuning, setup, size)
         few = jnp.minimum(now.steps, FEW_STEPS)
-        return step(data, now._replace(steps=jnp.where(apart, few, now.steps)), key, state)
+        return walk.step(data, now._replace(steps=jnp.where(apart, few, now.steps)), key, state)
 
     def one(carry: Any, key: AnyArray) -> Any:
         states, averaging = carry
         states, info = jax.vmap(moved)(states, jnp.exp(averaging.log_step_size), jax.random.split(key, chains))
         rates = jnp.nan_to_num(info.acceptance_rate)
         averaging = jax.vmap(update)(averaging, jnp.where(apart, rates, rates.mean()))
-        u = jax.vmap(partial(estimands_of, data, setup))(states)["u_boundary"] if tuning.watched else None
+        u = jax.vmap(partial(walk.estimands, data, setup))(states)["u_boundary"] if tuning.watched else None
         return (states, averaging), (rates.mean(), u)
 
-    first = jax.vmap(partial(init, data, setup))(starts), jax.vmap(begin)(jnp.full(chains, setup.step_size))
+    first = jax.vmap(partial(walk.init, data, setup))(starts), jax.vmap(begin)(jnp.full(chains, setup.step_size))
     (states, averaging), (rates, path) = jax.lax.scan(one, first, keys)
-    return jax.vmap(partial(estimands_of, data, setup))(states), jax.vmap(final)(averaging), rates, path
+    return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates, path
 
 
 def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:

@@ -7,6 +7,7 @@ way back to the estimands are the same for all.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -78,8 +79,8 @@ class Moved(NamedTuple):
     densities: AnyArray | int = 0
 
 
-# (data, setup, key, state) → (state, Moved)
-Transition = Callable[[Any, Setup, AnyArray, Any], tuple[Any, Moved]]
+# (target, data, setup, key, state) → (state, Moved)
+Transition = Callable[[SmoothTarget, Any, Setup, AnyArray, Any], tuple[Any, Moved]]
 # (target, data, setup) → the log density of the whitened coordinates that the transition works with
 Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
 
@@ -128,6 +129,47 @@ def clearance_of(target: SmoothTarget, data: Any, setup: Setup) -> Clearance:
     return lambda u: target.clearance(data, u, setup.walls.nodes)
 
 
+@dataclass(frozen=True)
+class Walk:
+    """Chains of whitened coordinates by a transition, as pure functions of (data, setup, …), see `Sampler`.
+
+    Two are equal if their targets are and their functions are the same: what is compiled for one serves the other.
+    """
+
+    target: SmoothTarget
+    transition: Transition
+    begin: Callable[[AnyArray, Callable], Any]
+    density: Density
+
+    def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
+        """The state of a chain there."""
+        flat = ravel_pytree(self.target.unconstrain_of(data, estimands))[0]
+        return self.begin(whitened(setup.reference, flat), self.density(self.target, data, setup))
+
+    def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
+        """The state after a transition."""
+        state, moved = self.transition(self.target, data, setup, key, state)
+        info = Info(
+            acceptance_rate=moved.acceptance_rate,
+            outside_support=jnp.asarray(moved.outside_support),
+            solver_failed=jnp.zeros((), bool),
+            solver_iterations=jnp.zeros((), int),
+            diverging=jnp.asarray(moved.diverging),
+            gradients=jnp.asarray(moved.gradients),
+            densities=jnp.asarray(moved.densities),
+        )
+        return state, info
+
+    def estimands(self, data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
+        """Where a chain is."""
+        return self.target.constrain_of(data, whitened_position(self.target, setup.reference, state.position))
+
+    def observe(self, data: Any, setup: Setup, state: Any) -> Draw:
+        """The same, with what the density is made of there."""
+        estimands = self.estimands(data, setup, state)
+        return Draw(estimands, self.target.evaluate_estimands(data, estimands))
+
+
 def about_reference(
     target: SmoothTarget,
     transition: Transition,
@@ -144,7 +186,7 @@ def about_reference(
     ----------
     target : SmoothTarget
     transition : callable
-        (data, setup, key, state) → (state, Moved).
+        (target, data, setup, key, state) → (state, Moved).
     tuning : Tuning, optional
         Of the step size; without it there is no warm-up.
     begin : callable
@@ -176,29 +218,7 @@ def about_reference(
             "or sampler.name: rwmh"
         )
 
-    def init(data: Any, setup: Setup, estimands: Estimands) -> Any:
-        flat = ravel_pytree(target.unconstrain_of(data, estimands))[0]
-        return begin(whitened(setup.reference, flat), density(target, data, setup))
-
-    def step(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
-        state, moved = transition(data, setup, key, state)
-        info = Info(
-            acceptance_rate=moved.acceptance_rate,
-            outside_support=jnp.asarray(moved.outside_support),
-            solver_failed=jnp.zeros((), bool),
-            solver_iterations=jnp.zeros((), int),
-            diverging=jnp.asarray(moved.diverging),
-            gradients=jnp.asarray(moved.gradients),
-            densities=jnp.asarray(moved.densities),
-        )
-        return state, info
-
-    def estimands_of(data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
-        return target.constrain_of(data, whitened_position(target, setup.reference, state.position))
-
-    def observe(data: Any, setup: Setup, state: Any) -> Draw:
-        estimands = estimands_of(data, setup, state)
-        return Draw(estimands, target.evaluate_estimands(data, estimands))
+    walk = Walk(target, transition, begin, density)
 
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         found = search_modes(target, points, mode_search == "per_chain", say)
@@ -212,16 +232,15 @@ def about_reference(
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
             return setups[0], points
-        kernel = init, step, estimands_of
         # Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already
         # the first is whitened by the curvature where they start: that at the mode alone can be so much less that no
         # step is short enough for a chain to leave.
         stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
         key_settle, key_tune, key_search = jax.random.split(key_tune, 3)
         begun = _averaged(target, modes[0], points)
-        _, points, settling = tuned(conditioned(begun), kernel, begun, points, key_settle, stage, apart=True)
+        _, points, settling = tuned(conditioned(begun), walk, begun, points, key_settle, stage, apart=True)
         setup = _averaged(target, modes[0], points)
-        setup, points, path = tuned(conditioned(setup), kernel, setup, points, key_tune, stage, say=say)
+        setup, points, path = tuned(conditioned(setup), walk, setup, points, key_tune, stage, say=say)
         if settling is None or path is None:
             return setup, points
         late = np.concatenate([np.asarray(part[len(part) // 4 :]) for part in (settling, path)], axis=1)
@@ -240,7 +259,7 @@ def about_reference(
         nothing = jnp.zeros(unknowns)
         return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
 
-    sampler = Sampler(prepare, conditioned, blank, init, step, observe, exact)
+    sampler = Sampler(prepare, conditioned, blank, walk.init, walk.step, walk.observe, exact)
     # What is approximate anyway does without the normaliser's own value.
     if target.costly_normaliser and exact:
         sampler = _with_normaliser(target, sampler)

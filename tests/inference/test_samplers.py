@@ -50,7 +50,7 @@ def poor_reference() -> Reference:
 def nodes_alone() -> Sampler:
     """The moves of single nodes that follow on those of others, without these."""
 
-    def stay(data, setup, key, state):
+    def stay(target, data, setup, key, state):
         return state, Moved(jnp.ones(()))
 
     return about_reference(target(), stay, alone=len(target().sampled))

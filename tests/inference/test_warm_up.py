@@ -1,0 +1,49 @@
+"""Chains that start where the density is steep come home by steps of their own."""
+
+from typing import Any, NamedTuple
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayesreg.inference.warm_up import FIRST_STEP, Tuning, tuned
+from bayesreg.inference.whitened import Moved
+
+
+class Steps(NamedTuple):
+    step_size: Any = jnp.asarray(FIRST_STEP)
+    steps: Any = jnp.asarray(1)
+
+
+def density(z):
+    """The tail of a log parameter: beyond a unit Gaussian, a wall whose curvature is e^z."""
+    return -(z**2).sum() / 2 - jnp.exp(z[0])
+
+
+class Walk:
+    def init(self, data, setup, estimands):
+        return blackjax.mcmc.hmc.init(estimands["u_boundary"], density)
+
+    def step(self, data, setup, key, state):
+        kernel = blackjax.mcmc.hmc.build_kernel()
+        state, info = kernel(key, state, density, setup.step_size, jnp.ones(3), setup.steps)
+        return state, Moved(info.acceptance_rate)
+
+    def estimands(self, data, setup, state):
+        return {"u_boundary": state.position}
+
+
+def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_its_own():
+    starts = {"u_boundary": jnp.zeros((4, 3)).at[3, 0].set(9.0)}
+    tuning = Tuning(60, 0.75, watched=True)
+    found = {}
+    for apart in (True, False):
+        setup, points, path = tuned(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
+        assert path.shape == (60, 4, 3)
+        np.testing.assert_array_equal(path[-1], points["u_boundary"])
+        found[apart] = float(setup.step_size), float(points["u_boundary"][3, 0])
+    assert found[True][1] < 3
+    # With one step for all it stands where it began, and the others pay for it.
+    assert found[False][1] == 9.0
+    assert found[False][0] < found[True][0]
