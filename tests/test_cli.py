@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import bayesreg
+from bayesreg import cli
 from bayesreg.cli import app
 from bayesreg.types import InputError
 
@@ -205,3 +206,27 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_a_folder_is_named(
     assert named(XDG_CACHE_HOME=str(home), JAX_COMPILATION_CACHE_DIR=str(own)) == str(own)
     blocked.touch()
     assert named(XDG_CACHE_HOME=str(blocked)) == "None"
+
+
+def test_without_a_home_nothing_is_kept_and_old_programs_go(tmp_path, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(cli.platformdirs, "user_cache_path", lambda name: tmp_path / name)
+    # Set, so that it is put back afterwards.
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+    cli.keep_compiled_programs()
+    folder = Path(os.environ.pop("JAX_COMPILATION_CACHE_DIR"))
+    assert folder.is_relative_to(tmp_path / "bayesreg")
+    old, new = folder / "old-cache", folder / "new-cache"
+    old.touch()
+    new.touch()
+    os.utime(old, (0, time.time() - 40 * 24 * 3600))
+    cli.keep_compiled_programs()
+    assert [path.name for path in folder.iterdir()] == ["new-cache"]
+    del os.environ["JAX_COMPILATION_CACHE_DIR"]
+
+    def homeless(name):
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.setattr(cli.platformdirs, "user_cache_path", homeless)
+    cli.keep_compiled_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

@@ -20,6 +20,11 @@ from bayesreg.types import AnyArray, InputError
 # Beyond this many unknowns the dense inverse (4 bytes × their square) outgrows caches and, soon, memory.
 DENSE_LIMIT = 6000
 
+SINGULAR = (
+    "the interior stiffness is singular: sample or hold at least three non-collinear nodes, and keep λ and μ from "
+    "extremes by narrower priors"
+)
+
 
 class ReferenceInverse(NamedTuple):
     """K_II⁻¹ at the reference parameters, scaled to a unit diagonal of K_II (a pytree).
@@ -65,7 +70,10 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse | Non
     """
     if matrix.shape[0] > DENSE_LIMIT:
         return None
-    scale, factor = _scaled_factor(matrix)
+    try:
+        scale, factor = _scaled_factor(matrix)
+    except scipy.linalg.LinAlgError as error:
+        raise InputError(SINGULAR) from error
     inverse = scipy.linalg.cho_solve(factor, np.eye(len(scale)))
     return ReferenceInverse(jnp.asarray(scale), jnp.asarray((inverse + inverse.T) / 2, jnp.float32))
 
@@ -76,28 +84,33 @@ def solved(
     """K_II⁻¹ times many columns, to double precision.
 
     Up to `DENSE_LIMIT` unknowns by a dense factor: a thousand columns are five times as fast as by a sparse one, whose
-    solves are not products of matrices.
+    solves are not products of matrices. Where contrasts of stiffness leave it no Cholesky factor, and beyond the limit,
+    by a sparse one.
 
     Raises
     ------
     InputError
-        If the matrix is not positive definite.
+        If the matrix is singular or not finite.
     """
-    if matrix.shape[0] > DENSE_LIMIT:
+    if matrix.shape[0] <= DENSE_LIMIT:
+        try:
+            scale, factor = _scaled_factor(matrix)
+            return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right)
+        except scipy.linalg.LinAlgError:
+            pass
+    try:
         return scipy.sparse.linalg.splu(matrix.tocsc()).solve(right)
-    scale, factor = _scaled_factor(matrix)
-    return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right)
+    except RuntimeError as error:
+        raise InputError(SINGULAR) from error
 
 
 def _scaled_factor(
     matrix: scipy.sparse.csr_matrix,
 ) -> tuple[Float[np.ndarray, "unknowns"], tuple[Float[np.ndarray, "unknowns unknowns"], bool]]:
     """diag(K)^(−1/2), and the Cholesky factor of K scaled by it from both sides, for `scipy.linalg.cho_solve`."""
-    scale = 1 / np.sqrt(matrix.diagonal())
-    try:
-        return scale, scipy.linalg.cho_factor(matrix.toarray() * scale[:, None] * scale, lower=True)
-    except (scipy.linalg.LinAlgError, ValueError) as error:
-        raise InputError(
-            "the interior stiffness is singular: sample or hold at least three non-collinear nodes, and keep λ and μ "
-            "from extremes by narrower priors"
-        ) from error
+    if not np.isfinite(matrix.data).all():
+        raise InputError(SINGULAR)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.sqrt(matrix.diagonal())
+        scaled = scipy.sparse.diags(scale) @ matrix @ scipy.sparse.diags(scale)
+    return scale, scipy.linalg.cho_factor(scaled.toarray(), lower=True, overwrite_a=True, check_finite=False)

@@ -237,11 +237,15 @@ def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.
     Gaussian's own, whose motion is reflected exactly; kicks are left with what is beyond second order. A scale stays
     where it is: its force at the mode of what it scales is no hint (see `hierarchy`).
     """
-    data = target.without_walls(target.data)
-    slopes = np.mean([np.asarray(_slope(target, data, jnp.asarray(flat))) for flat in flats], axis=0)
+    slopes = np.mean([slope_at(target, flat) for flat in flats], axis=0)
     factor, moving = np.asarray(reference.factor), 1 - is_scale(target)
     shift = moving * (factor @ (factor.T @ (moving * slopes)))
     return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
+
+
+def slope_at(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """∇log π of the density without walls."""
+    return np.asarray(_slope(target, target.without_walls(target.data), jnp.asarray(flat)))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from bayesreg.inference.approximations import laplace_sampler, pathfinder
 from bayesreg.inference.hamiltonian import hmc, mclmc, nuts
 from bayesreg.inference.kernel import Sampler
@@ -18,6 +20,7 @@ from bayesreg.inference.local import barker, mala, pcn, rwmh_adaptive
 from bayesreg.inference.random_walk import rwmh
 from bayesreg.inference.target import Target
 from bayesreg.inference.tempering import smc
+from bayesreg.types import InputError
 
 SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "rwmh": rwmh,
@@ -48,7 +51,7 @@ class Chosen:
     """
 
     name: str
-    target: Target
+    target: Target = field(repr=False)
     settings: tuple[tuple[str, Any], ...]
     sampler: Sampler = field(init=False, compare=False, repr=False)
 
@@ -57,5 +60,18 @@ class Chosen:
 
 
 def chosen_sampler(name: str, target: Target, settings: dict[str, Any]) -> Chosen:
-    """The sampler of that name, with these settings."""
-    return Chosen(name, target, tuple(sorted(settings.items())))
+    """The sampler of that name, with these settings: numbers and words.
+
+    Raises
+    ------
+    InputError
+        If a setting is neither, or see `Chosen`.
+    """
+    plain = {
+        key: value.item() if hasattr(value, "item") and np.size(value) == 1 else value
+        for key, value in settings.items()
+    }
+    for key, value in plain.items():
+        if not isinstance(value, (bool, int, float, str)):
+            raise InputError(f"{key} must be a number or a word, got {value!r}")
+    return Chosen(name, target, tuple(sorted(plain.items())))

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
-from bayesreg.inference.laplace import Reference, averaged, pulled, unravel
+from bayesreg.inference.laplace import Reference, averaged, pulled, slope_at, unravel
 from bayesreg.inference.loose import Loose, loose, moved_alone, searched, slowest
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
@@ -219,6 +219,8 @@ def about_reference(
         )
 
     walk = Walk(target, transition, begin, density)
+    # Made here and not while something is traced, where it would leave the target's own arrays in the program.
+    unravel(target)
 
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         found = search_modes(target, points, mode_search == "per_chain", say)
@@ -313,9 +315,9 @@ def _about(target: SmoothTarget, reference: Reference, middle: AnyArray) -> Setu
 
 
 def _averaged(target: SmoothTarget, mode: AnyArray, points: Any) -> Setup:
-    """The setup about the Gaussian averaged over the mode and where the chains are."""
-    flats = jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points)
-    sound = [flat for flat in np.asarray(flats) if np.isfinite(flat).all()]
+    """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there."""
+    flats = np.asarray(jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points))
+    sound = [flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all()]
     places = [mode, *sound[:AVERAGED]]
     return _about(target, averaged(target, places), np.mean(places, axis=0))
 

@@ -84,7 +84,8 @@ class Posterior:
         leaves, tree = jax.tree.flatten(self.data)
         shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         entries = tuple((name, tuple(free.tolist())) for name, free in self.free.items())
-        return self.mesh.digest, self.options.model_dump_json(), tuple(self.sampled.tolist()), entries, tree, shapes
+        options = self.options.model_dump_json(), self.costly_normaliser
+        return self.mesh.digest, *options, tuple(self.sampled.tolist()), entries, tree, shapes
 
     @cached_property
     def free(self) -> dict[str, Int[np.ndarray, "free"]]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from bayesreg.inference import run
 from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.diagnostics import convergence, open_posterior, save_posterior
 from bayesreg.inference.initialise import starting_points
@@ -17,11 +18,15 @@ MESH = box_mesh(2)
 OPTIONS = {"sampler": "rwmh", "chains": 3, "thin": 3, "seed": 5, "progress": False, "sigma_u": 0.05}
 
 
+def posterior_of(seed: int) -> br.Posterior:
+    fixed, moving = smooth_image(MESH.points, seed=seed), smooth_image(MESH.points, seed=seed + 1)
+    skull = flat_skull(MESH.points, axis=2, wall=MESH.points[:, 2].max() + 0.05, voxel=2.0)
+    return br.build_posterior(fixed, moving, MESH, skull=skull)
+
+
 @cache
 def posterior() -> br.Posterior:
-    fixed = smooth_image(MESH.points, seed=1)
-    skull = flat_skull(MESH.points, axis=2, wall=MESH.points[:, 2].max() + 0.05, voxel=2.0)
-    return br.build_posterior(fixed, smooth_image(MESH.points, seed=2), MESH, skull=skull)
+    return posterior_of(1)
 
 
 @cache
@@ -51,6 +56,31 @@ def test_a_resumed_run_is_the_run_that_was_not_cut_off():
         np.testing.assert_array_equal(values, draws(resumed)[name])
     np.testing.assert_array_equal(resumed.u_sd, samples.u_sd)
     np.testing.assert_array_equal(resumed.tally.acceptance, samples.tally.acceptance)
+
+
+def test_what_is_compiled_serves_another_seed_and_another_pair_on_the_mesh():
+    whole()
+    compiled = run._run_block._cache_size()
+    again = br.sample(posterior(), draws=12, block=4, **OPTIONS)
+    np.testing.assert_array_equal(draws(again)["u_boundary"], draws(whole()[0])["u_boundary"])
+    seeded = br.sample(posterior(), draws=12, block=4, **OPTIONS | {"seed": 6})
+    paired = br.sample(posterior_of(3), draws=12, block=4, **OPTIONS)
+    assert run._run_block._cache_size() == compiled
+    for found in (seeded, paired):
+        assert (draws(found)["u_boundary"] != draws(again)["u_boundary"]).any()
+    br.sample(posterior(), draws=12, block=4, **OPTIONS | {"sigma_u": 0.06})
+    assert run._run_block._cache_size() == compiled + 1
+
+
+@pytest.mark.parametrize("value", [np.array(0.05), np.float64(0.05)])
+def test_a_setting_may_be_a_number_of_numpys(value):
+    found = br.sample(posterior(), draws=12, block=4, **OPTIONS | {"sigma_u": value})
+    np.testing.assert_array_equal(draws(found)["u_boundary"], draws(whole()[0])["u_boundary"])
+
+
+def test_a_setting_that_is_no_number_is_refused():
+    with pytest.raises(br.InputError, match="sigma_u must be a number or a word, got array"):
+        br.sample(posterior(), **OPTIONS | {"sigma_u": np.ones(3)})
 
 
 @pytest.mark.slow
