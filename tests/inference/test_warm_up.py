@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayesreg.inference import whitened
 from bayesreg.inference.warm_up import FIRST_STEP, Tuning, tuned
 from bayesreg.inference.whitened import Moved
+from tests.inference.gaussians import DIMENSION, GaussianTarget
 
 
 class Steps(NamedTuple):
@@ -47,3 +49,18 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
     # With one step for all it stands where it began, and the others pay for it.
     assert found[False][1] == 9.0
     assert found[False][0] < found[True][0]
+
+
+def test_a_place_without_a_slope_has_no_part_in_the_reference():
+    class Broken(GaussianTarget):
+        def logdensity_of(self, data, position):
+            return super().logdensity_of(data, position) + jnp.sqrt(50 - position["u_boundary"].max())
+
+    target, mode = Broken(), np.zeros(DIMENSION)
+    sound = jnp.asarray(target.exact_draws(np.random.default_rng(0), 3))
+    lost = sound.at[1].set(jnp.array([-1.0, 60.0, 0.0]))
+    found = whitened._averaged(target, mode, {"u_boundary": lost})
+    expected = whitened._averaged(target, mode, {"u_boundary": sound[jnp.array([0, 2])]})
+    np.testing.assert_array_equal(found.reference.centre, expected.reference.centre)
+    np.testing.assert_array_equal(found.middle, expected.middle)
+    assert np.isfinite(found.middle).all()
