@@ -14,11 +14,11 @@ def ess_per_step(covariance, variances, acceptance, effective=np.inf):
     """a C_ii / (4 [C D⁻¹ C]_ii) of every entry, the limit of small steps.
 
     A covariance of n effective draws has noise whose squares add up: the expectation of [C D⁻¹ C]_ii is greater by
-    C_ii tr(D⁻¹ C) / n, which is taken off.
+    C_ii tr(D⁻¹ C) / n, which is taken off, down to the part C_ii² / D_ii of it that is the entry's own.
     """
     diagonal = np.diag(covariance)
     spread = np.einsum("ij,j,ji->i", covariance, 1 / variances, covariance)
-    spread -= diagonal * (diagonal / variances).sum() / effective
+    spread = np.maximum(spread - diagonal * (diagonal / variances).sum() / effective, diagonal**2 / variances)
     return acceptance * diagonal / (4 * spread)
 
 

@@ -26,3 +26,13 @@ def test_the_noise_of_a_sampled_covariance_is_taken_off():
     np.testing.assert_allclose(found.mean(), exact.mean(), rtol=0.03)
     raw = ess_per_step(np.cov(rng.normal(size=(draws, size)).T), variances, 0.2)
     assert raw.mean() < 0.9 * exact.mean()
+
+
+def test_entries_whose_spread_is_lost_in_that_noise_have_an_ess_all_the_same():
+    rng = np.random.default_rng(2)
+    size, draws = 60, 80
+    widths = np.geomspace(1, 1e-3, size)
+    covariance = np.cov((widths * rng.normal(size=(draws, size))).T)
+    found = ess_per_step(covariance, np.full(size, 0.1), 0.2, draws / 2)
+    assert (found > 0).all()
+    assert found.argmin() < 3
