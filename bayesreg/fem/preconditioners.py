@@ -70,10 +70,10 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse | Non
     """
     if matrix.shape[0] > DENSE_LIMIT:
         return None
-    try:
-        scale, factor = _scaled_factor(matrix)
-    except scipy.linalg.LinAlgError as error:
-        raise InputError(SINGULAR) from error
+    found = _scaled_factor(matrix)
+    if found is None:
+        raise InputError(SINGULAR)
+    scale, factor = found
     inverse = scipy.linalg.cho_solve(factor, np.eye(len(scale)))
     return ReferenceInverse(jnp.asarray(scale), jnp.asarray((inverse + inverse.T) / 2, jnp.float32))
 
@@ -83,21 +83,18 @@ def solved(
 ) -> Float[np.ndarray, "unknowns columns"]:
     """K_II⁻¹ times many columns, to double precision.
 
-    Up to `DENSE_LIMIT` unknowns by a dense factor: a thousand columns are five times as fast as by a sparse one, whose
-    solves are not products of matrices. Where contrasts of stiffness leave it no Cholesky factor, and beyond the limit,
-    by a sparse one.
+    Up to `DENSE_LIMIT` unknowns by a dense factor, whose solves are products of matrices, as those of a sparse one are
+    not. Where contrasts of stiffness leave no Cholesky factor, and beyond the limit, by a sparse one.
 
     Raises
     ------
     InputError
         If the matrix is singular or not finite.
     """
-    if matrix.shape[0] <= DENSE_LIMIT:
-        try:
-            scale, factor = _scaled_factor(matrix)
-            return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right)
-        except scipy.linalg.LinAlgError:
-            pass
+    found = _scaled_factor(matrix) if matrix.shape[0] <= DENSE_LIMIT else None
+    if found is not None:
+        scale, factor = found
+        return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right)
     try:
         return scipy.sparse.linalg.splu(matrix.tocsc()).solve(right)
     except RuntimeError as error:
@@ -106,11 +103,17 @@ def solved(
 
 def _scaled_factor(
     matrix: scipy.sparse.csr_matrix,
-) -> tuple[Float[np.ndarray, "unknowns"], tuple[Float[np.ndarray, "unknowns unknowns"], bool]]:
-    """diag(K)^(−1/2), and the Cholesky factor of K scaled by it from both sides, for `scipy.linalg.cho_solve`."""
+) -> tuple[Float[np.ndarray, "unknowns"], tuple[Float[np.ndarray, "unknowns unknowns"], bool]] | None:
+    """diag(K)^(−1/2), and the Cholesky factor of K scaled by it from both sides, for `scipy.linalg.cho_solve`.
+
+    None where K, to double precision, is not positive definite.
+    """
     if not np.isfinite(matrix.data).all():
         raise InputError(SINGULAR)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1 / np.sqrt(matrix.diagonal())
         scaled = scipy.sparse.diags(scale) @ matrix @ scipy.sparse.diags(scale)
-    return scale, scipy.linalg.cho_factor(scaled.toarray(), lower=True, overwrite_a=True, check_finite=False)
+    try:
+        return scale, scipy.linalg.cho_factor(scaled.toarray(), lower=True, overwrite_a=True, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        return None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 import blackjax
@@ -317,8 +318,8 @@ def _about(target: SmoothTarget, reference: Reference, middle: AnyArray) -> Setu
 def _averaged(target: SmoothTarget, mode: AnyArray, points: Any) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there."""
     flats = np.asarray(jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points))
-    sound = [flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all()]
-    places = [mode, *sound[:AVERAGED]]
+    sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
+    places = [mode, *islice(sound, AVERAGED)]
     return _about(target, averaged(target, places), np.mean(places, axis=0))
 
 
