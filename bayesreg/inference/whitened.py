@@ -235,38 +235,49 @@ def about_reference(
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
             return setups[0], points
-        # Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already
-        # the first is whitened by the curvature where they start: that at the mode alone can be so much less that no
-        # step is short enough for a chain to leave.
-        stage = tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
-        key_settle, key_tune, key_search = jax.random.split(key_tune, 3)
-        begun = _averaged(target, modes[0], points)
-        _, points, settling = tuned(conditioned(begun), walk, begun, points, key_settle, stage, apart=True)
-        setup = _averaged(target, modes[0], points)
-        setup, points, path = tuned(conditioned(setup), walk, setup, points, key_tune, stage, say=say)
-        if settling is None or path is None:
-            return setup, points
-        late = np.concatenate([np.asarray(part[len(part) // 4 :]) for part in (settling, path)], axis=1)
-        nodes = slowest(late, alone)
-        say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
-        seen = np.moveaxis(late[:, :, nodes].reshape(-1, alone, 3), 1, 0)
-        setup = setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen))
-        beyond = searched(target, conditioned(setup), setup.loose, points, key_search)
-        seen = np.concatenate([seen, beyond], axis=1)
-        return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen)), points
-
-    def conditioned(setup: Setup) -> Any:
-        return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)), setup.loose.nodes)
+        return _warmed_up(walk, tuning, alone, modes[0], points, key_tune, say)
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
         return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
 
-    sampler = Sampler(prepare, conditioned, blank, walk.init, walk.step, walk.observe, exact)
+    sampler = Sampler(prepare, partial(_conditioned, target), blank, walk.init, walk.step, walk.observe, exact)
     # What is approximate anyway does without the normaliser's own value.
     if target.costly_normaliser and exact:
         sampler = _with_normaliser(target, sampler)
     return _with_loose_nodes(target, sampler, begin, density) if alone else sampler
+
+
+def _conditioned(target: SmoothTarget, setup: Setup) -> Any:
+    """The target's data, prepared for chains about the middle."""
+    return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)), setup.loose.nodes)
+
+
+def _warmed_up(
+    walk: Walk, tuning: Tuning, alone: int, mode: AnyArray, points: Any, key: AnyArray, say: Say
+) -> tuple[Setup, Any]:
+    """The setup that the chains go on with, and where they then are.
+
+    Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already the
+    first is whitened by the curvature where they start: that at the mode alone can be so much less that no step is
+    short enough for a chain to leave.
+    """
+    target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
+    key_settle, key_tune, key_search = jax.random.split(key, 3)
+    begun = _averaged(target, mode, points)
+    _, points, settling = tuned(_conditioned(target, begun), walk, begun, points, key_settle, stage, apart=True)
+    setup = _averaged(target, mode, points)
+    setup, points, path = tuned(_conditioned(target, setup), walk, setup, points, key_tune, stage, say=say)
+    if settling is None or path is None:
+        return setup, points
+    late = np.concatenate([np.asarray(part[len(part) // 4 :]) for part in (settling, path)], axis=1)
+    nodes = slowest(late, alone)
+    say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
+    seen = np.moveaxis(late[:, :, nodes].reshape(-1, alone, 3), 1, 0)
+    setup = setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen))
+    beyond = searched(target, _conditioned(target, setup), setup.loose, points, key_search)
+    seen = np.concatenate([seen, beyond], axis=1)
+    return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen)), points
 
 
 def _with_loose_nodes(target: SmoothTarget, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
