@@ -13,7 +13,8 @@ from blackjax.vi.pathfinder import approximate
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Sampler, Say
-from bayesreg.inference.laplace import Reference, softened
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.mode import softened
 from bayesreg.inference.reflection import rotated
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.whitened import (

@@ -1,4 +1,4 @@
-"""The mode of a posterior, and the Gaussian reference that its curvature defines there (Laplace's approximation)."""
+"""The Gaussian reference that the curvature of a posterior defines at its mode (Laplace's approximation)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,15 @@ import numpy as np
 import scipy.linalg
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import minimize
 
-from bayesreg.inference.hierarchy import balanced, gained, is_scale, is_temperature, tempered
+from bayesreg.inference.hierarchy import gained, is_scale, is_temperature
 from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
-# The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
-SOFTNESS, GAP = 0.05, 0.02
 # See `_with_tails`.
 LEAST_CURVATURE, INFLATION = 1.0, np.pi**2 / 3
 # Of differences between gradients, in logarithmic coordinates.
 STEP = 1e-4
-# The last stage of a search for a mode is repeated so often, at most, or until no coordinate moves by more.
-REPEATS, SETTLED = 20, 1e-3
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25
 
@@ -52,41 +47,6 @@ class Reference(NamedTuple):
 def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
     """The map from flat positions to positions."""
     return ravel_pytree(target.unconstrain(target.reference()))[1]
-
-
-def find_mode(
-    target: SmoothTarget,
-    start: Float[np.ndarray, "dimension"],
-    say: Callable[[str], None] = lambda text: None,
-    iterations: int = 40,
-) -> Float[np.ndarray, "dimension"]:
-    """A mode of the log density of the position, in its support, by L-BFGS along the target's continuation.
-
-    Parameters
-    ----------
-    target : SmoothTarget
-    start : (d,) array
-        Flat position to start from; it need not lie in the support.
-    say : callable
-        Told of each stage.
-    iterations : int
-        Most iterations of a stage; the last is repeated, whitened anew, until it moves nothing.
-
-    Returns
-    -------
-    (d,) array
-        Flat position. Nodes that the soft skull let in are moved to its surface.
-
-    Raises
-    ------
-    InputError
-        If the density is not finite at the start.
-    """
-    flat = np.asarray(start)
-    *way, (data, moves) = target.continuation()
-    for each, moves_there in way:
-        flat = _improved(target, each, flat, moves_there, iterations, say)
-    return settled(target, data, flat, moves, say, iterations)
 
 
 def settled(
@@ -117,71 +77,15 @@ def settled(
     return _admissible(target, flat)
 
 
-def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """The flat position with T_r, if it is inferred, nearer to the maximum of its evidence."""
-    entry = np.flatnonzero(is_temperature(target))
-    if not len(entry):
-        return flat
-    slope = np.asarray(_slope(target, target.data, jnp.asarray(flat)))[entry]
-    curvature = -_hessian_rows(target, target.data, flat, entry)[0, entry]
-    return tempered(target, flat, float(slope[0]), float(curvature[0]), _shares(target, target.data, flat))
-
-
-def _shares(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
+def shares(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
     """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
     colder = flat - np.log(2) * is_temperature(target)
     here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
 
 
-def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
-    """Signed distance of every sampled node to the forbidden region, mm; infinite where there is none."""
-    u = unravel(target)(jnp.asarray(flat))["u_boundary"]
-    return np.asarray(target.clearance(target.data, u, jnp.arange(len(target.sampled))))
-
-
 def _factor(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
     return np.asarray(laplace(target, flat).factor)
-
-
-def _improved(
-    target: SmoothTarget,
-    data: Any,
-    flat: Float[np.ndarray, "dimension"],
-    moves: bool,
-    iterations: int,
-    say: Callable[[str], None],
-    shift: Float[np.ndarray, "sampled"] | None = None,
-) -> Float[np.ndarray, "dimension"]:
-    """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
-    shift = np.zeros(len(target.sampled)) if shift is None else shift
-    reference = _gaussian(flat, _apart(precision_at(target, flat, data, moves), is_scale(target) > 0))
-    if not moves:
-        # The same for all displacements.
-        data = target.without_normaliser(data)
-    moving = 1 - is_scale(target)
-    if not moves:
-        moving[: len(flat) - 3 * len(target.sampled)] = 0.0
-    best: list[tuple[Any, float, Any, float]] = []
-
-    def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        (value, penalty), gradient = _softened_with_slope(target, data, reference, moving * xi, shift)
-        value, gradient = float(value), moving * np.asarray(gradient)
-        if not (np.isfinite(value) and np.isfinite(gradient).all()):
-            if not best:
-                raise InputError("the mode cannot be looked for: the density is not finite at the start field")
-            # A wall for the line search: uphill from the best place so far, sloping back to it.
-            place, least, slope, _ = best[-1]
-            return least + 2 * abs(slope @ (xi - place)), -slope
-        if not best or value < best[-1][1]:
-            best[:] = [(xi.copy(), value, gradient, float(penalty))]
-        return value, gradient
-
-    options = {"maxiter": iterations, "maxcor": 20, "ftol": 1e-10, "gtol": 1e-2}
-    minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
-    place, least, _, penalty = best[-1]
-    say(f"mode: log density {penalty - least:.1f}")
-    return flat + np.asarray(reference.factor) @ (moving * place)
 
 
 def _apart(
@@ -194,24 +98,11 @@ def _apart(
     return precision
 
 
-def softened(
-    target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray, shift: AnyArray | float = 0.0
-) -> tuple[AnyArray, AnyArray]:
-    """Minus the log density of whitened coordinates plus a penalty for the hard skull, and that penalty alone."""
-    position = unravel(target)(reference.place(xi))
-    gap = target.clearance(data, position["u_boundary"], jnp.arange(len(target.sampled)))
-    penalty = 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
-    return penalty - target.logdensity_of(target.without_walls(data), position), penalty
-
-
-_softened_with_slope = jax.jit(jax.value_and_grad(softened, argnums=3, has_aux=True), static_argnums=0)
-
-
 def laplace(
     target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
 ) -> Reference:
     """The Gaussian reference about a flat position, with the curvature there (see `precision_at`)."""
-    return _gaussian(flat, precision_at(target, flat, data, joint))
+    return gaussian(flat, precision_at(target, flat, data, joint))
 
 
 def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
@@ -227,7 +118,7 @@ def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"
     approximate = np.mean([found.gauss_newton for found in curvatures], axis=0)
     curvature = _convex(_regular(approximate), np.mean([found.remainder for found in curvatures], axis=0))
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
-    return pulled(target, _gaussian(flats[0], precision), flats)
+    return pulled(target, gaussian(flats[0], precision), flats)
 
 
 def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
@@ -267,7 +158,8 @@ def _convex(
     return (vectors * np.maximum(np.abs(1 + values), LEAST_RATIO)) @ vectors.T
 
 
-def _gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]) -> Reference:
+def gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]) -> Reference:
+    """The reference of that centre and precision."""
     lower = np.linalg.cholesky(precision)
     factor = scipy.linalg.solve_triangular(lower, np.eye(len(centre)), lower=True).T
     return Reference(jnp.asarray(centre), jnp.asarray(factor))
@@ -338,12 +230,12 @@ def _jointly(
     first = len(curvature) - int(curved.sum())
     precision[count:, count:] = curvature[first:, first:]
     if joint and count:
-        rows = -_hessian_rows(target, target.without_walls(data), flat, order[:count])[:, order]
+        rows = -hessian_rows(target, target.without_walls(data), flat, order[:count])[:, order]
         _require_finite(rows)
         temperature = np.flatnonzero(is_temperature(target)[order[:count]])
         if len(temperature):
-            shares = _shares(target, data, flat)
-            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else gained(shares)
+            prior = shares(target, data, flat)
+            rows[temperature, temperature] += np.trace(prior) / 2 if at_draws else gained(prior)
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]
@@ -379,7 +271,7 @@ def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
     return np.asarray(ravel_pytree(marked)[0]) > 0
 
 
-def _hessian_rows(
+def hessian_rows(
     target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows dimension"]:
     """Rows of the Hessian of the log density, by differences of its gradient.
@@ -393,20 +285,6 @@ def _hessian_rows(
         ahead, behind = (np.asarray(_slope(target, data, jnp.asarray(flat + way * step))) for way in (1, -1))
         rows.append((ahead - behind) / (2 * STEP))
     return np.array(rows)
-
-
-def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
-    count = 3 * len(target.sampled)
-    u = np.array(flat[len(flat) - count :].reshape(-1, 3))
-    for _ in range(100):
-        gap, slope = (np.asarray(found) for found in _clearance_with_slope(target, target.data, jnp.asarray(u)))
-        inside = gap < GAP / 2
-        if not inside.any():
-            return np.concatenate([flat[: len(flat) - count], u.ravel()])
-        steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
-        u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
-    raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")
 
 
 @partial(jax.jit, static_argnums=0)

@@ -130,6 +130,9 @@ class SmoothTarget(Target, Protocol):
         where they are: it must not matter to any of them where another one is.
         """
 
+    def place_of_rest(self, data: Any, estimands: Estimands, which: AnyArray) -> AnyArray:
+        """Displacement (3,), mm, of one of these nodes at which no elastic force acts on it while all others stay."""
+
     def without_walls(self, data: Any) -> Any:
         """The data of the same problem in which a node may be anywhere."""
 

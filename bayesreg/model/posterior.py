@@ -23,7 +23,7 @@ from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.neighbourhood import neighbourhoods
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.problem import registration_data
-from bayesreg.model.program import RegistrationData, in_support, local_logdensity, stiffness_factor
+from bayesreg.model.program import RegistrationData, in_support, local_logdensity, place_of_rest, stiffness_factor
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -208,6 +208,12 @@ class Posterior:
     ) -> Callable[[Float[AnyArray, "3"]], Scalar]:
         """Approximate log density of one node's displacement; see `bayesreg.model.program.local_logdensity`."""
         return local_logdensity(data, self.options.similarity, complete(data, estimands, self.free), which)
+
+    def place_of_rest(
+        self, data: RegistrationData, estimands: Values, which: Int[AnyArray, ""]
+    ) -> Float[AnyArray, "3"]:
+        """Where no elastic force acts on one node; see `bayesreg.model.program.place_of_rest`."""
+        return place_of_rest(data, estimands["u_boundary"], which)
 
     def displacement_curvature(self, data: RegistrationData, estimands: Values) -> Curvature:
         """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".

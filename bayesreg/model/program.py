@@ -223,6 +223,21 @@ def local_logdensity(
     return log
 
 
+def place_of_rest(
+    data: RegistrationData, u_boundary: Float[AnyArray, "sampled 3"], which: Int[AnyArray, ""]
+) -> Float[AnyArray, "3"]:
+    """Displacement of one node at which no elastic force acts on it, mm, while all other sampled and held nodes stay.
+
+    Of the (λ, μ) that solves are preconditioned at. `which` is one of the neighbourhoods.
+    """
+    near = data.neighbourhoods
+    assert near is not None
+    row, force = near.rows[which], near.force[which]
+    stiffness = force[:, data.slots[row]]
+    u_prescribed = data.held.at[data.slots].set(u_boundary)
+    return u_boundary[row] - jnp.linalg.solve(stiffness, jnp.tensordot(force, u_prescribed, 2))
+
+
 def log_elastic_normaliser(
     data: RegistrationData, lam: AnyArray, mu: AnyArray, t_elastic: AnyArray, **field: AnyArray
 ) -> Scalar:

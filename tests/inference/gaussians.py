@@ -98,6 +98,9 @@ class GaussianTarget:
 
         return log
 
+    def place_of_rest(self, data, estimands, which):
+        return estimands["u_boundary"][which]
+
     def log_normaliser(self, data, estimands):
         return jnp.zeros(())
 

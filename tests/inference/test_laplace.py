@@ -9,7 +9,8 @@ from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.special import polygamma
 
 import bayesreg as br
-from bayesreg.inference.laplace import GAP, _convex, _with_tails, find_mode, laplace, precision_at, pulled, unravel
+from bayesreg.inference.laplace import _convex, _with_tails, laplace, precision_at, pulled, unravel
+from bayesreg.inference.mode import GAP, find_mode
 from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem, walled
 from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image

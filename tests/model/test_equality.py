@@ -5,7 +5,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference import laplace
+from bayesreg.inference.laplace import unravel
+from bayesreg.inference.mode import _softened_with_slope, find_mode
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)
@@ -19,14 +20,14 @@ def posterior(seed=1, mesh=MESH, skull=SKULL, shape=(14, 11, 16), **options):
 
 
 def mode(of):
-    return laplace.find_mode(of, np.asarray(ravel_pytree(of.unconstrain(of.reference()))[0]))
+    return find_mode(of, np.asarray(ravel_pytree(of.unconstrain(of.reference()))[0]))
 
 
 def test_what_was_compiled_for_one_finds_the_mode_of_the_other():
     first, second = posterior(seed=1), posterior(seed=3)
     assert first == second
     assert hash(first) == hash(second)
-    compiled = laplace._softened_with_slope._cache_size
+    compiled = _softened_with_slope._cache_size
     found = [mode(first)]
     before = compiled()
     found.append(mode(second))
@@ -34,7 +35,7 @@ def test_what_was_compiled_for_one_finds_the_mode_of_the_other():
     assert abs(found[0] - found[1]).max() > 0.1
     # Downhill to the other's mode.
     towards = found[1] + 0.05 * (found[0] - found[1])
-    here, there = (second.logdensity(laplace.unravel(second)(flat)) for flat in (found[1], towards))
+    here, there = (second.logdensity(unravel(second)(flat)) for flat in (found[1], towards))
     assert here > there
 
 
