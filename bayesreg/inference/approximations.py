@@ -13,8 +13,8 @@ from blackjax.vi.pathfinder import approximate
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Sampler, Say
-from bayesreg.inference.laplace import Reference
-from bayesreg.inference.mode import softened
+from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.mode import penalty
 from bayesreg.inference.reflection import rotated
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.inference.whitened import (
@@ -76,7 +76,9 @@ def _path(target: SmoothTarget, data: Any, reference: Reference, start: AnyArray
     """Evidence bound, mean and covariance in whitened coordinates."""
 
     def density(xi: AnyArray) -> AnyArray:
-        return -softened(target, data, reference, xi)[0]
+        position = unravel(target)(reference.place(xi))
+        height = target.logdensity_of(target.without_walls(data), position)
+        return height - penalty(target, data, position["u_boundary"])
 
     best, _ = approximate(key, density, start, JUDGES, maxiter=ITERATIONS)
     covariance = lbfgs_inverse_hessian_formula_1(best.alpha, best.beta, best.gamma)

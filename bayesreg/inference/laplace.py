@@ -49,53 +49,11 @@ def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
     return ravel_pytree(target.unconstrain(target.reference()))[1]
 
 
-def settled(
-    target: SmoothTarget,
-    data: Any,
-    flat: Float[np.ndarray, "dimension"],
-    moves: bool = True,
-    say: Callable[[str], None] = lambda text: None,
-    iterations: int = 40,
-) -> Float[np.ndarray, "dimension"]:
-    """The mode next to a flat position: the last stage of `find_mode`, repeated, whitened anew, until it moves nothing.
-
-    `moves` says whether anything but displacements does.
-    """
-    # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
-    # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
-    # skull and not in it, however great the force that presses.
-    shift = np.zeros(len(target.sampled))
-    for _ in range(REPEATS):
-        before, pressed = flat, shift
-        flat = _improved(target, data, flat, moves, iterations, say, shift)
-        flat = _tempered(target, balanced(target, flat, partial(_factor, target, flat)))
-        shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
-        if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
-            break
-    else:
-        say("mode: not settled")
-    return _admissible(target, flat)
-
-
 def shares(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
     """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
     colder = flat - np.log(2) * is_temperature(target)
     here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
-
-
-def _factor(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
-    return np.asarray(laplace(target, flat).factor)
-
-
-def _apart(
-    precision: Float[np.ndarray, "dimension dimension"], held: Bool[np.ndarray, "dimension"]
-) -> Float[np.ndarray, "dimension dimension"]:
-    """Without what couples the held entries to the others: no move of the whitened others moves the held then."""
-    precision = np.array(precision)
-    precision[held] = precision[:, held] = 0.0
-    precision[held, held] = 1.0
-    return precision
 
 
 def laplace(
@@ -136,12 +94,20 @@ def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.
 
 def slope_at(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """∇log π of the density without walls."""
-    return np.asarray(_slope(target, target.without_walls(target.data), jnp.asarray(flat)))
+    return height_and_slope(target, target.data, flat)[1]
+
+
+def height_and_slope(
+    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
+) -> tuple[float, Float[np.ndarray, "dimension"]]:
+    """log π and ∇log π of the density without walls, with some data."""
+    height, slope = _height_and_slope(target, target.without_walls(data), jnp.asarray(flat))
+    return float(height), np.asarray(slope)
 
 
 @partial(jax.jit, static_argnums=0)
-def _slope(target: SmoothTarget, data: Any, flat: AnyArray) -> AnyArray:
-    return jax.grad(lambda x: target.logdensity_of(data, unravel(target)(x)))(flat)
+def _height_and_slope(target: SmoothTarget, data: Any, flat: AnyArray) -> tuple[AnyArray, AnyArray]:
+    return jax.value_and_grad(lambda x: target.logdensity_of(data, unravel(target)(x)))(flat)
 
 
 def _convex(
@@ -230,7 +196,7 @@ def _jointly(
     first = len(curvature) - int(curved.sum())
     precision[count:, count:] = curvature[first:, first:]
     if joint and count:
-        rows = -hessian_rows(target, target.without_walls(data), flat, order[:count])[:, order]
+        rows = -hessian_rows(target, data, flat, order[:count])[:, order]
         _require_finite(rows)
         temperature = np.flatnonzero(is_temperature(target)[order[:count]])
         if len(temperature):
@@ -274,7 +240,7 @@ def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
 def hessian_rows(
     target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows dimension"]:
-    """Rows of the Hessian of the log density, by differences of its gradient.
+    """Rows of the Hessian of the log density without walls, by differences of its gradient.
 
     The coordinates are logarithms, so that one step suits all. Exact rows would cost more to compile than the search.
     """
@@ -282,12 +248,6 @@ def hessian_rows(
     for entry in entries:
         step = np.zeros(len(flat))
         step[entry] = STEP
-        ahead, behind = (np.asarray(_slope(target, data, jnp.asarray(flat + way * step))) for way in (1, -1))
+        ahead, behind = (height_and_slope(target, data, flat + way * step)[1] for way in (1, -1))
         rows.append((ahead - behind) / (2 * STEP))
     return np.array(rows)
-
-
-@partial(jax.jit, static_argnums=0)
-def _clearance_with_slope(target: SmoothTarget, data: Any, u: AnyArray) -> tuple[AnyArray, AnyArray]:
-    gap, pullback = jax.vjp(lambda u: target.clearance(data, u, jnp.arange(len(u))), u)
-    return gap, pullback(jnp.ones_like(gap))[0]

@@ -14,8 +14,8 @@ from scipy.optimize import minimize
 
 from bayesreg.inference.hierarchy import balanced, is_scale, is_temperature, tempered
 from bayesreg.inference.laplace import (
-    Reference,
     gaussian,
+    height_and_slope,
     hessian_rows,
     laplace,
     precision_at,
@@ -25,7 +25,7 @@ from bayesreg.inference.laplace import (
 )
 from bayesreg.inference.pockets import out_of_pockets
 from bayesreg.inference.target import SmoothTarget
-from bayesreg.types import AnyArray, InputError
+from bayesreg.types import AnyArray, InputError, Scalar
 
 # The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
 SOFTNESS, GAP = 0.05, 0.02
@@ -114,7 +114,7 @@ def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Flo
     if not len(entry):
         return flat
     slope = slope_at(target, flat)[entry]
-    curvature = -hessian_rows(target, target.without_walls(target.data), flat, entry)[0, entry]
+    curvature = -hessian_rows(target, target.data, flat, entry)[0, entry]
     return tempered(target, flat, float(slope[0]), float(curvature[0]), shares(target, target.data, flat))
 
 
@@ -146,11 +146,16 @@ def _improved(
     moving = 1 - is_scale(target)
     if not moves:
         moving[: len(flat) - 3 * len(target.sampled)] = 0.0
+    nodes, factor = len(target.sampled), np.asarray(reference.factor)
     best: list[tuple[Any, float, Any, float]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        (value, penalty), gradient = _softened_with_slope(target, data, reference, moving * xi, shift)
-        value, gradient = float(value), moving * np.asarray(gradient)
+        there = flat + factor @ (moving * xi)
+        height, slope = height_and_slope(target, data, there)
+        pressed, push = _penalty_with_slope(target, data, jnp.asarray(there[-3 * nodes :].reshape(nodes, 3)), shift)
+        value, slope = float(pressed) - height, -slope
+        slope[-3 * nodes :] += np.asarray(push).ravel()
+        gradient = moving * (factor.T @ slope)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
@@ -158,14 +163,14 @@ def _improved(
             place, least, slope, _ = best[-1]
             return least + 2 * abs(slope @ (xi - place)), -slope
         if not best or value < best[-1][1]:
-            best[:] = [(xi.copy(), value, gradient, float(penalty))]
+            best[:] = [(xi.copy(), value, gradient, float(pressed))]
         return value, gradient
 
     options = {"maxiter": iterations, "maxcor": 20, "ftol": 1e-10, "gtol": 1e-2}
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
-    place, least, _, penalty = best[-1]
-    say(f"mode: log density {penalty - least:.1f}")
-    return flat + np.asarray(reference.factor) @ (moving * place)
+    place, least, _, pressed = best[-1]
+    say(f"mode: log density {pressed - least:.1f}")
+    return flat + factor @ (moving * place)
 
 
 def _apart(
@@ -178,17 +183,13 @@ def _apart(
     return precision
 
 
-def softened(
-    target: SmoothTarget, data: Any, reference: Reference, xi: AnyArray, shift: AnyArray | float = 0.0
-) -> tuple[AnyArray, AnyArray]:
-    """Minus the log density of whitened coordinates plus a penalty for the hard skull, and that penalty alone."""
-    position = unravel(target)(reference.place(xi))
-    gap = target.clearance(data, position["u_boundary"], jnp.arange(len(target.sampled)))
-    penalty = 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
-    return penalty - target.logdensity_of(target.without_walls(data), position), penalty
+def penalty(target: SmoothTarget, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
+    """What stands for the hard skull, moved inwards by `shift`, mm, in minus the log density of displacements."""
+    gap = target.clearance(data, u, jnp.arange(len(target.sampled)))
+    return 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
 
 
-_softened_with_slope = jax.jit(jax.value_and_grad(softened, argnums=3, has_aux=True), static_argnums=0)
+_penalty_with_slope = jax.jit(jax.value_and_grad(penalty, argnums=2), static_argnums=0)
 
 
 def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:

@@ -5,8 +5,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.laplace import unravel
-from bayesreg.inference.mode import _softened_with_slope, find_mode
+from bayesreg.inference.laplace import _height_and_slope, unravel
+from bayesreg.inference.mode import find_mode
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)
@@ -27,7 +27,7 @@ def test_what_was_compiled_for_one_finds_the_mode_of_the_other():
     first, second = posterior(seed=1), posterior(seed=3)
     assert first == second
     assert hash(first) == hash(second)
-    compiled = _softened_with_slope._cache_size
+    compiled = _height_and_slope._cache_size
     found = [mode(first)]
     before = compiled()
     found.append(mode(second))
