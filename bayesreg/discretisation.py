@@ -17,7 +17,7 @@ from bayesreg.config import model_of
 from bayesreg.image import Image
 from bayesreg.inference.diagnostics import dataset
 from bayesreg.inference.laplace import unravel
-from bayesreg.inference.mode import find_mode
+from bayesreg.inference.mode_search import find_mode
 from bayesreg.inference.recalibration import RANGE, least_bodies
 from bayesreg.io import store
 from bayesreg.io.meshing import MeshOptions, build_mesh, load_mesh, save_mesh

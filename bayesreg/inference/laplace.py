@@ -49,7 +49,9 @@ def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
     return ravel_pytree(target.unconstrain(target.reference()))[1]
 
 
-def shares(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
+def prior_shares(
+    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
+) -> Float[np.ndarray, "rows rows"]:
     """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
     colder = flat - np.log(2) * is_temperature(target)
     here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
@@ -100,7 +102,16 @@ def slope_at(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Floa
 def height_and_slope(
     target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[float, Float[np.ndarray, "dimension"]]:
-    """log π and ∇log π of the density without walls, with some data."""
+    """log π and ∇log π of the density without walls.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    data : pytree
+        The target's, or that of a similar problem.
+    flat : (d,) array
+        Flat position.
+    """
     height, slope = _height_and_slope(target, target.without_walls(data), jnp.asarray(flat))
     return float(height), np.asarray(slope)
 
@@ -200,8 +211,8 @@ def _jointly(
         _require_finite(rows)
         temperature = np.flatnonzero(is_temperature(target)[order[:count]])
         if len(temperature):
-            prior = shares(target, data, flat)
-            rows[temperature, temperature] += np.trace(prior) / 2 if at_draws else gained(prior)
+            shares = prior_shares(target, data, flat)
+            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else gained(shares)
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from bayesreg.inference.kernel import Say
 from bayesreg.inference.laplace import Reference, laplace, unravel
-from bayesreg.inference.mode import find_mode
+from bayesreg.inference.mode_search import find_mode
 from bayesreg.inference.target import SmoothTarget
 
 # Modes count as one where no coordinate lies further apart than this, in its standard deviations.

@@ -1,9 +1,9 @@
-"""Nodes that a search for the mode has left in a pocket, millimetres from where they are far more probable.
+"""Pockets: local maxima of the density in the displacement of a single node, where a search for the mode may leave it.
 
 A node that few elements hold may be caught where the blurred images of a search's first stages match by chance. It
-stays there, and the chains with it: between the two places the density is next to nothing, and no curvature in the
-pocket hints at the other. Elasticity does. Of every node, while all others stay, places are looked at about the one
-where no elastic force acts on it.
+stays there, and the chains with it: between that place and the one where it belongs, millimetres away, the density is
+next to nothing, and no curvature in the pocket hints at the other. Elasticity does. For every node, while all others
+stay, places are looked at about its elastic equilibrium.
 """
 
 from __future__ import annotations
@@ -14,44 +14,56 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
-from bayesreg.inference.laplace import unravel
+from bayesreg.inference.laplace import height_and_slope, unravel
 from bayesreg.inference.target import Estimands, SmoothTarget
 from bayesreg.types import AnyArray
 
-# Places for a node: Normal about where no force acts on it, their standard deviations its way there and halves of it.
-PLACES, HALVES = 240, 5
-# A node is put elsewhere if the log density is higher there by more.
-GAIN = 1.0
-# Nodes looked at together: all of them respond to every sampled one.
+# Places for a node: Normal about its equilibrium, with its distance from there, 1/2, 1/4, 1/8 and 1/16 of it as
+# standard deviations.
+PLACES, WIDTHS = 240, 5
+# A node is moved where the density is higher by this factor, log.
+GAIN = 5.0
+# Nodes that are looked at together: how the nodes near any of them follow all sampled ones is one dense matrix.
 AT_A_TIME = 512
 
 
 def out_of_pockets(
     target: SmoothTarget, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[Float[np.ndarray, "dimension"], Int[np.ndarray, "moved"]]:
-    """The flat position with some nodes elsewhere, where the log density is higher, and the rows of these nodes."""
-    nodes = len(target.sampled)
-    moved: list[int] = []
-    if not target.knows_neighbourhoods:
-        return flat, np.array(moved, int)
-    estimands = target.constrain_of(target.data, unravel(target)(jnp.asarray(flat)))
-    for rows in np.array_split(np.arange(nodes), -(-nodes // AT_A_TIME)):
-        data = target.conditioned(estimands, rows)
-        gains, places = (np.asarray(found) for found in _looked(target, data, estimands, jnp.asarray(rows)))
-        # What is said of a node holds while its neighbours stay.
-        for which in np.argsort(-gains):
-            if gains[which] <= GAIN:
-                break
-            u = estimands["u_boundary"].at[rows[which]].set(places[which])
-            there = {**estimands, "u_boundary": u}
-            if _height(target, target.data, there) > _height(target, target.data, estimands) + GAIN:
-                estimands = there
-                moved.append(int(rows[which]))
-    position = target.unconstrain_of(target.data, estimands)
-    return np.asarray(ravel_pytree(position)[0]) if moved else flat, np.array(sorted(moved), int)
+    """Move single nodes to where the density is far higher.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+        One that knows no neighbourhoods is left alone.
+    flat : (d,) array
+        Flat position, a local maximum.
+
+    Returns
+    -------
+    flat : (d,) array
+        With these nodes elsewhere.
+    nodes : (moved,) int array
+        Their rows of "u_boundary".
+    """
+    count, moved = len(target.sampled), []
+    # The same for all displacements.
+    data = target.without_normaliser(target.data)
+    estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
+    for first in range(0, count if target.knows_neighbourhoods else 0, AT_A_TIME):
+        rows = np.arange(first, min(first + AT_A_TIME, count))
+        near = target.conditioned(estimands, rows, quick=True)
+        gains, places = (np.asarray(found) for found in _looked(target, near, estimands, jnp.asarray(rows)))
+        # Approximate, and said of a node while all others stay: the density itself decides, one node after the other.
+        for which in np.flatnonzero(gains > GAIN)[np.argsort(-gains[gains > GAIN])]:
+            there, at = flat.copy(), len(flat) - 3 * (count - rows[which])
+            there[at : at + 3] = places[which]
+            if height_and_slope(target, data, there)[0] > height_and_slope(target, data, flat)[0] + GAIN:
+                flat = there
+                moved.append(rows[which])
+    return flat, np.array(sorted(moved), int)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -60,18 +72,13 @@ def _looked(target: SmoothTarget, data: Any, estimands: Estimands, rows: Int[Any
 
     def of_node(asked: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
         which, row = asked
-        here, rest = estimands["u_boundary"][row], target.place_of_rest(data, estimands, which)
-        width = jnp.linalg.norm(rest - here) / 2.0 ** (jnp.arange(PLACES) % HALVES)
-        spread = jax.random.normal(jax.random.fold_in(jax.random.key(0), row), (PLACES, 3))
-        places = jnp.concatenate([here[None], rest + width[:, None] * spread])
+        here, rest = estimands["u_boundary"][row], target.local_equilibrium(data, estimands, which)
+        width = jnp.linalg.norm(rest - here) / 2.0 ** (jnp.arange(PLACES) % WIDTHS)
+        about = jax.random.normal(jax.random.fold_in(jax.random.key(0), row), (PLACES, 3))
+        places = jnp.concatenate([here[None], rest[None], rest + width[:, None] * about])
         heights = jax.lax.map(target.local_logdensity(data, estimands, which), places)
-        heights = jnp.nan_to_num(heights, nan=-jnp.inf)
+        heights = jnp.where(jnp.isnan(heights), -jnp.inf, heights)
         best = heights.argmax()
         return heights[best] - heights[0], places[best]
 
     return jax.lax.map(of_node, (jnp.arange(len(rows)), rows))
-
-
-@partial(jax.jit, static_argnums=0)
-def _height(target: SmoothTarget, data: Any, estimands: Estimands) -> AnyArray:
-    return target.logdensity_of(data, target.unconstrain_of(data, estimands))

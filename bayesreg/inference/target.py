@@ -113,10 +113,11 @@ class SmoothTarget(Target, Protocol):
     def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
         """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
 
-    def conditioned(self, estimands: Estimands, alone: AnyArray) -> Any:
+    def conditioned(self, estimands: Estimands, alone: AnyArray, quick: bool = False) -> Any:
         """The data of the same problem, prepared for fast densities near these estimands.
 
-        And for `local_logdensity` of the nodes in the rows `alone` of "u_boundary".
+        And for `local_logdensity` of the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
+        about as good and cheap.
         """
 
     @property
@@ -130,8 +131,8 @@ class SmoothTarget(Target, Protocol):
         where they are: it must not matter to any of them where another one is.
         """
 
-    def place_of_rest(self, data: Any, estimands: Estimands, which: AnyArray) -> AnyArray:
-        """Displacement (3,), mm, of one of these nodes at which no elastic force acts on it while all others stay."""
+    def local_equilibrium(self, data: Any, estimands: Estimands, which: AnyArray) -> AnyArray:
+        """Displacement (3,), mm, at which one of these nodes feels no elastic force while all others stay."""
 
     def without_walls(self, data: Any) -> Any:
         """The data of the same problem in which a node may be anywhere."""

@@ -22,8 +22,8 @@ from bayesreg.model.curvature import Curvature, displacement_curvature
 from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.neighbourhood import neighbourhoods
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.problem import registration_data
-from bayesreg.model.program import RegistrationData, in_support, local_logdensity, place_of_rest, stiffness_factor
+from bayesreg.model.problem import registration_data, sparsely_compared
+from bayesreg.model.program import RegistrationData, in_support, local_equilibrium, local_logdensity, stiffness_factor
 from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -180,12 +180,16 @@ class Posterior:
         """Problems of growing difficulty that lead to this one, and whether each moves more than displacements."""
         return continuation(self.data, self.fixed, self.moving, self.options.interpolation)
 
-    def conditioned(self, estimands: Values, alone: Int[AnyArray, "k"] | None = None) -> RegistrationData:
+    def conditioned(
+        self, estimands: Values, alone: Int[AnyArray, "k"] | None = None, quick: bool = False
+    ) -> RegistrationData:
         """The data of the same problem for chains: faster near these λ, μ and field, where solves are preconditioned.
 
         Solves end at `CHAIN_TOLERANCE`. The nodes in these rows of "u_boundary" may be moved alone, see
-        `local_logdensity`.
+        `local_logdensity`. With `quick` the images are compared at four points of each tetrahedron, wherever the model
+        does so.
         """
+        data = sparsely_compared(self.data, self.mesh, self.fixed, self.options.interpolation) if quick else self.data
         values = complete(self.data, estimands, self.free)
         # A tissue that is next to nothing leaves K_II without a factor.
         reference = {name: np.asarray(getattr(self.data, name).reference) for name in LAME}
@@ -194,9 +198,8 @@ class Posterior:
         system = _conditioned_system(self, lam, mu, CHAIN_TOLERANCE)
         rows = np.zeros(0, int) if alone is None else np.asarray(alone)
         slots, at = np.asarray(self.data.slots)[rows], np.asarray(estimands["u_boundary"])[rows]
-        quadrature = self.data.quadrature
-        around = neighbourhoods(self.mesh, system, quadrature, np.array(lam), np.array(mu), slots, rows, at)
-        return self.data._replace(system=system, neighbourhoods=around)
+        around = neighbourhoods(self.mesh, system, data.quadrature, np.array(lam), np.array(mu), slots, rows, at)
+        return data._replace(system=system, neighbourhoods=around)
 
     @property
     def knows_neighbourhoods(self) -> bool:
@@ -209,11 +212,11 @@ class Posterior:
         """Approximate log density of one node's displacement; see `bayesreg.model.program.local_logdensity`."""
         return local_logdensity(data, self.options.similarity, complete(data, estimands, self.free), which)
 
-    def place_of_rest(
+    def local_equilibrium(
         self, data: RegistrationData, estimands: Values, which: Int[AnyArray, ""]
     ) -> Float[AnyArray, "3"]:
-        """Where no elastic force acts on one node; see `bayesreg.model.program.place_of_rest`."""
-        return place_of_rest(data, estimands["u_boundary"], which)
+        """Elastic equilibrium of one node; see `bayesreg.model.program.local_equilibrium`."""
+        return local_equilibrium(data, estimands["u_boundary"], which)
 
     def displacement_curvature(self, data: RegistrationData, estimands: Values) -> Curvature:
         """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".

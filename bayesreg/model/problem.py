@@ -14,7 +14,7 @@ from bayesreg.fem.elasticity import rigid_modes
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import locate
-from bayesreg.image import Image, Interpolator
+from bayesreg.image import Image, Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
 from bayesreg.model.field import stiffness_field
@@ -250,6 +250,19 @@ def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: 
     tissues = {"uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
     found = (of_tissue(model, given, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
     return [default if value is None else value for value in found]
+
+
+def sparsely_compared(
+    data: RegistrationData, mesh: TetMesh, fixed: Image, interpolation: Interpolation
+) -> RegistrationData:
+    """The data with the images compared at four points of every tetrahedron."""
+    quadrature = gauss_quadrature(mesh, "gauss4")
+    positions = quadrature.positions(mesh)
+    return data._replace(
+        quadrature=quadrature,
+        positions=jnp.asarray(positions),
+        fixed_values=fixed.interpolate(positions, interpolation),
+    )
 
 
 def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature:

@@ -223,12 +223,12 @@ def local_logdensity(
     return log
 
 
-def place_of_rest(
+def local_equilibrium(
     data: RegistrationData, u_boundary: Float[AnyArray, "sampled 3"], which: Int[AnyArray, ""]
 ) -> Float[AnyArray, "3"]:
-    """Displacement of one node at which no elastic force acts on it, mm, while all other sampled and held nodes stay.
+    """Elastic equilibrium of one node, mm: no force acts on it there while all other sampled and held nodes stay.
 
-    Of the (λ, μ) that solves are preconditioned at. `which` is one of the neighbourhoods.
+    At the λ and μ that the data are conditioned for. `which` is one of the neighbourhoods.
     """
     near = data.neighbourhoods
     assert near is not None

@@ -24,7 +24,7 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.laplace import averaged
-from bayesreg.inference.mode import settled
+from bayesreg.inference.mode_search import settled
 from bayesreg.inference.reflection import rotated
 from bayesreg.inference.samplers import SAMPLERS
 from bayesreg.inference.whitened import Setup, clearance_of, whitened, whitened_position

@@ -85,7 +85,7 @@ class GaussianTarget:
     def constant_data(self):
         return {}
 
-    def conditioned(self, estimands, alone):
+    def conditioned(self, estimands, alone, quick=False):
         return self.data
 
     def local_logdensity(self, data, estimands, which):
@@ -98,7 +98,7 @@ class GaussianTarget:
 
         return log
 
-    def place_of_rest(self, data, estimands, which):
+    def local_equilibrium(self, data, estimands, which):
         return estimands["u_boundary"][which]
 
     def log_normaliser(self, data, estimands):

@@ -10,7 +10,7 @@ from scipy.special import polygamma
 
 import bayesreg as br
 from bayesreg.inference.laplace import _convex, _with_tails, laplace, precision_at, pulled, unravel
-from bayesreg.inference.mode import GAP, find_mode
+from bayesreg.inference.mode_search import GAP, find_mode
 from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem, walled
 from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image

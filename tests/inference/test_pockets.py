@@ -7,9 +7,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference import mode
+from bayesreg.inference import mode_search, pockets
 from bayesreg.inference.laplace import unravel
-from bayesreg.inference.mode import find_mode
+from bayesreg.inference.mode_search import find_mode
 from bayesreg.inference.pockets import out_of_pockets
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 from tests.model.test_neighbourhood import MESH, posterior, state
@@ -19,49 +19,52 @@ AWAY = 9.0
 
 
 class Pocket(GaussianTarget):
-    """N(0, covariance) and, with the first node so far away along y, the same, lower by `depth`.
+    """N(0, covariance) and, with the second node so far away along −x, the same, lower by `depth`.
 
-    No force acts on a node where N(0, covariance) has its conditional mean.
+    A node is in equilibrium where N(0, covariance) has its conditional mean.
     """
 
-    def __init__(self, depth: float):
-        super().__init__(wall=50.0)
+    def __init__(self, depth: float, wall: float = 50.0):
+        super().__init__(wall)
         self.depth = depth
 
     def logdensity_of(self, data, position):
         flat = position["u_boundary"].ravel()
-        away = jnp.stack([flat, flat.at[1].add(-AWAY)])
+        away = jnp.stack([flat, flat.at[3].add(AWAY)])
+        inside = (self.clearance(data, position["u_boundary"], self.sampled) >= 0).all()
         heights = -0.5 * jnp.einsum("ci,ij,cj->c", away, data.precision, away) - jnp.array([0.0, self.depth])
-        return jax.nn.logsumexp(heights)
+        return jnp.where(inside, jax.nn.logsumexp(heights), -jnp.inf)
 
     def local_logdensity(self, data, estimands, which):
         u = estimands["u_boundary"]
         return lambda place: self.logdensity_of(data, {"u_boundary": u.at[which].set(place)})
 
-    def place_of_rest(self, data, estimands, which):
+    def local_equilibrium(self, data, estimands, which):
         u, precision = estimands["u_boundary"], data.precision.reshape(NODES, 3, NODES, 3)
         force = jnp.einsum("ibj,bj->i", precision[which], u)
         return u[which] - jnp.linalg.solve(precision[which, :, which], force)
 
 
-def start(first_y: float) -> np.ndarray:
-    return np.zeros(DIMENSION) + first_y * np.eye(DIMENSION)[1]
+def start(second_x: float = -AWAY) -> np.ndarray:
+    return second_x * np.eye(DIMENSION)[3]
 
 
-def test_the_search_leaves_a_pocket(monkeypatch):
-    target, told = Pocket(depth=6.0), []
-    np.testing.assert_allclose(find_mode(target, start(AWAY), told.append), 0, atol=1e-2)
-    assert any("put elsewhere: nodes 0" in line for line in told)
-    monkeypatch.setattr(mode, "RESCUES", 0)
-    assert find_mode(target, start(AWAY))[1] == pytest.approx(AWAY, abs=0.1)
+@pytest.mark.parametrize("at_a_time", [pockets.AT_A_TIME, 1])
+def test_the_search_leaves_a_pocket(monkeypatch, at_a_time):
+    monkeypatch.setattr(pockets, "AT_A_TIME", at_a_time)
+    target, told = Pocket(depth=8.0), []
+    np.testing.assert_allclose(find_mode(target, start(), told.append), 0, atol=1e-2)
+    assert any("more probable: nodes 1" in line for line in told)
+    monkeypatch.setattr(mode_search, "RESCUES", 0)
+    assert find_mode(target, start())[3] == pytest.approx(-AWAY, abs=0.1)
 
 
-def test_the_search_stays_where_the_density_is_highest():
-    """Also if no force acts on the node somewhere else."""
+@pytest.mark.parametrize("target", [Pocket(depth=-8.0), Pocket(depth=8.0, wall=-3.0)], ids=["higher", "wall"])
+def test_the_search_stays(target):
+    """Where the density is higher than where the node is in equilibrium, or where only a wall keeps it from there."""
     told = []
-    found = find_mode(Pocket(depth=-6.0), start(AWAY), told.append)
-    assert found[1] == pytest.approx(AWAY, abs=0.1)
-    assert not any("put elsewhere" in line for line in told)
+    assert find_mode(target, start() - 8.0 * np.eye(DIMENSION)[0], told.append)[3] == pytest.approx(-AWAY, abs=2.0)
+    assert not any("more probable" in line for line in told)
 
 
 def test_a_gain_that_the_density_itself_does_not_confirm_moves_nothing():
@@ -70,24 +73,35 @@ def test_a_gain_that_the_density_itself_does_not_confirm_moves_nothing():
             u = estimands["u_boundary"]
             return lambda place: 100 * jnp.abs(place - u[which]).sum()
 
-        def place_of_rest(self, data, estimands, which):
+        def local_equilibrium(self, data, estimands, which):
             return estimands["u_boundary"][which] + 5.0
 
-    flat, nodes = out_of_pockets(Wrong(depth=6.0), start(0.0))
+    flat, nodes = out_of_pockets(Wrong(depth=8.0), start(0.0))
     assert not len(nodes)
     np.testing.assert_array_equal(flat, start(0.0))
 
 
-@pytest.mark.parametrize("sampled", ["boundary", "all"])
-def test_a_node_astray_between_two_equal_images_comes_back(sampled):
+def test_without_sampled_nodes_or_neighbourhoods_nothing_is_looked_at():
+    held = {int(node): (0.0, 0.0, 0.0) for node in MESH.boundary}
+    model = br.ModelConfig(t_similarity=1.0, sampled=[], held=held, priors={"lam": {"high": 10}, "mu": {"high": 10}})
+    post = br.build_posterior(smooth_image(MESH.points), smooth_image(MESH.points, seed=2), MESH, model=model)
+    flat = np.asarray(ravel_pytree(post.unconstrain(post.reference()))[0])
+    assert not len(out_of_pockets(post, flat)[1])
+    target = Pocket(depth=8.0)
+    target.knows_neighbourhoods = False
+    assert not len(out_of_pockets(target, start())[1])
+
+
+@pytest.mark.parametrize("options", [{}, {"sampled": "all"}, {"quadrature": "voxels"}])
+def test_a_node_astray_between_two_equal_images_comes_back(options):
     """And no other node moves; rows of "u_boundary" are not those of prescribed nodes."""
     image, row = smooth_image(MESH.points), 11
     model = br.ModelConfig(
         t_similarity=1.0,
         t_elastic=10.0,
         interpolation="cubic",
-        sampled=sampled,
         held={int(MESH.boundary[0]): (0, 0, 0)},
+        **options,
     )
     post = br.build_posterior(image, image, MESH, model=model)
     nowhere = jnp.zeros((len(post.sampled), 3))
@@ -95,7 +109,7 @@ def test_a_node_astray_between_two_equal_images_comes_back(sampled):
     found, nodes = out_of_pockets(post, np.asarray(ravel_pytree(astray)[0]))
     back = unravel(post)(found)
     assert nodes.tolist() == [row]
-    assert float(post.logdensity(back)) > float(post.logdensity(astray)) + 1
+    assert float(post.logdensity(back)) > float(post.logdensity(astray)) + pockets.GAIN
     assert np.linalg.norm(back["u_boundary"][row]) < 3.0
     np.testing.assert_array_equal(back["u_boundary"].at[row].set(0.0), nowhere)
 
@@ -105,7 +119,7 @@ def test_at_rest_no_elastic_force_acts_on_a_node():
     post = posterior()
     values, row = state(post), 11
     data = post.conditioned(post.estimands(values), np.array([3, row]))
-    rest = np.asarray(post.place_of_rest(data, post.estimands(values), jnp.asarray(1)))
+    rest = np.asarray(post.local_equilibrium(data, post.estimands(values), jnp.asarray(1)))
 
     def energy(place):
         u = values["u_boundary"].at[row].set(jnp.asarray(place))

@@ -19,7 +19,7 @@ from bayesreg.inference.laplace import (
     hessian_rows,
     laplace,
     precision_at,
-    shares,
+    prior_shares,
     slope_at,
     unravel,
 )
@@ -31,7 +31,7 @@ from bayesreg.types import AnyArray, InputError, Scalar
 SOFTNESS, GAP = 0.05, 0.02
 # The last stage is repeated so often, at most, or until no coordinate moves by more.
 REPEATS, SETTLED = 20, 1e-3
-# So often, at most, nodes are taken out of pockets.
+# So often, at most, single nodes are moved elsewhere.
 RESCUES = 3
 
 
@@ -43,8 +43,7 @@ def find_mode(
 ) -> Float[np.ndarray, "dimension"]:
     """A mode of the log density of the position, in its support, by L-BFGS along the target's continuation.
 
-    Nodes that the way there left in a pocket of their own are then put where they are far more probable, and the search
-    goes on (`pockets`).
+    Single nodes that are then far more probable elsewhere are moved there, and the search goes on (`out_of_pockets`).
 
     Parameters
     ----------
@@ -75,8 +74,11 @@ def find_mode(
         elsewhere, nodes = out_of_pockets(target, flat)
         if not len(nodes):
             break
-        say(f"mode: put elsewhere: nodes {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
+        named = ", ".join(map(str, np.asarray(target.sampled)[nodes]))
+        say(f"mode: moved to where they are more probable: nodes {named}")
         flat = settled(target, data, elsewhere, moves, say, iterations)
+    else:
+        say("mode: single nodes may be more probable elsewhere")
     return flat
 
 
@@ -115,7 +117,7 @@ def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Flo
         return flat
     slope = slope_at(target, flat)[entry]
     curvature = -hessian_rows(target, target.data, flat, entry)[0, entry]
-    return tempered(target, flat, float(slope[0]), float(curvature[0]), shares(target, target.data, flat))
+    return tempered(target, flat, float(slope[0]), float(curvature[0]), prior_shares(target, target.data, flat))
 
 
 def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
@@ -143,18 +145,18 @@ def _improved(
     if not moves:
         # The same for all displacements.
         data = target.without_normaliser(data)
-    moving = 1 - is_scale(target)
+    moving, first = 1 - is_scale(target), len(flat) - 3 * len(target.sampled)
     if not moves:
-        moving[: len(flat) - 3 * len(target.sampled)] = 0.0
-    nodes, factor = len(target.sampled), np.asarray(reference.factor)
+        moving[:first] = 0.0
+    factor = np.asarray(reference.factor)
     best: list[tuple[Any, float, Any, float]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
         there = flat + factor @ (moving * xi)
         height, slope = height_and_slope(target, data, there)
-        pressed, push = _penalty_with_slope(target, data, jnp.asarray(there[-3 * nodes :].reshape(nodes, 3)), shift)
+        pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[first:].reshape(-1, 3)), shift)
         value, slope = float(pressed) - height, -slope
-        slope[-3 * nodes :] += np.asarray(push).ravel()
+        slope[first:] += np.asarray(push).ravel()
         gradient = moving * (factor.T @ slope)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
@@ -184,7 +186,7 @@ def _apart(
 
 
 def penalty(target: SmoothTarget, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
-    """What stands for the hard skull, moved inwards by `shift`, mm, in minus the log density of displacements."""
+    """What minus the log density gains in place of the hard skull, moved inwards by `shift`, mm."""
     gap = target.clearance(data, u, jnp.arange(len(target.sampled)))
     return 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
 
