@@ -13,14 +13,23 @@ BALL = ball_mesh(spacing=18.0)
 
 
 def with_ears(points, cells):
-    """A tetrahedron on the first face of the boundary, and another one on a face of that."""
+    """A tetrahedron on the first face of the boundary, another one on a face of that, and two on two other faces.
+
+    These two share a node of their own.
+    """
     mesh = TetMesh.from_arrays(points, cells, np.zeros(len(cells), int), ("all",))
-    face = mesh.boundary_faces[0]
-    outwards = points[face].mean(axis=0) - points.mean(axis=0)
-    first, second = len(points), len(points) + 1
-    added = np.array([points[face].mean(axis=0) + outwards * length for length in (0.2, 0.4)])
-    cells = np.vstack([cells, [*face, first], [*face[:2], first, second]])
-    return np.vstack([points, added]), oriented(np.vstack([points, added]), cells)
+    faces, middle = mesh.boundary_faces, points.mean(axis=0)
+    first, second, third = len(points) + np.arange(3)
+    away = next(face for face in faces[::-1] if not np.isin(face, faces[0]).any())
+    beside = next(face for face in faces if np.isin(face, away).sum() == 2)
+
+    def above(face, length):
+        return points[face].mean(axis=0) + length * (points[face].mean(axis=0) - middle)
+
+    added = [above(faces[0], 0.2), above(faces[0], 0.4), (above(away, 0.3) + above(beside, 0.3)) / 2]
+    ears = [[*faces[0], first], [*faces[0][:2], first, second], [*away, third], [*beside, third]]
+    points = np.vstack([points, added])
+    return points, oriented(points, np.vstack([cells, ears]))
 
 
 def oriented(points, cells):
@@ -37,7 +46,7 @@ def test_ears_on_ears_are_cut_off():
 
 
 def test_a_mesh_without_ears_is_left_as_it_is():
-    assert (np.bincount(BALL.cells.ravel()) > 1).all()
+    assert (np.bincount(BALL.cells.ravel()) > 2).all()
     points, cells = without_ears(BALL.points, BALL.cells)
     assert points is BALL.points
     assert cells is BALL.cells
