@@ -32,8 +32,8 @@ def bench_effective_draws():
     if "BAYESREG_DATA" not in os.environ:
         print("\neffective draws: skipped, BAYESREG_DATA does not name the folder of the paper's data", end="")
         return
-    mesh = os.environ.get("BAYESREG_MESH")
-    overrides = [] if mesh is None else [f"mesh.file={mesh}"]
+    given = os.environ.get("BAYESREG_MESH")
+    overrides = [] if given is None else [f"mesh.file={given}"]
     with tempfile.TemporaryDirectory() as folder:
         result = br.run(br.load_config(CONFIG, overrides), Path(folder) / "run", progress=False)
         convergence = result.run.manifest["convergence"]
@@ -41,10 +41,12 @@ def bench_effective_draws():
         posterior = posterior_of(br.load_config(CONFIG, overrides), store.read_inputs(result.folder))
         draws = result.idata.posterior.load()
         effective = float(np.median(np.asarray(result.convergence.ess_bulk.u_boundary)))
+        mesh = result.mesh
+    print(f"\nmesh of {len(mesh.points)} nodes, {len(mesh.boundary)} sampled; {seconds:.0f} s until {convergence}")
     covariance, variances = covariance_and_steps(draws)
     rate, acceptance = papers_kernel(posterior, draws)
     ess = ess_per_step(covariance, variances, acceptance, effective)
-    print(f"\nthe paper's kernel at the posterior: {rate:.0f} steps per second and chain, {acceptance:.1%} accepted")
+    print(f"the paper's kernel at the posterior: {rate:.0f} steps per second and chain, {acceptance:.1%} accepted")
     print("steps per effective draw: median {:,.0f}, greatest {:,.0f}".format(*np.quantile(1 / ess, [0.5, 1.0])))
     for kind in ("bulk", "tail"):
         found, least = convergence[f"ess_{kind}_min"] / seconds, ess.min() * rate * CHAINS
