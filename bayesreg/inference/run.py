@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from bayesreg.inference.checkpoint import Block, Checkpoint, Tally, counted, no_steps
+from bayesreg.inference.devices import devices_for, side_by_side
 from bayesreg.inference.diagnostics import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, starting_points
 from bayesreg.inference.kernel import Draw
@@ -80,7 +82,7 @@ def sample(
     sampler : str
         A name in `bayesreg.inference.samplers.SAMPLERS`.
     chains : int
-        Run side by side under `vmap`.
+        Run side by side under `vmap`, in equal shares on as many devices as divide their number.
     draws : int
         Most draws to keep for each chain.
     seed : int
@@ -220,11 +222,11 @@ def _advance(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """Blocks of draws, until there are `draws` of them."""
     spent = float(checkpoint.seconds)
-    data = chosen.sampler.data(checkpoint.setup)
+    data, devices = chosen.sampler.data(checkpoint.setup), devices_for(len(chain_keys))
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
         state, moments, tally, found = _run_block(
-            chosen, length, thin, data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
+            chosen, length, thin, devices, data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
         )
         found = {name: np.asarray(value) for name, value in found.items()}
         seconds = np.array(spent + time.perf_counter() - began)
@@ -233,11 +235,12 @@ def _advance(
         yield found, checkpoint
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _run_block(  # type: ignore[no-untyped-def]
     chosen: Chosen,
     length: int,
     thin: int,
+    devices: Mesh | None,
     data: Any,
     chain_keys: AnyArray,
     first: AnyArray | int,
@@ -265,7 +268,7 @@ def _run_block(  # type: ignore[no-untyped-def]
         carry, kept = jax.lax.scan(one_draw, (state, moments, tally), first + jnp.arange(length))
         return *carry, kept
 
-    return jax.vmap(chain)(chain_keys, state, moments, tally)
+    return side_by_side(chain, devices)(chain_keys, state, moments, tally)
 
 
 def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:

@@ -1,0 +1,84 @@
+"""Chains on two devices draw what they draw on one. Devices are counted when JAX starts: in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bayesreg.inference import run
+from bayesreg.inference.devices import devices_for
+from bayesreg.inference.samplers import chosen_sampler
+from tests.inference.gaussians import GaussianTarget
+from tests.model.test_equality import posterior
+
+CHAINS, DRAWS = 4, 12
+
+
+def found(sampler):
+    """What differs between two devices, one, two again, and two with chains in another order."""
+    target = GaussianTarget() if sampler == "hmc" else posterior()
+    settings = {"warm_up": 5} if sampler == "hmc" else {}
+    chosen, begun = (
+        chosen_sampler(sampler, target, settings),
+        run.first_checkpoint(target, sampler, CHAINS, 0, **settings),
+    )
+    data, keys = chosen.sampler.data(begun.setup), jax.random.split(jax.random.key(1), CHAINS)
+
+    def draws(devices, order=(0, 1, 2, 3)):
+        order = np.array(order)
+        state, moments, tally = jax.tree.map(lambda x: x[order], (begun.state, begun.moments, begun.tally))
+        block = run._run_block(chosen, DRAWS, 2, devices, data, keys[order], 0, begun.setup, state, moments, tally)
+        jax.block_until_ready(block)
+        kept = block[-1]["u_boundary"]
+        return len(kept.sharding.device_set), np.asarray(kept)[np.argsort(order)]
+
+    two = devices_for(CHAINS)
+    (count, here), (_, there), (_, again), (_, mixed) = (
+        draws(two), draws(None), draws(two), draws(two, (0, 2, 1, 3))
+    )  # fmt: skip
+    return {
+        "devices": count,
+        "spread": float(here.std()),
+        "moved": float(abs(here[:, 1:] - here[:, :-1]).max()),
+        "one": float(abs(here - there).max()),
+        "again": float(abs(here - again).max()),
+        "mixed": float(abs(here - mixed).max()),
+    }
+
+
+@pytest.mark.parametrize("sampler", ["hmc", "rwmh"])
+def test_the_same_draws_on_two_devices(sampler):
+    """To rounding; and the same bits on as many devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    script = f"import json; from tests.inference.test_devices import found; print(json.dumps(found({sampler!r})))"
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["devices"] == 2
+    assert told["moved"] > 0
+    assert told["again"] == 0
+    assert max(told["one"], told["mixed"]) < 1e-9 * told["spread"]
+
+
+def test_chains_that_cannot_be_shared_stay_on_one_device(monkeypatch):
+    device = jax.devices()[0]
+    for devices, chains, expected in ((1, 4, None), (3, 4, 2), (4, 6, 3), (3, 5, None), (8, 4, 4)):
+        monkeypatch.setattr(jax, "local_devices", lambda count=devices: [device] * count)
+        shared = devices_for(chains)
+        assert (None if shared is None else shared.size) == expected
+
+
+def test_one_device_is_a_plain_vmap():
+    assert devices_for(3) is None or jax.local_device_count() > 1
+    assert jnp.allclose(run.side_by_side(lambda x: 2 * x, None)(jnp.arange(3.0)), 2 * jnp.arange(3.0))
