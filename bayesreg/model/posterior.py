@@ -186,8 +186,8 @@ class Posterior:
         """The data of the same problem for chains: faster near these λ, μ and field, where solves are preconditioned.
 
         Solves end at `CHAIN_TOLERANCE`. The nodes in these rows of "u_boundary" may be moved alone, see
-        `local_logdensity`. With `quick` the images are compared at four points of each tetrahedron, wherever the model
-        does so.
+        `local_logdensity`. With `quick` the images are compared at four points of each tetrahedron, whatever the
+        model's quadrature.
         """
         data = sparsely_compared(self.data, self.mesh, self.fixed, self.options.interpolation) if quick else self.data
         values = complete(self.data, estimands, self.free)
