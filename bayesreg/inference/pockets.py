@@ -57,7 +57,7 @@ def out_of_pockets(
         near = target.conditioned(estimands, rows, quick=True)
         gains, places = (np.asarray(found) for found in _looked(target, near, estimands, jnp.asarray(rows)))
         # Approximate, and said of a node while all others stay: the density itself decides, one node after the other.
-        for which in np.flatnonzero(gains > GAIN)[np.argsort(-gains[gains > GAIN])]:
+        for which in (candidate for candidate in np.argsort(-gains) if gains[candidate] > GAIN):
             there, at = flat.copy(), len(flat) - 3 * (count - rows[which])
             there[at : at + 3] = places[which]
             if height_and_slope(target, data, there)[0] > height_and_slope(target, data, flat)[0] + GAIN:

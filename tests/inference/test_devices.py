@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -77,8 +76,3 @@ def test_chains_that_cannot_be_shared_stay_on_one_device(monkeypatch):
         monkeypatch.setattr(jax, "local_devices", lambda count=devices: [device] * count)
         shared = devices_for(chains)
         assert (None if shared is None else shared.size) == expected
-
-
-def test_one_device_is_a_plain_vmap():
-    assert devices_for(3) is None or jax.local_device_count() > 1
-    assert jnp.allclose(run.side_by_side(lambda x: 2 * x, None)(jnp.arange(3.0)), 2 * jnp.arange(3.0))
