@@ -18,7 +18,9 @@ from bayesreg.types import AnyArray
 
 
 def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
-    """Hamiltonian Monte Carlo: a quarter turn about the Gaussian reference, in as many steps as acceptance asks for.
+    """Hamiltonian Monte Carlo: about a Gaussian reference, in as many steps as make a quarter turn at least.
+
+    How long a step is, acceptance says.
 
     Parameters
     ----------

@@ -17,9 +17,9 @@ from bayesreg.inference.hierarchy import gained, is_scale, is_temperature
 from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
-# See `_with_tails`.
-LEAST_CURVATURE, INFLATION = 1.0, np.pi**2 / 3
-# Of differences between gradients, in logarithmic coordinates.
+# Of a parameter that nothing but its prior is known of: its Normal score is N(0, 1).
+LEAST_CURVATURE = 1.0
+# Of differences between gradients, in Normal scores and logarithms.
 STEP = 1e-4
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25
@@ -70,7 +70,7 @@ def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"
 
     Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
     wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
-    large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with the parameter,
+    large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with its argument,
     and its mean over places would be that of the largest. In log T_r it is that at draws about the mode, which
     trajectories meet, though the posterior of T_r is wider.
     """
@@ -148,7 +148,7 @@ def precision_at(
     """A positive definite curvature of minus the log density.
 
     The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are differences of the
-    gradient; directions in which these are not convex are given the least curvature of a logarithmic parameter.
+    gradient; directions in which these are not convex count by their size, and as no less than `LEAST_CURVATURE`.
 
     Parameters
     ----------
@@ -219,25 +219,12 @@ def _jointly(
         inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[count:, count:]), cross.T)
         schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
         values, vectors = np.linalg.eigh(schur)
-        convex = (vectors * _with_tails(values)) @ vectors.T
+        convex = (vectors * np.maximum(np.abs(values), LEAST_CURVATURE)) @ vectors.T
         precision[:count, :count] = convex + cross @ inner
     else:
         precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
     precision[np.ix_(order, order)] = (precision + precision.T) / 2
     return precision
-
-
-def _with_tails(curvature: Float[np.ndarray, "directions"]) -> Float[np.ndarray, "directions"]:
-    """Precisions of logarithms of parameters whose density has some curvatures at the mode.
-
-    The logarithm z of a parameter that only its flat prior and the elastic energy see has the density exp(z − e^z): its
-    variance π²/6 is more than the inverse of its curvature, one, at the mode. Twice that, and a quarter turn of the
-    Gaussian crosses its exponential tail. The more the images say, the greater is the curvature κ and the lighter that
-    tail: exp(κz − e^z) has the variance ψ′(κ), and κ ψ′(κ) falls to one. What the variance gains therefore falls, as
-    1/κ²; where it did not, steps were shorter.
-    """
-    curvature = np.maximum(np.abs(curvature), LEAST_CURVATURE)
-    return curvature / (1 + (INFLATION - 1) / curvature**2)
 
 
 def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
@@ -253,7 +240,8 @@ def hessian_rows(
 ) -> Float[np.ndarray, "rows dimension"]:
     """Rows of the Hessian of the log density without walls, by differences of its gradient.
 
-    The coordinates are logarithms, so that one step suits all. Exact rows would cost more to compile than the search.
+    The coordinates are Normal scores and logarithms, so that one step suits all. Exact rows would cost more to compile
+    than the search.
     """
     rows = []
     for entry in entries:

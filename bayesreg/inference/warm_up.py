@@ -88,7 +88,7 @@ def tuned(
     keys = jax.random.split(key, tuning.warm_up)
     points, sizes, rates, path = _run(walk, tuning, data, setup, starts, keys, jnp.asarray(apart))
     setup, late = _sized(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
-    say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a quarter turn, acceptance {late:.0%}")
+    say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a trajectory, acceptance {late:.0%}")
     return setup, points, path
 
 
@@ -126,5 +126,6 @@ def _run(
 
 def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
     size = jnp.clip(size, tuning.least, tuning.greatest)
-    steps = jnp.maximum(jnp.round(jnp.pi / 2 / size), 1).astype(int)
+    # A quarter turn at least: less leaves what is not refused correlated with where it came from.
+    steps = jnp.maximum(jnp.ceil(jnp.pi / 2 / size), 1).astype(int)
     return setup._replace(step_size=size, steps=steps)

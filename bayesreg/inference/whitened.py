@@ -54,7 +54,7 @@ class Setup(NamedTuple):
     step_size : scalar
         In whitened coordinates; π/2 is a quarter turn of the reference's motion.
     steps : scalar integer
-        Steps of a trajectory of fixed length: those of a quarter turn.
+        Steps of a trajectory of fixed length: as many as make a quarter turn.
     stand_in : StandIn
         Of the density's normaliser, where it has one.
     loose : Loose
@@ -270,10 +270,11 @@ def _warmed_up(
     setup, points, path = tuned(_conditioned(target, setup), walk, setup, points, key_tune, stage, say=say)
     if settling is None or path is None:
         return setup, points
-    late = np.concatenate([np.asarray(part[len(part) // 4 :]) for part in (settling, path)], axis=1)
-    nodes = slowest(late, alone)
+    # Of the second stage alone: in the first, trajectories are short and chains on their way.
+    nodes = slowest(np.asarray(path), alone)
     say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
-    seen = np.moveaxis(late[:, :, nodes].reshape(-1, alone, 3), 1, 0)
+    late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])
+    seen = np.moveaxis(late.reshape(-1, alone, 3), 1, 0)
     setup = setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen))
     beyond = searched(target, _conditioned(target, setup), setup.loose, points, key_search)
     seen = np.concatenate([seen, beyond], axis=1)

@@ -33,7 +33,8 @@ def whitened(data: RegistrationData, values: Values) -> dict[str, AnyArray]:
 
 def transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
     """The map from the real line to the sampled entries of λ or μ."""
-    return RangeTransform(jnp.asarray(parameter.low)[free], jnp.asarray(parameter.high)[free])
+    low, high, reference = (jnp.asarray(x)[free] for x in (parameter.low, parameter.high, parameter.reference))
+    return RangeTransform(low, high, jnp.where(reference > low, reference - low, reference))
 
 
 def to_estimands(

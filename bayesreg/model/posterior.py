@@ -47,7 +47,8 @@ class Posterior:
       the scalars "t_similarity", "t_elastic" where they have a prior, and where the elasticity has a field its
       "field_sd" and whitened components "field" (k,);
     - *estimands*: the same with the sampled entries of λ and μ only;
-    - *position*: estimands mapped to the real line (log, or logit where a prior is bounded).
+    - *position*: estimands mapped to the real line: λ and μ as by a probit (`RangeTransform`), temperatures and the
+      field's sd by their logarithm.
 
     Attributes
     ----------

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from jax.scipy.special import betaln, xlog1py, xlogy
+from jax.scipy.special import betaln, log_ndtr, ndtr, ndtri, xlog1py, xlogy
+from jax.scipy.stats import norm
 from jaxtyping import Float
 from numpyro.distributions import constraints
 from numpyro.distributions.transforms import Transform, biject_to
@@ -30,16 +31,22 @@ class _Range(constraints.Constraint):
 
 
 class RangeTransform(Transform):
-    """The real line to [low, high]: low + e^z where high is infinite, low + (high − low) sigmoid(z) elsewhere.
+    """The real line to [low, high]: what is Normal there is uniform here, or exponential where high is infinite.
+
+    With Φ the distribution function of N(0, 1): low + (high − low) Φ(z), or low − scale · log Φ(−z). A density that is
+    flat at a bound falls off towards it as a Normal one then; under a logarithm or a logit as e^−|z|, with excursions
+    that no Gaussian reference follows.
 
     Parameters
     ----------
     low, high : arrays
-        Bounds, entry by entry.
+        Bounds, entry by entry; high may be infinite.
+    scale : array
+        Mean of the exponential distribution, above low.
     """
 
-    def __init__(self, low: AnyArray, high: AnyArray) -> None:
-        self.low, self.high = low, high
+    def __init__(self, low: AnyArray, high: AnyArray, scale: AnyArray | float = 1.0) -> None:
+        self.low, self.high, self.scale = low, high, scale
 
     @property
     def domain(self):  # type: ignore[no-untyped-def]
@@ -53,27 +60,38 @@ class RangeTransform(Transform):
 
     @property
     def _width(self) -> AnyArray:
-        # One where unbounded: the branch not taken must stay finite for its gradient.
-        return jnp.where(jnp.isinf(self.high), 1.0, self.high - self.low)
+        # The scale where unbounded: the branch not taken must stay finite for its gradient.
+        return jnp.where(jnp.isinf(self.high), self.scale, self.high - self.low)
 
     def __call__(self, z: AnyArray) -> AnyArray:
         """Constrained values."""
-        bounded = self._width / (1 + jnp.exp(-z))
-        return self.low + jnp.where(jnp.isinf(self.high), jnp.exp(z), bounded)
+        return self.low + self._width * jnp.where(jnp.isinf(self.high), -log_ndtr(-z), ndtr(z))
 
     def _inverse(self, x: AnyArray) -> AnyArray:
-        offset = x - self.low
-        fraction = jnp.where(jnp.isinf(self.high), 0.5, offset / self._width)
-        return jnp.where(jnp.isinf(self.high), jnp.log(offset), jnp.log(fraction) - jnp.log1p(-fraction))
+        share = (x - self.low) / self._width
+        return jnp.where(jnp.isinf(self.high), _score(share), ndtri(share))
 
     def log_abs_det_jacobian(self, x: AnyArray, y: AnyArray, intermediates: None = None) -> AnyArray:
-        """log |dy/dx|, entry by entry."""
-        bounded = jnp.log(self._width) - jnp.logaddexp(0.0, x) - jnp.logaddexp(0.0, -x)
-        return jnp.where(jnp.isinf(self.high), x, bounded)
+        """log |dy/dx|, entry by entry: φ(z) or φ(z) / Φ(−z), times the width."""
+        return jnp.log(self._width) + norm.logpdf(x) - jnp.where(jnp.isinf(self.high), log_ndtr(-x), 0.0)
 
     def tree_flatten(self):  # type: ignore[no-untyped-def]
-        """Bounds are data."""
-        return (self.low, self.high), (("low", "high"), {})
+        """All are data."""
+        return (self.low, self.high, self.scale), (("low", "high", "scale"), {})
+
+
+def _score(t: AnyArray) -> AnyArray:
+    """z with −log Φ(−z) = t > 0."""
+    # e^−t has no more digits beyond; Newton's steps, from the first terms of the tail's series, are exact there.
+    far = t > 600
+    near = jnp.where(far, 600.0, t)
+    z = jnp.where(near < 0.5, ndtri(-jnp.expm1(-near)), -ndtri(jnp.exp(-near)))
+    beyond = jnp.where(far, t, 600.0)
+    tail = jnp.sqrt(2 * beyond - jnp.log(4 * jnp.pi * beyond))
+    for _ in range(3):
+        height = log_ndtr(-tail)
+        tail += (height + beyond) * jnp.exp(height - norm.logpdf(tail))
+    return jnp.where(far, tail, z)
 
 
 @biject_to.register(_Range)

@@ -1,0 +1,61 @@
+"""The map from the real line to the range of λ and μ, against SciPy's Normal distribution."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesreg as br
+from bayesreg.model.priors import RangeTransform
+from tests.phantoms import box_mesh, smooth_image
+
+Z = np.array([-9.0, -3.0, -0.5, 0.0, 0.7, 2.0, 8.0])
+
+
+def unbounded(low=0.0, scale=0.01):
+    return RangeTransform(jnp.asarray(low), jnp.asarray(jnp.inf), jnp.asarray(scale))
+
+
+def test_a_bounded_range_is_reached_by_the_distribution_function():
+    to_range = RangeTransform(jnp.asarray(0.5), jnp.asarray(40.0))
+    np.testing.assert_allclose(to_range(Z), 0.5 + 39.5 * stats.norm.cdf(Z), rtol=1e-12)
+    # A flat prior there is the standard Normal density of z.
+    expected = stats.norm.logpdf(Z) + np.log(39.5)
+    np.testing.assert_allclose(to_range.log_abs_det_jacobian(Z, to_range(Z)), expected, rtol=1e-12)
+
+
+def test_a_range_without_end_is_that_of_an_exponential_distribution():
+    to_range = unbounded(low=2.0, scale=3.0)
+    np.testing.assert_allclose(to_range(Z), 2 - 3 * stats.norm.logsf(Z), rtol=1e-12)
+    np.testing.assert_allclose(stats.expon.logsf(to_range(Z), 2, 3), stats.norm.logsf(Z), rtol=1e-12, atol=1e-12)
+    steep = jax.vmap(jax.grad(unbounded()))(jnp.asarray(Z))
+    np.testing.assert_allclose(unbounded().log_abs_det_jacobian(Z, unbounded()(Z)), np.log(steep), rtol=1e-11)
+
+
+@pytest.mark.parametrize("above", [1e-30, 1e-9, 1e-3, 0.4, 0.6, 1.0, 1e2, 599.0, 601.0, 1e9, 1e30])
+def test_it_is_inverted_over_many_decades(above):
+    z = unbounded().inv(jnp.asarray(0.01 * above))
+    assert float(unbounded()(z)) == pytest.approx(0.01 * above, rel=1e-9)
+    assert np.sign(float(z)) == np.sign(above - np.log(2))
+
+
+def test_a_flat_density_falls_off_as_a_normal_one_towards_the_bound():
+    """At twice the distance log p is four times as low; under a logarithm twice."""
+    z = np.array([-10.0, -20.0])
+    near, far = unbounded().log_abs_det_jacobian(z, unbounded()(z)) - np.log(0.01)
+    assert far / near == pytest.approx(4, rel=0.05)
+
+
+def test_the_scale_is_the_reference_above_the_lower_bound():
+    mesh = box_mesh(2)
+    images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
+    model = br.ModelConfig(priors={"lam": {"low": 1.0}, "mu": {"high": 8.0}})
+    given = {"lam": np.array([3.0, 0.5, 30.0]), "mu": np.ones(3)}
+    posterior = br.build_posterior(*images, mesh, model=model, reference=given)
+    median = {**posterior.unconstrain(posterior.reference()), "lam": jnp.zeros(3), "mu": jnp.zeros(2)}
+    found = posterior.constrain(median)
+    # 0.5 lies below the range: its size then is the scale above it.
+    np.testing.assert_allclose(found["lam"], 1 + np.log(2) * np.array([2.0, 0.5, 29.0]))
+    # μ of GM is known.
+    np.testing.assert_allclose(found["mu"], [4.0, 1.0, 4.0])
