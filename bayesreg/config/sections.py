@@ -181,8 +181,8 @@ class Hamiltonian(_Tuned):
     """Gradients, in coordinates whitened at the mode, trajectories reflected by the skull; see docs/samplers.md."""
 
     name: Literal["hmc", "nuts", "mclmc"] = "hmc"
-    """hmc: Hamiltonian Monte Carlo with trajectories of a quarter turn or more; nuts: the No-U-Turn sampler; mclmc:
-    adjusted microcanonical trajectories."""
+    """hmc: Hamiltonian Monte Carlo with trajectories of a quarter turn; nuts: the No-U-Turn sampler; mclmc: adjusted
+    microcanonical trajectories."""
 
 
 class Local(_AboutMode):

@@ -18,9 +18,9 @@ from bayesreg.types import AnyArray
 
 
 def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
-    """Hamiltonian Monte Carlo: about a Gaussian reference, in as many steps as make a quarter turn at least.
+    """Hamiltonian Monte Carlo: a quarter turn about the Gaussian reference, in as many steps as acceptance asks for.
 
-    How long a step is, acceptance says.
+    All steps of a trajectory are longer or shorter by up to a fifth, at random.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75
         "once" or "per_chain".
     """
 
-    tuning = Tuning(warm_up, target_acceptance)
+    tuning = Tuning(warm_up, target_acceptance, quarter_turns=True)
     return about_reference(target, _quarter_turn, tuning, mode_search=mode_search, alone=LOOSE)
 
 
@@ -68,7 +68,8 @@ def mclmc(
     The speed is one whatever the density, so that a time of √d does what a time of one does in `hmc`.
     """
 
-    return about_reference(target, _microcanonical, Tuning(warm_up, target_acceptance), mode_search=mode_search)
+    tuning = Tuning(warm_up, target_acceptance, quarter_turns=True)
+    return about_reference(target, _microcanonical, tuning, mode_search=mode_search)
 
 
 def _microcanonical(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:

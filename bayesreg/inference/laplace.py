@@ -17,8 +17,10 @@ from bayesreg.inference.hierarchy import gained, is_scale, is_temperature
 from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
-# Of a parameter that nothing but its prior is known of: its Normal score is N(0, 1).
-LEAST_CURVATURE = 1.0
+# So many times what is expected of any of its kind, a parameter has no end.
+FAR = 1e6
+# Of coordinates other than the displacements, where these alone are moved.
+ALONE = 10.0
 # Of differences between gradients, in Normal scores and logarithms.
 STEP = 1e-4
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
@@ -148,7 +150,7 @@ def precision_at(
     """A positive definite curvature of minus the log density.
 
     The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are differences of the
-    gradient; directions in which these are not convex count by their size, and as no less than `LEAST_CURVATURE`.
+    gradient; directions in which these are not convex count by their size, and as no less than the target says.
 
     Parameters
     ----------
@@ -162,7 +164,7 @@ def precision_at(
     Raises
     ------
     InputError
-        If a parameter or its curvature is not finite.
+        If a parameter runs away, or its curvature is not finite.
     """
     data = target.data if data is None else data
     return _jointly(target, data, flat, _regular(_curvature(target, data, flat).gauss_newton), joint)
@@ -170,12 +172,14 @@ def precision_at(
 
 def _curvature(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
     estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
-    _require_finite(ravel_pytree({name: value for name, value in estimands.items() if name != "u_boundary"})[0])
+    expected = target.reference()
+    for name in (name for name in estimands if name not in ("field", "u_boundary")):
+        _require_an_end((np.asarray(estimands[name]) < FAR * np.max(expected[name])).all())
     return target.displacement_curvature(data, estimands)
 
 
-def _require_finite(numbers: AnyArray) -> None:
-    if not np.isfinite(np.asarray(numbers)).all():
+def _require_an_end(found: bool | np.bool_) -> None:
+    if not found:
         raise InputError(
             "the search for the mode has no end: λ, μ or a temperature runs away; fix one more of them, or give it a "
             "narrower prior"
@@ -208,7 +212,7 @@ def _jointly(
     precision[count:, count:] = curvature[first:, first:]
     if joint and count:
         rows = -hessian_rows(target, data, flat, order[:count])[:, order]
-        _require_finite(rows)
+        _require_an_end(np.isfinite(rows).all())
         temperature = np.flatnonzero(is_temperature(target)[order[:count]])
         if len(temperature):
             shares = prior_shares(target, data, flat)
@@ -218,11 +222,14 @@ def _jointly(
         cross = rows[:, count:]
         inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[count:, count:]), cross.T)
         schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
-        values, vectors = np.linalg.eigh(schur)
-        convex = (vectors * np.maximum(np.abs(values), LEAST_CURVATURE)) @ vectors.T
+        least = ravel_pytree(target.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
+        unit = np.sqrt(np.asarray(least)[order[:count]])
+        values, vectors = np.linalg.eigh(schur / np.outer(unit, unit))
+        vectors *= unit[:, None]
+        convex = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
         precision[:count, :count] = convex + cross @ inner
     else:
-        precision[:count, :count] = 10 * LEAST_CURVATURE * np.eye(count)
+        precision[:count, :count] = ALONE * np.eye(count)
     precision[np.ix_(order, order)] = (precision + precision.T) / 2
     return precision
 

@@ -110,7 +110,7 @@ def sample(
     Raises
     ------
     InputError
-        If an option is out of range or a chain cannot start.
+        If an option is out of range, a chain cannot start, or those to resume are not where their draws end.
     """
     if sampler not in SAMPLERS:
         raise InputError(f"unknown sampler {sampler!r}; there are {', '.join(SAMPLERS)}")
@@ -126,6 +126,7 @@ def sample(
         began = time.perf_counter()
     else:
         checkpoint, blocks = resume[0], list(resume[1])
+        _require_continuation(chosen, checkpoint, blocks)
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(chosen, chain_keys, thin, block, draws, checkpoint, began)
@@ -187,6 +188,18 @@ def checkpoint_from_arrays(
             "another version of bayesreg began"
         )
     return jax.tree.unflatten(structure, leaves)
+
+
+def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: list[Block]) -> None:
+    """Raise InputError where a state is read otherwise than it was written: coordinates differ between versions."""
+    if not blocks:
+        return
+    here = _observed(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
+    if not all(np.allclose(here[name], blocks[-1][name][:, -1], rtol=1e-3, atol=1e-4) for name in here):
+        raise InputError(
+            "the chains do not stand where their last draws were: another version of bayesreg began this run; begin it "
+            "anew in another folder"
+        )
 
 
 def _first(chosen: Chosen, data: Any, setup: Any, points: Any) -> Checkpoint:

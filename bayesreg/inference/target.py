@@ -140,5 +140,8 @@ class SmoothTarget(Target, Protocol):
     def continuation(self) -> Iterable[tuple[Any, bool]]:
         """Data of ever harder problems that end with this one, and whether each moves more than displacements."""
 
+    def least_curvature(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
+        """Of minus the log density in every coordinate where next to nothing is known of it, positive."""
+
     def displacement_curvature(self, data: Any, estimands: Estimands) -> Curvature:
         """Curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""

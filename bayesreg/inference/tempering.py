@@ -148,10 +148,11 @@ def _rise(
         _SHARE,
         batch_size=_BATCH,
     )
+    steps = jnp.maximum(jnp.ceil(jnp.pi / 2 / size), 1).astype(int)
     settings = {
-        "step_size": size,
+        "step_size": jnp.pi / 2 / steps,
         "inverse_mass_matrix": jnp.ones_like(setup.reference.centre) / precision,
-        "num_integration_steps": jnp.maximum(jnp.round(jnp.pi / 2 / size), 1).astype(int),
+        "num_integration_steps": steps,
     }
     state, info = kernel(key, state, _MOVES, jax.tree.map(lambda x: x[None], settings))
     return state, info.update_info.acceptance_rate.mean()

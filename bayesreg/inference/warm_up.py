@@ -32,6 +32,9 @@ class Tuning(NamedTuple):
         Bounds of the step. Beyond a quarter turn, the default, there is nothing to gain.
     watched : bool
         Whether displacements of all transitions are wanted.
+    quarter_turns : bool
+        Whether a transition has as many steps as make a quarter turn of the reference, of one size no greater than what
+        the acceptance allows.
     """
 
     warm_up: int
@@ -39,6 +42,7 @@ class Tuning(NamedTuple):
     least: float = 0.01
     greatest: float = float(jnp.pi / 2)
     watched: bool = False
+    quarter_turns: bool = False
 
 
 @runtime_checkable
@@ -80,7 +84,7 @@ def tuned(
     tuning : Tuning
     apart : bool
         Tune each chain's step by itself, and let no trajectory have more than `FEW_STEPS`. A chain that starts where
-        the density is steep, such as far out in log λ, takes short steps until it is back; with one step for all it
+        the density is steep, takes short steps until it is back; with one step for all it
         would stand still for as long as the others take longer ones, or shorten theirs.
     say : callable
         Told of what was found.
@@ -88,7 +92,8 @@ def tuned(
     keys = jax.random.split(key, tuning.warm_up)
     points, sizes, rates, path = _run(walk, tuning, data, setup, starts, keys, jnp.asarray(apart))
     setup, late = _sized(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
-    say(f"warm-up: step {float(setup.step_size):.2g}, {int(setup.steps)} to a trajectory, acceptance {late:.0%}")
+    trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
+    say(f"warm-up: step {float(setup.step_size):.2g}{trajectory}, acceptance {late:.0%}")
     return setup, points, path
 
 
@@ -126,6 +131,8 @@ def _run(
 
 def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
     size = jnp.clip(size, tuning.least, tuning.greatest)
-    # A quarter turn at least: less leaves what is not refused correlated with where it came from.
+    if not tuning.quarter_turns:
+        return setup._replace(step_size=size)
+    # Less leaves what is not refused correlated with where it came from, and much more its square.
     steps = jnp.maximum(jnp.ceil(jnp.pi / 2 / size), 1).astype(int)
-    return setup._replace(step_size=size, steps=steps)
+    return setup._replace(step_size=jnp.pi / 2 / steps, steps=steps)

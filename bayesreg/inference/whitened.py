@@ -270,7 +270,8 @@ def _warmed_up(
     setup, points, path = tuned(_conditioned(target, setup), walk, setup, points, key_tune, stage, say=say)
     if settling is None or path is None:
         return setup, points
-    # Of the second stage alone: in the first, trajectories are short and chains on their way.
+    # Of the second stage alone, where trajectories are whole from the first: before, they are short, and chains on
+    # their way.
     nodes = slowest(np.asarray(path), alone)
     say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
     late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])

@@ -34,7 +34,7 @@ def whitened(data: RegistrationData, values: Values) -> dict[str, AnyArray]:
 def transform(parameter: LameParameter, free: np.ndarray) -> RangeTransform:
     """The map from the real line to the sampled entries of λ or μ."""
     low, high, reference = (jnp.asarray(x)[free] for x in (parameter.low, parameter.high, parameter.reference))
-    return RangeTransform(low, high, jnp.where(reference > low, reference - low, reference))
+    return RangeTransform(low, high, reference)
 
 
 def to_estimands(
@@ -51,6 +51,20 @@ def to_estimands(
         estimands[name] = jnp.exp(position[name])
         log_jacobian += position[name]
     return estimands, log_jacobian
+
+
+def least_curvature(data: RegistrationData, position: Values, free: Mapping[str, np.ndarray]) -> dict[str, AnyArray]:
+    """Of minus the log density in every coordinate, where next to nothing is known: one of a Normal score or logarithm.
+
+    Without an upper bound a score is scale · z²/2 far out, where its logarithm, which knows no scale, is what has one.
+    """
+    least = {name: jnp.ones_like(value) for name, value in position.items()}
+    for name in (name for name in LAME if len(free[name])):
+        to_range, z = transform(getattr(data, name), free[name]), position[name]
+        x = to_range(z)
+        growth = jnp.exp(to_range.log_abs_det_jacobian(z, x)) / (x - to_range.low)
+        least[name] = jnp.where(jnp.isinf(to_range.high), jnp.minimum(growth, 1.0) ** 2, 1.0)
+    return least
 
 
 def lame_by_cell(data: RegistrationData, values: Values) -> list[np.ndarray]:

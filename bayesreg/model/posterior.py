@@ -17,7 +17,17 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model import evaluation
 from bayesreg.model.constraint import is_allowed
 from bayesreg.model.continuation import continuation
-from bayesreg.model.coordinates import FIELD, LAME, Values, complete, lame_by_cell, to_estimands, transform, whitened
+from bayesreg.model.coordinates import (
+    FIELD,
+    LAME,
+    Values,
+    complete,
+    lame_by_cell,
+    least_curvature,
+    to_estimands,
+    transform,
+    whitened,
+)
 from bayesreg.model.curvature import Curvature, displacement_curvature
 from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.neighbourhood import neighbourhoods
@@ -47,7 +57,7 @@ class Posterior:
       the scalars "t_similarity", "t_elastic" where they have a prior, and where the elasticity has a field its
       "field_sd" and whitened components "field" (k,);
     - *estimands*: the same with the sampled entries of λ and μ only;
-    - *position*: estimands mapped to the real line: λ and μ as by a probit (`RangeTransform`), temperatures and the
+    - *position*: estimands mapped to the real line: λ and μ as Normal scores (`RangeTransform`), temperatures and the
       field's sd by their logarithm.
 
     Attributes
@@ -243,6 +253,10 @@ class Posterior:
         """Estimands of an unconstrained position, as a pure function of the data."""
         return to_estimands(data, position, self.free)[0]
 
+    def least_curvature(self, data: RegistrationData, position: Values) -> dict[str, AnyArray]:
+        """Of −`logdensity` in every coordinate where next to nothing is known of it; shaped as the position."""
+        return least_curvature(data, position, self.free)
+
     def constrain(self, position: Values) -> dict[str, AnyArray]:
         """Values (known entries included) of an unconstrained position."""
         estimands, _ = to_estimands(self.data, position, self.free)
@@ -317,7 +331,7 @@ class Posterior:
         return {"points": mesh.points, "cells": mesh.cells, "tissue": mesh.tissue, "boundary": self.sampled}
 
     def initial(self, key: AnyArray) -> dict[str, AnyArray]:
-        """A random position near `reference`: displacements of 0.01 mm, the rest within about 10 %."""
+        """A random position near `reference`: displacements of 0.01 mm, the other coordinates within 0.1."""
         position = self.unconstrain(self.reference())
         keys = jax.random.split(key, len(position))
         return {

@@ -60,16 +60,20 @@ class RangeTransform(Transform):
 
     @property
     def _width(self) -> AnyArray:
-        # The scale where unbounded: the branch not taken must stay finite for its gradient.
         return jnp.where(jnp.isinf(self.high), self.scale, self.high - self.low)
 
     def __call__(self, z: AnyArray) -> AnyArray:
-        """Constrained values."""
-        return self.low + self._width * jnp.where(jnp.isinf(self.high), -log_ndtr(-z), ndtr(z))
+        """Constrained values, below an upper bound by more than rounding."""
+        below = jnp.minimum(ndtr(z), 1 - 8 * jnp.finfo(float).eps)
+        # Each side from the lesser of Φ(z) and Φ(−z): next to one, nothing is left of the other.
+        lower, upper = jnp.where(z < 0, z, 0.0), jnp.where(z < 0, 0.0, z)
+        exponential = jnp.where(z < 0, -jnp.log1p(-ndtr(lower)), -log_ndtr(-upper))
+        return self.low + self._width * jnp.where(jnp.isinf(self.high), exponential, below)
 
     def _inverse(self, x: AnyArray) -> AnyArray:
-        share = (x - self.low) / self._width
-        return jnp.where(jnp.isinf(self.high), _score(share), ndtri(share))
+        share, endless = (x - self.low) / self._width, jnp.isinf(self.high)
+        # What is not taken must stay finite for its gradient.
+        return jnp.where(endless, _score(jnp.where(endless, share, 0.5)), ndtri(jnp.where(endless, 0.5, share)))
 
     def log_abs_det_jacobian(self, x: AnyArray, y: AnyArray, intermediates: None = None) -> AnyArray:
         """log |dy/dx|, entry by entry: φ(z) or φ(z) / Φ(−z), times the width."""
@@ -82,16 +86,14 @@ class RangeTransform(Transform):
 
 def _score(t: AnyArray) -> AnyArray:
     """z with −log Φ(−z) = t > 0."""
-    # e^−t has no more digits beyond; Newton's steps, from the first terms of the tail's series, are exact there.
-    far = t > 600
-    near = jnp.where(far, 600.0, t)
-    z = jnp.where(near < 0.5, ndtri(-jnp.expm1(-near)), -ndtri(jnp.exp(-near)))
-    beyond = jnp.where(far, t, 600.0)
-    tail = jnp.sqrt(2 * beyond - jnp.log(4 * jnp.pi * beyond))
-    for _ in range(3):
+    small, far = t < 0.5, t > 600
+    low, middle, beyond = (jnp.where(taken, t, 1.0) for taken in (small, ~small & ~far, far))
+    # e^−t has no digits at the last; there, Newton's steps from the first terms of the tail's series are exact.
+    tail = jnp.sqrt(2 * beyond)
+    for _ in range(4):
         height = log_ndtr(-tail)
         tail += (height + beyond) * jnp.exp(height - norm.logpdf(tail))
-    return jnp.where(far, tail, z)
+    return jnp.where(small, ndtri(-jnp.expm1(-low)), jnp.where(far, tail, -ndtri(jnp.exp(-middle))))
 
 
 @biject_to.register(_Range)

@@ -5,11 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
 import bayesreg as br
-from bayesreg.inference.laplace import _convex, laplace, precision_at, pulled, unravel
+from bayesreg.inference.laplace import _convex, hessian_rows, laplace, precision_at, pulled, unravel
 from bayesreg.inference.mode_search import GAP, find_mode
+from bayesreg.model.coordinates import transform
 from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem, walled
 from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image
@@ -125,16 +127,44 @@ def test_parameters_that_nothing_is_known_of_have_the_prior_s_width():
     model = br.ModelConfig(priors={"lam": {"high": 20.0}, "mu": {"high": 5.0}}, rigid_sd=1.0)
     posterior = br.build_posterior(flat, flat, MESH, model=model)
     position = {**posterior.unconstrain(posterior.reference()), "lam": jnp.array([-1.0, 0.0, 2.0])}
-    precision = precision_at(posterior, np.asarray(ravel_pytree(position)[0]))
+    flat = np.asarray(ravel_pytree(position)[0])
+    precision = precision_at(posterior, flat)
     count = len(precision) - 3 * len(posterior.sampled)
     assert count == 5
     np.testing.assert_allclose(precision[:count], np.eye(len(precision))[:count], atol=1e-6)
+    rows = hessian_rows(posterior, posterior.data, flat, np.arange(count))
+    np.testing.assert_allclose(rows, -np.eye(len(flat))[:count], atol=1e-6)
+
+
+def smooth_posterior():
+    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    return br.build_posterior(*images, MESH, model=br.ModelConfig(interpolation="cubic", rigid_sd=1.0))
+
+
+@pytest.mark.parametrize("above", [0.1, 1.0, 20.0, 300.0])
+def test_a_parameter_far_above_its_scale_is_as_wide_as_its_logarithm(above):
+    """exp(z − e^z) has the variance π²/6: whatever the unit, the reference is not much narrower."""
+    posterior = smooth_posterior()
+    x = stats.expon.ppf((np.arange(4000) + 0.5) / 4000, scale=10.0 * above)
+    z = np.asarray(transform(posterior.data.lam, np.array([1])).inv(jnp.asarray(x)[:, None]))[:, 0]
+    position = posterior.unconstrain(posterior.reference())
+    at = {**position, "lam": position["lam"].at[1].set(np.median(z))}
+    least = posterior.least_curvature(posterior.data, at)["lam"][1]
+    assert 0.5 < z.std() * np.sqrt(least) < 1.5
 
 
 def test_a_parameter_that_runs_away_is_told():
-    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    posterior = br.build_posterior(*images, MESH, model=br.ModelConfig(interpolation="cubic", rigid_sd=1.0))
-    away = posterior.unconstrain(posterior.reference())
-    away["lam"] = away["lam"].at[1].set(1e160)
+    posterior = smooth_posterior()
+    away = posterior.unconstrain(posterior.reference() | {"lam": jnp.array([0.01, 1e13, 10.0])})
     with pytest.raises(br.InputError, match="λ, μ or a temperature runs away"):
         precision_at(posterior, np.asarray(ravel_pytree(away)[0]))
+
+
+def test_a_search_without_an_end_is_told():
+    """Without contrast, and flat priors without bound, λ and μ grow for ever."""
+    flat = smooth_image(MESH.points, seed=1)
+    flat = flat.with_voxels(np.zeros(flat.shape))
+    posterior = br.build_posterior(flat, flat, MESH, model=br.ModelConfig(rigid_sd=1.0))
+    start = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
+    with pytest.raises(br.InputError, match="runs away"):
+        find_mode(posterior, start)

@@ -181,6 +181,17 @@ def test_a_resumed_run_is_the_run_that_was_not_cut_off(name):
     np.testing.assert_array_equal(whole.idata.posterior["u_boundary"], resumed.idata.posterior["u_boundary"])
 
 
+def test_chains_that_do_not_stand_where_their_draws_end_are_told():
+    """As those of a version with other coordinates."""
+    blocks = []
+    options = {"chains": 3, "draws": 6, "block": 3, "sigma_u": 0.5, "progress": False}
+    br.sample(target(), "rwmh", on_block=lambda *found: blocks.append(found), **options)
+    _, draws, checkpoint = blocks[0]
+    elsewhere = draws | {"u_boundary": draws["u_boundary"] + 0.01}
+    with pytest.raises(br.InputError, match="another version of bayesreg began this run"):
+        br.sample(target(), "rwmh", resume=(checkpoint, [elsewhere]), **options)
+
+
 def two_modes() -> GaussianTarget:
     return GaussianTarget(wall=50.0, apart=9.0)
 

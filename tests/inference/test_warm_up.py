@@ -6,9 +6,10 @@ import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from bayesreg.inference import whitened
-from bayesreg.inference.warm_up import FIRST_STEP, Tuning, tuned
+from bayesreg.inference.warm_up import FIRST_STEP, Tuning, _sized, tuned
 from bayesreg.inference.whitened import Moved
 from tests.inference.gaussians import DIMENSION, GaussianTarget
 
@@ -38,7 +39,7 @@ class Walk:
 
 def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_its_own():
     starts = {"u_boundary": jnp.zeros((4, 3)).at[3, 0].set(9.0)}
-    tuning = Tuning(60, 0.75, watched=True)
+    tuning = Tuning(60, 0.75, watched=True, quarter_turns=True)
     found = {}
     for apart in (True, False):
         setup, points, path = tuned(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
@@ -49,6 +50,16 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
     # With one step for all it stands where it began, and the others pay for it.
     assert found[False][1] == 9.0
     assert found[False][0] < found[True][0]
+
+
+@pytest.mark.parametrize("size", [0.011, 0.3, 0.46, 0.53, 0.79, 1.2, 1.5, 1.6, 4.0])
+def test_steps_make_a_quarter_turn_and_none_is_too_long(size):
+    setup = _sized(Tuning(60, 0.75, quarter_turns=True), Steps(), jnp.asarray(size))
+    assert float(setup.step_size * setup.steps) == pytest.approx(np.pi / 2)
+    assert setup.step_size <= size
+    assert (setup.steps - 1) * size < np.pi / 2
+    alone = _sized(Tuning(60, 0.75), Steps(), jnp.asarray(size))
+    assert (float(alone.step_size), int(alone.steps)) == (min(size, np.pi / 2), int(Steps().steps))
 
 
 def test_a_place_without_a_slope_has_no_part_in_the_reference():

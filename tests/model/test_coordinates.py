@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.model.priors import RangeTransform
+from bayesreg.model.priors import RangeTransform, ScaledBeta
 from tests.phantoms import box_mesh, smooth_image
 
-Z = np.array([-9.0, -3.0, -0.5, 0.0, 0.7, 2.0, 8.0])
+Z = np.array([-9.0, -7.9, -6.5, -3.0, -0.5, 0.0, 0.7, 2.0, 7.0])
 
 
 def unbounded(low=0.0, scale=0.01):
@@ -20,6 +20,7 @@ def unbounded(low=0.0, scale=0.01):
 def test_a_bounded_range_is_reached_by_the_distribution_function():
     to_range = RangeTransform(jnp.asarray(0.5), jnp.asarray(40.0))
     np.testing.assert_allclose(to_range(Z), 0.5 + 39.5 * stats.norm.cdf(Z), rtol=1e-12)
+    np.testing.assert_allclose(to_range.inv(to_range(Z[3:8])), Z[3:8], atol=1e-12)
     # A flat prior there is the standard Normal density of z.
     expected = stats.norm.logpdf(Z) + np.log(39.5)
     np.testing.assert_allclose(to_range.log_abs_det_jacobian(Z, to_range(Z)), expected, rtol=1e-12)
@@ -36,7 +37,7 @@ def test_a_range_without_end_is_that_of_an_exponential_distribution():
 @pytest.mark.parametrize("above", [1e-30, 1e-9, 1e-3, 0.4, 0.6, 1.0, 1e2, 599.0, 601.0, 1e9, 1e30])
 def test_it_is_inverted_over_many_decades(above):
     z = unbounded().inv(jnp.asarray(0.01 * above))
-    assert float(unbounded()(z)) == pytest.approx(0.01 * above, rel=1e-9)
+    assert float(unbounded()(z)) == pytest.approx(0.01 * above, rel=1e-9, abs=0)
     assert np.sign(float(z)) == np.sign(above - np.log(2))
 
 
@@ -47,7 +48,29 @@ def test_a_flat_density_falls_off_as_a_normal_one_towards_the_bound():
     assert far / near == pytest.approx(4, rel=0.05)
 
 
-def test_the_scale_is_the_reference_above_the_lower_bound():
+def test_bounded_and_unbounded_entries_stand_beside_each_other():
+    """With derivatives of any order: what is not taken is finite."""
+    low, high, scale = (jnp.array(x) for x in ([0.0, 1.0], [jnp.inf, 3.0], [0.1, 50.0]))
+    to_range, z = RangeTransform(low, high, scale), jnp.array([4.0, -4.0])
+    apart = [RangeTransform(*(x[k] for x in (low, high, scale))) for k in range(2)]
+    x = to_range(z)
+    np.testing.assert_array_equal(x, [each(z[k]) for k, each in enumerate(apart)])
+    np.testing.assert_allclose(to_range.inv(x), z, rtol=1e-9)
+    slopes = jax.vmap(lambda e: jax.jvp(to_range, (z,), (e,))[1])(jnp.eye(2))
+    inverse = jax.jacrev(to_range.inv)(x)
+    np.testing.assert_allclose(inverse @ slopes, np.eye(2), atol=1e-6)
+    assert np.isfinite(jax.jacfwd(jax.jacrev(lambda z: to_range.log_abs_det_jacobian(z, to_range(z)).sum()))(z)).all()
+
+
+def test_no_value_rounds_to_a_bound_at_which_a_density_is_infinite():
+    to_range, prior = (
+        RangeTransform(jnp.asarray(0.0), jnp.asarray(5.0)),
+        ScaledBeta(*map(jnp.asarray, (1.0, 0.2, 0.0, 5.0))),
+    )
+    assert np.isfinite(prior.log_prob(to_range(jnp.asarray([8.0, 9.0, 40.0])))).all()
+
+
+def test_the_scale_is_the_reference():
     mesh = box_mesh(2)
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
     model = br.ModelConfig(priors={"lam": {"low": 1.0}, "mu": {"high": 8.0}})
@@ -55,7 +78,6 @@ def test_the_scale_is_the_reference_above_the_lower_bound():
     posterior = br.build_posterior(*images, mesh, model=model, reference=given)
     median = {**posterior.unconstrain(posterior.reference()), "lam": jnp.zeros(3), "mu": jnp.zeros(2)}
     found = posterior.constrain(median)
-    # 0.5 lies below the range: its size then is the scale above it.
-    np.testing.assert_allclose(found["lam"], 1 + np.log(2) * np.array([2.0, 0.5, 29.0]))
+    np.testing.assert_allclose(found["lam"], 1 + np.log(2) * given["lam"])
     # μ of GM is known.
     np.testing.assert_allclose(found["mu"], [4.0, 1.0, 4.0])
