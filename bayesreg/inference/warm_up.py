@@ -84,8 +84,8 @@ def tuned(
     tuning : Tuning
     apart : bool
         Tune each chain's step by itself, and let no trajectory have more than `FEW_STEPS`. A chain that starts where
-        the density is steep, takes short steps until it is back; with one step for all it
-        would stand still for as long as the others take longer ones, or shorten theirs.
+        the density is steep takes short steps until it is back; with one step for all it would stand still for as long
+        as the others take longer ones, or shorten theirs.
     say : callable
         Told of what was found.
     """

@@ -387,8 +387,9 @@ def build_posterior(
     skull : Image, optional
         Nonzero = forbidden; off its grid is forbidden too. None: no constraint.
     reference : mapping, optional
-        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start; the nearer
-        to the posterior the faster. Default: λ = 10, μ = 1, and 0.01 for a tissue named "csf".
+        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start, and the scale of the
+        coordinate of a parameter without an upper bound; the nearer to the posterior the faster. Default: λ = 10,
+        μ = 1, and 0.01 for a tissue named "csf".
 
     Returns
     -------

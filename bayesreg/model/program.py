@@ -36,7 +36,8 @@ class LameParameter(NamedTuple):
     is_free : (entries,) bool array
         False where the parameter is known.
     reference : (entries,) array
-        The known value, or the one at which the interior solve is preconditioned and chains may start.
+        The known value, or the one at which the interior solve is preconditioned and chains may start, and which is
+        the scale of the coordinate where there is no upper bound.
     """
 
     alpha: Float[AnyArray, "entries"]

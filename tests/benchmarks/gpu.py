@@ -29,7 +29,7 @@ from bayesreg.io import store
 
 REPEATS = 5
 CHAINS = (1, 4, 16, 64, 256, 1024, 4096)
-# Of the chains about the truth: standard deviations in mm and of log λ, log μ.
+# Of the chains about the truth: standard deviations in mm and of the scores of λ, μ.
 SPREAD = {"u_boundary": 0.1, "lam": 0.3, "mu": 0.3}
 
 

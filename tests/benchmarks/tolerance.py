@@ -1,6 +1,6 @@
 """What the tolerance of a chain's solves costs and leaves: iterations, and the error of the log density.
 
-At forty draws of a finished run, solves preconditioned at their mean log λ, log μ.
+At forty draws of a finished run, solves preconditioned at the mean of their λ, μ (as Normal scores), like chains'.
 
     python -m tests.benchmarks.tolerance RUN
 """
@@ -32,8 +32,9 @@ def main() -> None:
     )
     at = [{n: jnp.asarray(draws[n].values[place], float) for n in known if n in draws} for place in places]
     estimands = [posterior.estimands(known | values) for values in at]
-    middle = {n: jnp.exp(jnp.log(jnp.stack([e[n] for e in estimands])).mean(axis=0)) for n in posterior.free}
-    data = posterior.conditioned(estimands[0] | middle)
+    positions = [posterior.unconstrain_of(posterior.data, e) for e in estimands]
+    middle = jax.tree.map(lambda *x: jnp.stack(x).mean(axis=0), *positions)
+    data = posterior.conditioned(posterior.constrain_of(posterior.data, middle))
     evaluate = jax.jit(posterior.evaluate_estimands)
 
     def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:
