@@ -85,10 +85,10 @@ class RangeTransform(Transform):
 
 
 def _score(t: AnyArray) -> AnyArray:
-    """z with −log Φ(−z) = t > 0."""
+    """The Normal score z of a standard exponential value t > 0: −log Φ(−z) = t."""
     small, far = t < 0.5, t > 600
     low, middle, beyond = (jnp.where(taken, t, 1.0) for taken in (small, ~small & ~far, far))
-    # e^−t has no digits at the last; there, Newton's steps from the first terms of the tail's series are exact.
+    # Before e^−t underflows Newton's steps from √(2t) take over, which are exact there.
     tail = jnp.sqrt(2 * beyond)
     for _ in range(4):
         height = log_ndtr(-tail)
