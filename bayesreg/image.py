@@ -206,12 +206,21 @@ def _cubic_jvp(primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, Any
     return value, (gradient * tangents[1]).sum(axis=-1)
 
 
+# Points whose taps are looked at together.
+_BATCH = 1024
+
+
 def _cubic_and_gradient(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Value, and its gradient in the indices (last axis)."""
     # The 64 taps of so many points stay in the cache; those of all points at once do not, which costs three times as
-    # much.
-    found = jax.lax.map(partial(_cubic_at, coefficients), indices.reshape(-1, 3), batch_size=1024)
+    # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
+    flat = indices.reshape(-1, 3)
+    batches = max(-(-len(flat) // _BATCH), 1)
+    size = -(-len(flat) // batches)
+    filled = jnp.pad(flat, ((0, batches * size - len(flat)), (0, 0))).reshape(batches, size, 3)
+    found = jax.lax.map(jax.vmap(partial(_cubic_at, coefficients)), filled)
     value, gradient = jax.lax.optimization_barrier(found)
+    value, gradient = value.reshape(-1)[: len(flat)], gradient.reshape(-1, 3)[: len(flat)]
     return value.reshape(indices.shape[:-1]), gradient.reshape(indices.shape)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from jax.scipy.special import betaln, log_ndtr, ndtr, ndtri, xlog1py, xlogy
+from jax.scipy.special import betaln, erfc, ndtri, xlog1py, xlogy
 from jax.scipy.stats import norm
 from jaxtyping import Float
 from numpyro.distributions import constraints
@@ -64,36 +65,72 @@ class RangeTransform(Transform):
 
     def __call__(self, z: AnyArray) -> AnyArray:
         """Constrained values, below an upper bound by more than rounding."""
-        below = jnp.minimum(ndtr(z), 1 - 8 * jnp.finfo(float).eps)
-        # Each side from the lesser of Φ(z) and Φ(−z): next to one, nothing is left of the other.
-        lower, upper = jnp.where(z < 0, z, 0.0), jnp.where(z < 0, 0.0, z)
-        exponential = jnp.where(z < 0, -jnp.log1p(-ndtr(lower)), -log_ndtr(-upper))
-        return self.low + self._width * jnp.where(jnp.isinf(self.high), exponential, below)
+        tail = _tail(z)
+        below = jnp.minimum(jnp.where(z < 0, tail, 1 - tail), 1 - 8 * jnp.finfo(float).eps)
+        return self.low + self._width * jnp.where(jnp.isinf(self.high), -_log_survival(z), below)
 
     def _inverse(self, x: AnyArray) -> AnyArray:
         share, endless = (x - self.low) / self._width, jnp.isinf(self.high)
-        # What is not taken must stay finite for its gradient.
-        return jnp.where(endless, _score(jnp.where(endless, share, 0.5)), ndtri(jnp.where(endless, 0.5, share)))
+        # Of the two tails the lesser, and of what is not taken nothing that has no gradient.
+        upper, far = endless & (share >= 0.5), endless & (share > 600)
+        small, middle, beyond = (jnp.where(taken, share, 1.0) for taken in (endless & ~upper, upper & ~far, far))
+        tail = jnp.where(endless, jnp.where(upper, jnp.exp(-middle), -jnp.expm1(-small)), share)
+        z = ndtri(jnp.where(far, 0.5, tail))
+        return jnp.where(far, _far_score(beyond), jnp.where(upper, -z, z))
 
     def log_abs_det_jacobian(self, x: AnyArray, y: AnyArray, intermediates: None = None) -> AnyArray:
         """log |dy/dx|, entry by entry: φ(z) or φ(z) / Φ(−z), times the width."""
-        return jnp.log(self._width) + norm.logpdf(x) - jnp.where(jnp.isinf(self.high), log_ndtr(-x), 0.0)
+        return jnp.log(self._width) + norm.logpdf(x) - jnp.where(jnp.isinf(self.high), _log_survival(x), 0.0)
 
     def tree_flatten(self):  # type: ignore[no-untyped-def]
         """All are data."""
         return (self.low, self.high, self.scale), (("low", "high", "scale"), {})
 
 
-def _score(t: AnyArray) -> AnyArray:
-    """The Normal score z of a standard exponential value t > 0: −log Φ(−z) = t."""
-    small, far = t < 0.5, t > 600
-    low, middle, beyond = (jnp.where(taken, t, 1.0) for taken in (small, ~small & ~far, far))
-    # Before e^−t underflows Newton's steps from √(2t) take over, which are exact there.
-    tail = jnp.sqrt(2 * beyond)
+# Beyond, log Φ(−z) is its asymptotic series, to rounding; long before, Φ(−z) would be zero.
+_FAR = 30.0
+
+
+def _tail(z: AnyArray) -> AnyArray:
+    """Φ(−|z|), no further out than `_FAR`: next to one, nothing is left of the other tail.
+
+    All that is needed of Φ is made of one erfc: Φ and log Φ of the library compile to a third of a whole gradient.
+    """
+    away = jnp.where(z < 0, -z, z)
+    # The barrier keeps XLA from writing the whole of it into everything that follows.
+    return jax.lax.optimization_barrier(erfc(jnp.where(away < _FAR, away, _FAR) / np.sqrt(2)) / 2)
+
+
+@jax.custom_jvp
+def _log_survival(z: AnyArray) -> AnyArray:
+    """log Φ(−z)."""
+    tail = _tail(z)
+    near = jnp.where(z < 0, jnp.log1p(-tail), jnp.log(tail))
+    return jnp.where(z < _FAR, near, _far_log_survival(jnp.where(z < _FAR, _FAR, z)))
+
+
+@_log_survival.defjvp
+def _log_survival_jvp(primals: tuple[AnyArray], tangents: tuple[AnyArray]) -> tuple[AnyArray, AnyArray]:
+    (z,), (dz,) = primals, tangents
+    value = _log_survival(z)
+    return value, -jnp.exp(norm.logpdf(z) - value) * dz
+
+
+def _far_log_survival(z: AnyArray) -> AnyArray:
+    """log Φ(−z) of z ≥ `_FAR`: φ(z)/z (1 − 1/z² + 3/z⁴ − 15/z⁶ + …)."""
+    series = jnp.ones_like(z)
+    for odd in (9, 7, 5, 3, 1):
+        series = 1 - odd / z**2 * series
+    return norm.logpdf(z) - jnp.log(z) + jnp.log(series)
+
+
+def _far_score(t: AnyArray) -> AnyArray:
+    """The z of −log Φ(−z) = t > 600, by Newton's steps: exact where e^−t underflows."""
+    z = jnp.sqrt(2 * t)
     for _ in range(4):
-        height = log_ndtr(-tail)
-        tail += (height + beyond) * jnp.exp(height - norm.logpdf(tail))
-    return jnp.where(small, ndtri(-jnp.expm1(-low)), jnp.where(far, tail, -ndtri(jnp.exp(-middle))))
+        height = _far_log_survival(z)
+        z += (height + t) * jnp.exp(height - norm.logpdf(z))
+    return z
 
 
 @biject_to.register(_Range)
@@ -108,6 +145,8 @@ class ScaledBeta(dist.Distribution):
     ----------
     alpha, beta, low, high : arrays of one common shape
         Shape parameters A, B and the range [r1, r2], in the unit of the parameter.
+    log_beta : array, optional
+        log B(α, β), where it is known already: it takes longer to compile than the rest of the density.
 
     Raises
     ------
@@ -123,8 +162,11 @@ class ScaledBeta(dist.Distribution):
     }
     reparametrized_params = ("alpha", "beta", "low", "high")
 
-    def __init__(self, alpha: AnyArray, beta: AnyArray, low: AnyArray, high: AnyArray) -> None:
+    def __init__(
+        self, alpha: AnyArray, beta: AnyArray, low: AnyArray, high: AnyArray, log_beta: AnyArray | None = None
+    ) -> None:
         self.alpha, self.beta, self.low, self.high = alpha, beta, low, high
+        self.log_beta = betaln(alpha, beta) if log_beta is None else log_beta
         super().__init__(batch_shape=jnp.shape(alpha), validate_args=False)
 
     @constraints.dependent_property(is_discrete=False, event_dim=0)
@@ -139,7 +181,7 @@ class ScaledBeta(dist.Distribution):
         width = jnp.where(improper, 1.0, self.high - self.low)
         fraction = jnp.where(inside & ~improper, (value - self.low) / width, 0.5)
         beta = xlogy(self.alpha - 1, fraction) + xlog1py(self.beta - 1, -fraction)
-        density = jnp.where(improper, 0.0, beta - betaln(self.alpha, self.beta) - jnp.log(width))
+        density = jnp.where(improper, 0.0, beta - self.log_beta - jnp.log(width))
         return jnp.where(inside, density, -jnp.inf)
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> AnyArray:

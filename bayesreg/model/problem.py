@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import betaln
 
 from bayesreg.distance import signed_distance
 from bayesreg.fem.determinant import schur_determinant
@@ -214,11 +215,13 @@ def lame_parameter(
     if start.shape != (entries,) or not (np.isfinite(start) & (start > 0)).all():
         raise InputError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
     values = np.array([s if k is None else float(k) for s, k in zip(start, known, strict=True)])
+    alpha, beta = (np.array([float(getattr(p, name)) for p in prior]) for name in ("alpha", "beta"))
     return LameParameter(
-        alpha=jnp.array([float(p.alpha) for p in prior]),
-        beta=jnp.array([float(p.beta) for p in prior]),
+        alpha=jnp.asarray(alpha),
+        beta=jnp.asarray(beta),
         low=jnp.array([float(p.low) for p in prior]),
         high=jnp.array([float(p.high) for p in prior]),
+        log_beta=jnp.asarray(betaln(alpha, beta)),
         is_free=jnp.array([k is None for k in known]),
         reference=jnp.asarray(values),
     )

@@ -33,6 +33,8 @@ class LameParameter(NamedTuple):
     ----------
     alpha, beta, low, high : (entries,) arrays
         Of the scaled Beta prior of each entry.
+    log_beta : (entries,) array
+        log B(α, β).
     is_free : (entries,) bool array
         False where the parameter is known.
     reference : (entries,) array
@@ -44,12 +46,13 @@ class LameParameter(NamedTuple):
     beta: Float[AnyArray, "entries"]
     low: Float[AnyArray, "entries"]
     high: Float[AnyArray, "entries"]
+    log_beta: Float[AnyArray, "entries"]
     is_free: Bool[AnyArray, "entries"]
     reference: Float[AnyArray, "entries"]
 
     def prior(self) -> dist.Distribution:
         """p(λ) or p(μ), with known entries left out of the density."""
-        return ScaledBeta(self.alpha, self.beta, self.low, self.high).mask(self.is_free).to_event(1)
+        return ScaledBeta(self.alpha, self.beta, self.low, self.high, self.log_beta).mask(self.is_free).to_event(1)
 
 
 class RegistrationData(NamedTuple):

@@ -25,28 +25,37 @@ from tests.inference.random_walk import ess_per_step, gaussian_walk
 
 CONFIG = Path(__file__).parents[2] / "configs" / "converged_tissues.yaml"
 STEPS = {"u_boundary": 0.008, "lam": 0.03, "mu": 0.003}
-CHAINS, STEPS_TIMED = 3, 1500
+CHAINS, STEPS_TIMED, STEPS_TRIED = 3, 1500, 10_000
 
 
 def bench_effective_draws():
-    if "BAYESREG_DATA" not in os.environ:
+    finished = os.environ.get("BAYESREG_RUN")
+    if finished is not None:
+        compare_kernels(br.load_result(finished))
+    elif "BAYESREG_DATA" in os.environ:
+        with tempfile.TemporaryDirectory() as folder:
+            compare_kernels(br.run(br.load_config(CONFIG), Path(folder) / "run", progress=False))
+    else:
         print("\neffective draws: skipped, BAYESREG_DATA does not name the folder of the paper's data", end="")
-        return
-    given = os.environ.get("BAYESREG_MESH")
-    overrides = [] if given is None else [f"mesh.file={given}"]
-    with tempfile.TemporaryDirectory() as folder:
-        result = br.run(br.load_config(CONFIG, overrides), Path(folder) / "run", progress=False)
-        convergence = result.run.manifest["convergence"]
-        seconds = result.run.manifest["timings"]["sampling"]
-        posterior = posterior_of(br.load_config(CONFIG, overrides), store.read_inputs(result.folder))
-        draws = result.idata.posterior.load()
-        effective = float(np.median(np.asarray(result.convergence.ess_bulk.u_boundary)))
-        mesh = result.mesh
-    print(f"\nmesh of {len(mesh.points)} nodes, {len(mesh.boundary)} sampled; {seconds:.0f} s until {convergence}")
+
+
+def compare_kernels(result):
+    """Of a run by `CONFIG` that has ended."""
+    convergence = result.run.manifest["convergence"]
+    seconds = result.run.manifest["timings"]["sampling"]
+    posterior = posterior_of(br.load_config(result.folder / "config.yaml"), store.read_inputs(result.folder))
+    draws = result.idata.posterior.load()
+    effective = float(np.median(np.asarray(result.convergence.ess_bulk.u_boundary)))
+    nodes, sampled = len(result.mesh.points), len(result.mesh.boundary)
+    print(f"\nmesh of {nodes} nodes, {sampled} sampled; {seconds:.0f} s until {convergence}")
     covariance, variances = covariance_and_steps(draws)
-    rate, acceptance = papers_kernel(posterior, draws)
+    acceptance, inside = papers_acceptance(posterior, draws)
+    rate = papers_speed(posterior, draws)
     ess = ess_per_step(covariance, variances, acceptance, effective)
-    print(f"the paper's kernel at the posterior: {rate:.0f} steps per second and chain, {acceptance:.1%} accepted")
+    print(
+        f"the paper's kernel at the posterior: {rate:.0f} steps per second and chain, "
+        f"{acceptance:.3%} accepted ({inside:.1%} in the support)"
+    )
     print("steps per effective draw: median {:,.0f}, greatest {:,.0f}".format(*np.quantile(1 / ess, [0.5, 1.0])))
     for kind in ("bulk", "tail"):
         found, least = convergence[f"ess_{kind}_min"] / seconds, ess.min() * rate * CHAINS
@@ -61,26 +70,50 @@ def covariance_and_steps(draws: xr.Dataset):
     return np.cov(np.concatenate(list(free.values()), axis=1).T), variances
 
 
-def papers_kernel(posterior, draws):
-    """Steps per second of each of three chains, and the share of all proposals that is accepted, at the posterior."""
+def estimands_of(posterior, draws):
+    """Of every kept draw of all chains."""
+    flat = {name: draws[name].values.reshape(-1, *draws[name].shape[2:]) for name in STEPS}
+    return jax.vmap(posterior.estimands)({name: jnp.asarray(values, float) for name, values in flat.items()})
+
+
+def papers_acceptance(posterior, draws):
+    """Mean over the posterior of the probability that a step is accepted, and the share of steps in the support."""
+    kernel, places = SAMPLERS["rwmh"](posterior), estimands_of(posterior, draws)
+
+    @jax.jit
+    def tried(data, place, keys):
+        def one(key):
+            state = kernel.init(data, None, place)
+            info = kernel.step(data, None, key, state)[1]
+            return info.acceptance_rate, ~info.outside_support
+
+        return jax.lax.map(one, keys)
+
+    count = len(places["u_boundary"])
+    keys = jax.random.split(jax.random.key(1), (count, STEPS_TRIED // count + 1))
+    found = [tried(posterior.data, jax.tree.map(lambda x, i=i: x[i], places), keys[i]) for i in range(count)]
+    rates, inside = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return float(np.nan_to_num(rates).mean()), float(inside.mean())
+
+
+def papers_speed(posterior, draws):
+    """Steps per second of each of three chains, from draws of the posterior."""
     kernel = SAMPLERS["rwmh"](posterior)
-    last = {name: jnp.asarray(draws[name].values[:CHAINS, -1], float) for name in STEPS}
-    estimands = jax.vmap(posterior.estimands)(last)
+    last = jax.tree.map(lambda x: x[-CHAINS:], estimands_of(posterior, draws))
 
     @jax.jit
     def walk(data, states, keys):
         def step(states, keys):
-            states, info = jax.vmap(partial(kernel.step, data, None))(keys, states)
-            return states, info.acceptance_rate
+            return jax.vmap(partial(kernel.step, data, None))(keys, states)
 
         return jax.lax.scan(step, states, keys)
 
-    states = jax.vmap(partial(kernel.init, posterior.data, None))(estimands)
+    states = jax.vmap(partial(kernel.init, posterior.data, None))(last)
     keys = jax.random.split(jax.random.key(0), (STEPS_TIMED, CHAINS))
     jax.block_until_ready(walk(posterior.data, states, keys))
     began = time.perf_counter()
-    _, rates = jax.block_until_ready(walk(posterior.data, states, keys))
-    return STEPS_TIMED / (time.perf_counter() - began), float(rates.mean())
+    jax.block_until_ready(walk(posterior.data, states, keys))
+    return STEPS_TIMED / (time.perf_counter() - began)
 
 
 def check_formula(covariance, variances):

@@ -120,11 +120,13 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 
     @jax.jit
     def moved(data, setup, key):
-        states = jax.vmap(lambda key: sampler.init(data, setup, estimands))(jax.random.split(key, 2))
-        for number in range(3):
-            keys = jax.random.split(jax.random.fold_in(key, number), 2)
+        def step(states, keys):
             states, info = jax.vmap(lambda key, state: sampler.step(data, setup, key, state))(keys, states)
-        return jax.vmap(lambda state: sampler.observe(data, setup, state))(states), info.gradients
+            return states, info.gradients
+
+        states = jax.vmap(lambda key: sampler.init(data, setup, estimands))(jax.random.split(key, 2))
+        states, gradients = jax.lax.scan(step, states, jax.random.split(key, (3, 2)))
+        return jax.vmap(lambda state: sampler.observe(data, setup, state))(states), gradients
 
     found, gradients = moved(sampler.data(setup), setup, jax.random.key(0))
     # One of a trajectory of one step, one where two nodes were moved alone.

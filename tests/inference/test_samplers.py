@@ -280,7 +280,7 @@ def test_places_have_the_density_that_is_said():
     """The share of the places in a ball is the integral of the density over it; both on a grid."""
     rng = np.random.default_rng(0)
     middles, scale = 2.0 * rng.normal(size=(40, 3)), np.array([[0.9, 0, 0], [0.3, 0.6, 0], [-0.2, 0.4, 0.5]])
-    kernels = loose.Kernels(jnp.asarray(middles), jnp.asarray(scale), 4.0)
+    kernels = loose.Kernels(jnp.asarray(middles), jnp.asarray(scale), 4)
     axis = np.linspace(-30, 30, 121)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     density = np.exp(np.concatenate([kernels.log_density(jnp.asarray(part)) for part in np.array_split(grid, 40)]))
