@@ -67,6 +67,14 @@ def folder(anatomy, tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def no_report(finished):
+    """Runs without their reports, whose pictures take longer than these runs; those of `finished` are looked at."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "write_report", lambda *arguments: None)
+        yield
+
+
 @pytest.fixture(scope="module")
 def finished(folder):
     return br.run(folder / "run.yaml", folder / "out", progress=False)
@@ -117,6 +125,7 @@ def test_a_folder_that_holds_a_run_is_left_alone(finished, folder):
     np.testing.assert_array_equal(again.u_mean, br.load_result(folder / "out").u_mean)
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("cause", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
 def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monkeypatch, cause):
     def cut_off(where, arrays):
@@ -144,6 +153,7 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
     np.testing.assert_array_equal(resumed.u_sd, finished.u_sd)
 
 
+@pytest.mark.usefixtures("no_report")
 def test_a_finished_run_is_continued_with_more_draws(finished, folder):
     """The draws are those of a run that had the greater budget from the start."""
     more = br.load_config(folder / "run.yaml", [f"stop.max_steps={2 * STOP['max_steps']}"])
@@ -234,6 +244,7 @@ def synthetic(folder, anatomy, monkeypatch):
     return config
 
 
+@pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize("kind", ["paper", "calibrated"])
 def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
     result = br.run(synthetic(kind), folder / kind, progress=False)
@@ -275,7 +286,7 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     """On a phantom in place of MNI152, from a quickstart made small, with a field of stiffness, which is mapped."""
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
-    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38))
+    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38, spacing=24))
     monkeypatch.chdir(tmp_path)
     small = {
         "simulate": {"displacement": 3, "patch_nodes": 4},
@@ -300,6 +311,7 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     assert 0 <= stiffer.min() <= stiffer.max() <= 1
 
 
+@pytest.mark.usefixtures("no_report")
 def test_simulate_writes_the_pair(synthetic, folder):
     out = pipeline.simulate(synthetic("paper"), folder / "simulated")
     inputs = store.read_inputs(out)
