@@ -34,6 +34,18 @@ def test_a_range_without_end_is_that_of_an_exponential_distribution():
     np.testing.assert_allclose(unbounded().log_abs_det_jacobian(Z, unbounded()(Z)), np.log(steep), rtol=1e-11)
 
 
+def test_both_tails_are_followed_far_out():
+    """Also where Φ(−z) is next to zero, and beyond."""
+    z = np.array([-25.0, 12.0, 29.99, 30.01, 45.0, 1e3])
+    np.testing.assert_allclose(unbounded(scale=1.0)(z), -stats.norm.logsf(z), rtol=1e-12)
+    slopes = jax.vmap(jax.grad(unbounded(scale=1.0)))(jnp.asarray(z))
+    np.testing.assert_allclose(slopes, np.exp(stats.norm.logpdf(z) - stats.norm.logsf(z)), rtol=1e-12)
+    # The difference of two logarithms of 5 · 10⁵.
+    np.testing.assert_allclose(unbounded().log_abs_det_jacobian(z, z), np.log(0.01 * slopes), atol=1e-10)
+    bounded = RangeTransform(jnp.asarray(0.0), jnp.asarray(2.0))
+    np.testing.assert_allclose(bounded(z[:2]), 2 * stats.norm.cdf(z[:2]), rtol=1e-12)
+
+
 @pytest.mark.parametrize("above", [1e-30, 1e-9, 1e-3, 0.4, 0.6, 1.0, 1e2, 599.0, 601.0, 1e9, 1e30])
 def test_it_is_inverted_over_many_decades(above):
     z = unbounded().inv(jnp.asarray(0.01 * above))
