@@ -147,6 +147,19 @@ def test_linear_interpolation_reproduces_a_linear_function(image):
     np.testing.assert_allclose(linear.interpolate(points), points @ slope + 4, atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [0, 1, 1024, 2051])
+def test_any_number_of_points_has_the_values_and_gradients_of_each(count):
+    """They are looked at in batches."""
+    image = Image(np.random.default_rng(0).normal(size=SHAPE), AFFINES["oblique"])
+    points, value = image.voxel_to_world(indices_inside(count)), image.interpolator("cubic")
+    expected = ndimage.map_coordinates(image.voxels, indices_inside(count).T, **MODES["cubic"])
+    values, gradients = jax.value_and_grad(lambda x: (lambda v: (v.sum(), v))(value(x)), has_aux=True)(points)
+    np.testing.assert_allclose(values[1], expected, atol=1e-10)
+    if count:
+        last = jax.grad(value)(points[-1])
+        np.testing.assert_allclose(gradients[-1], last, rtol=1e-12)
+
+
 def test_cubic_gradient_is_continuous_across_voxels():
     image = Image(np.random.default_rng(0).normal(size=SHAPE), np.eye(4))
     slope = jax.grad(image.interpolator("cubic"))

@@ -134,7 +134,11 @@ class Worst(NamedTuple):
 
 
 def worst(blocks: list[dict[str, np.ndarray]]) -> Worst:
-    """The worst figures of blocks of draws (see `to_inference_data`); R̂ infinite where there are too few draws."""
+    """The worst figures of blocks of draws (see `to_inference_data`).
+
+    R̂ is infinite, and the effective sample sizes are zero, where there are too few draws, one is not a number, or an
+    estimand has stood still in all chains.
+    """
     names = [name for name in blocks[0] if name not in STATISTICS] if blocks else []
     draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in names}
     if not draws or next(iter(draws.values())).shape[1] < 4:
@@ -142,10 +146,13 @@ def worst(blocks: list[dict[str, np.ndarray]]) -> Worst:
     data = xr.Dataset(
         {name: (["chain", "draw", *(f"{name}_{k}" for k in range(x.ndim - 2))], x) for name, x in draws.items()}
     )
-    rhat, bulk, tail = (_plain(found) for found in (az.rhat(data), az.ess(data), az.ess(data, method="tail")))
+    moving = [name for name, x in draws.items() if x.size]
+    # ArviZ divides zero by zero for what has stood still.
+    with np.errstate(invalid="ignore"):
+        rhat, bulk, tail = (_plain(found) for found in (az.rhat(data), az.ess(data), az.ess(data, method="tail")))
     return Worst(
-        max(float(rhat[name].max()) for name in draws),
-        *(min(float(ess[name].min()) for name in draws) for ess in (bulk, tail)),
+        max(float(rhat[name].fillna(np.inf).max()) for name in moving),
+        *(min(float(ess[name].where(rhat[name].notnull(), 0.0).min()) for name in moving) for ess in (bulk, tail)),
     )
 
 

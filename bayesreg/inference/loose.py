@@ -46,7 +46,7 @@ class Kernels(NamedTuple):
     scale : (3, 3) array
         Lower triangular.
     degrees : int
-        Of freedom.
+        Of freedom: not an array, for so many numbers are drawn.
     """
 
     middles: Float[AnyArray, "kernels 3"]

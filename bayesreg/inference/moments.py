@@ -80,8 +80,7 @@ def pooled(moments: Moments) -> tuple[Any, Any]:
 def scale_reduction(moments: Moments) -> Any:
     """R̂ = √(var⁺ / W) of Gelman et al. (the paper's reference 12), chains not split, for every entry.
 
-    NaN where there are fewer than two chains or two draws; infinite where chains stand still at different
-    places; one where all stand still at the same.
+    NaN where there are fewer than two chains or two draws; infinite where chains stand still.
     """
     count = float(np.asarray(moments.count)[0])
 
@@ -92,7 +91,7 @@ def scale_reduction(moments: Moments) -> Any:
         within = squares.mean(axis=0) / (count - 1)
         pooled_variance = (count - 1) / count * within + mean.var(axis=0, ddof=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(pooled_variance == 0, 1.0, np.sqrt(pooled_variance / within))
+            return np.where(within == 0, np.inf, np.sqrt(pooled_variance / within))
 
     return jax.tree.map(ratio, moments.mean, moments.squares)
 

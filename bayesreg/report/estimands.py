@@ -71,8 +71,9 @@ class Diagnosed(NamedTuple):
 def estimands(mesh: TetMesh, diagnosed: Diagnosed, posterior: xr.Dataset) -> list[Estimand]:
     """Every sampled entry of every variable, in the posterior's order.
 
-    An entry without any figure that is the same in all draws was held fixed, and is none; one that only never
-    moved within its chain counts. Derived quantities (the ratios) are left out.
+    An entry of λ or μ without any figure that is the same in all draws was held fixed, and is none; one that only never
+    moved within its chain counts, and so does a displacement that never moved at all. Derived quantities (the ratios)
+    are left out.
     """
     found = []
     for variable in diagnosed.rhat.data_vars:
@@ -87,7 +88,9 @@ def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[E
     dims = [dim for dim in draws.dims if dim not in ("chain", "draw")]
     figures = np.stack([np.asarray(part[name].transpose(*dims).to_numpy(), float) for part in diagnosed], axis=-1)
     sampled = ~np.isnan(figures).all(axis=-1)
-    if not sampled.all():
+    if name == DISPLACEMENT:
+        sampled[...] = True
+    elif not sampled.all():
         spread = draws.max(("chain", "draw")) - draws.min(("chain", "draw"))
         sampled |= spread.transpose(*dims).to_numpy() > 0
     naming = _Naming(name, mesh, *_coordinates(draws, dims))

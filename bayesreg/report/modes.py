@@ -25,7 +25,7 @@ APART = 3.0
 TOGETHER_IN_ALL_BUT = 3
 MOST_SHOWN = 4
 NODES_SHOWN = 10
-SEEN = (DISPLACEMENT, "lam", "mu", "field_sd", "field")
+SEEN = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")
 
 
 class Grouping(NamedTuple):

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference.diagnostics import STATISTICS, convergence, open_posterior, save_posterior, to_inference_data
+from bayesreg.inference.diagnostics import (
+    STATISTICS,
+    convergence,
+    open_posterior,
+    save_posterior,
+    to_inference_data,
+    worst,
+)
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -65,3 +72,16 @@ def test_known_temperatures_are_not_there():
     idata = to_inference_data(target, list(blocks(target)))
     assert set(idata.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
     assert set(convergence(idata).rhat.data_vars) == {"u_boundary", "lam", "mu"}
+
+
+@pytest.mark.parametrize("wrong", [0.7, np.nan])
+def test_what_stands_still_or_is_no_number_has_not_converged(wrong):
+    rng = np.random.default_rng(0)
+    draws = {"u_boundary": rng.normal(size=(4, 500, 2, 3)), "lam": rng.normal(size=(4, 500, 2))}
+    sound = worst([draws])
+    assert sound.rhat < 1.01
+    assert min(sound.ess_bulk, sound.ess_tail) > 1000
+    # One component in all chains; a single draw that is no number.
+    where = (slice(None), slice(None), 1, 2) if np.isfinite(wrong) else (0, 30, 1, 2)
+    draws["u_boundary"][where] = wrong
+    assert worst([draws]) == (np.inf, 0.0, 0.0)

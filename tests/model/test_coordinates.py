@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import betaln
 
 import bayesreg as br
 from bayesreg.model.priors import RangeTransform, ScaledBeta
@@ -36,17 +37,21 @@ def test_a_range_without_end_is_that_of_an_exponential_distribution():
 
 def test_both_tails_are_followed_far_out():
     """Also where Φ(−z) is next to zero, and beyond."""
-    z = np.array([-25.0, 12.0, 29.99, 30.01, 45.0, 1e3])
+    z = np.array([-35.0, -25.0, 12.0, 29.99, 30.01, 45.0, 1e3])
     np.testing.assert_allclose(unbounded(scale=1.0)(z), -stats.norm.logsf(z), rtol=1e-12)
     slopes = jax.vmap(jax.grad(unbounded(scale=1.0)))(jnp.asarray(z))
-    np.testing.assert_allclose(slopes, np.exp(stats.norm.logpdf(z) - stats.norm.logsf(z)), rtol=1e-12)
+    np.testing.assert_allclose(slopes, np.exp(stats.norm.logpdf(z) - stats.norm.logsf(z)), rtol=1e-10)
     # The difference of two logarithms of 5 · 10⁵.
     np.testing.assert_allclose(unbounded().log_abs_det_jacobian(z, z), np.log(0.01 * slopes), atol=1e-10)
     bounded = RangeTransform(jnp.asarray(0.0), jnp.asarray(2.0))
-    np.testing.assert_allclose(bounded(z[:2]), 2 * stats.norm.cdf(z[:2]), rtol=1e-12)
+    np.testing.assert_allclose(bounded(z[:3]), 2 * stats.norm.cdf(z[:3]), rtol=1e-12)
+    # Φ(−z) / φ(z) is 1/z − 1/z³ + 3/z⁵ − …: the slope z + 1/z − 2/z³, the second derivative 1 − 1/z² + 6/z⁴.
+    steep, far = unbounded(scale=1.0), jnp.asarray(1e4)
+    assert float(jax.grad(steep)(far)) == pytest.approx(1e4 + 1e-4, rel=1e-15)
+    assert float(jax.grad(jax.grad(steep))(far)) == pytest.approx(1 - 1e-8, rel=1e-12)
 
 
-@pytest.mark.parametrize("above", [1e-30, 1e-9, 1e-3, 0.4, 0.6, 1.0, 1e2, 599.0, 601.0, 1e9, 1e30])
+@pytest.mark.parametrize("above", [1e-30, 1e-9, 1e-3, 0.4, 0.6, 1.0, 1e2, 599.0, 601.0, 1e9, 1.3e19, 1e30])
 def test_it_is_inverted_over_many_decades(above):
     z = unbounded().inv(jnp.asarray(0.01 * above))
     assert float(unbounded()(z)) == pytest.approx(0.01 * above, rel=1e-9, abs=0)
@@ -80,6 +85,14 @@ def test_no_value_rounds_to_a_bound_at_which_a_density_is_infinite():
         ScaledBeta(*map(jnp.asarray, (1.0, 0.2, 0.0, 5.0))),
     )
     assert np.isfinite(prior.log_prob(to_range(jnp.asarray([8.0, 9.0, 40.0])))).all()
+
+
+def test_a_prior_is_the_same_after_a_round_trip_as_a_pytree():
+    prior = ScaledBeta(*map(jnp.asarray, (2.0, 3.0, 0.0, 5.0)))
+    expected = stats.beta.logpdf(1.0, 2, 3, 0, 5)
+    assert float(jax.jit(lambda prior: prior.log_prob(jnp.ones(())))(prior)) == pytest.approx(expected, rel=1e-12)
+    given = ScaledBeta(*map(jnp.asarray, (2.0, 3.0, 0.0, 5.0)), jnp.asarray(betaln(2.0, 3.0)))
+    assert float(jax.tree.map(lambda x: x, given).log_prob(jnp.ones(()))) == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_scale_is_the_reference():

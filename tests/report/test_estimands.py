@@ -51,6 +51,16 @@ def test_a_fixed_entry_is_none_but_one_stuck_at_different_places_is_the_worst():
     assert above(found, 1e9) == 1
 
 
+def test_a_displacement_that_never_moved_is_the_worst():
+    posterior, diagnosed = make()
+    posterior["u_boundary"][:, :, 1, 2] = 0.3
+    for part in diagnosed:
+        part["u_boundary"][1, 2] = np.nan
+    found = estimands(MESH, diagnosed, posterior)
+    assert len(found) == 9 + 3 + 1
+    assert worst(found, 1)[0].name == "u_z of node 2"
+
+
 def test_elements_are_named_with_their_centre():
     posterior, diagnosed = make(len(MESH.cells))
     names = {entry.name: entry for entry in estimands(MESH, diagnosed, posterior)}
