@@ -51,7 +51,7 @@ def main() -> None:
     value = jax.jit(of)
     both = jax.jit(jax.value_and_grad(of, argnums=(2, 3)))
     given = determinant, elements, jnp.asarray(LAM), jnp.asarray(MU)
-    found, (by_lam, by_mu) = both(*given)
+    found, (by_lam, _) = both(*given)
     step = 1e-5
     ahead, behind = (float(value(determinant, elements, jnp.asarray(LAM * np.exp(h)), given[3])) for h in (step, -step))
     peer = sparse_log_pdet(mesh, LAM, MU)
