@@ -168,6 +168,7 @@ class Interpolator:
     shape: tuple[int, int, int]
     method: Interpolation
 
+    @jax.jit
     def __call__(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch"]:
         """Values at world points, mm."""
         last = jnp.asarray([n - 1.0 for n in self.shape])

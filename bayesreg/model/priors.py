@@ -63,12 +63,14 @@ class RangeTransform(Transform):
     def _width(self) -> AnyArray:
         return jnp.where(jnp.isinf(self.high), self.scale, self.high - self.low)
 
+    @jax.jit
     def __call__(self, z: AnyArray) -> AnyArray:
         """Constrained values, below an upper bound by more than rounding."""
         tail = _tail(z)
         below = jnp.minimum(jnp.where(z < 0, tail, 1 - tail), 1 - 8 * jnp.finfo(float).eps)
         return self.low + self._width * jnp.where(jnp.isinf(self.high), -_log_survival(z), below)
 
+    @jax.jit
     def _inverse(self, x: AnyArray) -> AnyArray:
         share, endless = (x - self.low) / self._width, jnp.isinf(self.high)
         # Of the two tails the lesser, and of what is not taken nothing that has no gradient.
@@ -78,6 +80,7 @@ class RangeTransform(Transform):
         z = ndtri(jnp.where(far, 0.5, tail))
         return jnp.where(far, _far_score(beyond), jnp.where(upper, -z, z))
 
+    @jax.jit
     def log_abs_det_jacobian(self, x: AnyArray, y: AnyArray, intermediates: None = None) -> AnyArray:
         """log |dy/dx|, entry by entry: φ(z) or φ(z) / Φ(−z), times the width."""
         return jnp.log(self._width) + norm.logpdf(x) - jnp.where(jnp.isinf(self.high), _log_survival(x), 0.0)
