@@ -203,16 +203,11 @@ def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: list[B
 
 
 def _first(chosen: Chosen, data: Any, setup: Any, points: Any) -> Checkpoint:
-    state = _begun(chosen, data, setup, points)
+    state = jax.vmap(partial(chosen.sampler.init, data, setup))(points)
     chains = len(next(iter(points.values())))
     shapes = jax.eval_shape(partial(_observed, chosen), data, setup, state)
     moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), _watched(shapes)))
     return Checkpoint(np.array(0), setup, state, moments, no_steps((chains,)), np.array(0.0))
-
-
-@partial(jax.jit, static_argnums=0)
-def _begun(chosen: Chosen, data: Any, setup: Any, points: Any) -> Any:
-    return jax.vmap(partial(chosen.sampler.init, data, setup))(points)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -90,7 +90,8 @@ def tuned(
         Told of what was found.
     """
     keys = jax.random.split(key, tuning.warm_up)
-    points, sizes, rates, path = _run(walk, tuning, data, setup, starts, keys, jnp.asarray(apart))
+    first = jax.vmap(partial(walk.init, data, setup))(starts)
+    points, sizes, rates, path = _run(walk, tuning, data, setup, first, keys, jnp.asarray(apart))
     setup, late = _sized(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     say(f"warm-up: step {float(setup.step_size):.2g}{trajectory}, acceptance {late:.0%}")
@@ -103,13 +104,13 @@ def _run(
     tuning: Tuning,
     data: Any,
     setup: Any,
-    starts: Any,
+    first: Any,
     keys: AnyArray,
     apart: AnyArray,
 ) -> tuple[Any, AnyArray, AnyArray, AnyArray | None]:
     """Estimands, step size by chain, and of every transition the acceptance and, if watched, the array u by chain."""
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
-    chains = len(next(iter(starts.values())))
+    chains = len(jax.tree.leaves(first)[0])
 
     def moved(state: Any, size: AnyArray, key: AnyArray) -> Any:
         now = _sized(tuning, setup, size)
@@ -124,8 +125,8 @@ def _run(
         u = jax.vmap(partial(walk.estimands, data, setup))(states)["u_boundary"] if tuning.watched else None
         return (states, averaging), (rates.mean(), u)
 
-    first = jax.vmap(partial(walk.init, data, setup))(starts), jax.vmap(begin)(jnp.full(chains, setup.step_size))
-    (states, averaging), (rates, path) = jax.lax.scan(one, first, keys)
+    averaging = jax.vmap(begin)(jnp.full(chains, setup.step_size))
+    (states, averaging), (rates, path) = jax.lax.scan(one, (first, averaging), keys)
     return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates, path
 
 

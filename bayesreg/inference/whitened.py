@@ -98,7 +98,8 @@ def setup_about(
     held = walls(centre, rows, jnp.arange(nodes))
     at = middle[first:].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
     nodes_alone = loose(reference, nodes, jnp.asarray(alone, int), at)
-    return Setup(reference, jnp.asarray(middle), held, jnp.asarray(FIRST_STEP), jnp.asarray(1), nothing, nodes_alone)
+    step_size, steps = jnp.asarray(FIRST_STEP), jnp.asarray(1, int)
+    return Setup(reference, jnp.asarray(middle), held, step_size, steps, nothing, nodes_alone)
 
 
 def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
@@ -142,6 +143,8 @@ class Walk:
     begin: Callable[[AnyArray, Callable], Any]
     density: Density
 
+    # Compiled by itself: the warm-up and the chains begin with the same program.
+    @partial(jax.jit, static_argnums=0)
     def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
         """The state of a chain there."""
         flat = ravel_pytree(self.target.unconstrain_of(data, estimands))[0]
@@ -264,9 +267,9 @@ def _warmed_up(
     """
     target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
     key_settle, key_tune, key_search = jax.random.split(key, 3)
-    begun = _averaged(target, mode, points)
+    begun = _averaged(target, mode, points, alone)
     _, points, settling = tuned(_conditioned(target, begun), walk, begun, points, key_settle, stage, apart=True)
-    setup = _averaged(target, mode, points)
+    setup = _averaged(target, mode, points, alone)
     setup, points, path = tuned(_conditioned(target, setup), walk, setup, points, key_tune, stage, say=say)
     if settling is None or path is None:
         return setup, points
@@ -323,17 +326,23 @@ def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _about(target: SmoothTarget, reference: Reference, middle: AnyArray) -> Setup:
+def _about(
+    target: SmoothTarget, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
+) -> Setup:
     """A setup before its tuning, with the stand-in about the middle."""
-    return setup_about(target, reference, middle)._replace(stand_in=stand_in(target, reference, jnp.asarray(middle)))
+    setup = setup_about(target, reference, middle, alone)
+    return setup._replace(stand_in=stand_in(target, reference, jnp.asarray(middle)))
 
 
-def _averaged(target: SmoothTarget, mode: AnyArray, points: Any) -> Setup:
-    """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there."""
+def _averaged(target: SmoothTarget, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
+    """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there.
+
+    Which nodes are moved alone is not known yet: the first stands for so many.
+    """
     flats = np.asarray(jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points))
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
-    return _about(target, averaged(target, places), np.mean(places, axis=0))
+    return _about(target, averaged(target, places), np.mean(places, axis=0), np.zeros(alone, int))
 
 
 def _overdispersed(target: SmoothTarget, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
