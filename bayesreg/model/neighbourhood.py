@@ -20,6 +20,8 @@ from bayesreg.types import AnyArray
 
 # Quadrature points that are looked at: as many as so many average cells have, those that follow a node the furthest.
 CELLS = 128
+# The number of nodes near them is a multiple of this, so that what is compiled for some nodes serves others, too.
+ROUND = 128
 # Quadrature points that are ranked at a time: there may be millions.
 AT_A_TIME = 100_000
 
@@ -34,7 +36,8 @@ class Neighbourhoods(NamedTuple):
     at : (k, 3) array
         Their displacements about which the neighbours' follow, mm.
     response : (n, 3, prescribed, 3) array
-        Displacement of the nodes near any of them for one of a prescribed node.
+        Displacement of the nodes near any of them, and of as many others as make a round number, for one of a
+        prescribed node.
     points : (k, p) int array
         Quadrature points that follow each.
     corners : (k, p, 4) int array
@@ -100,6 +103,8 @@ def neighbourhoods(
     follows = np.stack([following(points[which], which) for which in range(len(nodes))])
     touching = np.isin(mesh.cells, nodes).any(axis=1)
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
+    others = np.setdiff1d(np.arange(len(mesh.points)), near)
+    near = np.sort(np.concatenate([near, others[: -len(near) % ROUND]]))
     response = linear_response(system, matrix, near, prescribed)
     corners = np.searchsorted(near, mesh.cells[cell_of[points]])
     force = matrix[unknowns_of(nodes)][:, unknowns_of(near)] @ response
