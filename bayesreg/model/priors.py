@@ -97,8 +97,8 @@ _FAR = 30.0
 def _tail(z: AnyArray) -> AnyArray:
     """Φ(−|z|), above no further out than `_FAR`: next to one, nothing is left of the other tail.
 
-    All that is needed of Φ is made of one erfc: with Φ and log Φ of the library a quarter of the time that a gradient
-    takes to compile went into them.
+    All that is needed of Φ is made of one erfc: with Φ and log Φ of the library a good part of the time that a
+    gradient takes to compile went into them.
     """
     away = jnp.where(z < 0, -z, jnp.where(z < _FAR, z, _FAR))
     # The barrier keeps XLA from writing the whole of it into everything that follows.
