@@ -13,7 +13,7 @@ import scipy.linalg
 import scipy.sparse.linalg
 
 from bayesreg.fem.determinant import log_pseudo_determinant, schur_determinant
-from bayesreg.fem.elasticity import stiffness, unknowns_of
+from bayesreg.fem.elasticity import rigid_modes, stiffness, unknowns_of
 from bayesreg.fem.elements import elements_of
 from tests.phantoms import LAM, MU, box_mesh
 
@@ -24,11 +24,7 @@ def sparse_log_pdet(mesh, lam, mu):
     """log det K_{−J} − log det K_II − 2 log |det N_J| by SuperLU; J: six boundary unknowns that stop the motions N."""
     matrix = stiffness(mesh, lam, mu).tocsc()
     inner, outer = unknowns_of(mesh.interior), unknowns_of(mesh.boundary)
-    points = mesh.points[mesh.boundary] - mesh.points[mesh.boundary].mean(axis=0)
-    motions = np.concatenate(
-        [np.tile(np.eye(3), (len(points), 1)), *(np.cross(axis, points).reshape(-1, 1) for axis in np.eye(3))], axis=1
-    )
-    basis = np.linalg.qr(motions)[0]
+    basis = rigid_modes(mesh.points[mesh.boundary])
     held = scipy.linalg.qr(basis.T, pivoting=True, mode="r")[1][:6]
     kept = np.setdiff1d(np.arange(matrix.shape[0]), outer[held])
     null = 2 * np.linalg.slogdet(basis[held])[1]
