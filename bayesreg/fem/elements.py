@@ -1,8 +1,7 @@
 """Linear (P1) tetrahedra: shape gradients, displacement gradients and quadrature.
 
-Everything over cells keeps the cell as its *last* axis, and the sums over the four nodes and three axes
-are written out: XLA then fuses them into one pass over the cells, where an `einsum` over 3 × 4 blocks
-runs several times slower on the CPU.
+Everything over cells keeps the cell as its *last* axis, and small sums over nodes and axes are written out: XLA then
+fuses them into one pass over the cells, where an `einsum` over 3 × 4 blocks runs several times slower on the CPU.
 """
 
 from __future__ import annotations
@@ -12,8 +11,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 
+from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 
@@ -29,17 +30,29 @@ class Elements(NamedTuple):
         ∂N_a/∂x_i of each node's shape function, 1/mm.
     volumes : (m,) array
         mm³.
+    derivative : SparseOperator
+        (3m, n): nodal values to ∂/∂x_j in each cell, row j · m + cell.
     """
 
     cells: Int[AnyArray, "4 cells"]
     gradients: Float[AnyArray, "4 3 cells"]
     volumes: Float[AnyArray, "cells"]
+    derivative: SparseOperator
 
 
 def elements_of(mesh: TetMesh) -> Elements:
     """Shape gradients and volumes of a mesh."""
     gradients = np.moveaxis(shape_gradients(mesh), 0, -1)
-    return Elements(jnp.asarray(mesh.cells.T), jnp.asarray(gradients), jnp.asarray(mesh.volumes))
+    derivative = sparse_operator(derivative_matrix(mesh))
+    return Elements(jnp.asarray(mesh.cells.T), jnp.asarray(gradients), jnp.asarray(mesh.volumes), derivative)
+
+
+def derivative_matrix(mesh: TetMesh) -> scipy.sparse.csr_array:
+    """Nodal values to ∂/∂x_j in each cell, on the host: (3m, n), row j · m + cell."""
+    gradients = np.moveaxis(shape_gradients(mesh), 2, 0)
+    columns, starts = np.broadcast_to(mesh.cells, gradients.shape), np.arange(0, gradients.size + 1, 4)
+    shape = (3 * len(mesh.cells), len(mesh.points))
+    return scipy.sparse.csr_array((gradients.ravel(), columns.ravel(), starts), shape=shape)
 
 
 def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
@@ -51,12 +64,9 @@ def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
     return np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
 
 
-def displacement_gradient(elements: Elements, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "3 3 cells"]:
-    """∂u_k/∂x_j of every cell, first axis k, second axis j."""
-    nodal = [[u[:, k][elements.cells[a]] for k in range(3)] for a in range(4)]
-    return jnp.stack(
-        [jnp.stack([sum(elements.gradients[a, j] * nodal[a][k] for a in range(4)) for j in range(3)]) for k in range(3)]
-    )
+def displacement_gradient(derivative: SparseOperator, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "3 3 cells"]:
+    """∂u_k/∂x_j of every cell, first axis k, second axis j; `derivative` as in `Elements`."""
+    return jnp.moveaxis(derivative(u).reshape(3, -1, 3), -1, 0)
 
 
 class Quadrature(NamedTuple):
@@ -76,11 +86,24 @@ class Quadrature(NamedTuple):
     cells: Int[AnyArray, "points"]
     barycentric: Float[AnyArray, "points 4"]
     weights: Float[AnyArray, "points"]
+    interpolation: SparseOperator
 
     def positions(self, mesh: TetMesh) -> Float[np.ndarray, "points 3"]:
         """World position of every point, mm."""
         corners = mesh.points[mesh.cells[np.asarray(self.cells)]]
         return np.einsum("qa,qai->qi", np.asarray(self.barycentric), corners)
+
+
+def quadrature_at(
+    mesh: TetMesh,
+    cells: Int[np.ndarray, "points"],
+    barycentric: Float[np.ndarray, "points 4"],
+    weights: Float[np.ndarray, "points"],
+) -> Quadrature:
+    """Points of given weights (mm³) at barycentric coordinates in some cells."""
+    starts, shape = np.arange(0, 4 * len(cells) + 1, 4), (len(cells), len(mesh.points))
+    matrix = scipy.sparse.csr_array((barycentric.ravel(), mesh.cells[cells].ravel(), starts), shape=shape)
+    return Quadrature(jnp.asarray(cells), jnp.asarray(barycentric), jnp.asarray(weights), sparse_operator(matrix))
 
 
 # Four-point Gauss rule, exact for quadratics (the paper's; Zienkiewicz and Taylor).
@@ -103,11 +126,8 @@ def gauss_quadrature(mesh: TetMesh, rule: str = "gauss4") -> Quadrature:
     """
     barycentric = _subdivided(GAUSS_SUBDIVISIONS[rule])
     count, per_cell = len(mesh.cells), len(barycentric)
-    return Quadrature(
-        jnp.asarray(np.repeat(np.arange(count), per_cell)),
-        jnp.asarray(np.tile(barycentric, (count, 1))),
-        jnp.asarray(np.repeat(mesh.volumes / per_cell, per_cell)),
-    )
+    cells, weights = np.repeat(np.arange(count), per_cell), np.repeat(mesh.volumes / per_cell, per_cell)
+    return quadrature_at(mesh, cells, np.tile(barycentric, (count, 1)), weights)
 
 
 def _subdivided(levels: int) -> Float[np.ndarray, "points 4"]:

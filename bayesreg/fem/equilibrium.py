@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -11,16 +12,21 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
+from bayesreg.fem import preconditioners
 from bayesreg.fem.elasticity import (
+    force_between,
     internal_force,
     lame_by_cell,
+    rigid_modes,
     stiffness,
     stiffness_diagonal,
     strain_products,
     unknowns_of,
 )
-from bayesreg.fem.elements import Elements, elements_of
-from bayesreg.fem.preconditioners import ReferenceInverse, reference_inverse
+from bayesreg.fem.elements import Elements, derivative_matrix, elements_of
+from bayesreg.fem.multigrid import Multigrid, multigrid
+from bayesreg.fem.operators import SparseOperator, sparse_operator
+from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
 
@@ -39,18 +45,22 @@ class ElasticSystem(NamedTuple):
     elements : Elements
     prescribed, free : (b,), (f,) int arrays
         A partition of the nodes.
-    preconditioner : ReferenceInverse or None
-        See `bayesreg.fem.preconditioners`.
-    tolerance : scalar
+    derivative : SparseOperator
+        The columns of `elements.derivative` that belong to the free nodes.
+    preconditioner : ReferenceInverse, Multigrid or None
+        None where no node is free.
+    tolerance, adjoint_tolerance : scalar
         On the relative residual in the norm of the inverse diagonal of K, so that it also speaks for tissues a million
-        times softer than their neighbours.
+        times softer than their neighbours; of the equilibrium, and of the solve behind its derivative.
     """
 
     elements: Elements
     prescribed: Int[AnyArray, "prescribed"]
     free: Int[AnyArray, "free"]
-    preconditioner: ReferenceInverse | None
+    derivative: SparseOperator
+    preconditioner: ReferenceInverse | Multigrid | None
     tolerance: Scalar
+    adjoint_tolerance: Scalar
 
 
 class SolverInfo(NamedTuple):
@@ -67,8 +77,11 @@ def elastic_system(
     lam_reference: Float[AnyArray, "entries"],
     mu_reference: Float[AnyArray, "entries"],
     tolerance: float = TOLERANCE,
+    adjoint_tolerance: float | None = None,
 ) -> ElasticSystem:
     """Prepare the solves on a mesh whose `prescribed` nodes have given displacements.
+
+    The adjoint's tolerance is that of the equilibrium unless given.
 
     Raises
     ------
@@ -78,10 +91,24 @@ def elastic_system(
     free = np.setdiff1d(np.arange(len(mesh.points)), np.asarray(prescribed))
     degrees = unknowns_of(free)
     reference = stiffness(mesh, lam_reference, mu_reference)[degrees][:, degrees]
-    preconditioner = reference_inverse(reference) if len(free) else None
+    preconditioner = _preconditioner(reference, mesh.points[free]) if len(free) else None
     return ElasticSystem(
-        elements_of(mesh), jnp.asarray(prescribed), jnp.asarray(free), preconditioner, jnp.asarray(tolerance)
+        elements=elements_of(mesh),
+        prescribed=jnp.asarray(prescribed),
+        free=jnp.asarray(free),
+        derivative=sparse_operator(derivative_matrix(mesh)[:, free]),
+        preconditioner=preconditioner,
+        tolerance=jnp.asarray(tolerance),
+        adjoint_tolerance=jnp.asarray(tolerance if adjoint_tolerance is None else adjoint_tolerance),
     )
+
+
+def _preconditioner(
+    matrix: scipy.sparse.csr_matrix, points: Float[np.ndarray, "free 3"]
+) -> ReferenceInverse | Multigrid:
+    if matrix.shape[0] <= preconditioners.DENSE_LIMIT:
+        return preconditioners.reference_inverse(matrix)
+    return multigrid(matrix, rigid_modes(points))
 
 
 def equilibrium(
@@ -110,27 +137,26 @@ def _settled(
         fine = jnp.isfinite(u_given).all()
         return Equilibrium(u_given, jnp.zeros(()), jnp.zeros((), int), fine)
     load = -internal_force(system.elements, lam, mu, u_given)[system.free]
-    u_free, info = _response(system, lam, mu, load, guess)
+    u_free, info = _response(system, lam, mu, load, system.tolerance, guess)
     u = u_given.at[system.free].set(u_free)
     # A node whose cells have no free node never enters the solve, but must be finite all the same.
     return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
 
 
 def _response(
-    system: ElasticSystem, lam: AnyArray, mu: AnyArray, load: AnyArray, guess: AnyArray | None = None
+    system: ElasticSystem,
+    lam: AnyArray,
+    mu: AnyArray,
+    load: AnyArray,
+    tolerance: AnyArray,
+    guess: AnyArray | None = None,
 ) -> tuple[AnyArray, SolverInfo]:
     """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
-    elements, prescribed, free, reference, tolerance = system
-    nodes = len(prescribed) + len(free)
-
-    def apply(u_free: AnyArray) -> AnyArray:
-        u = jnp.zeros((nodes, 3)).at[free].set(u_free)
-        return internal_force(elements, lam, mu, u)[free]
-
+    elements, free, precondition = system.elements, system.free, system.preconditioner
+    assert precondition is not None
+    apply = partial(force_between, system.derivative, elements.volumes, lam, mu)
+    nodes = len(system.prescribed) + len(free)
     inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(elements, lam, mu, nodes)[free])
-
-    def precondition(r: AnyArray) -> AnyArray:
-        return inverse_diagonal * r if reference is None else reference(r)
 
     def solve(apply: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
         first = None if guess is None else guess[free]
@@ -156,17 +182,14 @@ def _forward(
 def _backward(
     kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
 ) -> tuple[None, AnyArray, AnyArray, AnyArray]:
-    """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
-
-    Written out, for what is derived from the solve by transposing its gathers runs several times slower on the CPU.
-    """
+    """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u."""
     system, lam, mu, u = kept
     bar = cotangent.u
     if len(system.free) == 0:
         return None, jnp.zeros_like(lam), jnp.zeros_like(mu), bar[system.prescribed]
-    w_free, _ = _response(system, lam, mu, bar[system.free])
+    w_free, _ = _response(system, lam, mu, bar[system.free], system.adjoint_tolerance)
     w = jnp.zeros_like(u).at[system.free].set(w_free)
-    dilatation, distortion = strain_products(system.elements, u, w)
+    dilatation, distortion = strain_products(system.elements.derivative, u, w)
     reaction = internal_force(system.elements, lam, mu, w)
     volumes = system.elements.volumes
     return None, -volumes * dilatation, -volumes * distortion, (bar - reaction)[system.prescribed]
@@ -223,7 +246,7 @@ def linear_response(
     Parameters
     ----------
     system : ElasticSystem
-        With a preconditioner, or without free nodes.
+        With a dense preconditioner, or without free nodes.
     matrix : (3n, 3n) sparse matrix
         K, at the λ and μ that the system is preconditioned at.
     nodes : (k,) int array
@@ -240,7 +263,7 @@ def linear_response(
     response = (unknowns_of(nodes)[:, None] == unknowns_of(moved)).astype(float)
     if not np.isin(nodes, free).any():
         return response
-    assert system.preconditioner is not None
+    assert isinstance(system.preconditioner, ReferenceInverse)
     scale = np.asarray(system.preconditioner.scale)
     wanted = unknowns_of(np.searchsorted(free, nodes[np.isin(nodes, free)]))
     inverse = np.asarray(system.preconditioner.inverse)[wanted]

@@ -50,8 +50,8 @@ class ReferenceInverse(NamedTuple):
         return (self.scale * (self.inverse @ scaled)).reshape(residual.shape)
 
 
-def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse | None:
-    """Dense inverse of the interior stiffness at the reference parameters.
+def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
+    """Dense inverse of the interior stiffness at the reference parameters, for at most some `DENSE_LIMIT` unknowns.
 
     Parameters
     ----------
@@ -60,16 +60,13 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse | Non
 
     Returns
     -------
-    ReferenceInverse or None
-        None where k exceeds `DENSE_LIMIT`: the solve is then preconditioned by the diagonal alone.
+    ReferenceInverse
 
     Raises
     ------
     InputError
         If the matrix is not positive definite: the prescribed nodes do not hold the mesh.
     """
-    if matrix.shape[0] > DENSE_LIMIT:
-        return None
     found = _scaled_factor(matrix)
     if found is None:
         raise InputError(SINGULAR)

@@ -16,7 +16,6 @@ from bayesreg.fem.preconditioners import solved
 from bayesreg.mesh import TetMesh
 from bayesreg.model.program import RegistrationData
 from bayesreg.model.similarity import SIMILARITIES, Noise
-from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray
 
 
@@ -133,7 +132,7 @@ def _point_curvature(
     With e(m) the energy of a point, e″ ∇m ∇mᵀ + e′ ∇²m.
     """
     quadrature = data.quadrature
-    moved = data.positions + displacement_at(data.system.elements, quadrature, u)
+    moved = data.positions + quadrature.interpolation(u)
 
     def slope(x: AnyArray) -> AnyArray:
         return jax.grad(lambda x: data.moving(x).sum())(x)

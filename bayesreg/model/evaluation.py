@@ -12,7 +12,6 @@ from numpyro.infer.util import log_density
 
 from bayesreg.model.coordinates import FIELD, LAME
 from bayesreg.model.program import RegistrationData, log_elastic_normaliser, registration
-from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -79,5 +78,5 @@ def log_normaliser(data: RegistrationData, values: dict[str, AnyArray]) -> Scala
 @jax.jit
 def residuals(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
     """f(x_q) − m(x_q + u(x_q))."""
-    displacement = displacement_at(data.system.elements, data.quadrature, u)
+    displacement = data.quadrature.interpolation(u)
     return data.fixed_values - data.moving(data.positions + displacement)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
+from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model import evaluation
@@ -42,6 +43,10 @@ CHEAP_NODES = 200
 
 # Of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance can tell.
 CHAIN_TOLERANCE = 1e-6
+
+# Of the solves behind their slopes. A slope that is a little off, and the same at the same place, leaves what is
+# sampled as it is: it only proposes.
+CHAIN_ADJOINT_TOLERANCE = 1e-3
 
 # Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
 NEAR = 1e3
@@ -206,7 +211,7 @@ class Posterior:
         reference = {name: np.asarray(getattr(self.data, name).reference) for name in LAME}
         near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
         lam, mu = (tuple(by_cell.tolist()) for by_cell in lame_by_cell(self.data, {**values, **near}))
-        system = _conditioned_system(self, lam, mu, CHAIN_TOLERANCE)
+        system = _conditioned_system(self, lam, mu, CHAIN_TOLERANCE, CHAIN_ADJOINT_TOLERANCE)
         rows = np.zeros(0, int) if alone is None else np.asarray(alone)
         slots, at = np.asarray(self.data.slots)[rows], np.asarray(estimands["u_boundary"])[rows]
         around = neighbourhoods(self.mesh, system, data.quadrature, np.array(lam), np.array(mu), slots, rows, at)
@@ -215,7 +220,7 @@ class Posterior:
     @property
     def knows_neighbourhoods(self) -> bool:
         """Whether data can be conditioned for `local_logdensity`: a dense preconditioner says what follows a node."""
-        return self.data.system.preconditioner is not None or not len(self.data.system.free)
+        return isinstance(self.data.system.preconditioner, ReferenceInverse) or not len(self.data.system.free)
 
     def local_logdensity(
         self, data: RegistrationData, estimands: Values, which: Int[AnyArray, ""]
@@ -413,7 +418,7 @@ def _settled(posterior: Posterior, data: RegistrationData, estimands: Values) ->
 
 @lru_cache(maxsize=2)
 def _conditioned_system(
-    posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...], tolerance: float
+    posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...], *tolerances: float
 ) -> ElasticSystem:
     prescribed = np.asarray(posterior.data.system.prescribed)
-    return elastic_system(posterior.mesh, prescribed, np.array(lam), np.array(mu), tolerance)
+    return elastic_system(posterior.mesh, prescribed, np.array(lam), np.array(mu), *tolerances)

@@ -12,7 +12,7 @@ from scipy.special import betaln
 from bayesreg.distance import signed_distance
 from bayesreg.fem.determinant import schur_determinant
 from bayesreg.fem.elasticity import rigid_modes
-from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature
+from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import locate
 from bayesreg.image import Image, Interpolation, Interpolator
@@ -285,4 +285,4 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
     if not inside.any():
         raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
     weights = np.full(inside.sum(), fixed.voxel_volume)
-    return Quadrature(jnp.asarray(cells[inside]), jnp.asarray(barycentric[inside]), jnp.asarray(weights))
+    return quadrature_at(mesh, cells[inside], barycentric[inside], weights)

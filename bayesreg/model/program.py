@@ -22,7 +22,6 @@ from bayesreg.model.field import StiffnessField
 from bayesreg.model.neighbourhood import Neighbourhoods
 from bayesreg.model.priors import ScaledBeta
 from bayesreg.model.similarity import SIMILARITIES, Noise
-from bayesreg.model.warp import displacement_at
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -151,7 +150,7 @@ def registration(
     state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, guess)
 
     elements, quadrature = data.system.elements, data.quadrature
-    moved = data.positions + displacement_at(elements, quadrature, state.u)
+    moved = data.positions + quadrature.interpolation(state.u)
     likelihood, noise = SIMILARITIES[similarity], Noise(t_similarity, data.degrees_of_freedom)
     similarity_energy = likelihood.energy(data.fixed_values, data.moving(moved), quadrature.weights, noise)
     strain_energy = total_strain_energy(elements, lam_cells, mu_cells, state.u)

@@ -6,24 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.fem.elements import Elements, Quadrature, displacement_gradient, elements_of
+from bayesreg.fem.elements import displacement_gradient, elements_of
 from bayesreg.fem.location import locate
 from bayesreg.image import Image, Interpolation
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 
 
-def displacement_at(
-    elements: Elements, quadrature: Quadrature, u: Float[AnyArray, "nodes 3"]
-) -> Float[AnyArray, "points 3"]:
-    """u(x_q) = Σ_a N_a(x_q) u_a at every quadrature point, mm."""
-    nodal = u[elements.cells[:, quadrature.cells]]
-    return sum(quadrature.barycentric[:, a, None] * nodal[a] for a in range(4))
-
-
 def volume_ratio(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "cells"]:
     """det F = det(I + ∇u) of every cell: its volume after the deformation over that before."""
-    gradient = displacement_gradient(elements_of(mesh), jnp.asarray(u))
+    gradient = displacement_gradient(elements_of(mesh).derivative, jnp.asarray(u))
     return jnp.linalg.det(jnp.moveaxis(gradient, -1, 0) + jnp.eye(3))
 
 

@@ -11,6 +11,7 @@ from bayesreg.model.posterior import build_posterior
 from tests.oracles.paper import Paper
 from tests.phantoms import ball_mesh, smooth_image
 
+REPETITIONS = 9
 STEPS_PER_SECOND = 50  # What each of three chains should make on two cores; the paper's made 5.
 
 
@@ -20,42 +21,41 @@ def _posterior(model: ModelConfig):
     return build_posterior(fixed, smooth_image(mesh.points, (60, 60, 60), seed=1), mesh, model)
 
 
-def bench_density():
-    for interpolation in ("linear", "cubic"):
-        posterior = _posterior(ModelConfig(interpolation=interpolation))
-        position = posterior.initial(jax.random.key(0))
-        for name, function in (
-            ("density", jax.jit(posterior.logdensity)),
-            ("gradient", jax.jit(jax.grad(posterior.logdensity))),
-        ):
-            jax.block_until_ready(function(position))
-            start = time.perf_counter()
-            for _ in range(20):
-                jax.block_until_ready(function(position))
-            print(f"\n{interpolation} {name}: {(time.perf_counter() - start) / 20 * 1e3:.1f} ms", end="")
-
-
-def bench_density_against_numpy_and_scipy():
-    """One density of three chains against the plain transcription in tests/oracles (SuperLU, map_coordinates)."""
-    posterior = _posterior(ModelConfig())
-    mesh, chains = posterior.mesh, 3
+def bench_density_and_gradient():
+    """Of 1, 4 and 16 chains, beside the plain transcription in tests/oracles (SuperLU, map_coordinates) for each."""
+    posteriors = {method: _posterior(ModelConfig(interpolation=method)) for method in ("linear", "cubic")}
+    mesh = posteriors["linear"].mesh
     images = [smooth_image(mesh.points, (60, 60, 60), seed=seed) for seed in (0, 1)]
-    arrays = [(image.voxels, image.affine) for image in images]
-    peer = Paper(mesh.points, mesh.cells, mesh.tissue, *arrays, mesh.boundary)
-    values = posterior.constrain(posterior.initial(jax.random.key(0)))
-    estimands = jax.tree.map(lambda x: np.tile(x, (chains,) + (1,) * x.ndim), posterior.estimands(values))
-    evaluate = jax.jit(jax.vmap(posterior.evaluate_estimands, in_axes=(None, 0)))
-    arguments = [np.asarray(values[name]) for name in ("u_boundary", "lam", "mu")]
-    ratios = []
-    jax.block_until_ready(evaluate(posterior.data, estimands))
-    for _ in range(10):
+    peer = Paper(mesh.points, mesh.cells, mesh.tissue, *((i.voxels, i.affine) for i in images), mesh.boundary)
+    print(f"\n{len(mesh.points)} nodes, {len(mesh.cells)} elements; medians of {REPETITIONS}")
+    for method, posterior in posteriors.items():
+        values = posterior.constrain(posterior.initial(jax.random.key(0)))
+        arguments = [np.asarray(values[name]) for name in ("u_boundary", "lam", "mu")]
+        data = posterior.conditioned(posterior.estimands(values))
+        for chains in (1, 4, 16):
+            keys = jax.random.split(jax.random.key(0), chains)
+            positions = jax.vmap(posterior.initial)(keys)
+            of_all = jax.vmap(posterior.logdensity_of, in_axes=(None, 0))
+            slopes = jax.vmap(jax.value_and_grad(posterior.logdensity_of, argnums=1), in_axes=(None, 0))
+            density, gradient = (_median(jax.jit(f), data, positions) for f in (of_all, slopes))
+            text = (
+                f"{method}, {chains} chains: density {density * 1e3:.1f} ms, gradient {gradient / density:.2f} as long"
+            )
+            if method == "linear":
+                text += (
+                    f"; {chains * _median(peer.logdensity, *arguments) / density:.1f} times as fast as NumPy and SciPy"
+                )
+            print(text, flush=True)
+
+
+def _median(function, *arguments):
+    jax.block_until_ready(function(*arguments))
+    seconds = []
+    for _ in range(REPETITIONS):
         start = time.perf_counter()
-        jax.block_until_ready(evaluate(posterior.data, estimands))
-        middle = time.perf_counter()
-        for _ in range(chains):
-            peer.logdensity(*arguments)
-        ratios.append((time.perf_counter() - middle) / (middle - start))
-    print(f"\ndensity of {chains} chains: {np.median(ratios):.1f} times as fast as NumPy and SciPy", end="")
+        jax.block_until_ready(function(*arguments))
+        seconds.append(time.perf_counter() - start)
+    return np.median(seconds)
 
 
 def bench_steps_of_the_papers_sampler():

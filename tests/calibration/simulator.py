@@ -17,7 +17,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 import bayesreg as br
-from bayesreg.model.warp import displacement_at
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
@@ -144,7 +143,7 @@ class Simulator:
 def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
     """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
     u = posterior.evaluate_estimands(posterior.without_normaliser(data), estimands).u
-    predicted = data.moving(data.positions + displacement_at(data.system.elements, data.quadrature, u))
+    predicted = data.moving(data.positions + data.quadrature.interpolation(u))
     t_similarity = estimands.get("t_similarity", data.t_similarity)
     sd = jnp.sqrt(t_similarity / (2 * data.quadrature.weights))
     return predicted + sd * jax.random.normal(key, predicted.shape)

@@ -38,13 +38,14 @@ def test_the_density_of_chains_is_the_density_to_a_hundredth():
         assert 0 < abs(near.logdensity - exact.logdensity) < 0.01
 
 
-def test_solves_a_hundred_times_as_exact_give_the_same_draws():
-    post, chains = posterior(), 4
+@cache
+def chains():
+    """Data conditioned for chains, and (data) → where 60 transitions of 4 chains lead, and how probably they go."""
+    post, count = posterior(), 4
     estimands = post.estimands(post.reference())
     flat = np.asarray(ravel_pytree(post.unconstrain_of(post.data, estimands))[0])
     setup = setup_about(post, laplace(post, flat), flat)._replace(step_size=jnp.asarray(0.3), steps=jnp.asarray(5))
     kernel = SAMPLERS["hmc"](post)
-    conditioned = post.conditioned(estimands)
 
     @jax.jit
     def draws(data):
@@ -52,12 +53,31 @@ def test_solves_a_hundred_times_as_exact_give_the_same_draws():
             states, info = jax.vmap(partial(kernel.step, data, setup))(keys, states)
             return states, (states.position, info.acceptance_rate)
 
-        states = jax.vmap(lambda _: kernel.init(data, setup, estimands))(jnp.arange(chains))
-        return jax.lax.scan(step, states, jax.random.split(jax.random.key(0), (60, chains)))[1]
+        states = jax.vmap(lambda _: kernel.init(data, setup, estimands))(jnp.arange(count))
+        return jax.lax.scan(step, states, jax.random.split(jax.random.key(0), (60, count)))[1]
 
-    system = conditioned.system
+    return post.conditioned(estimands), draws
+
+
+def with_tolerances(data, solve, slope):
+    system = data.system
+    tolerances = {"tolerance": system.tolerance / solve, "adjoint_tolerance": system.adjoint_tolerance / slope}
+    return data._replace(system=system._replace(**tolerances))
+
+
+def test_solves_a_hundred_times_as_exact_give_the_same_draws():
+    conditioned, draws = chains()
     found, rate = draws(conditioned)
-    expected, _ = draws(conditioned._replace(system=system._replace(tolerance=system.tolerance / 100)))
+    expected, _ = draws(with_tolerances(conditioned, 100, 1))
     assert 0.5 < rate.mean() < 0.999
     # In standard deviations of the reference.
     assert 0 < abs(found - expected).max() < 0.01
+
+
+def test_slopes_a_million_times_as_exact_are_accepted_no_more_often():
+    """A slope only proposes: what it is off by may cost acceptance, and does not."""
+    conditioned, draws = chains()
+    (found, rate), (exact, best) = draws(conditioned), draws(with_tolerances(conditioned, 1, 1e6))
+    # After one transition, before what is rounding to a trajectory grows.
+    assert 0 < abs(found[0] - exact[0]).max() < 0.01
+    assert abs(rate.mean() - best.mean()) < 0.01

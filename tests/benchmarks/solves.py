@@ -1,0 +1,200 @@
+"""A hundred interior solves, each at its own λ and μ, beside other libraries on the same systems.
+
+    python -m tests.benchmarks.solves [--nodes 5000 30000 100000] [--solves 100] [--chains 20]
+
+A ball of three shells, λ and μ scattered about the reference by a factor of 1.35, displacements of the boundary random.
+Every solve ends at 1e-8 of the load in the norm of the inverse diagonal. Set-up is counted, ours and PyAMG's once,
+at the reference; a direct solver factors every matrix. Slow peers make fewer solves, whose time is scaled up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from jaxtyping import Float
+
+from bayesreg.fem.elasticity import rigid_modes, stiffness, unknowns_of
+from bayesreg.fem.equilibrium import ElasticSystem, elastic_system, equilibrium
+from bayesreg.mesh import TetMesh
+from tests.phantoms import LAM, MU, ball_mesh
+
+TOLERANCE, SPREAD, LONGEST = 1e-8, 0.3, 60.0
+
+System = tuple[scipy.sparse.csr_array, np.ndarray]
+Solve = Callable[[scipy.sparse.csr_array, np.ndarray], np.ndarray]
+
+
+def main() -> None:
+    """Print a table for each mesh."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--nodes", type=int, nargs="+", default=[5_000, 30_000, 100_000])
+    parser.add_argument("--solves", type=int, default=100)
+    parser.add_argument("--chains", type=int, default=20, help="solved side by side, as columns")
+    options = parser.parse_args()
+    for nodes in options.nodes:
+        compare(mesh_of(nodes), options.solves, options.chains)
+
+
+def mesh_of(nodes: int) -> TetMesh:
+    """A ball of about so many nodes."""
+    # A body-centred lattice of spacing s has two nodes in s³.
+    return ball_mesh(radius=80.0, spacing=(2 * 4 / 3 * np.pi * 80.0**3 / nodes) ** (1 / 3))
+
+
+def compare(mesh: TetMesh, solves: int, chains: int) -> None:
+    """Time all ways on one mesh, and check that they agree."""
+    rng = np.random.default_rng(0)
+    lam, mu = (values * np.exp(SPREAD * rng.normal(size=(solves, 3))) for values in (LAM, MU))
+    u = rng.normal(size=(solves, len(mesh.boundary), 3))
+    print(f"\n{len(mesh.points):,} nodes, {3 * len(mesh.interior):,} unknowns; seconds for {solves} solves")
+    ours, expected = _ours(mesh, lam, mu, u, chains)
+    peers: dict[str, Callable[[TetMesh], Solve]] = {
+        "PyAMG and CG": _pyamg,
+        "cholespy": _cholespy,
+        "SuperLU": _superlu,
+    }
+    for name, setup in peers.items():
+        seconds, worst, made = _peer(mesh, setup, lam, mu, u, expected)
+        print(
+            f"  {name:14s} {seconds:9.1f}  {seconds / ours:6.2f} times ours  ({made} made, off by {worst:.0e})",
+            flush=True,
+        )
+
+
+def _ours(mesh: TetMesh, lam: np.ndarray, mu: np.ndarray, u: np.ndarray, chains: int) -> tuple[float, np.ndarray]:
+    begun = time.perf_counter()
+    system = elastic_system(mesh, mesh.boundary, LAM, MU, TOLERANCE)
+    jax.block_until_ready(system)
+    ready = time.perf_counter()
+    shape = jax.eval_shape(lambda: jnp.zeros((chains, *u.shape[1:])))
+    entries = jax.eval_shape(lambda: jnp.zeros((chains, 3)))
+    tissue = jnp.asarray(mesh.tissue)
+
+    @jax.jit
+    def many(system: ElasticSystem, lam: jax.Array, mu: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = jax.vmap(lambda lam, mu, u: equilibrium(system, lam[tissue], mu[tissue], u))(lam, mu, u)
+        return found.u, jnp.where(found.converged, found.iterations, -1)
+
+    compiled = many.lower(system, entries, entries, shape).compile()
+    compiling = time.perf_counter() - ready
+    begun += compiling
+    found, iterations = zip(
+        *(compiled(system, *(jnp.asarray(x[i : i + chains]) for x in (lam, mu, u))) for i in range(0, len(u), chains)),
+        strict=True,
+    )
+    found, iterations = np.concatenate(found), np.concatenate(iterations)
+    seconds = time.perf_counter() - begun
+    print(
+        f"  {'bayesreg':14s} {seconds:9.1f}  of which set-up {ready - begun + compiling:.1f}; compiling, not "
+        f"counted, {compiling:.1f}; {iterations.min()} to {iterations.max()} iterations",
+        flush=True,
+    )
+    return seconds, found[:, mesh.interior].reshape(len(u), -1)
+
+
+def _peer(
+    mesh: TetMesh,
+    setup: Callable[[TetMesh], Solve],
+    lam: np.ndarray,
+    mu: np.ndarray,
+    u: np.ndarray,
+    expected: Float[np.ndarray, "solves unknowns"],
+) -> tuple[float, float, int]:
+    """Seconds for all solves, the greatest relative difference from what we found, and how many were made."""
+    begun = time.perf_counter()
+    solve, system = setup(mesh), _systems(mesh)
+    setting_up, worst, made = time.perf_counter() - begun, 0.0, 0
+    begun = time.perf_counter()
+    for each in zip(lam, mu, u, strict=True):
+        found = solve(*system(*each))
+        worst = max(worst, float(abs(found - expected[made]).max() / abs(expected[made]).max()))
+        made += 1
+        if time.perf_counter() - begun > LONGEST:
+            break
+    return setting_up + (time.perf_counter() - begun) * len(u) / made, worst, made
+
+
+def _systems(mesh: TetMesh) -> Callable[[np.ndarray, np.ndarray, np.ndarray], System]:
+    """λ, μ and u_B to K_II and −K_IB u_B: an affine sum of the data of stored matrices of one pattern."""
+    free, given = unknowns_of(mesh.interior), unknowns_of(mesh.boundary)
+    parts = [stiffness(mesh, *pair)[free] for e in np.eye(3) for pair in ((e, 0 * e), (0 * e, e))]
+    whole = stiffness(mesh, np.ones(3), np.ones(3))[free]
+    whole.data[:] = 1.0
+    patterns = [scipy.sparse.csr_array(whole[:, these]) for these in (free, given)]
+    data = [
+        np.array([_with_pattern(part[:, these], pattern) for part in parts])
+        for these, pattern in zip((free, given), patterns, strict=True)
+    ]
+
+    def system(lam: np.ndarray, mu: np.ndarray, u: np.ndarray) -> System:
+        theta = np.column_stack([lam, mu]).ravel()
+        inner, outer = (
+            scipy.sparse.csr_array((theta @ stored, pattern.indices, pattern.indptr), shape=pattern.shape)
+            for stored, pattern in zip(data, patterns, strict=True)
+        )
+        return inner, -outer @ u.ravel()
+
+    return system
+
+
+def _with_pattern(matrix: scipy.sparse.csr_matrix, pattern: scipy.sparse.csr_array) -> np.ndarray:
+    """The data of a matrix in the places of a pattern that contains its own."""
+    found = (pattern + matrix).tocsr()
+    found.sort_indices()
+    pattern.sort_indices()
+    return found.data - pattern.data
+
+
+def _pyamg(mesh: TetMesh) -> Solve:
+    import pyamg
+
+    free = unknowns_of(mesh.interior)
+    reference = scipy.sparse.bsr_array(stiffness(mesh, LAM, MU)[free][:, free], blocksize=(3, 3))
+    hierarchy = pyamg.smoothed_aggregation_solver(
+        reference, rigid_modes(mesh.points[mesh.interior]), strength=("symmetric", {"theta": 0.08}), max_coarse=600
+    )
+    cycle = hierarchy.aspreconditioner()
+
+    def solve(matrix: scipy.sparse.csr_array, load: np.ndarray) -> np.ndarray:
+        # SciPy stops by the plain norm: exactly as far as ours it goes in the coordinates scaled by the diagonal.
+        root = np.sqrt(matrix.diagonal())
+        scaled = scipy.sparse.linalg.LinearOperator(matrix.shape, lambda x: (matrix @ (x / root)) / root)
+        precondition = scipy.sparse.linalg.LinearOperator(matrix.shape, lambda x: root * (cycle @ (root * x)))
+        found, failed = scipy.sparse.linalg.cg(scaled, load / root, rtol=TOLERANCE, M=precondition)
+        assert not failed
+        return found / root
+
+    return solve
+
+
+def _cholespy(mesh: TetMesh) -> Solve:
+    from cholespy import CholeskySolverD, MatrixType
+
+    def solve(matrix: scipy.sparse.csr_array, load: np.ndarray) -> np.ndarray:
+        factor = CholeskySolverD(
+            matrix.shape[0],
+            matrix.indptr.astype(np.int32),
+            matrix.indices.astype(np.int32),
+            matrix.data,
+            MatrixType.CSR,
+        )
+        found = np.zeros_like(load)
+        factor.solve(load, found)
+        return found
+
+    return solve
+
+
+def _superlu(mesh: TetMesh) -> Solve:
+    return lambda matrix, load: scipy.sparse.linalg.splu(matrix.tocsc(), permc_spec="COLAMD").solve(load)
+
+
+if __name__ == "__main__":
+    main()

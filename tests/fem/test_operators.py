@@ -1,0 +1,125 @@
+"""Sparse products on the device against SciPy's, for any number of columns, under vmap and differentiated."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+
+from bayesreg.fem.elasticity import force_between, internal_force, stiffness
+from bayesreg.fem.elements import displacement_gradient, elements_of, gauss_quadrature
+from bayesreg.fem.operators import product, sparse_operator, with_chains_as_columns
+from tests.phantoms import LAM, MU, ball_mesh
+
+MESH = ball_mesh(spacing=20.0)
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def matrix():
+    """An empty row, an empty column and entries given in two parts among the others."""
+    dense = RNG.normal(size=(13, 9)) * (RNG.random((13, 9)) < 0.4)
+    dense[4], dense[:, 2] = 0, 0
+    parts = scipy.sparse.coo_array(dense)
+    data, row, column = np.tile(parts.data / 2, 2), np.tile(parts.row, 2), np.tile(parts.col, 2)
+    return scipy.sparse.coo_array((data, (row, column)), shape=dense.shape)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3, 4, 5, 12])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_product_is_scipys(matrix, columns, dtype):
+    operator, x = sparse_operator(matrix.astype(dtype)), RNG.normal(size=(9, columns)).astype(dtype)
+    found = jax.jit(lambda operator, x: operator(x))(operator, x)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, matrix @ x, atol=50 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(operator.transpose(matrix @ x), matrix.T @ (matrix @ x), atol=1e3 * np.finfo(dtype).eps)
+
+
+def test_chains_and_candidates_join_the_columns(matrix):
+    operator, x = sparse_operator(matrix), RNG.normal(size=(3, 2, 9, 5))
+    found = jax.jit(jax.vmap(jax.vmap(operator)))(x)
+    np.testing.assert_allclose(found, np.einsum("rs,abst->abrt", matrix.toarray(), x), atol=1e-13)
+    other_axis = jax.vmap(operator, in_axes=2, out_axes=2)(x[0].swapaxes(0, 1).swapaxes(1, 2))
+    np.testing.assert_allclose(other_axis, np.einsum("rs,ast->rta", matrix.toarray(), x[0]), atol=1e-13)
+
+
+def test_the_derivative_is_the_transposed_product(matrix):
+    operator, x, weight = sparse_operator(matrix), RNG.normal(size=(4, 9, 3)), RNG.normal(size=(13, 3))
+    dense = matrix.toarray()
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: (weight * operator(x) ** 2).sum())))(x)
+    expected = [dense.T @ (2 * weight * (dense @ one)) for one in x]
+    np.testing.assert_allclose(slope, expected, atol=1e-12)
+
+
+def test_a_chain_that_is_not_a_number_leaves_the_others_alone(matrix):
+    operator, x = sparse_operator(matrix), RNG.normal(size=(5, 9, 3))
+    x[2] = np.nan
+    found = np.asarray(jax.vmap(operator)(x))
+    np.testing.assert_allclose(found[[0, 1, 3, 4]], [matrix @ x[i] for i in (0, 1, 3, 4)], atol=1e-13)
+
+
+@with_chains_as_columns
+def weighted(shared, x, y):
+    return shared[:, None] * x * y
+
+
+def test_arguments_that_chains_do_not_have_are_repeated():
+    shared, x, y = np.arange(3.0), np.ones((3, 1)), RNG.normal(size=(4, 3, 1))
+    found = jax.vmap(lambda y: weighted(jnp.asarray(shared), jnp.asarray(x), y))(y)
+    np.testing.assert_allclose(found, shared[:, None] * y)
+
+
+def test_what_chains_share_cannot_differ():
+    with pytest.raises(NotImplementedError, match="what weighted shares among chains"):
+        jax.vmap(weighted)(np.ones((2, 3)), np.ones((2, 3, 1)), np.ones((2, 3, 1)))
+
+
+def test_columns_that_are_not_aligned_are_the_same(matrix):
+    """What is padded never shows: neither in the values nor in their number."""
+    on_device, x = sparse_operator(matrix).matrix, RNG.normal(size=(9, 7))
+    np.testing.assert_array_equal(product(on_device, jnp.asarray(x[:, :3])), product(on_device, jnp.asarray(x))[:, :3])
+
+
+def test_displacements_and_gradients_of_a_linear_field():
+    slope, shift = RNG.normal(size=(3, 3)), RNG.normal(size=3)
+    u = MESH.points @ slope.T + shift
+    found = displacement_gradient(elements_of(MESH).derivative, jnp.asarray(u))
+    np.testing.assert_allclose(found, np.repeat(slope[:, :, None], len(MESH.cells), axis=2), atol=1e-12)
+    quadrature = gauss_quadrature(MESH)
+    places = quadrature.positions(MESH)
+    np.testing.assert_allclose(quadrature.interpolation(jnp.asarray(u)), places @ slope.T + shift, atol=1e-12)
+
+
+@pytest.mark.parametrize("batched", [(0, 0, 0), (None, None, 0), (0, None, None), (None, 0, 0)])
+def test_forces_of_chains_are_those_of_the_assembled_matrix(batched):
+    elements, chains = elements_of(MESH), 3
+    full = [RNG.uniform(1, 2, (chains, len(MESH.cells))), RNG.uniform(1, 2, (chains, len(MESH.cells)))]
+    full.append(RNG.normal(size=(chains, *MESH.points.shape)))
+    given = [x if axis == 0 else x[0] for x, axis in zip(full, batched, strict=True)]
+    found = jax.vmap(lambda *x: internal_force(elements, *x), in_axes=batched)(*map(jnp.asarray, given))
+    for chain in range(chains):
+        lam, mu, u = (x[chain] if axis == 0 else x[0] for x, axis in zip(full, batched, strict=True))
+        expected = stiffness(MESH, lam, mu) @ u.ravel()
+        np.testing.assert_allclose(np.ravel(found[chain]), expected, atol=1e-10)
+
+
+def test_derivatives_of_a_block_of_forces():
+    """In λ, μ and u, against differences: forces are linear in each."""
+    elements, some = elements_of(MESH), np.arange(0, len(MESH.points), 2)
+    derivative = sparse_operator(scipy.sparse.csr_array(np.asarray(elements.derivative.matrix.todense()))[:, some])
+    lam, mu = (jnp.asarray(values[MESH.tissue]) for values in (LAM, MU))
+    u, weight = (jnp.asarray(RNG.normal(size=(len(some), 3))) for _ in range(2))
+
+    def work(lam, mu, u):
+        return (weight * force_between(derivative, elements.volumes, lam, mu, u)).sum()
+
+    slopes = jax.grad(work, argnums=(0, 1, 2))(lam, mu, u)
+    for place, slope in enumerate(slopes):
+        way = jnp.asarray(RNG.normal(size=slope.shape))
+        ends = [[lam, mu, u], [lam, mu, u]]
+        for end, sign in zip(ends, (1, -1), strict=True):
+            end[place] = end[place] + sign * way
+        expected = float(work(*ends[0]) - work(*ends[1])) / 2
+        assert float((slope * way).sum()) == pytest.approx(expected, rel=1e-9)
