@@ -152,8 +152,9 @@ def _response(
     guess: AnyArray | None = None,
 ) -> tuple[AnyArray, SolverInfo]:
     """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
-    elements, free, precondition = system.elements, system.free, system.preconditioner
-    assert precondition is not None
+    elements, free = system.elements, system.free
+    assert system.preconditioner is not None
+    precondition = system.preconditioner.__call__
     apply = partial(force_between, system.derivative, elements.volumes, lam, mu)
     nodes = len(system.prescribed) + len(free)
     inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(elements, lam, mu, nodes)[free])

@@ -56,8 +56,9 @@ def _on_device(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> BCSR:
     rows = scipy.sparse.csr_array(matrix)
     rows.sum_duplicates()
     # Indices of 32 bits: those of 64 have no kernel on GPUs.
-    arrays = rows.data, rows.indices.astype(np.int32), rows.indptr.astype(np.int32)
-    return BCSR(tuple(jnp.asarray(a) for a in arrays), shape=rows.shape, indices_sorted=True, unique_indices=True)
+    indices, starts = (jnp.asarray(places, jnp.int32) for places in (rows.indices, rows.indptr))
+    arrays = jnp.asarray(rows.data), indices, starts
+    return BCSR(arrays, shape=rows.shape, indices_sorted=True, unique_indices=True)
 
 
 def with_chains_as_columns(function: Callable[..., AnyArray]) -> Callable[..., AnyArray]:
