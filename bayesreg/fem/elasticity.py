@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
+from jax.experimental.sparse import BCSR
 from jaxtyping import Float, Int
 
 from bayesreg.fem.elements import Elements, displacement_gradient, elements_of, shape_gradients
@@ -56,18 +57,24 @@ def strain_energy_density(
     u: Float[AnyArray, "nodes 3"],
 ) -> Float[AnyArray, "cells"]:
     """μ/4 Σ_jk (∂_j u_k + ∂_k u_j)² + λ/2 (div u)² in each cell: eq. (2), which equals eq. (3)."""
-    dilatation, distortion = strain_products(elements.derivative, u, u)
+    gradient = displacement_gradient(elements.derivative, u)
+    dilatation, distortion = strain_products(gradient, gradient)
     return (lam * dilatation + mu * distortion) / 2
 
 
 def strain_products(
-    derivative: SparseOperator, u: Float[AnyArray, "nodes 3"], w: Float[AnyArray, "nodes 3"]
+    first: Float[AnyArray, "3 3 cells"], second: Float[AnyArray, "3 3 cells"]
 ) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
-    """div u · div w and ½ (∇u + ∇uᵀ) : (∇w + ∇wᵀ) of each cell: uᵀ K w is the integral of λ and μ times them."""
-    gradients = [displacement_gradient(derivative, field) for field in ((u,) if w is u else (u, w))]
-    divergence = [g[0, 0] + g[1, 1] + g[2, 2] for g in gradients]
-    twice_strain = [g + jnp.swapaxes(g, 0, 1) for g in gradients]
-    return divergence[0] * divergence[-1], (twice_strain[0] * twice_strain[-1]).sum(axis=(0, 1)) / 2
+    """div u · div w and ½ (∇u + ∇uᵀ) : (∇w + ∇wᵀ) of each cell: uᵀ K w is the integral of λ and μ times them.
+
+    Parameters
+    ----------
+    first, second : (3, 3, m) array
+        ∇u and ∇w, see `displacement_gradient`.
+    """
+    divergence = [g[0, 0] + g[1, 1] + g[2, 2] for g in (first, second)]
+    twice_strain = [g + jnp.swapaxes(g, 0, 1) for g in (first, second)]
+    return divergence[0] * divergence[1], (twice_strain[0] * twice_strain[1]).sum(axis=(0, 1)) / 2
 
 
 @jax.custom_jvp
@@ -81,7 +88,8 @@ def _strain_energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> t
     """∂E_r/∂u = K u, ∂E_r/∂λ = V (div u)²/2."""
     elements, lam, mu, u = primals
     _, d_lam, d_mu, d_u = tangents
-    dilatation, distortion = strain_products(elements.derivative, u, u)
+    gradient = displacement_gradient(elements.derivative, u)
+    dilatation, distortion = strain_products(gradient, gradient)
     energy = elements.volumes @ (lam * dilatation + mu * distortion) / 2
     by_parameters = elements.volumes @ (d_lam * dilatation + d_mu * distortion) / 2
     return energy, by_parameters + (internal_force(elements, lam, mu, u) * d_u).sum()
@@ -94,59 +102,64 @@ def internal_force(
     u: Float[AnyArray, "nodes 3"],
 ) -> Float[AnyArray, "nodes 3"]:
     """K(λ, μ) u of eq. (7): Σ_e V_e σ ∇N_a."""
-    return force_between(elements.derivative, elements.volumes, lam, mu, u)
+    return force_between(elements.derivative, elements.derivative, elements.volumes, lam, mu, u)
 
 
-@jax.custom_vjp
 def force_between(
-    derivative: SparseOperator,
+    on: SparseOperator,
+    of: SparseOperator,
     volumes: Float[AnyArray, "cells"],
     lam: Float[AnyArray, "cells"],
     mu: Float[AnyArray, "cells"],
-    u: Float[AnyArray, "nodes 3"],
-) -> Float[AnyArray, "nodes 3"]:
-    """Forces on some nodes while these alone move by u: a diagonal block of K(λ, μ) times u.
+    u: Float[AnyArray, "moved 3"],
+) -> Float[AnyArray, "held 3"]:
+    """Forces on some nodes while others move by u: a block of K(λ, μ) times u.
 
     Parameters
     ----------
-    derivative : SparseOperator
-        The columns of `Elements.derivative` that belong to these nodes.
+    on, of : SparseOperator
+        The columns of `Elements.derivative` that belong to the nodes on which forces act, and to those that move.
     """
-    return _forces((derivative, volumes), lam[:, None], mu[:, None], u[:, :, None])[:, :, 0]
+    return _forces_of_chains((on.transposed, of.matrix, volumes), lam[:, None], mu[:, None], u[:, :, None])[:, :, 0]
 
 
-def _force_forward(
-    derivative: SparseOperator, volumes: AnyArray, lam: AnyArray, mu: AnyArray, u: AnyArray
-) -> tuple[AnyArray, tuple[SparseOperator, AnyArray, AnyArray, AnyArray, AnyArray]]:
-    return force_between(derivative, volumes, lam, mu, u), (derivative, volumes, lam, mu, u)
-
-
-def _force_backward(
-    kept: tuple[SparseOperator, AnyArray, AnyArray, AnyArray, AnyArray], w: AnyArray
-) -> tuple[None, None, AnyArray, AnyArray, AnyArray]:
-    """K is symmetric, and uᵀ K w the integral of λ and μ times `strain_products`."""
-    derivative, volumes, lam, mu, u = kept
-    dilatation, distortion = strain_products(derivative, u, w)
-    return None, None, volumes * dilatation, volumes * distortion, force_between(derivative, volumes, lam, mu, w)
-
-
-force_between.defvjp(_force_forward, _force_backward)
-
-
-@with_chains_as_columns
-def _forces(
-    geometry: tuple[SparseOperator, Float[AnyArray, "cells"]],
+def forces(
+    geometry: tuple[BCSR, BCSR, Float[AnyArray, "cells"]],
     lam: Float[AnyArray, "cells chains"],
     mu: Float[AnyArray, "cells chains"],
-    u: Float[AnyArray, "nodes 3 chains"],
-) -> Float[AnyArray, "nodes 3 chains"]:
-    """Gᵀ V σ(G u) with Hooke's law σ = μ (∇u + ∇uᵀ) + λ (div u) I, G the derivative, each chain with its own λ, μ."""
-    derivative, volumes = geometry
-    gradient = product(derivative.matrix, u.reshape(len(u), -1)).reshape(3, -1, *u.shape[1:])
+    u: Float[AnyArray, "moved 3 chains"],
+) -> Float[AnyArray, "held 3 chains"]:
+    """Gᵀ V σ(G u) with Hooke's law σ = μ (∇u + ∇uᵀ) + λ (div u) I, each chain with its own λ and μ.
+
+    The geometry is Gᵀ, G (`Elements.derivative`, or columns of it) and V.
+    """
+    on, of, volumes = geometry
+    gradient = product(of, u.reshape(len(u), -1)).reshape(3, -1, *u.shape[1:])
     divergence = gradient[0, :, 0] + gradient[1, :, 1] + gradient[2, :, 2]
     dilatational = (lam * divergence)[:, None] * jnp.eye(3)[:, None, :, None]
     stress = volumes[:, None, None] * (mu[:, None] * (gradient + jnp.swapaxes(gradient, 0, 2)) + dilatational)
-    return product(derivative.transposed, stress.reshape(3 * len(volumes), -1)).reshape(u.shape)
+    return product(on, stress.reshape(3 * len(volumes), -1)).reshape(-1, *u.shape[1:])
+
+
+_forces_of_chains = with_chains_as_columns(forces)
+
+
+def stiffness_diagonal(
+    squares: BCSR,
+    volumes: Float[AnyArray, "cells"],
+    lam: Float[AnyArray, "cells chains"],
+    mu: Float[AnyArray, "cells chains"],
+) -> Float[AnyArray, "nodes 3 chains"]:
+    """The diagonal of K(λ, μ), one entry for each node and axis: Σ_e V_e ((λ + μ) (∂_i N_a)² + μ |∇N_a|²).
+
+    Parameters
+    ----------
+    squares : BCSR
+        (nodes, 3m): the transposed `Elements.derivative`, or rows of it, every entry squared.
+    """
+    own = (lam + mu)[:, None] * jnp.eye(3)[:, None, :, None]
+    entries = volumes[:, None, None] * (mu[:, None] + own)
+    return product(squares, entries.reshape(3 * len(volumes), -1)).reshape(-1, 3, lam.shape[1])
 
 
 def element_stiffness(
@@ -158,13 +171,6 @@ def element_stiffness(
     inner = (gradients[:, None] * gradients[None]).sum(axis=2)
     shear = jnp.swapaxes(outer, 1, 3) + inner[:, None, :, None] * jnp.eye(3)[None, :, None, :, None]
     return elements.volumes * (lam * outer + mu * shear)
-
-
-def stiffness_diagonal(elements: Elements, lam: AnyArray, mu: AnyArray, nodes: int) -> Float[AnyArray, "nodes 3"]:
-    """diag K(λ, μ), one entry for each node and axis."""
-    squares = elements.gradients**2
-    entries = elements.volumes * ((lam + mu) * squares + mu * squares.sum(axis=1, keepdims=True))
-    return jnp.zeros((nodes, 3)).at[elements.cells].add(jnp.moveaxis(entries, 1, -1))
 
 
 def strain_energy(

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
+from jax.experimental.sparse import BCSR
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.fem import preconditioners
 from bayesreg.fem.elasticity import (
     force_between,
-    internal_force,
+    forces,
     lame_by_cell,
     rigid_modes,
     stiffness,
@@ -23,9 +24,9 @@ from bayesreg.fem.elasticity import (
     strain_products,
     unknowns_of,
 )
-from bayesreg.fem.elements import Elements, derivative_matrix, elements_of
+from bayesreg.fem.elements import Elements, derivative_matrix, displacement_gradient, elements_of
 from bayesreg.fem.multigrid import Multigrid, multigrid
-from bayesreg.fem.operators import SparseOperator, sparse_operator
+from bayesreg.fem.operators import SparseOperator, sparse_operator, with_chains_as_columns
 from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
@@ -45,8 +46,10 @@ class ElasticSystem(NamedTuple):
     elements : Elements
     prescribed, free : (b,), (f,) int arrays
         A partition of the nodes.
-    derivative : SparseOperator
-        The columns of `elements.derivative` that belong to the free nodes.
+    free_derivative, prescribed_derivative : SparseOperator
+        The columns of `elements.derivative` that belong to these nodes.
+    squares : BCSR
+        (f, 3m): of those of the free nodes, for `stiffness_diagonal`.
     preconditioner : ReferenceInverse, Multigrid or None
         None where no node is free.
     tolerance, adjoint_tolerance : scalar
@@ -57,18 +60,20 @@ class ElasticSystem(NamedTuple):
     elements: Elements
     prescribed: Int[AnyArray, "prescribed"]
     free: Int[AnyArray, "free"]
-    derivative: SparseOperator
+    free_derivative: SparseOperator
+    prescribed_derivative: SparseOperator
+    squares: BCSR
     preconditioner: ReferenceInverse | Multigrid | None
     tolerance: Scalar
     adjoint_tolerance: Scalar
 
 
 class SolverInfo(NamedTuple):
-    """Relative residual, iterations, and whether the one is below the tolerance."""
+    """Relative residual, iterations, and whether the one is below the tolerance, of each chain."""
 
-    residual: Scalar
-    iterations: Int[AnyArray, ""]
-    converged: Bool[AnyArray, ""]
+    residual: Float[AnyArray, "chains"]
+    iterations: Int[AnyArray, "chains"]
+    converged: Bool[AnyArray, "chains"]
 
 
 def elastic_system(
@@ -92,11 +97,14 @@ def elastic_system(
     degrees = unknowns_of(free)
     reference = stiffness(mesh, lam_reference, mu_reference)[degrees][:, degrees]
     preconditioner = _preconditioner(reference, mesh.points[free]) if len(free) else None
+    derivative = derivative_matrix(mesh)
     return ElasticSystem(
         elements=elements_of(mesh),
         prescribed=jnp.asarray(prescribed),
         free=jnp.asarray(free),
-        derivative=sparse_operator(derivative_matrix(mesh)[:, free]),
+        free_derivative=sparse_operator(derivative[:, free]),
+        prescribed_derivative=sparse_operator(derivative[:, np.asarray(prescribed)]),
+        squares=sparse_operator(derivative[:, free] ** 2).transposed,
         preconditioner=preconditioner,
         tolerance=jnp.asarray(tolerance),
         adjoint_tolerance=jnp.asarray(tolerance if adjoint_tolerance is None else adjoint_tolerance),
@@ -136,36 +144,31 @@ def _settled(
     if len(system.free) == 0:
         fine = jnp.isfinite(u_given).all()
         return Equilibrium(u_given, jnp.zeros(()), jnp.zeros((), int), fine)
-    load = -internal_force(system.elements, lam, mu, u_given)[system.free]
-    u_free, info = _response(system, lam, mu, load, system.tolerance, guess)
+    load = -_force(system, system.free_derivative, system.prescribed_derivative, lam, mu, u_prescribed)
+    u_free, info = _response(system, system.tolerance, lam, mu, load, guess)
     u = u_given.at[system.free].set(u_free)
     # A node whose cells have no free node never enters the solve, but must be finite all the same.
     return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
 
 
+def _force(
+    system: ElasticSystem, on: SparseOperator, of: SparseOperator, lam: AnyArray, mu: AnyArray, u: AnyArray
+) -> AnyArray:
+    return force_between(on, of, system.elements.volumes, lam, mu, u)
+
+
 def _response(
     system: ElasticSystem,
+    tolerance: Scalar,
     lam: AnyArray,
     mu: AnyArray,
     load: AnyArray,
-    tolerance: AnyArray,
     guess: AnyArray | None = None,
 ) -> tuple[AnyArray, SolverInfo]:
     """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
-    elements, free = system.elements, system.free
-    assert system.preconditioner is not None
-    precondition = system.preconditioner.__call__
-    apply = partial(force_between, system.derivative, elements.volumes, lam, mu)
-    nodes = len(system.prescribed) + len(free)
-    inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(elements, lam, mu, nodes)[free])
-
-    def solve(apply: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
-        first = None if guess is None else guess[free]
-        return _conjugate_gradients(apply, load, first, precondition, inverse_diagonal, tolerance)
-
-    if guess is None:
-        return jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
-    return solve(apply, load)
+    start = () if guess is None else (guess[system.free],)
+    found = _conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
+    return jax.tree.map(lambda x: x[..., 0], found)
 
 
 @jax.custom_vjp
@@ -188,52 +191,73 @@ def _backward(
     bar = cotangent.u
     if len(system.free) == 0:
         return None, jnp.zeros_like(lam), jnp.zeros_like(mu), bar[system.prescribed]
-    w_free, _ = _response(system, lam, mu, bar[system.free], system.adjoint_tolerance)
-    w = jnp.zeros_like(u).at[system.free].set(w_free)
-    dilatation, distortion = strain_products(system.elements.derivative, u, w)
-    reaction = internal_force(system.elements, lam, mu, w)
+    w, _ = _response(system, system.adjoint_tolerance, lam, mu, bar[system.free])
+    reaction = _force(system, system.prescribed_derivative, system.free_derivative, lam, mu, w)
+    dilatation, distortion = strain_products(
+        displacement_gradient(system.elements.derivative, u), displacement_gradient(system.free_derivative, w)
+    )
     volumes = system.elements.volumes
-    return None, -volumes * dilatation, -volumes * distortion, (bar - reaction)[system.prescribed]
+    return None, -volumes * dilatation, -volumes * distortion, bar[system.prescribed] - reaction
 
 
 _differentiable.defvjp(_forward, _backward)
 
 
+@with_chains_as_columns
 def _conjugate_gradients(
-    apply: LinearMap,
-    load: AnyArray,
-    first: AnyArray | None,
-    precondition: LinearMap,
-    inverse_diagonal: AnyArray,
-    tolerance: Scalar | float,
-) -> tuple[AnyArray, SolverInfo]:
-    """Preconditioned conjugate gradients from `first`, else from zero; NaN anywhere ends the iteration unconverged."""
+    shared: tuple[ElasticSystem, Scalar],
+    lam: Float[AnyArray, "cells chains"],
+    mu: Float[AnyArray, "cells chains"],
+    load: Float[AnyArray, "free 3 chains"],
+    *start: Float[AnyArray, "free 3 chains"],
+) -> tuple[Float[AnyArray, "free 3 chains"], SolverInfo]:
+    """K_II⁻¹ times a load from `start`, else from zero, each chain with its own K.
 
-    def norm(r: AnyArray) -> Scalar:
-        return jnp.sqrt((inverse_diagonal * r**2).sum())
+    A chain that has arrived, or in which something is not a number, stands still while others go on: no chain knows of
+    another.
+    """
+    system, tolerance = shared
+    precondition, volumes = system.preconditioner, system.elements.volumes
+    assert precondition is not None
+    geometry = system.free_derivative.transposed, system.free_derivative.matrix, volumes
+    inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(system.squares, volumes, lam, mu))
 
-    target = tolerance * norm(load)
+    def dot(a: AnyArray, b: AnyArray) -> AnyArray:
+        return (a * b).sum(axis=(0, 1))
 
-    def unfinished(state):  # type: ignore[no-untyped-def]
-        _, residual, _, _, iteration = state
-        size = norm(residual)
-        return (size > target) & jnp.isfinite(size) & (iteration < MAX_ITERATIONS)
+    def norm(r: AnyArray) -> AnyArray:
+        return jnp.sqrt(dot(inverse_diagonal * r, r))
 
-    def iterate(state):  # type: ignore[no-untyped-def]
-        x, residual, direction, rho, iteration = state
-        image = apply(direction)
-        step = rho / (direction * image).sum()
-        x, residual = x + step * direction, residual - step * image
-        z = precondition(residual)
-        rho, previous = (residual * z).sum(), rho
-        return x, residual, z + (rho / previous) * direction, rho, iteration + 1
+    def solve(apply: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
+        target = tolerance * norm(load)
 
-    x, residual = (jnp.zeros_like(load), load) if first is None else (first, load - apply(first))
-    z = precondition(residual)
-    start = x, residual, z, (residual * z).sum(), jnp.zeros((), int)
-    x, residual, _, _, iterations = jax.lax.while_loop(unfinished, iterate, start)
-    relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
-    return x, SolverInfo(relative, iterations, relative <= tolerance)
+        def unfinished(residual: AnyArray, iterations: AnyArray) -> AnyArray:
+            size = norm(residual)
+            return (size > target) & jnp.isfinite(size) & (iterations < MAX_ITERATIONS)
+
+        def iterate(state):  # type: ignore[no-untyped-def]
+            x, residual, direction, rho, iterations, going = state
+            image = apply(direction)
+            step = rho / dot(direction, image)
+            x = jnp.where(going, x + step * direction, x)
+            residual = jnp.where(going, residual - step * image, residual)
+            z = precondition(residual)
+            rho, previous = dot(residual, z), rho
+            direction = z + (rho / previous) * direction
+            iterations = iterations + going
+            return x, residual, direction, rho, iterations, going & unfinished(residual, iterations)
+
+        x, residual = (start[0], load - apply(start[0])) if start else (jnp.zeros_like(load), load)
+        z, none = precondition(residual), jnp.zeros(load.shape[-1:], int)
+        begun = x, residual, z, dot(residual, z), none, unfinished(residual, none)
+        x, residual, _, _, iterations, _ = jax.lax.while_loop(lambda state: state[-1].any(), iterate, begun)
+        relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
+        return x, SolverInfo(relative, iterations, relative <= tolerance)
+
+    apply = partial(forces, geometry, lam, mu)
+    if start:
+        return solve(apply, load)
+    return jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
 
 
 def linear_response(

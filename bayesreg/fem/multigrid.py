@@ -14,7 +14,7 @@ import scipy.sparse
 from jax.experimental.sparse import BCSR
 from jaxtyping import Float
 
-from bayesreg.fem.operators import SparseOperator, product, sparse_operator, with_chains_as_columns
+from bayesreg.fem.operators import SparseOperator, product, sparse_operator
 from bayesreg.fem.preconditioners import SINGULAR
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -64,11 +64,11 @@ class Multigrid(NamedTuple):
     levels: tuple[Level, ...]
     coarsest: Float[AnyArray, "coarsest coarsest"]
 
-    def __call__(self, residual: Float[AnyArray, "free 3"]) -> Float[AnyArray, "free 3"]:
+    def __call__(self, residual: Float[AnyArray, "free 3 chains"]) -> Float[AnyArray, "free 3 chains"]:
         """K_II⁻¹ r, approximately."""
-        scaled = (self.scale * residual.reshape(-1)).astype(self.coarsest.dtype)
-        found = _cycle((self.levels, self.coarsest), scaled[:, None])[:, 0]
-        return (self.scale * found).reshape(residual.shape)
+        scale = self.scale.reshape(-1, 3, 1)
+        scaled = (scale * residual).astype(self.coarsest.dtype).reshape(len(self.scale), -1)
+        return scale * _cycle(self.levels, self.coarsest, scaled).reshape(residual.shape)
 
 
 def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "unknowns modes"]) -> Multigrid:
@@ -133,18 +133,18 @@ def _greatest_eigenvalue(matrix: scipy.sparse.csr_array) -> float:
     return 1.1 * float(scipy.sparse.linalg.eigsh(matrix, 1, v0=start, tol=0.05, return_eigenvectors=False)[0])
 
 
-@with_chains_as_columns
 def _cycle(
-    hierarchy: tuple[tuple[Level, ...], Float[AnyArray, "coarsest coarsest"]], load: Float[AnyArray, "unknowns chains"]
+    levels: tuple[Level, ...],
+    coarsest: Float[AnyArray, "coarsest coarsest"],
+    load: Float[AnyArray, "unknowns chains"],
 ) -> Float[AnyArray, "unknowns chains"]:
     """One V-cycle from zero, smoothed before and after by the same polynomial, so that it is symmetric."""
-    levels, coarsest = hierarchy
     if not levels:
         return coarsest @ load
     level, *coarser = levels
     x = _smoothed(level, jnp.zeros_like(load), load)
     residual = product(level.prolongation.transposed, load - product(level.matrix, x))
-    x += product(level.prolongation.matrix, _cycle((tuple(coarser), coarsest), residual))
+    x += product(level.prolongation.matrix, _cycle(tuple(coarser), coarsest, residual))
     return _smoothed(level, x, load - product(level.matrix, x))
 
 

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import scipy.sparse
 from jax.custom_batching import custom_vmap
 from jax.experimental.sparse import BCSR
@@ -24,9 +23,9 @@ ALIGNED = 32
 
 
 class SparseOperator(NamedTuple):
-    """A sparse matrix and its transpose (a pytree); differentiable in what it is applied to, by reverse mode.
+    """A sparse matrix and its transpose (a pytree), differentiable by reverse mode in what it is applied to.
 
-    Under `vmap` the batch joins the columns. The matrix itself cannot be batched.
+    Under `vmap` chains join the columns; the matrix is the same for all.
 
     Attributes
     ----------
@@ -40,11 +39,6 @@ class SparseOperator(NamedTuple):
     def __call__(self, x: Float[AnyArray, "s columns"]) -> Float[AnyArray, "r columns"]:
         """A x."""
         return _linear(self, x)
-
-    @property
-    def transpose(self) -> SparseOperator:
-        """Aᵀ, of the same arrays."""
-        return SparseOperator(self.transposed, self.matrix)
 
 
 def sparse_operator(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> SparseOperator:
@@ -61,21 +55,22 @@ def _on_device(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> BCSR:
     return BCSR(arrays, shape=rows.shape, indices_sorted=True, unique_indices=True)
 
 
-def with_chains_as_columns(function: Callable[..., AnyArray]) -> Callable[..., AnyArray]:
-    """Decorate f(shared, *arrays), whose arrays end in an axis of chains, as its value does: `vmap` makes it longer.
+def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate f(shared, *arrays) whose arrays, as what it returns, end in an axis of chains: `vmap` makes it longer.
 
-    `shared` is a pytree that all chains have in common. What is decorated has no derivative.
+    `shared` is a pytree that all chains have in common. What is decorated has a derivative by forward mode alone.
     """
     decorated = custom_vmap(function)
 
     @decorated.def_vmap
-    def _(size: int, batched: Sequence[Any], shared: Any, *arrays: AnyArray) -> tuple[AnyArray, bool]:
+    def _(size: int, batched: Sequence[Any], shared: Any, *arrays: AnyArray) -> tuple[Any, Any]:
         if any(jax.tree.leaves(batched[0])):
             raise NotImplementedError(f"what {function.__name__} shares among chains cannot differ from chain to chain")
         shapes = [(size, *array.shape[own:]) for array, own in zip(arrays, batched[1:], strict=True)]
         longer = [_joined(jnp.broadcast_to(x, shape)) for x, shape in zip(arrays, shapes, strict=True)]
         found = decorated(shared, *longer)
-        return jnp.moveaxis(found.reshape(*found.shape[:-1], -1, size), -1, 0), True
+        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size), -1, 0), found)
+        return parted, jax.tree.map(lambda _: True, found)
 
     return decorated
 
@@ -86,28 +81,27 @@ def _joined(x: Float[AnyArray, "size *rows chains"]) -> Float[AnyArray, "*rows a
 
 
 def product(matrix: BCSR, x: Float[AnyArray, "s columns"]) -> Float[AnyArray, "r columns"]:
-    """A x, without a derivative and a rule for `vmap`; rows of x are padded to a multiple of `ALIGNED`."""
+    """A x, without a rule for `vmap`; rows of x are padded to a multiple of `ALIGNED`."""
     columns = x.shape[1]
     padded = jnp.pad(x, ((0, 0), (0, -columns % (ALIGNED // x.dtype.itemsize))))
     return (matrix @ padded)[:, :columns]
 
 
-@with_chains_as_columns
-def _product(matrix: BCSR, x: AnyArray) -> AnyArray:
-    return product(matrix, x)
+product_of_chains = with_chains_as_columns(product)
 
 
 @jax.custom_vjp
 def _linear(operator: SparseOperator, x: AnyArray) -> AnyArray:
-    return _product(operator.matrix, x)
+    return product_of_chains(operator.matrix, x)
 
 
+# Products without a rule for reverse mode in both: so slopes have derivatives by forward mode.
 def _forward(operator: SparseOperator, x: AnyArray) -> tuple[AnyArray, SparseOperator]:
-    return _linear(operator, x), operator
+    return product_of_chains(operator.matrix, x), operator
 
 
 def _backward(operator: SparseOperator, cotangent: AnyArray) -> tuple[None, AnyArray]:
-    return None, _linear(operator.transpose, cotangent)
+    return None, product_of_chains(operator.transposed, cotangent)
 
 
 _linear.defvjp(_forward, _backward)

@@ -44,10 +44,11 @@ class ReferenceInverse(NamedTuple):
     scale: Float[AnyArray, "unknowns"]
     inverse: Float[AnyArray, "unknowns unknowns"]
 
-    def __call__(self, residual: Float[AnyArray, "free 3"]) -> Float[AnyArray, "free 3"]:
+    def __call__(self, residual: Float[AnyArray, "free 3 chains"]) -> Float[AnyArray, "free 3 chains"]:
         """K_II⁻¹ r, approximately."""
-        scaled = (self.scale * residual.reshape(-1)).astype(self.inverse.dtype)
-        return (self.scale * (self.inverse @ scaled)).reshape(residual.shape)
+        scale = self.scale.reshape(-1, 3, 1)
+        scaled = (scale * residual).astype(self.inverse.dtype).reshape(len(self.inverse), -1)
+        return scale * (self.inverse @ scaled).reshape(residual.shape)
 
 
 def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
