@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jax.experimental.sparse import BCSR
 from jaxtyping import Float, Int
 
 from bayesreg.fem.elements import Elements, displacement_gradient, elements_of, shape_gradients
-from bayesreg.fem.operators import SparseOperator, product, with_chains_as_columns
+from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -120,32 +119,27 @@ def force_between(
     on, of : SparseOperator
         The columns of `Elements.derivative` that belong to the nodes on which forces act, and to those that move.
     """
-    return _forces_of_chains((on.transposed, of.matrix, volumes), lam[:, None], mu[:, None], u[:, :, None])[:, :, 0]
+    return forces(on, of, volumes, lam[:, None], mu[:, None], u[:, :, None])[:, :, 0]
 
 
 def forces(
-    geometry: tuple[BCSR, BCSR, Float[AnyArray, "cells"]],
+    on: SparseOperator,
+    of: SparseOperator,
+    volumes: Float[AnyArray, "cells"],
     lam: Float[AnyArray, "cells chains"],
     mu: Float[AnyArray, "cells chains"],
     u: Float[AnyArray, "moved 3 chains"],
 ) -> Float[AnyArray, "held 3 chains"]:
-    """Gᵀ V σ(G u) with Hooke's law σ = μ (∇u + ∇uᵀ) + λ (div u) I, each chain with its own λ and μ.
-
-    The geometry is Gᵀ, G (`Elements.derivative`, or columns of it) and V.
-    """
-    on, of, volumes = geometry
-    gradient = product(of, u.reshape(len(u), -1)).reshape(3, -1, *u.shape[1:])
+    """`force_between` of many chains: Gᵀ V σ(G u), G the derivative, and Hooke's law σ = μ (∇u + ∇uᵀ) + λ (div u) I."""
+    gradient = of(u.reshape(len(u), -1)).reshape(3, -1, *u.shape[1:])
     divergence = gradient[0, :, 0] + gradient[1, :, 1] + gradient[2, :, 2]
     dilatational = (lam * divergence)[:, None] * jnp.eye(3)[:, None, :, None]
     stress = volumes[:, None, None] * (mu[:, None] * (gradient + jnp.swapaxes(gradient, 0, 2)) + dilatational)
-    return product(on, stress.reshape(3 * len(volumes), -1)).reshape(-1, *u.shape[1:])
-
-
-_forces_of_chains = with_chains_as_columns(forces)
+    return on.transpose(stress.reshape(3 * len(volumes), -1)).reshape(-1, *u.shape[1:])
 
 
 def stiffness_diagonal(
-    squares: BCSR,
+    squares: SparseOperator,
     volumes: Float[AnyArray, "cells"],
     lam: Float[AnyArray, "cells chains"],
     mu: Float[AnyArray, "cells chains"],
@@ -154,12 +148,12 @@ def stiffness_diagonal(
 
     Parameters
     ----------
-    squares : BCSR
-        (nodes, 3m): the transposed `Elements.derivative`, or rows of it, every entry squared.
+    squares : SparseOperator
+        `Elements.derivative`, or columns of it, every entry squared.
     """
     own = (lam + mu)[:, None] * jnp.eye(3)[:, None, :, None]
     entries = volumes[:, None, None] * (mu[:, None] + own)
-    return product(squares, entries.reshape(3 * len(volumes), -1)).reshape(-1, 3, lam.shape[1])
+    return squares.transpose(entries.reshape(3 * len(volumes), -1)).reshape(-1, 3, lam.shape[1])
 
 
 def element_stiffness(

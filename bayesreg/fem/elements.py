@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from bayesreg.fem.operators import SparseOperator, product_of_chains, sparse_operator
+from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 
@@ -66,7 +66,7 @@ def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
 
 def displacement_gradient(derivative: SparseOperator, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "3 3 cells"]:
     """∂u_k/∂x_j of every cell, first axis k, second axis j; `derivative` as in `Elements`."""
-    return jnp.moveaxis(product_of_chains(derivative.matrix, u).reshape(3, -1, 3), -1, 0)
+    return jnp.moveaxis(derivative(u).reshape(3, -1, 3), -1, 0)
 
 
 class Quadrature(NamedTuple):
@@ -81,6 +81,8 @@ class Quadrature(NamedTuple):
     weights : (q,) array
         mm³; those of a Gauss rule sum to the volume of Ω, those of voxels to the volume of the voxels whose centres
         lie inside.
+    interpolation : SparseOperator
+        (q, n): values at the nodes to values at the points, N_a(x_q).
     """
 
     cells: Int[AnyArray, "points"]

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jax.experimental.sparse import BCSR
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.fem import preconditioners
@@ -48,8 +47,8 @@ class ElasticSystem(NamedTuple):
         A partition of the nodes.
     free_derivative, prescribed_derivative : SparseOperator
         The columns of `elements.derivative` that belong to these nodes.
-    squares : BCSR
-        (f, 3m): of those of the free nodes, for `stiffness_diagonal`.
+    squares : SparseOperator
+        Of the first, every entry squared: for `stiffness_diagonal`.
     preconditioner : ReferenceInverse, Multigrid or None
         None where no node is free.
     tolerance, adjoint_tolerance : scalar
@@ -62,7 +61,7 @@ class ElasticSystem(NamedTuple):
     free: Int[AnyArray, "free"]
     free_derivative: SparseOperator
     prescribed_derivative: SparseOperator
-    squares: BCSR
+    squares: SparseOperator
     preconditioner: ReferenceInverse | Multigrid | None
     tolerance: Scalar
     adjoint_tolerance: Scalar
@@ -104,7 +103,7 @@ def elastic_system(
         free=jnp.asarray(free),
         free_derivative=sparse_operator(derivative[:, free]),
         prescribed_derivative=sparse_operator(derivative[:, np.asarray(prescribed)]),
-        squares=sparse_operator(derivative[:, free] ** 2).transposed,
+        squares=sparse_operator(derivative[:, free] ** 2),
         preconditioner=preconditioner,
         tolerance=jnp.asarray(tolerance),
         adjoint_tolerance=jnp.asarray(tolerance if adjoint_tolerance is None else adjoint_tolerance),
@@ -167,8 +166,15 @@ def _response(
 ) -> tuple[AnyArray, SolverInfo]:
     """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
     start = () if guess is None else (guess[system.free],)
-    found = _conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
-    return jax.tree.map(lambda x: x[..., 0], found)
+
+    def solve(_: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
+        found = _conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
+        return jax.tree.map(lambda x: x[..., 0], found)
+
+    apply = partial(_force, system, system.free_derivative, system.free_derivative, lam, mu)
+    if start:
+        return solve(apply, load)
+    return jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
 
 
 @jax.custom_vjp
@@ -219,8 +225,8 @@ def _conjugate_gradients(
     system, tolerance = shared
     precondition, volumes = system.preconditioner, system.elements.volumes
     assert precondition is not None
-    geometry = system.free_derivative.transposed, system.free_derivative.matrix, volumes
-    inverse_diagonal = jax.lax.stop_gradient(1 / stiffness_diagonal(system.squares, volumes, lam, mu))
+    apply = partial(forces, system.free_derivative, system.free_derivative, volumes, lam, mu)
+    inverse_diagonal = 1 / stiffness_diagonal(system.squares, volumes, lam, mu)
 
     def dot(a: AnyArray, b: AnyArray) -> AnyArray:
         return (a * b).sum(axis=(0, 1))
@@ -228,36 +234,30 @@ def _conjugate_gradients(
     def norm(r: AnyArray) -> AnyArray:
         return jnp.sqrt(dot(inverse_diagonal * r, r))
 
-    def solve(apply: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
-        target = tolerance * norm(load)
+    target = tolerance * norm(load)
 
-        def unfinished(residual: AnyArray, iterations: AnyArray) -> AnyArray:
-            size = norm(residual)
-            return (size > target) & jnp.isfinite(size) & (iterations < MAX_ITERATIONS)
+    def unfinished(residual: AnyArray, iterations: AnyArray) -> AnyArray:
+        size = norm(residual)
+        return (size > target) & jnp.isfinite(size) & (iterations < MAX_ITERATIONS)
 
-        def iterate(state):  # type: ignore[no-untyped-def]
-            x, residual, direction, rho, iterations, going = state
-            image = apply(direction)
-            step = rho / dot(direction, image)
-            x = jnp.where(going, x + step * direction, x)
-            residual = jnp.where(going, residual - step * image, residual)
-            z = precondition(residual)
-            rho, previous = dot(residual, z), rho
-            direction = z + (rho / previous) * direction
-            iterations = iterations + going
-            return x, residual, direction, rho, iterations, going & unfinished(residual, iterations)
+    def iterate(state):  # type: ignore[no-untyped-def]
+        x, residual, direction, rho, iterations, going = state
+        image = apply(direction)
+        step = rho / dot(direction, image)
+        x = jnp.where(going, x + step * direction, x)
+        residual = jnp.where(going, residual - step * image, residual)
+        z = precondition(residual)
+        rho, previous = dot(residual, z), rho
+        direction = z + (rho / previous) * direction
+        iterations = iterations + going
+        return x, residual, direction, rho, iterations, going & unfinished(residual, iterations)
 
-        x, residual = (start[0], load - apply(start[0])) if start else (jnp.zeros_like(load), load)
-        z, none = precondition(residual), jnp.zeros(load.shape[-1:], int)
-        begun = x, residual, z, dot(residual, z), none, unfinished(residual, none)
-        x, residual, _, _, iterations, _ = jax.lax.while_loop(lambda state: state[-1].any(), iterate, begun)
-        relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
-        return x, SolverInfo(relative, iterations, relative <= tolerance)
-
-    apply = partial(forces, geometry, lam, mu)
-    if start:
-        return solve(apply, load)
-    return jax.lax.custom_linear_solve(apply, load, solve, symmetric=True, has_aux=True)
+    x, residual = (start[0], load - apply(start[0])) if start else (jnp.zeros_like(load), load)
+    z, none = precondition(residual), jnp.zeros(load.shape[-1:], int)
+    begun = x, residual, z, dot(residual, z), none, unfinished(residual, none)
+    x, residual, _, _, iterations, _ = jax.lax.while_loop(lambda state: state[-1].any(), iterate, begun)
+    relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
+    return x, SolverInfo(relative, iterations, relative <= tolerance)
 
 
 def linear_response(

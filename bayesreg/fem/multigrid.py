@@ -11,10 +11,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jax.experimental.sparse import BCSR
+import scipy.sparse.linalg
 from jaxtyping import Float
 
-from bayesreg.fem.operators import SparseOperator, product, sparse_operator
+from bayesreg.fem.operators import SparseOperator, sparse_operator, symmetric_operator
 from bayesreg.fem.preconditioners import SINGULAR
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -26,29 +26,29 @@ DEGREE = 2
 # Below this a connection of two nodes does not bind them into one aggregate.
 STRENGTH = 0.08
 # The least eigenvalue of the coarsest matrix, of unit diagonal: rigid motions are in it to rounding.
-SINGULAR_BELOW = 1e-10
+SINGULAR_BELOW = 1e-13
 
 
 class Level(NamedTuple):
-    """One level of the hierarchy, its matrix scaled to a unit diagonal (a pytree).
+    """One level of the hierarchy, its matrix scaled to a unit diagonal; in single precision (a pytree).
 
     Attributes
     ----------
-    matrix : BCSR
-        (k, k), single precision.
+    matrix : SparseOperator
+        (k, k).
     greatest : scalar
-        A bound of its eigenvalues.
+        Above its eigenvalues.
     prolongation : SparseOperator
         (k, next k).
     """
 
-    matrix: BCSR
+    matrix: SparseOperator
     greatest: Scalar
     prolongation: SparseOperator
 
 
 class Multigrid(NamedTuple):
-    """A V-cycle for K_II at the reference parameters (a pytree): symmetric, positive definite, single precision.
+    """A V-cycle for K_II at the reference parameters (a pytree): symmetric and positive definite to single precision.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Multigrid(NamedTuple):
     levels : tuple of Level
         From fine to coarse.
     coarsest : (c, c) array
-        Inverse of the last matrix.
+        Inverse of the last matrix, in double precision: where tissues differ by much, it is far from the identity.
     """
 
     scale: Float[AnyArray, "unknowns"]
@@ -67,12 +67,12 @@ class Multigrid(NamedTuple):
     def __call__(self, residual: Float[AnyArray, "free 3 chains"]) -> Float[AnyArray, "free 3 chains"]:
         """K_II⁻¹ r, approximately."""
         scale = self.scale.reshape(-1, 3, 1)
-        scaled = (scale * residual).astype(self.coarsest.dtype).reshape(len(self.scale), -1)
+        scaled = (scale * residual).astype(jnp.float32).reshape(len(self.scale), -1)
         return scale * _cycle(self.levels, self.coarsest, scaled).reshape(residual.shape)
 
 
 def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "unknowns modes"]) -> Multigrid:
-    """The hierarchy of a symmetric positive definite matrix.
+    """The hierarchy of a symmetric positive definite matrix; the same for the same matrix.
 
     Parameters
     ----------
@@ -86,36 +86,43 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
     InputError
         If the matrix is singular or not finite.
     """
-    if not np.isfinite(matrix.data).all():
-        raise InputError(SINGULAR)
     # A second to import, and of use to large meshes only.
     import pyamg
 
-    scale = 1 / np.sqrt(matrix.diagonal())
-    scaled = scipy.sparse.bsr_array(_scaled(matrix, scale, scale), blocksize=(3, 3))
+    diagonal = matrix.diagonal()
+    if not (np.isfinite(matrix.data).all() and (diagonal > 0).all()):
+        raise InputError(SINGULAR)
+    scale = 1 / np.sqrt(diagonal)
     hierarchy = pyamg.smoothed_aggregation_solver(
-        scaled,
+        scipy.sparse.bsr_array(_scaled(matrix, scale, scale), blocksize=(3, 3)),
         near_kernel / scale[:, None],
         strength=("symmetric", {"theta": STRENGTH}),
+        # PyAMG draws at random for an estimate of the greatest eigenvalue, but not for this one.
+        smooth=("jacobi", {"omega": 4 / 3, "weighting": "local"}),
         improve_candidates=None,
         # Counted in blocks; on coarse levels one for each of the six motions of an aggregate.
         max_coarse=COARSEST // 6,
         max_levels=20,
     ).levels
-    scales = [1 / np.sqrt(level.A.diagonal()) for level in hierarchy]
-    matrices = [_scaled(level.A, own, own) for level, own in zip(hierarchy, scales, strict=True)]
-    levels = [
-        Level(
-            sparse_operator(fine.astype(np.float32)).matrix,
-            jnp.float32(_greatest_eigenvalue(fine)),
-            sparse_operator(_scaled(level.P, 1 / own, coarse).astype(np.float32)),
-        )
-        for fine, level, own, coarse in zip(matrices[:-1], hierarchy[:-1], scales[:-1], scales[1:], strict=True)
-    ]
+    # An aggregate of one or two nodes has fewer than six motions of its own: the others are columns of zeros.
+    kept = [np.flatnonzero(level.A.diagonal() > 1e-12) for level in hierarchy]
+    inner = [scipy.sparse.csr_array(level.A)[own][:, own] for level, own in zip(hierarchy, kept, strict=True)]
+    scales = [1 / np.sqrt(each.diagonal()) for each in inner]
+    matrices = [_scaled(each, own, own) for each, own in zip(inner, scales, strict=True)]
     values, vectors = np.linalg.eigh(matrices[-1].toarray())
-    if not values[0] > SINGULAR_BELOW:
+    if not (np.isfinite(values).all() and values[0] > SINGULAR_BELOW):
         raise InputError(SINGULAR)
-    return Multigrid(jnp.asarray(scale), tuple(levels), jnp.asarray((vectors / values) @ vectors.T, jnp.float32))
+    levels = []
+    for depth, fine in enumerate(matrices[:-1]):
+        prolongation = scipy.sparse.csr_array(hierarchy[depth].P)[kept[depth]][:, kept[depth + 1]]
+        prolongation = _scaled(prolongation, 1 / scales[depth], scales[depth + 1])
+        greatest = jnp.float32(_above_the_eigenvalues(fine))
+        levels.append(
+            Level(
+                symmetric_operator(fine.astype(np.float32)), greatest, sparse_operator(prolongation.astype(np.float32))
+            )
+        )
+    return Multigrid(jnp.asarray(scale), tuple(levels), jnp.asarray((vectors / values) @ vectors.T))
 
 
 def _scaled(
@@ -127,8 +134,8 @@ def _scaled(
     return scipy.sparse.csr_array(scipy.sparse.diags_array(rows) @ found @ scipy.sparse.diags_array(columns))
 
 
-def _greatest_eigenvalue(matrix: scipy.sparse.csr_array) -> float:
-    """A bound from above that is a tenth too great at most: of Lanczos' tenth estimate, which is near from below."""
+def _above_the_eigenvalues(matrix: scipy.sparse.csr_array) -> float:
+    """A tenth more than Lanczos' estimate of the greatest, which is some hundredths below it at most."""
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
     return 1.1 * float(scipy.sparse.linalg.eigsh(matrix, 1, v0=start, tol=0.05, return_eigenvectors=False)[0])
 
@@ -140,12 +147,12 @@ def _cycle(
 ) -> Float[AnyArray, "unknowns chains"]:
     """One V-cycle from zero, smoothed before and after by the same polynomial, so that it is symmetric."""
     if not levels:
-        return coarsest @ load
+        return (coarsest @ load.astype(coarsest.dtype)).astype(load.dtype)
     level, *coarser = levels
     x = _smoothed(level, jnp.zeros_like(load), load)
-    residual = product(level.prolongation.transposed, load - product(level.matrix, x))
-    x += product(level.prolongation.matrix, _cycle(tuple(coarser), coarsest, residual))
-    return _smoothed(level, x, load - product(level.matrix, x))
+    residual = level.prolongation.transpose(load - level.matrix(x))
+    x += level.prolongation(_cycle(tuple(coarser), coarsest, residual))
+    return _smoothed(level, x, load - level.matrix(x))
 
 
 def _smoothed(
@@ -157,7 +164,7 @@ def _smoothed(
     step = residual / centre
     x = x + step
     for _ in range(DEGREE - 1):
-        residual = residual - product(level.matrix, step)
+        residual = residual - level.matrix(step)
         before, ratio = ratio, 1 / (2 * centre / half - ratio)
         step = ratio * before * step + 2 * ratio / half * residual
         x = x + step

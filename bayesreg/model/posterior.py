@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
+from bayesreg.fem.multigrid import Multigrid
 from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
@@ -201,6 +202,7 @@ class Posterior:
     ) -> RegistrationData:
         """The data of the same problem for chains: faster near these λ, μ and field, where solves are preconditioned.
 
+        (By a dense inverse, that is; a multigrid hierarchy stays that of the posterior's own reference.)
         Solves end at `CHAIN_TOLERANCE`. The nodes in these rows of "u_boundary" may be moved alone, see
         `local_logdensity`. With `quick` the images are compared at four points of each tetrahedron, whatever the
         model's quadrature.
@@ -420,5 +422,9 @@ def _settled(posterior: Posterior, data: RegistrationData, estimands: Values) ->
 def _conditioned_system(
     posterior: Posterior, lam: tuple[float, ...], mu: tuple[float, ...], *tolerances: float
 ) -> ElasticSystem:
-    prescribed = np.asarray(posterior.data.system.prescribed)
-    return elastic_system(posterior.mesh, prescribed, np.array(lam), np.array(mu), *tolerances)
+    system = posterior.data.system
+    if isinstance(system.preconditioner, Multigrid):
+        # Another reference has aggregates of its own, of other shapes, and everything would be compiled again.
+        tolerance, adjoint_tolerance = map(jnp.asarray, tolerances)
+        return system._replace(tolerance=tolerance, adjoint_tolerance=adjoint_tolerance)
+    return elastic_system(posterior.mesh, np.asarray(system.prescribed), np.array(lam), np.array(mu), *tolerances)

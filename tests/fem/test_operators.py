@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from bayesreg.fem.elasticity import force_between, internal_force, stiffness, unknowns_of
-from bayesreg.fem.elements import displacement_gradient, elements_of, gauss_quadrature
-from bayesreg.fem.operators import product, sparse_operator, with_chains_as_columns
+from bayesreg.fem.elasticity import force_between, internal_force, stiffness, strain_energy, unknowns_of
+from bayesreg.fem.elements import derivative_matrix, displacement_gradient, elements_of, gauss_quadrature
+from bayesreg.fem.operators import sparse_operator, with_chains_as_columns
 from tests.phantoms import LAM, MU, ball_mesh
 
 MESH = ball_mesh(spacing=20.0)
@@ -52,6 +52,33 @@ def test_the_derivative_is_the_transposed_product(matrix):
     np.testing.assert_allclose(slope, expected, atol=1e-12)
 
 
+def test_derivatives_of_any_order_in_both_modes(matrix):
+    operator, x, way = sparse_operator(matrix), jnp.asarray(RNG.normal(size=(9, 1))), RNG.normal(size=(9, 1))
+    dense = matrix.toarray()
+
+    def energy(x):
+        return (operator(x) ** 4).sum() / 12
+
+    exact = dense.T @ (np.asarray(dense @ x) ** 2 * dense)
+    for hessian in (jax.hessian(energy), jax.jacrev(jax.grad(energy)), jax.jacfwd(jax.jacfwd(energy))):
+        np.testing.assert_allclose(hessian(x)[:, 0, :, 0], exact, atol=1e-11)
+    along = jax.jvp(jax.grad(energy), (x,), (jnp.asarray(way),))[1]
+    np.testing.assert_allclose(along, exact @ way, atol=1e-11)
+
+
+def test_the_hessian_of_the_strain_energy_is_the_stiffness():
+    lam, mu, u = jnp.asarray(LAM), jnp.asarray(MU), jnp.asarray(RNG.normal(size=MESH.points.shape))
+    exact = stiffness(MESH, LAM, MU).toarray()
+    for hessian in (jax.hessian, lambda f: jax.jacrev(jax.grad(f))):
+        found = hessian(lambda u: strain_energy(MESH, lam, mu, u))(u)
+        np.testing.assert_allclose(found.reshape(exact.shape), exact, atol=1e-10)
+    mixed = jax.jacfwd(jax.grad(lambda mu, u: strain_energy(MESH, lam, mu, u), argnums=1))(mu, u)
+    for tissue, unit in enumerate(np.eye(3)):
+        np.testing.assert_allclose(
+            np.ravel(mixed[..., tissue]), stiffness(MESH, 0 * unit, unit) @ np.ravel(u), atol=1e-10
+        )
+
+
 def test_a_chain_that_is_not_a_number_leaves_the_others_alone(matrix):
     operator, x = sparse_operator(matrix), RNG.normal(size=(5, 9, 3))
     x[2] = np.nan
@@ -70,15 +97,30 @@ def test_arguments_that_chains_do_not_have_are_repeated():
     np.testing.assert_allclose(found, shared[:, None] * y)
 
 
-def test_what_chains_share_cannot_differ():
+def test_what_chains_share_cannot_differ(matrix):
+    operator = sparse_operator(matrix)
+    entries = jnp.stack([operator.matrix.entries] * 2)
+    with pytest.raises(NotImplementedError, match="matrix of a sparse product cannot differ"):
+        jax.vmap(lambda e: operator._replace(matrix=operator.matrix._replace(entries=e))(jnp.ones((9, 1))))(entries)
     with pytest.raises(NotImplementedError, match="what weighted shares among chains"):
         jax.vmap(weighted)(np.ones((2, 3)), np.ones((2, 3, 1)), np.ones((2, 3, 1)))
 
 
 def test_columns_that_are_not_aligned_are_the_same(matrix):
     """What is padded never shows: neither in the values nor in their number."""
-    on_device, x = sparse_operator(matrix).matrix, RNG.normal(size=(9, 7))
-    np.testing.assert_array_equal(product(on_device, jnp.asarray(x[:, :3])), product(on_device, jnp.asarray(x))[:, :3])
+    operator, x = sparse_operator(matrix), RNG.normal(size=(9, 7))
+    np.testing.assert_array_equal(operator(jnp.asarray(x[:, :3])), operator(jnp.asarray(x))[:, :3])
+
+
+def test_what_was_given_stays_as_it_was():
+    """Rows are sorted for the device, which must not reach the arrays that they came from."""
+    data, columns, starts = RNG.normal(size=6), np.array([4, 1, 0, 3, 2, 1]), np.array([0, 3, 6])
+    kept = data.copy(), columns.copy()
+    given = scipy.sparse.csr_array((data, columns, starts), shape=(2, 5))
+    operator = sparse_operator(given)
+    np.testing.assert_array_equal(data, kept[0])
+    np.testing.assert_array_equal(columns, kept[1])
+    np.testing.assert_allclose(operator(jnp.eye(5)), given.toarray())
 
 
 def test_displacements_and_gradients_of_a_linear_field():
@@ -107,8 +149,7 @@ def test_forces_of_chains_are_those_of_the_assembled_matrix(batched):
 def test_a_block_of_forces_and_its_derivative():
     """Those of the assembled matrix, linear in λ, μ and in u."""
     elements, moved, held = elements_of(MESH), MESH.boundary, MESH.interior
-    whole = scipy.sparse.csr_array(np.asarray(elements.derivative.matrix.todense()))
-    on, of = (sparse_operator(whole[:, some]) for some in (held, moved))
+    on, of = (sparse_operator(derivative_matrix(MESH)[:, some]) for some in (held, moved))
     lam, mu = (jnp.asarray(values[MESH.tissue]) for values in (LAM, MU))
     u = jnp.asarray(RNG.normal(size=(len(moved), 3)))
 
