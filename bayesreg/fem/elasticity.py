@@ -139,7 +139,7 @@ def forces(
 
 
 def stiffness_diagonal(
-    squares: SparseOperator,
+    derivative: SparseOperator,
     volumes: Float[AnyArray, "cells"],
     lam: Float[AnyArray, "cells chains"],
     mu: Float[AnyArray, "cells chains"],
@@ -148,9 +148,10 @@ def stiffness_diagonal(
 
     Parameters
     ----------
-    squares : SparseOperator
-        `Elements.derivative`, or columns of it, every entry squared.
+    derivative : SparseOperator
+        `Elements.derivative`, or the columns of it that belong to these nodes.
     """
+    squares = SparseOperator(*(part._replace(entries=part.entries**2) for part in derivative))
     own = (lam + mu)[:, None] * jnp.eye(3)[:, None, :, None]
     entries = volumes[:, None, None] * (mu[:, None] + own)
     return squares.transpose(entries.reshape(3 * len(volumes), -1)).reshape(-1, 3, lam.shape[1])

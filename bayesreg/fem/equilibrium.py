@@ -47,8 +47,6 @@ class ElasticSystem(NamedTuple):
         A partition of the nodes.
     free_derivative, prescribed_derivative : SparseOperator
         The columns of `elements.derivative` that belong to these nodes.
-    squares : SparseOperator
-        Of the first, every entry squared: for `stiffness_diagonal`.
     preconditioner : ReferenceInverse, Multigrid or None
         None where no node is free.
     tolerance, adjoint_tolerance : scalar
@@ -61,7 +59,6 @@ class ElasticSystem(NamedTuple):
     free: Int[AnyArray, "free"]
     free_derivative: SparseOperator
     prescribed_derivative: SparseOperator
-    squares: SparseOperator
     preconditioner: ReferenceInverse | Multigrid | None
     tolerance: Scalar
     adjoint_tolerance: Scalar
@@ -103,7 +100,6 @@ def elastic_system(
         free=jnp.asarray(free),
         free_derivative=sparse_operator(derivative[:, free]),
         prescribed_derivative=sparse_operator(derivative[:, np.asarray(prescribed)]),
-        squares=sparse_operator(derivative[:, free] ** 2),
         preconditioner=preconditioner,
         tolerance=jnp.asarray(tolerance),
         adjoint_tolerance=jnp.asarray(tolerance if adjoint_tolerance is None else adjoint_tolerance),
@@ -226,7 +222,7 @@ def _conjugate_gradients(
     precondition, volumes = system.preconditioner, system.elements.volumes
     assert precondition is not None
     apply = partial(forces, system.free_derivative, system.free_derivative, volumes, lam, mu)
-    inverse_diagonal = 1 / stiffness_diagonal(system.squares, volumes, lam, mu)
+    inverse_diagonal = 1 / stiffness_diagonal(system.free_derivative, volumes, lam, mu)
 
     def dot(a: AnyArray, b: AnyArray) -> AnyArray:
         return (a * b).sum(axis=(0, 1))

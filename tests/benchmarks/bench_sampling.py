@@ -38,13 +38,11 @@ def bench_density_and_gradient():
             of_all = jax.vmap(posterior.logdensity_of, in_axes=(None, 0))
             slopes = jax.vmap(jax.value_and_grad(posterior.logdensity_of, argnums=1), in_axes=(None, 0))
             density, gradient = (_median(jax.jit(f), data, positions) for f in (of_all, slopes))
-            text = (
-                f"{method}, {chains} chains: density {density * 1e3:.1f} ms, gradient {gradient / density:.2f} as long"
-            )
+            text = f"{method}, {chains} chains: density {density * 1e3:.1f} ms"
+            text += f", gradient {gradient / density:.2f} times as long"
             if method == "linear":
-                text += (
-                    f"; {chains * _median(peer.logdensity, *arguments) / density:.1f} times as fast as NumPy and SciPy"
-                )
+                ratio = chains * _median(peer.logdensity, *arguments) / density
+                text += f"; {ratio:.1f} times as fast as NumPy and SciPy"
             print(text, flush=True)
 
 

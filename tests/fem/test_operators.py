@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from bayesreg.fem.elasticity import force_between, internal_force, stiffness, strain_energy, unknowns_of
+from bayesreg.fem.elasticity import (
+    force_between,
+    internal_force,
+    stiffness,
+    stiffness_diagonal,
+    strain_energy,
+    unknowns_of,
+)
 from bayesreg.fem.elements import derivative_matrix, displacement_gradient, elements_of, gauss_quadrature
 from bayesreg.fem.operators import sparse_operator, with_chains_as_columns
 from tests.phantoms import LAM, MU, ball_mesh
@@ -161,3 +168,12 @@ def test_a_block_of_forces_and_its_derivative():
     way = tuple(jnp.asarray(RNG.normal(size=x.shape)) for x in (lam, mu, u))
     _, slope = jax.jvp(force, (lam, mu, u), way)
     np.testing.assert_allclose(slope, force(lam, mu, way[2]) + force(way[0], way[1], u), atol=1e-10)
+
+
+def test_the_diagonal_is_that_of_the_assembled_matrix():
+    elements, some = elements_of(MESH), MESH.interior
+    lam, mu = (RNG.uniform(1, 2, (len(MESH.cells), 3)) for _ in range(2))
+    found = stiffness_diagonal(sparse_operator(derivative_matrix(MESH)[:, some]), elements.volumes, lam, mu)
+    for chain in range(3):
+        expected = stiffness(MESH, lam[:, chain], mu[:, chain]).diagonal()[unknowns_of(some)]
+        np.testing.assert_allclose(np.ravel(found[..., chain]), expected, rtol=1e-12)
