@@ -17,7 +17,7 @@ from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.config.sections import StopConfig
 from bayesreg.distance import signed_distance
-from bayesreg.inference.diagnostics import Convergence, dataset
+from bayesreg.inference.diagnostics import Convergence
 from bayesreg.inference.moments import greatest_rhat
 from bayesreg.inference.run import Samples
 from bayesreg.io.store import Inputs
@@ -33,6 +33,7 @@ def manifest(
     inputs: Inputs,
     posterior: Posterior,
     samples: Samples,
+    draws: xr.Dataset,
     judged: Convergence,
     provenance: dict[str, Any],
     began: float,
@@ -45,6 +46,8 @@ def manifest(
     inputs : Inputs
     posterior : Posterior
     samples : Samples
+    draws : xarray.Dataset
+        The group `posterior`.
     judged : Convergence
     provenance : dict
         "timings" (s) of the preparation, and what is known of a synthetic "pair".
@@ -95,7 +98,7 @@ def manifest(
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
         "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
-        "implied_noise_sd": implied_noise_sd(posterior, dataset(samples.idata, "posterior")),
+        "implied_noise_sd": implied_noise_sd(posterior, draws),
     }
 
 

@@ -15,8 +15,9 @@ from rich.console import Console
 
 from bayesreg.assembly import posterior_of, start_of, with_initial
 from bayesreg.config import Config, load_config, resolved_yaml
-from bayesreg.inference.checkpoint import Block, Checkpoint, checkpoint_to_arrays
-from bayesreg.inference.diagnostics import Convergence, convergence, dataset, open_posterior, save_posterior, to_block
+from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, checkpoint_to_arrays
+from bayesreg.inference.diagnostics import Convergence, convergence
+from bayesreg.inference.draws import dataset, open_posterior, save_posterior, to_blocks
 from bayesreg.inference.run import (
     Samples,
     checkpoint_from_arrays,
@@ -134,7 +135,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
         if (out / "run.json").exists():
-            store.reopen(out, to_block(posterior, load_result(out).idata))
+            store.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
         write_text(out / "config.yaml", inputs.config)
         reached = _reached(config, inputs, posterior, out, progress)
@@ -149,7 +150,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         inputs, provenance = prepared_inputs(config)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs)
-        reached = _first(config, inputs, posterior, progress)
+        reached = _first(config, inputs, posterior, out, progress)
         inputs = with_initial(inputs, config)
         _store(out, inputs, _timed(provenance, began))
     say(_described(inputs))
@@ -290,31 +291,30 @@ def _store(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
     store.write_inputs(out, inputs)
 
 
-Reached = tuple[Checkpoint, list[Block]]
+Reached = tuple[Checkpoint, Blocks]
 
 
-def _first(config: Config, inputs: Inputs, posterior: Posterior, progress: bool) -> Reached:
+def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
     """The chains before their first step; InputError where one cannot start."""
     options, start = config.sampler, start_of(config, inputs, posterior)
     found = first_checkpoint(
         posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
     )
-    return found, []
+    return found, store.StoredBlocks(out, 0)
 
 
 def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
     """The chains as the run that was cut off stored them last."""
     state = store.load_state(out)
     if state is None:
-        return _first(config, inputs, posterior, progress)
-    blocks = list(store.load_blocks(out, int(state.pop("blocks"))))
+        return _first(config, inputs, posterior, out, progress)
+    blocks = store.StoredBlocks(out, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
 
 
 def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
-    def keep(index: int, block: Block, checkpoint: Checkpoint) -> None:
-        store.save_block(out, index, block)
+    def keep(index: int, _block: Block, checkpoint: Checkpoint) -> None:
         store.save_state(out, {"blocks": np.array(index + 1), **checkpoint_to_arrays(checkpoint)})
 
     options = config.sampler
@@ -344,23 +344,17 @@ def _finish(
     began: float,
 ) -> Result:
     """Everything after the last draw: the files of the run folder, run.json last but for the report."""
-    save_posterior(samples.idata, out / "posterior.nc")
-    judged = convergence(samples.idata)
+    save_posterior(posterior, samples.blocks, out / "posterior.nc")
+    idata = open_posterior(out / "posterior.nc")
+    draws, judged = dataset(idata, "posterior"), convergence(idata)
     mean_field = nodal_field_on_grid(inputs.mesh, samples.u_mean, inputs.fixed)
     sd_field = nodal_field_on_grid(inputs.mesh, samples.u_sd, inputs.fixed)
     metrics = None
     if inputs.truth is not None:
-        metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, dataset(samples.idata, "posterior"))
-    predicted = predict(
-        posterior,
-        dataset(samples.idata, "posterior"),
-        samples.u_mean,
-        samples.u_sd,
-        config.report.landmarks,
-        config.seed,
-    )
+        metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
+    predicted = predict(posterior, draws, samples.u_mean, samples.u_sd, config.report.landmarks, config.seed)
     finished = Run(
-        manifest=manifest(config, inputs, posterior, samples, judged, provenance, began),
+        manifest=manifest(config, inputs, posterior, samples, draws, judged, provenance, began),
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
         warped=warp_image(inputs.moving, mean_field, inputs.fixed),
@@ -372,5 +366,5 @@ def _finish(
     store.write_results(out, finished, mean_field, sd_field)
     store.remove_blocks(out)
     result = Result(out, finished)
-    write_report(finished, samples.idata, *judged, result.report)
+    write_report(finished, idata, *judged, result.report)
     return result

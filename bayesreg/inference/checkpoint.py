@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,21 @@ from bayesreg.inference.kernel import Info
 from bayesreg.inference.moments import Moments
 from bayesreg.types import AnyArray
 
-Block = dict[str, np.ndarray]
+Block = Mapping[str, np.ndarray]
+
+
+@runtime_checkable
+class Blocks(Protocol):
+    """Blocks of draws in their order: a list, or what holds them elsewhere and hands out one at a time."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> Block: ...
+
+    def __iter__(self) -> Iterator[Block]: ...
+
+    def append(self, block: Block, /) -> None:
+        """Keep one block more."""
 
 
 class Tally(NamedTuple):

@@ -1,98 +1,19 @@
-"""Draws to ArviZ and back; R̂, effective sample sizes and Monte Carlo errors of every estimand.
-
-The one module that knows which ArviZ it has: 0.23 (InferenceData) and 1.x (xarray.DataTree) differ in
-how draws are handed over, and read each other's NetCDF files.
-"""
+"""R̂ and effective sample sizes of every estimand."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import arviz as az
 import numpy as np
 import xarray as xr
 
-from bayesreg.inference.target import Target
-from bayesreg.types import InputError
+from bayesreg.inference.checkpoint import Block, Blocks
+from bayesreg.inference.draws import OTHERS, STATISTICS, dataset
 
-_OLD = int(az.__version__.split(".")[0]) < 1
-
-STATISTICS = (
-    "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
-    "outside_support", "diverging", "gradients",
-)  # fmt: skip
-# Estimands besides u_boundary, λ and μ, which only some posteriors have.
-OTHERS = ("t_similarity", "t_elastic", "field_sd", "field")
-_DIMS = {
-    "u_boundary": ["node", "axis"],
-    "lam": ["tissue"],
-    "mu": ["tissue"],
-    "ratio": ["tissue"],
-    "field": ["mode"],
-    "points": ["point", "axis"],
-    "cells": ["cell", "corner"],
-    "tissue": ["cell"],
-    "boundary": ["node"],
-}
-
-
-def to_inference_data(target: Target, blocks: list[dict[str, np.ndarray]]) -> Any:
-    """Blocks of draws as ArviZ data.
-
-    Parameters
-    ----------
-    target : Target
-        For the known entries of λ and μ and the names of all of them.
-    blocks : list of mappings
-        Arrays (chain, draw, …) of the estimands and of `STATISTICS`.
-
-    Returns
-    -------
-    arviz.InferenceData or xarray.DataTree
-        posterior: u_boundary (chain, draw, node, axis) in mm, lam, mu and ratio = λ/μ (chain, draw, tissue),
-        known entries included, where they were sampled t_similarity, t_elastic, field_sd (chain, draw) and
-        field (chain, draw, mode), the components of the log-stiffness; sample_stats;
-        constant_data.
-    """
-    draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in blocks[0]}
-    estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
-    values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values["ratio"] = values["lam"] / values["mu"]
-    values |= {name: estimands[name] for name in OTHERS if name in estimands}
-    groups: dict[str, Any] = {
-        "posterior": values,
-        "sample_stats": {name: draws[name] for name in STATISTICS},
-        "constant_data": {name: np.asarray(value) for name, value in target.constant_data().items()},
-    }
-    coords = {"node": np.asarray(target.sampled), "axis": list("xyz"), "tissue": list(target.entry_names)}
-    return (
-        az.from_dict(**groups, coords=coords, dims=_DIMS) if _OLD else az.from_dict(groups, coords=coords, dims=_DIMS)
-    )
-
-
-def to_block(target: Target, idata: Any) -> dict[str, np.ndarray]:
-    """All draws as one block: the inverse of `to_inference_data`."""
-    posterior, statistics = dataset(idata, "posterior"), dataset(idata, "sample_stats")
-    block = {}
-    for name in target.estimands(target.reference()):
-        values = np.asarray(posterior[name].values, float)
-        block[name] = values[..., np.asarray(target.free[name])] if name in target.free else values
-    return block | {name: statistics[name].values for name in STATISTICS}
-
-
-def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """λ and μ with their known entries, on the host: there may be many draws."""
-    reference = target.reference()
-    found = {}
-    for name in ("lam", "mu"):
-        known = np.asarray(reference[name])
-        full = np.tile(known, (*estimands["u_boundary"].shape[:2], 1))
-        if name in estimands:
-            full[..., np.asarray(target.free[name])] = estimands[name]
-        found[name] = full
-    return found
+# Numbers (32 MB of them) that are judged at once, so that memory does not grow with the draws.
+AT_ONCE = 2**22
 
 
 class Convergence(NamedTuple):
@@ -112,17 +33,40 @@ class Convergence(NamedTuple):
 
 
 def convergence(idata: Any) -> Convergence:
-    """R̂ and effective sample sizes of every estimand; of few draws (below 4) all NaN."""
+    """R̂ and effective sample sizes of every estimand; of few draws (below 4) all NaN.
+
+    Draws that lie in a file are read in parts.
+    """
     draws = dataset(idata, "posterior")
-    posterior = draws[["u_boundary", "lam", "mu", *(name for name in OTHERS if name in draws)]]
-    if posterior.sizes["draw"] < 4:
-        nothing = xr.full_like(posterior.isel(chain=0, draw=0, drop=True), np.nan)
-        return Convergence(nothing, nothing, nothing)
-    constant = posterior.min(("chain", "draw")) == posterior.max(("chain", "draw"))
+    names = ["u_boundary", "lam", "mu", *(name for name in OTHERS if name in draws)]
+    judged = [_judged(draws[name]) for name in names]
+    return Convergence(*(xr.merge([found[k] for found in judged]) for k in range(len(Convergence._fields))))
+
+
+def _judged(draws: xr.DataArray) -> list[xr.DataArray]:
+    """R̂, bulk and tail ESS of one variable."""
+    others = [dim for dim in draws.dims if dim not in ("chain", "draw")]
+    if draws.sizes["draw"] < 4 or draws.size == 0:
+        return [xr.full_like(draws.isel(chain=0, draw=0, drop=True), np.nan, float)] * 3
+    if not others:
+        return _figures(draws.astype(float))
+    along = others[0]
+    width = max(1, AT_ONCE // (draws.size // draws.sizes[along]))
+    parts = [
+        _figures(draws.isel({along: slice(first, first + width)}).astype(float))
+        for first in range(0, draws.sizes[along], width)
+    ]
+    return [xr.concat(found, along) for found in zip(*parts, strict=True)]
+
+
+def _figures(draws: xr.DataArray) -> list[xr.DataArray]:
+    draws = draws.compute()
+    constant = draws.min(("chain", "draw")) == draws.max(("chain", "draw"))
+    data = draws.to_dataset()
     # ArviZ divides zero by zero for the known entries, which are left out below.
     with np.errstate(invalid="ignore"):
-        found = (az.rhat(posterior), az.ess(posterior, method="bulk"), az.ess(posterior, method="tail"))
-    return Convergence(*(_plain(result).where(~constant) for result in found))
+        found = (az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail"))
+    return [_plain(result)[draws.name].where(~constant) for result in found]
 
 
 class Worst(NamedTuple):
@@ -133,54 +77,46 @@ class Worst(NamedTuple):
     ess_tail: float
 
 
-def worst(blocks: list[dict[str, np.ndarray]]) -> Worst:
+def worst(blocks: Blocks) -> Worst:
     """The worst figures of blocks of draws (see `to_inference_data`).
 
     R̂ is infinite, and the effective sample sizes are zero, where there are too few draws, one is not a number, or an
     estimand has stood still in all chains.
     """
-    names = [name for name in blocks[0] if name not in STATISTICS] if blocks else []
-    draws = {name: np.concatenate([block[name] for block in blocks], axis=1) for name in names}
-    if not draws or next(iter(draws.values())).shape[1] < 4:
-        return Worst(np.inf, 0.0, 0.0)
-    data = xr.Dataset(
-        {name: (["chain", "draw", *(f"{name}_{k}" for k in range(x.ndim - 2))], x) for name, x in draws.items()}
+    parts = [_worst(part) for part in _columns(blocks)] if len(blocks) else []
+    return Worst(
+        max((part.rhat for part in parts), default=np.inf),
+        min((part.ess_bulk for part in parts), default=0.0),
+        min((part.ess_tail for part in parts), default=0.0),
     )
-    moving = [name for name, x in draws.items() if x.size]
+
+
+def _columns(blocks: Blocks) -> Iterator[np.ndarray]:
+    """All draws of some of the estimands, (chain, draw, estimand), then of others."""
+    first = _flat(blocks[0])
+    width = max(1, AT_ONCE // (first.shape[0] * first.shape[1] * len(blocks)))
+    for low in range(0, first.shape[-1], width):
+        # Copies: a view would keep its whole block.
+        yield np.concatenate([_flat(block)[..., low : low + width].copy() for block in blocks], axis=1)
+
+
+def _flat(block: Block) -> np.ndarray:
+    """All estimands of a block side by side."""
+    draws = [values for name, values in block.items() if name not in STATISTICS]
+    return np.concatenate([values.reshape(*values.shape[:2], -1) for values in draws], axis=-1)
+
+
+def _worst(draws: np.ndarray) -> Worst:
+    if draws.shape[1] < 4:
+        return Worst(np.inf, 0.0, 0.0)
+    data = xr.Dataset({"draws": (["chain", "draw", "estimand"], draws)})
     # ArviZ divides zero by zero for what has stood still.
     with np.errstate(invalid="ignore"):
-        rhat, bulk, tail = (_plain(found) for found in (az.rhat(data), az.ess(data), az.ess(data, method="tail")))
-    return Worst(
-        max(float(rhat[name].fillna(np.inf).max()) for name in moving),
-        *(min(float(ess[name].where(rhat[name].notnull(), 0.0).min()) for name in moving) for ess in (bulk, tail)),
-    )
+        found = (az.rhat(data), az.ess(data), az.ess(data, method="tail"))
+    rhat, bulk, tail = (_plain(one)["draws"] for one in found)
+    least = (float(ess.where(rhat.notnull(), 0.0).min()) for ess in (bulk, tail))
+    return Worst(float(rhat.fillna(np.inf).max()), *least)
 
 
 def _plain(result: Any) -> xr.Dataset:
     return result if isinstance(result, xr.Dataset) else result.to_dataset()
-
-
-def dataset(idata: Any, group: str) -> xr.Dataset:
-    """One group of the draws as an xarray Dataset, whichever ArviZ made them."""
-    found = getattr(idata, group)
-    return found if isinstance(found, xr.Dataset) else found.to_dataset()
-
-
-def save_posterior(idata: Any, path: str | Path) -> None:
-    """Write draws as NetCDF, displacements in single precision and compressed."""
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    groups = idata.groups() if _OLD else [name.strip("/") for name in idata.groups if name != "/"]
-    for index, group in enumerate(groups):
-        data = dataset(idata, group)
-        compact = {"dtype": "float32", "zlib": True, "complevel": 1}
-        encoding = {"u_boundary": compact} if "u_boundary" in data else {}
-        data.to_netcdf(partial, mode="w" if index == 0 else "a", group=group, engine="netcdf4", encoding=encoding)
-    partial.replace(path)
-
-
-def open_posterior(path: str | Path) -> Any:
-    """Read draws written by `save_posterior`; InputError where there are none."""
-    if not Path(path).is_file():
-        raise InputError(f"{path} is missing: the folder holds no draws")
-    return az.from_netcdf(str(path))

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from bayesreg.inference.checkpoint import Block, Checkpoint, Tally, counted, no_steps
+from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, counted, no_steps
 from bayesreg.inference.devices import devices_for, side_by_side
-from bayesreg.inference.diagnostics import to_inference_data
+from bayesreg.inference.draws import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, starting_points
 from bayesreg.inference.kernel import Draw
 from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
@@ -25,13 +26,15 @@ from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
 
 
-class Samples(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Samples:
     """What sampling found.
 
     Attributes
     ----------
-    idata : arviz.InferenceData or xarray.DataTree
-        What ArviZ opens: posterior and sample_stats.
+    posterior : Posterior
+    blocks : Blocks
+        The draws, as arrays (chain, draw, …) of the estimands and of their statistics.
     u_mean, u_sd : (n, 3) arrays
         Posterior mean and standard deviation of the displacement of every node, mm, over all kept draws.
     rhat : mapping
@@ -47,7 +50,8 @@ class Samples(NamedTuple):
         Whether the sampler leaves the posterior unchanged.
     """
 
-    idata: Any
+    posterior: Target
+    blocks: Blocks
     u_mean: np.ndarray
     u_sd: np.ndarray
     rhat: dict[str, np.ndarray]
@@ -56,6 +60,11 @@ class Samples(NamedTuple):
     reason: str
     seconds: float
     exact: bool
+
+    @cached_property
+    def idata(self) -> Any:
+        """All draws in memory, as ArviZ opens them (InferenceData or DataTree): posterior and sample_stats."""
+        return to_inference_data(self.posterior, self.blocks)
 
 
 def sample(
@@ -70,7 +79,7 @@ def sample(
     start: Start | None = None,
     stop: StopRule | None = None,
     progress: bool = True,
-    resume: tuple[Checkpoint, list[Block]] | None = None,
+    resume: tuple[Checkpoint, Blocks] | None = None,
     on_block: Callable[[int, Block, Checkpoint], None] | None = None,
     **settings: Any,
 ) -> Samples:
@@ -96,10 +105,10 @@ def sample(
     stop : StopRule, optional
     progress : bool
         Show a progress bar.
-    resume : (Checkpoint, list of blocks), optional
-        Continue from there instead of from `start`.
+    resume : (Checkpoint, Blocks), optional
+        Continue from there instead of from `start`; every new block is appended.
     on_block : callable, optional
-        Called with the block's number, its draws and the checkpoint after it.
+        Called with the block's number, its draws and the checkpoint after it, when the block is kept.
     **settings
         Of the sampler, see `bayesreg.inference.samplers`.
 
@@ -122,10 +131,11 @@ def sample(
     began = time.perf_counter()
     _, key_chains = jax.random.split(jax.random.key(seed))
     if resume is None:
-        checkpoint, blocks = first_checkpoint(posterior, sampler, chains, seed, start, **settings), []
+        checkpoint = first_checkpoint(posterior, sampler, chains, seed, start, **settings)
+        blocks: Blocks = []
         began = time.perf_counter()
     else:
-        checkpoint, blocks = resume[0], list(resume[1])
+        checkpoint, blocks = resume
         _require_continuation(chosen, checkpoint, blocks)
     chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
@@ -190,12 +200,13 @@ def checkpoint_from_arrays(
     return jax.tree.unflatten(structure, leaves)
 
 
-def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: list[Block]) -> None:
+def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks) -> None:
     """Raise InputError where a state is read otherwise than it was written: coordinates differ between versions."""
-    if not blocks:
+    if len(blocks) == 0:
         return
+    last = blocks[len(blocks) - 1]
     here = _observed(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
-    if not all(np.allclose(here[name], blocks[-1][name][:, -1], rtol=1e-3, atol=1e-4) for name in here):
+    if not all(np.allclose(here[name], last[name][:, -1], rtol=1e-3, atol=1e-4) for name in here):
         raise InputError(
             "the chains do not stand where their last draws were: another version of bayesreg began this run; begin it "
             "anew in another folder"
@@ -300,7 +311,7 @@ def _until(
     stop: StopRule,
     advance: Iterator[tuple[Block, Checkpoint]],
     checkpoint: Checkpoint,
-    blocks: list[Block],
+    blocks: Blocks,
     bar: Progress,
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """The blocks up to the one at which the stop rule holds; `blocks` are those before, which the caller extends."""
@@ -315,13 +326,14 @@ def _until(
 
 
 def _samples(
-    posterior: Target, exact: bool, blocks: list[Block], checkpoint: Checkpoint, stop: StopRule, draws: int
+    posterior: Target, exact: bool, blocks: Blocks, checkpoint: Checkpoint, stop: StopRule, draws: int
 ) -> Samples:
     mean, sd = pooled(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
     holds = None if stop.rhat is None else converged(stop, checkpoint, blocks)
     return Samples(
-        idata=to_inference_data(posterior, blocks),
+        posterior=posterior,
+        blocks=blocks,
         u_mean=mean["u"],
         u_sd=sd["u"],
         rhat=rhat,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from bayesreg.inference.checkpoint import Block, Checkpoint
+from bayesreg.inference.checkpoint import Blocks, Checkpoint
 from bayesreg.inference.diagnostics import Worst, worst
 from bayesreg.inference.moments import greatest_rhat, scale_reduction
 
@@ -31,7 +31,7 @@ class StopRule(NamedTuple):
     min_draws: int = 100
 
 
-def converged(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block]) -> bool:
+def converged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> bool:
     """Whether the rule holds."""
     if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
         return False
@@ -55,7 +55,7 @@ def out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
     return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
 
 
-def reason(stop: StopRule, checkpoint: Checkpoint, blocks: list[Block], holds: bool | None, draws: int) -> str:
+def reason(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, holds: bool | None, draws: int) -> str:
     """Why sampling stopped, in words; `draws` is the greatest number for each chain."""
     if stop.ess is None:
         greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])

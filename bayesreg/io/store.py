@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ BODIES = "bodies.json"
 RESULTS = (
     "config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html", BODIES,
 )  # fmt: skip
+RESUME_ANEW = "delete state.npz in that run's folder, and it resumes from its first step"
 _BODY = {"seed", "true", "found", "failed"}
 
 
@@ -303,19 +304,48 @@ def read_bodies(folder: str | Path) -> list[dict[str, Any]] | None:
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:
     """Write one block of draws in one step; a block of the same index is replaced."""
-    draws = Path(folder) / "draws"
-    draws.mkdir(parents=True, exist_ok=True)
-    save_arrays(draws / f"block_{index:05d}.npz", arrays)
+    path = _block_path(folder, index)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_arrays(path, arrays)
 
 
-def load_blocks(folder: str | Path, count: int) -> Iterator[dict[str, np.ndarray]]:
-    """The first `count` blocks of draws, in order, one in memory at a time; InputError where one is missing."""
-    advice = "delete state.npz in that run's folder, and it resumes from its first step"
-    for index in range(count):
-        path = Path(folder) / "draws" / f"block_{index:05d}.npz"
-        if not path.exists():
-            raise InputError(f"{path} is missing; {advice}")
-        yield load_arrays(path, advice)
+class StoredBlocks:
+    """The first blocks of draws in draws/ of a run folder, each read when it is asked for; see `save_block`.
+
+    Raises
+    ------
+    InputError
+        If one is missing or, when it is asked for, damaged.
+    """
+
+    def __init__(self, folder: str | Path, count: int) -> None:
+        self.folder, self.count = Path(folder), count
+        for index in range(count):
+            if not self._path(index).exists():
+                raise InputError(f"{self._path(index)} is missing; {RESUME_ANEW}")
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> dict[str, np.ndarray]:
+        if not 0 <= index < self.count:
+            raise IndexError(f"block {index} of {self.count}")
+        return load_arrays(self._path(index), RESUME_ANEW)
+
+    def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
+        return (self[index] for index in range(self.count))
+
+    def append(self, block: Mapping[str, AnyArray], /) -> None:
+        """Write one block more."""
+        save_block(self.folder, self.count, block)
+        self.count += 1
+
+    def _path(self, index: int) -> Path:
+        return _block_path(self.folder, index)
+
+
+def _block_path(folder: str | Path, index: int) -> Path:
+    return Path(folder) / "draws" / f"block_{index:05d}.npz"
 
 
 def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
@@ -334,8 +364,8 @@ def remove_blocks(folder: str | Path) -> None:
     shutil.rmtree(Path(folder) / "draws", ignore_errors=True)
 
 
-def reopen(folder: str | Path, draws: Mapping[str, AnyArray]) -> None:
-    """Make of a finished run one that was cut off after one block, which holds all its draws.
+def reopen(folder: str | Path, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
+    """Make of a finished run one that was cut off after these blocks, which hold all its draws.
 
     Killed between any two of its steps, it leaves a finished run, or what it is to leave.
 
@@ -348,8 +378,10 @@ def reopen(folder: str | Path, draws: Mapping[str, AnyArray]) -> None:
     state = load_state(folder)
     if state is None:
         raise InputError(f"{folder} cannot be continued: state.npz, where its chains stood last, is missing")
-    save_block(folder, 0, draws)
-    save_state(folder, state | {"blocks": np.array(1)})
+    kept = StoredBlocks(folder, 0)
+    for block in blocks:
+        kept.append(block)
+    save_state(folder, state | {"blocks": np.array(len(kept))})
     (folder / "run.json").unlink()
 
 

@@ -22,7 +22,8 @@ import bayesreg as br
 from bayesreg.discretisation import PATCH_SHARE, Subject, register_body
 from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
-from bayesreg.inference.diagnostics import convergence, dataset
+from bayesreg.inference.diagnostics import convergence
+from bayesreg.inference.draws import dataset
 from bayesreg.inference.recalibration import Response, recalibrated, response
 from bayesreg.inference.stopping import StopRule
 from bayesreg.io.atomic import write_text

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference.diagnostics import (
-    STATISTICS,
-    convergence,
-    open_posterior,
-    save_posterior,
-    to_inference_data,
-    worst,
-)
+from bayesreg.inference import diagnostics
+from bayesreg.inference.diagnostics import convergence, worst
+from bayesreg.inference.draws import STATISTICS, open_posterior, save_posterior, to_blocks, to_inference_data
+from bayesreg.io.store import StoredBlocks
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -46,12 +44,12 @@ def found():
         normalised=True, priors=priors, t_similarity={"median": 5.0}, t_elastic={"median": 100.0}, fixed={"mu": 1.0}
     )
     given = list(blocks(target))
-    return given, to_inference_data(target, given)
+    return target, given, to_inference_data(target, given)
 
 
 def test_temperatures_are_variables_of_the_posterior(found, tmp_path):
-    given, idata = found
-    save_posterior(idata, tmp_path / "posterior.nc")
+    target, given, idata = found
+    save_posterior(target, given, tmp_path / "posterior.nc")
     for data in (idata, open_posterior(tmp_path / "posterior.nc")):
         for name in ("t_similarity", "t_elastic"):
             assert data.posterior[name].dims == ("chain", "draw")
@@ -60,7 +58,7 @@ def test_temperatures_are_variables_of_the_posterior(found, tmp_path):
 
 
 def test_temperatures_are_judged(found):
-    judged = convergence(found[1])
+    judged = convergence(found[2])
     assert float(judged.rhat["t_similarity"]) < 1.05
     assert float(judged.rhat["t_elastic"]) > 1.5
     assert float(judged.ess_bulk["t_similarity"]) > 60 > 10 > float(judged.ess_bulk["t_elastic"])
@@ -85,3 +83,62 @@ def test_what_stands_still_or_is_no_number_has_not_converged(wrong):
     where = (slice(None), slice(None), 1, 2) if np.isfinite(wrong) else (0, 30, 1, 2)
     draws["u_boundary"][where] = wrong
     assert worst([draws]) == (np.inf, 0.0, 0.0)
+
+
+def test_figures_of_draws_in_parts_are_those_of_all_at_once(found, tmp_path, monkeypatch):
+    target, given, _ = found
+    save_posterior(target, given, tmp_path / "posterior.nc")
+    idata = open_posterior(tmp_path / "posterior.nc")
+    whole, extremes = convergence(idata), worst(given)
+    monkeypatch.setattr(diagnostics, "AT_ONCE", 7 * CHAINS * DRAWS)
+    assert len(list(diagnostics._columns(given))) == -(-diagnostics._flat(given[0]).shape[-1] // 7)
+    assert worst(given) == extremes
+    for expected, parts in zip(whole, convergence(idata), strict=True):
+        assert set(parts.data_vars) == set(expected.data_vars)
+        for name in expected.data_vars:
+            assert parts[name].dims == expected[name].dims
+            np.testing.assert_array_equal(parts[name], expected[name])
+
+
+def test_blocks_of_unequal_lengths_come_back_from_the_file(found, tmp_path):
+    target, given, idata = found
+    cut = [{name: values[:, part] for name, values in given[0].items()} for part in (slice(0, 12), slice(12, None))]
+    save_posterior(target, [*cut, given[1]], tmp_path / "posterior.nc")
+    again = open_posterior(tmp_path / "posterior.nc")
+    np.testing.assert_array_equal(again.posterior["draw"], idata.posterior["draw"])
+    np.testing.assert_allclose(again.posterior["u_boundary"], idata.posterior["u_boundary"], rtol=1e-6)
+    np.testing.assert_array_equal(again.sample_stats["lp"], idata.sample_stats["lp"])
+    lengths = [25, 25, 10]
+    for block, length in zip(to_blocks(target, again, 25), lengths, strict=True):
+        assert {len(values[0]) for values in block.values()} == {length}
+    np.testing.assert_array_equal(np.concatenate([b["lam"] for b in to_blocks(target, again, 25)], axis=1),
+                                  np.concatenate([block["lam"] for block in given], axis=1))  # fmt: skip
+
+
+def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
+    """Keeping, judging and writing ten times the draws, hardly more is held at once: temporaries of one estimand."""
+    target = posterior()
+    monkeypatch.setattr(diagnostics, "AT_ONCE", 2**14)
+    # What is imported at the first call is no draw.
+    _judged_and_written(target, tmp_path / "first", 2)
+    few, many = (_judged_and_written(target, tmp_path / f"{count}", count) for count in (6, 60))
+    added = 54 * sum(values.nbytes for values in next(blocks(target)).values())
+    assert many - few < 0.2 * added
+
+
+def _judged_and_written(target, folder, count):
+    """The greatest number of bytes at once, in the end and on the way."""
+    folder.mkdir()
+    kept = StoredBlocks(folder, 0)
+    tracemalloc.start()
+    for index in range(count):
+        kept.append(next(blocks(target, seed=index)))
+    worst(kept)
+    save_posterior(target, kept, folder / "posterior.nc")
+    idata = open_posterior(folder / "posterior.nc")
+    convergence(idata)
+    for _ in to_blocks(target, idata, DRAWS):
+        pass
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return most

@@ -9,7 +9,8 @@ import pytest
 import bayesreg as br
 from bayesreg.inference import run
 from bayesreg.inference.checkpoint import checkpoint_to_arrays
-from bayesreg.inference.diagnostics import convergence, open_posterior, save_posterior
+from bayesreg.inference.diagnostics import convergence
+from bayesreg.inference.draws import open_posterior, save_posterior
 from bayesreg.inference.initialise import starting_points
 from bayesreg.inference.run import checkpoint_from_arrays
 from tests.phantoms import box_mesh, flat_skull, smooth_image
@@ -51,7 +52,10 @@ def test_a_resumed_run_is_the_run_that_was_not_cut_off():
     arrays = {name: value.copy() for name, value in checkpoint_to_arrays(blocks[0][2]).items()}
     checkpoint = checkpoint_from_arrays(arrays, posterior(), "rwmh", 3)
     assert int(checkpoint.draws) == 4
-    resumed = br.sample(posterior(), draws=12, block=4, resume=(checkpoint, [blocks[0][1]]), **OPTIONS)
+    kept = [blocks[0][1]]
+    resumed = br.sample(posterior(), draws=12, block=4, resume=(checkpoint, kept), **OPTIONS)
+    assert resumed.blocks is kept
+    assert [len(block["lp"][0]) for block in kept] == [4, 4, 4]
     for name, values in draws(samples).items():
         np.testing.assert_array_equal(values, draws(resumed)[name])
     np.testing.assert_array_equal(resumed.u_sd, samples.u_sd)
@@ -187,7 +191,7 @@ def test_starts_spread_over_the_field_and_stay_out_of_the_skull():
 
 def test_posterior_file_round_trip(tmp_path):
     samples, _ = whole()
-    save_posterior(samples.idata, tmp_path / "posterior.nc")
+    save_posterior(posterior(), samples.blocks, tmp_path / "posterior.nc")
     found = open_posterior(tmp_path / "posterior.nc")
     assert set(found.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
     assert found.posterior.u_boundary.dims == ("chain", "draw", "node", "axis")

@@ -156,14 +156,19 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
 
 
 def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
-    assert list(store.load_blocks(tmp_path, 0)) == []
+    assert list(store.StoredBlocks(tmp_path, 0)) == []
     for k in range(12):
         store.save_block(tmp_path, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
     store.save_block(tmp_path, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
-    blocks = list(store.load_blocks(tmp_path, 12))
+    blocks = store.StoredBlocks(tmp_path, 12)
     assert [int(block["step"]) for block in blocks] == list(range(12))
     assert (blocks[11]["u"] == -1).all()
-    assert len(list(store.load_blocks(tmp_path, 5))) == 5
+    assert len(blocks) == 12
+    fewer = store.StoredBlocks(tmp_path, 5)
+    fewer.append({"step": np.array(50)})
+    assert [int(block["step"]) for block in fewer] == [0, 1, 2, 3, 4, 50]
+    with pytest.raises(IndexError, match="block 6 of 6"):
+        fewer[6]
 
 
 def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, monkeypatch):
@@ -187,7 +192,7 @@ def test_a_gap_among_the_blocks_is_an_error(tmp_path):
     for k in (0, 2):
         store.save_block(tmp_path, k, {"u": np.zeros(1)})
     with pytest.raises(ValueError, match=r"block_00001\.npz is missing"):
-        list(store.load_blocks(tmp_path, 3))
+        store.StoredBlocks(tmp_path, 3)
 
 
 @pytest.mark.parametrize("name", ["state.npz", "draws/block_00000.npz", "inputs/truth.npz"])
@@ -198,7 +203,7 @@ def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
     (tmp_path / name).write_bytes(b"PK half a file")
     read = {
         "state.npz": (store.load_state, r"delete it, and the run resumes from its first step"),
-        "draws/block_00000.npz": (lambda f: list(store.load_blocks(f, 1)), r"delete state\.npz"),
+        "draws/block_00000.npz": (lambda f: list(store.StoredBlocks(f, 1)), r"delete state\.npz"),
         "inputs/truth.npz": (store.read_inputs, r"run anew, into another folder"),
     }
     with pytest.raises(ValueError, match=f"{name} is damaged or no .npz file .*; {read[name][1]}"):
