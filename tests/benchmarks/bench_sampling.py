@@ -8,7 +8,7 @@ import numpy as np
 from bayesreg.inference.run import sample
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import build_posterior
-from tests.oracles.paper import Paper
+from tests.benchmarks.stored import SOLVERS, log_density
 from tests.phantoms import ball_mesh, smooth_image
 
 REPETITIONS = 9
@@ -22,16 +22,20 @@ def _posterior(model: ModelConfig):
 
 
 def bench_density_and_gradient():
-    """Of 1, 4 and 16 chains, beside the plain transcription in tests/oracles (SuperLU, map_coordinates) for each."""
+    """Of 1, 4 and 16 chains, beside `tests.benchmarks.stored`, one chain after the other."""
     posteriors = {method: _posterior(ModelConfig(interpolation=method)) for method in ("linear", "cubic")}
     mesh = posteriors["linear"].mesh
     images = [smooth_image(mesh.points, (60, 60, 60), seed=seed) for seed in (0, 1)]
-    peer = Paper(mesh.points, mesh.cells, mesh.tissue, *((i.voxels, i.affine) for i in images), mesh.boundary)
     print(f"\n{len(mesh.points)} nodes, {len(mesh.cells)} elements; medians of {REPETITIONS}")
     for method, posterior in posteriors.items():
         values = posterior.constrain(posterior.initial(jax.random.key(0)))
         arguments = [np.asarray(values[name]) for name in ("u_boundary", "lam", "mu")]
         data = posterior.conditioned(posterior.estimands(values))
+        peers = {}
+        for name, solve in SOLVERS.items():
+            peer = log_density(mesh, *images, {"linear": 1, "cubic": 3}[method], solve)
+            assert np.isclose(peer(*arguments), float(posterior.logdensity_constrained(values)), rtol=1e-9)
+            peers[name] = _median(peer, *arguments)
         for chains in (1, 4, 16):
             keys = jax.random.split(jax.random.key(0), chains)
             positions = jax.vmap(posterior.initial)(keys)
@@ -39,11 +43,8 @@ def bench_density_and_gradient():
             slopes = jax.vmap(jax.value_and_grad(posterior.logdensity_of, argnums=1), in_axes=(None, 0))
             density, gradient = (_median(jax.jit(f), data, positions) for f in (of_all, slopes))
             text = f"{method}, {chains} chains: density {density * 1e3:.1f} ms"
-            text += f", gradient {gradient / density:.2f} times as long"
-            if method == "linear":
-                ratio = chains * _median(peer.logdensity, *arguments) / density
-                text += f"; {ratio:.1f} times as fast as NumPy and SciPy"
-            print(text, flush=True)
+            text += f", gradient {gradient / density:.2f} times as long; times as fast as SciPy with "
+            print(text + ", ".join(f"{name} {chains * s / density:.1f}" for name, s in peers.items()), flush=True)
 
 
 def _median(function, *arguments):

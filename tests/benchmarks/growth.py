@@ -1,0 +1,110 @@
+"""How the cost of a density, of its gradient, and peak memory grow with the mesh and with the quadrature.
+
+    python -m tests.benchmarks.growth [--nodes 5000 30000 100000] [--chains 4] [--voxels]
+
+A ball of radius 80 mm, three shells, boundary nodes sampled, cubic interpolation of images of 1.5 mm; chains start as
+those of a run do, each with its own λ, μ and displacements, and their solves end where those of chains end. Every mesh
+has a process of its own, so that its peak memory is its own, too. With --voxels the quadrature is every voxel of a
+fixed image of 1 mm, two million of them, on the paper's mesh. Medians of seven.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from bayesreg.model.options import ModelConfig
+from bayesreg.model.posterior import Posterior, build_posterior
+from tests.benchmarks.solves import mesh_of
+from tests.phantoms import smooth_image
+
+REPETITIONS = 7
+PAPER_SIZE = 801
+
+
+def main() -> None:
+    """Print a row for each mesh, and the exponents."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--nodes", type=int, nargs="+", default=[5_000, 30_000, 100_000])
+    parser.add_argument("--chains", type=int, default=4)
+    parser.add_argument("--voxels", action="store_true", help="every voxel of a fixed image of 1 mm")
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        print(json.dumps(measured(options.one, options.chains, options.voxels)))
+        return
+    print(f"| nodes | points | density of {options.chains} chains, ms | gradient | set-up, s | compiling, s | GiB |")
+    print("|---|---|---|---|---|---|---|")
+    rows = []
+    for nodes in [PAPER_SIZE] if options.voxels else options.nodes:
+        arguments = ["--one", str(nodes), "--chains", str(options.chains)] + ["--voxels"] * options.voxels
+        process = subprocess.run([sys.executable, "-m", __spec__.name, *arguments], capture_output=True, text=True)
+        if process.returncode:
+            sys.exit(process.stderr)
+        row = json.loads(process.stdout.splitlines()[-1])
+        rows.append(row)
+        print(
+            f"| {row['nodes']:,} | {row['points']:,} | {row['density'] * 1e3:.1f} | {row['gradient'] * 1e3:.1f} | "
+            f"{row['setup']:.1f} | {row['compiling']:.1f} | {row['gib']:.2f} |",
+            flush=True,
+        )
+    if len(rows) > 1:
+        nodes, *times = (np.log([row[name] for row in rows]) for name in ("nodes", "density", "gradient"))
+        density, gradient = ((x[-1] - x[0]) / (nodes[-1] - nodes[0]) for x in times)
+        print(f"from the smallest to the largest as nodes to the power of {density:.2f}, gradient {gradient:.2f}")
+
+
+def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
+    """Seconds and peak memory of this process."""
+    begun = time.perf_counter()
+    posterior = phantom(nodes, voxels)
+    values = posterior.constrain(posterior.initial(jax.random.key(0)))
+    data = posterior.conditioned(posterior.estimands(values))
+    positions = jax.block_until_ready(jax.vmap(posterior.initial)(jax.random.split(jax.random.key(0), chains)))
+    setup = time.perf_counter() - begun
+    many = jax.jit(jax.vmap(posterior.logdensity_of, in_axes=(None, 0)))
+    slopes = jax.jit(jax.vmap(jax.value_and_grad(posterior.logdensity_of, argnums=1), in_axes=(None, 0)))
+    begun = time.perf_counter()
+    compiled = [function.lower(data, positions).compile() for function in (many, slopes)]
+    compiling = time.perf_counter() - begun
+    assert np.isfinite(compiled[0](data, positions)).all()
+    density, gradient = (_median(function, data, positions) for function in compiled)
+    return {
+        "nodes": len(posterior.mesh.points),
+        "points": len(posterior.data.quadrature.weights),
+        "density": density,
+        "gradient": gradient,
+        "setup": setup,
+        "compiling": compiling,
+        "gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+    }
+
+
+def phantom(nodes: int, voxels: bool) -> Posterior:
+    """The posterior of two smooth images on a ball of about so many nodes."""
+    mesh = mesh_of(nodes)
+    shape = (184,) * 3 if voxels else (120,) * 3
+    fixed, moving = (smooth_image(mesh.points, shape, seed=seed, blur=6.0) for seed in (0, 1))
+    return build_posterior(fixed, moving, mesh, ModelConfig(quadrature="voxels" if voxels else "gauss4"))
+
+
+def _median(function: Callable[..., Any], *arguments: Any) -> float:
+    seconds = []
+    for _ in range(REPETITIONS):
+        start = time.perf_counter()
+        jax.block_until_ready(function(*arguments))
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+if __name__ == "__main__":
+    main()
