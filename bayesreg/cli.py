@@ -126,6 +126,11 @@ def run(
     from bayesreg.config import load_config
 
     settings = load_config(config, overrides or ())
+    if settings.distributed is not None:
+        # BlackJAX computes something when it is imported, after which no process can join any more.
+        from bayesreg.inference.devices import join
+
+        join(**settings.distributed.model_dump())
     from bayesreg import pipeline
 
     result = pipeline.run(settings, out, resume=resume, progress=not quiet)

@@ -16,6 +16,7 @@ from rich.console import Console
 from bayesreg.assembly import posterior_of, start_of, with_initial
 from bayesreg.config import Config, load_config, resolved_yaml
 from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, checkpoint_to_arrays
+from bayesreg.inference.devices import is_first, require_joined, wait
 from bayesreg.inference.diagnostics import Convergence, convergence
 from bayesreg.inference.draws import dataset, open_posterior, save_posterior, to_blocks
 from bayesreg.inference.run import (
@@ -41,6 +42,8 @@ from bayesreg.types import InputError
 
 BLOCK = 100
 PROVENANCE = Path("inputs") / "provenance.json"
+# Where several processes wait for one another.
+BEGUN, KEPT, ENDED = "the run has begun", "a block of draws is kept", "the run has ended"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +122,37 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     Raises
     ------
     InputError
-        If the configuration or a file is wrong, or the folder holds another run.
+        If the configuration or a file is wrong, or the folder holds another run; if the section `distributed` is given
+        and `bayesreg.inference.devices.join` was not called.
     """
     config = config if isinstance(config, Config) else load_config(config)
-    out = Path(out)
+    if config.distributed is not None:
+        return _run_together(config, Path(out), resume, progress)
+    return _run(config, Path(out), resume, progress)
+
+
+def _run_together(config: Config, out: Path, resume: bool, progress: bool) -> Result:
+    """The first of several processes runs, and the others join it as if they resumed what it began.
+
+    A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
+    """
+    require_joined()
+    # Where a run is made is no part of it.
+    config = config.model_copy(update={"distributed": None})
+    if is_first():
+        result = _run(config, out, resume, progress)
+        wait(ENDED)
+        return result
+    wait(BEGUN)
+    if not (out / "run.json").exists():
+        begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
+        posterior = posterior_of(begun, inputs)
+        _sample(begun, posterior, _reached(begun, inputs, posterior, out, progress=False), out, progress=False)
+    wait(ENDED)
+    return load_result(out)
+
+
+def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
     began = time.perf_counter()
     say = _narrator(progress)
     if resume and (out / "config.yaml").exists():
@@ -131,6 +161,7 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
             say(f"{out} holds a finished run already; another budget (stop) would continue it")
             if not (out / "report.html").exists():
                 report(out)
+            wait(BEGUN)
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
         posterior = posterior_of(config, inputs)
@@ -153,7 +184,9 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         reached = _first(config, inputs, posterior, out, progress)
         inputs = with_initial(inputs, config)
         _store(out, inputs, _timed(provenance, began))
+        _save_state(out, *reached)
     say(_described(inputs))
+    wait(BEGUN)
     samples = _sample(config, posterior, reached, out, progress)
     say("writing the results")
     result = _finish(config, inputs, posterior, samples, provenance, out, began)
@@ -308,14 +341,20 @@ def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, pr
     state = store.load_state(out)
     if state is None:
         return _first(config, inputs, posterior, out, progress)
-    blocks = store.StoredBlocks(out, int(state.pop("blocks")))
+    blocks = store.StoredBlocks(out, int(state.pop("blocks")), writes=is_first())
     options = config.sampler
     return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
 
 
+def _save_state(out: Path, checkpoint: Checkpoint, blocks: Blocks) -> None:
+    store.save_state(out, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
+
+
 def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
-    def keep(index: int, _block: Block, checkpoint: Checkpoint) -> None:
-        store.save_state(out, {"blocks": np.array(index + 1), **checkpoint_to_arrays(checkpoint)})
+    def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
+        if is_first():
+            _save_state(out, checkpoint, reached[1])
+        wait(KEPT)
 
     options = config.sampler
     return sample(

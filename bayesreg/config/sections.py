@@ -277,6 +277,18 @@ class StopConfig(Section):
     """Minutes of sampling."""
 
 
+class DistributedConfig(Section):
+    """Several processes, one per host, that run the chains of one run together; null entries are left to the cluster's
+    own variables (Slurm, Open MPI)."""
+
+    coordinator: str | None = None
+    """Address and port of the first process, such as node01:12345."""
+    processes: Count | None = None
+    """How many there are."""
+    process: Annotated[int, Field(strict=True, ge=0)] | None = None
+    """Which this is, from 0."""
+
+
 class ReportConfig(Section):
     """What the report is to show."""
 
@@ -317,6 +329,8 @@ class Config(Section):
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()
+    distributed: DistributedConfig | None = None
+    """Other processes that share the chains; null runs alone."""
 
     # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
 

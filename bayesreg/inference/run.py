@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, counted, no_steps
-from bayesreg.inference.devices import devices_for, side_by_side
+from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host, side_by_side
 from bayesreg.inference.draws import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, starting_points
 from bayesreg.inference.kernel import Draw
@@ -129,17 +129,15 @@ def sample(
     stop = stop or StopRule()
     chosen = chosen_sampler(sampler, posterior, settings)
     began = time.perf_counter()
-    _, key_chains = jax.random.split(jax.random.key(seed))
     if resume is None:
-        checkpoint = first_checkpoint(posterior, sampler, chains, seed, start, **settings)
+        checkpoint = from_first(first_checkpoint(posterior, sampler, chains, seed, start, **settings))
         blocks: Blocks = []
         began = time.perf_counter()
     else:
         checkpoint, blocks = resume
         _require_continuation(chosen, checkpoint, blocks)
-    chain_keys = jax.vmap(partial(jax.random.fold_in, key_chains))(jnp.arange(chains))
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
-        advance = _advance(chosen, chain_keys, thin, block, draws, checkpoint, began)
+        advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
         for found, reached in _until(stop, advance, checkpoint, blocks, bar):
             blocks.append(found)
             checkpoint = reached
@@ -232,7 +230,8 @@ def _watched(draw: Draw) -> dict[str, Any]:
 
 def _advance(
     chosen: Chosen,
-    chain_keys: AnyArray,
+    chains: int,
+    seed: int,
     thin: int,
     block: int,
     draws: int,
@@ -241,14 +240,25 @@ def _advance(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """Blocks of draws, until there are `draws` of them."""
     spent = float(checkpoint.seconds)
-    data, devices = chosen.sampler.data(checkpoint.setup), devices_for(len(chain_keys))
+    devices = devices_for(chains)
+    data = on_host(chosen.sampler.data(checkpoint.setup))
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
-        state, moments, tally, found = _run_block(
-            chosen, length, thin, devices, data, chain_keys, int(checkpoint.draws), *checkpoint[1:5]
+        state, moments, tally, found = gathered(
+            _run_block(
+                chosen,
+                length,
+                thin,
+                devices,
+                data,
+                seed,
+                np.arange(chains),
+                int(checkpoint.draws),
+                *on_host(checkpoint[1:5]),
+            )
         )
         found = {name: np.asarray(value) for name, value in found.items()}
-        seconds = np.array(spent + time.perf_counter() - began)
+        seconds = from_first(np.array(spent + time.perf_counter() - began))
         drawn = np.array(int(checkpoint.draws) + length)
         checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
         yield found, checkpoint
@@ -261,7 +271,8 @@ def _run_block(  # type: ignore[no-untyped-def]
     thin: int,
     devices: Mesh | None,
     data: Any,
-    chain_keys: AnyArray,
+    seed: AnyArray | int,
+    numbers: AnyArray,
     first: AnyArray | int,
     setup: Any,
     state: Any,
@@ -269,8 +280,11 @@ def _run_block(  # type: ignore[no-untyped-def]
     tally: Tally,
 ):
     kernel = chosen.sampler
+    _, key_chains = jax.random.split(jax.random.key(seed))
 
-    def chain(key: AnyArray, state: Any, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
+    def chain(number: AnyArray, state: Any, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
+        key = jax.random.fold_in(key_chains, number)
+
         def one_draw(carry, draw):  # type: ignore[no-untyped-def]
             state, moments, tally = carry
 
@@ -287,7 +301,7 @@ def _run_block(  # type: ignore[no-untyped-def]
         carry, kept = jax.lax.scan(one_draw, (state, moments, tally), first + jnp.arange(length))
         return *carry, kept
 
-    return side_by_side(chain, devices)(chain_keys, state, moments, tally)
+    return side_by_side(chain, devices)(numbers, state, moments, tally)
 
 
 def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:
@@ -316,13 +330,17 @@ def _until(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """The blocks up to the one at which the stop rule holds; `blocks` are those before, which the caller extends."""
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    while not (converged(stop, checkpoint, blocks) or out_of_time(stop, checkpoint)):
+    while not from_first(np.array(is_first() and _ended(stop, checkpoint, blocks))):
         found = next(advance, None)
         if found is None:
             return
         checkpoint = found[1]
         bar.show(checkpoint, scale_reduction(checkpoint.moments))
         yield found
+
+
+def _ended(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> bool:
+    return converged(stop, checkpoint, blocks) or out_of_time(stop, checkpoint)
 
 
 def _samples(

@@ -312,14 +312,21 @@ def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -
 class StoredBlocks:
     """The first blocks of draws in draws/ of a run folder, each read when it is asked for; see `save_block`.
 
+    Parameters
+    ----------
+    folder : path
+    count : int
+    writes : bool
+        False where another process writes what is appended.
+
     Raises
     ------
     InputError
         If one is missing or, when it is asked for, damaged.
     """
 
-    def __init__(self, folder: str | Path, count: int) -> None:
-        self.folder, self.count = Path(folder), count
+    def __init__(self, folder: str | Path, count: int, writes: bool = True) -> None:
+        self.folder, self.count, self.writes = Path(folder), count, writes
         for index in range(count):
             if not self._path(index).exists():
                 raise InputError(f"{self._path(index)} is missing; {RESUME_ANEW}")
@@ -337,7 +344,8 @@ class StoredBlocks:
 
     def append(self, block: Mapping[str, AnyArray], /) -> None:
         """Write one block more."""
-        save_block(self.folder, self.count, block)
+        if self.writes:
+            save_block(self.folder, self.count, block)
         self.count += 1
 
     def _path(self, index: int) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bayesreg.inference import run
-from bayesreg.inference.devices import devices_for
+from bayesreg.inference.devices import devices_for, require_joined
 from bayesreg.inference.samplers import chosen_sampler
 from tests.inference.gaussians import GaussianTarget
 from tests.model.test_equality import posterior
@@ -26,12 +26,12 @@ def found(sampler):
         chosen_sampler(sampler, target, settings),
         run.first_checkpoint(target, sampler, CHAINS, 0, **settings),
     )
-    data, keys = chosen.sampler.data(begun.setup), jax.random.split(jax.random.key(1), CHAINS)
+    data = chosen.sampler.data(begun.setup)
 
     def draws(devices, order=(0, 1, 2, 3)):
         order = np.array(order)
         state, moments, tally = jax.tree.map(lambda x: x[order], (begun.state, begun.moments, begun.tally))
-        block = run._run_block(chosen, DRAWS, 2, devices, data, keys[order], 0, begun.setup, state, moments, tally)
+        block = run._run_block(chosen, DRAWS, 2, devices, data, 1, order, 0, begun.setup, state, moments, tally)
         jax.block_until_ready(block)
         kept = block[-1]["u_boundary"]
         return len(kept.sharding.device_set), np.asarray(kept)[np.argsort(order)]
@@ -73,6 +73,24 @@ def test_the_same_draws_on_two_devices(sampler):
 def test_chains_that_cannot_be_shared_stay_on_one_device(monkeypatch):
     device = jax.devices()[0]
     for devices, chains, expected in ((1, 4, None), (3, 4, 2), (4, 6, 3), (3, 5, None), (8, 4, 4)):
-        monkeypatch.setattr(jax, "local_devices", lambda count=devices: [device] * count)
+        monkeypatch.setattr(jax, "devices", lambda count=devices: [device] * count)
         shared = devices_for(chains)
         assert (None if shared is None else shared.size) == expected
+
+
+def test_processes_share_chains_and_their_devices_equally(monkeypatch):
+    class Device:
+        def __init__(self, process_index):
+            self.process_index = process_index
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "devices", lambda: [Device(process) for process in (0, 0, 0, 1, 1)])
+    assert [device.process_index for device in devices_for(8).devices] == [0, 0, 1, 1]
+    assert [device.process_index for device in devices_for(6).devices] == [0, 1]
+    with pytest.raises(ValueError, match="5 chains cannot be shared by 2 processes"):
+        devices_for(5)
+
+
+def test_processes_that_were_not_joined_are_told():
+    with pytest.raises(ValueError, match="not joined: use `bayesreg run`, or call"):
+        require_joined()
