@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from bayesreg.fem.elements import Elements, displacement_gradient, elements_of, shape_gradients
+from bayesreg.fem.elements import Elements, Gradient, displacement_gradient, elements_of, shape_gradients
 from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -62,18 +62,16 @@ def strain_energy_density(
 
 
 def strain_products(
-    first: Float[AnyArray, "3 3 cells"], second: Float[AnyArray, "3 3 cells"]
-) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
+    first: Gradient, second: Gradient
+) -> tuple[Float[AnyArray, "cells *chains"], Float[AnyArray, "cells *chains"]]:
     """div u · div w and ½ (∇u + ∇uᵀ) : (∇w + ∇wᵀ) of each cell: uᵀ K w is the integral of λ and μ times them.
 
-    Parameters
-    ----------
-    first, second : (3, 3, m) array
-        ∇u and ∇w, see `displacement_gradient`.
+    `first` and `second` are ∇u and ∇w, see `displacement_gradient`.
     """
-    divergence = [g[0, 0] + g[1, 1] + g[2, 2] for g in (first, second)]
-    twice_strain = [g + jnp.swapaxes(g, 0, 1) for g in (first, second)]
-    return divergence[0] * divergence[1], (twice_strain[0] * twice_strain[1]).sum(axis=(0, 1)) / 2
+    divergence = [g[0][0] + g[1][1] + g[2][2] for g in (first, second)]
+    stretch = sum(first[i][i] * second[i][i] for i in range(3))
+    shear = sum((first[i][j] + first[j][i]) * (second[i][j] + second[j][i]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    return divergence[0] * divergence[1], 2 * stretch + shear
 
 
 @jax.custom_jvp

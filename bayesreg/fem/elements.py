@@ -64,9 +64,18 @@ def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
     return np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
 
 
-def displacement_gradient(derivative: SparseOperator, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "3 3 cells"]:
-    """∂u_k/∂x_j of every cell, first axis k, second axis j; `derivative` as in `Elements`."""
-    return jnp.moveaxis(derivative(u).reshape(3, -1, 3), -1, 0)
+# ∂u_k/∂x_j of every cell by k, then j; where u has a last axis of chains, each entry has it, too.
+Gradient = tuple[tuple[AnyArray, ...], ...]
+
+
+def displacement_gradient(derivative: SparseOperator, u: Float[AnyArray, "nodes 3 *chains"]) -> Gradient:
+    """∇u of every cell; `derivative` as in `Elements`.
+
+    Entries and not one array: under `vmap` slices keep the chains where the product has them, side by side.
+    """
+    rows = derivative(u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
+    count = len(rows) // 3
+    return tuple(tuple(rows[j * count : (j + 1) * count, k] for j in range(3)) for k in range(3))
 
 
 class Quadrature(NamedTuple):

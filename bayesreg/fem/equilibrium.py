@@ -195,11 +195,20 @@ def _backward(
         return None, jnp.zeros_like(lam), jnp.zeros_like(mu), bar[system.prescribed]
     w, _ = _response(system, system.adjoint_tolerance, lam, mu, bar[system.free])
     reaction = _force(system, system.prescribed_derivative, system.free_derivative, lam, mu, w)
+    by_lam, by_mu = (x[..., 0] for x in _sensitivity(system, u[..., None], w[..., None]))
+    return None, by_lam, by_mu, bar[system.prescribed] - reaction
+
+
+@with_chains_as_columns
+def _sensitivity(
+    system: ElasticSystem, u: Float[AnyArray, "nodes 3 chains"], w: Float[AnyArray, "free 3 chains"]
+) -> tuple[Float[AnyArray, "cells chains"], Float[AnyArray, "cells chains"]]:
+    """−wᵀ (∂K/∂λ) u and −wᵀ (∂K/∂μ) u of every cell."""
     dilatation, distortion = strain_products(
         displacement_gradient(system.elements.derivative, u), displacement_gradient(system.free_derivative, w)
     )
-    volumes = system.elements.volumes
-    return None, -volumes * dilatation, -volumes * distortion, bar[system.prescribed] - reaction
+    volumes = system.elements.volumes[:, None]
+    return -volumes * dilatation, -volumes * distortion
 
 
 _differentiable.defvjp(_forward, _backward)

@@ -16,7 +16,7 @@ from bayesreg.types import AnyArray
 def volume_ratio(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "cells"]:
     """det F = det(I + ∇u) of every cell: its volume after the deformation over that before."""
     gradient = displacement_gradient(elements_of(mesh).derivative, jnp.asarray(u))
-    return jnp.linalg.det(jnp.moveaxis(gradient, -1, 0) + jnp.eye(3))
+    return jnp.linalg.det(jnp.moveaxis(jnp.array(gradient), -1, 0) + jnp.eye(3))
 
 
 def nodal_field_on_grid(
