@@ -26,7 +26,7 @@ MESH = box_mesh(2)
 LAM, MU = np.array([0.5, 1.0, 1.5]), np.array([0.7, 1.0, 1.4])
 OFFSET, GRADIENT = 0.4, np.array([0.03, -0.02, 0.04])
 TEMPERATURES = {"t_similarity": 1.0, "t_elastic": 20.0, "rigid_sd": 0.3}
-WALL = 21.0
+WALL, FAR = 21.0, 45.0
 
 CHAINS, STEPS_PER_DRAW = 32, 15
 # Of the random walk; the others forget sooner, and half as many do.
@@ -37,7 +37,6 @@ class Problem(NamedTuple):
     posterior: br.Posterior
     oracle: paper.Paper
     exact: paper.Gaussian
-    skull: br.Image
 
 
 @cache
@@ -48,20 +47,21 @@ def problem() -> Problem:
     # What the moving image shows after a shift by (0.8, -0.5, 0.3) mm, and a texture that it cannot explain.
     ramp = OFFSET + (texture.grid_points() + np.array([0.8, -0.5, 0.3])) @ GRADIENT
     fixed = br.Image(ramp + 0.1 * (texture.voxels - 0.5), affine)
-    skull = flat_skull(MESH.points, axis=0, wall=WALL, voxel=2.0)
     known = {name: dict(zip(MESH.names, values, strict=True)) for name, values in (("lam", LAM), ("mu", MU))}
     model = br.ModelConfig(fixed=known, **TEMPERATURES)
     arrays = ((image.voxels, image.affine) for image in (fixed, moving))
     oracle = paper.Paper(MESH.points, MESH.cells, MESH.tissue, *arrays, MESH.boundary, **TEMPERATURES)
     exact = paper.gaussian_posterior(oracle, LAM, MU, OFFSET, GRADIENT)
-    return Problem(br.build_posterior(fixed, moving, MESH, model=model), oracle, exact, skull)
+    return Problem(br.build_posterior(fixed, moving, MESH, model=model), oracle, exact)
 
 
 @cache
-def walled() -> br.Posterior:
+def walled(wall: float = WALL) -> br.Posterior:
+    """With a skull, the wall somewhere else at will: what is compiled for one serves the other."""
     found = problem()
     images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
-    return br.build_posterior(*images, MESH, model=found.posterior.options, skull=found.skull)
+    skull = flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
+    return br.build_posterior(*images, MESH, model=found.posterior.options, skull=skull)
 
 
 def run(posterior, sampler, seed, **settings):
@@ -117,7 +117,7 @@ def whitened_scores(y):
 
 def test_density_is_the_gaussian():
     """No sampling: log p is quadratic, with the exact mean and precision."""
-    posterior, _, exact, _ = problem()
+    posterior, _, exact = problem()
 
     def density(flat):
         return posterior.logdensity_constrained({"u_boundary": flat.reshape(-1, 3), "lam": LAM, "mu": MU})
@@ -133,8 +133,9 @@ def test_density_is_the_gaussian():
 
 @pytest.fixture(scope="module", params=["rwmh", "hmc", "nuts", "laplace"])
 def result(request):
-    """Laplace's approximation of a Gaussian is the Gaussian."""
-    return run(problem().posterior, request.param, seed=0, **({"sigma_u": 0.25} if request.param == "rwmh" else {}))
+    """Laplace's approximation of a Gaussian is the Gaussian. Where trajectories are long the skull is out of reach."""
+    posterior = walled(FAR) if request.param in ("hmc", "nuts") else problem().posterior
+    return run(posterior, request.param, seed=0, **({"sigma_u": 0.25} if request.param == "rwmh" else {}))
 
 
 @pytest.mark.slow
@@ -167,7 +168,7 @@ class TestGaussianPosterior:
 
     def test_displacement_at_every_node(self, result):
         """Moments accumulated while sampling are those of the extended draws, interior included."""
-        _, oracle, _, _ = problem()
+        _, oracle, _ = problem()
         extension = paper.extension(oracle.stiffness(LAM, MU), MESH.boundary)
         draws = result.idata.posterior["u_boundary"]
         every = draws.values.reshape(draws.sizes["chain"] * draws.sizes["draw"], -1) @ extension.T
