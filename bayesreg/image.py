@@ -183,15 +183,43 @@ def _first_tap(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, Any
     return (corner.astype(int) * strides).sum(axis=-1), indices - corner, strides
 
 
+@jax.custom_jvp
 def _trilinear(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
+    """Along one axis after the other; its derivative is in the indices alone."""
+    taps, offset = _corners(coefficients, indices)
+    return _between(_between(_between(taps, offset[..., 2]), offset[..., 1]), offset[..., 0])[0]
+
+
+@_trilinear.defjvp
+def _trilinear_jvp(
+    primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]
+) -> tuple[AnyArray, AnyArray]:
+    taps, offset = _corners(*primals)
+    # Looked at once, not once for each of the four results.
+    taps = jax.lax.optimization_barrier(taps)
+    x, y, z = (offset[..., axis] for axis in range(3))
+    at_z, by_z = _between(taps, z), _steps(taps)
+    at_y, by_y = _between(at_z, y), _steps(at_z)
+    change = tangents[1]
+    slope = _steps(at_y)[0] * change[..., 0] + _between(by_y, x)[0] * change[..., 1]
+    return _between(at_y, x)[0], slope + _between(_between(by_z, y), x)[0] * change[..., 2]
+
+
+def _corners(coefficients: AnyArray, indices: AnyArray) -> tuple[list[AnyArray], AnyArray]:
+    """The eight voxels about every point, the last axis fastest, and its offset from the first."""
     first, offset, strides = _first_tap(coefficients, indices)
-    weights = (1 - offset, offset)
     flat = coefficients.reshape(-1)
-    value = jnp.zeros(indices.shape[:-1])
-    for tap in product(range(2), repeat=3):
-        weight = weights[tap[0]][..., 0] * weights[tap[1]][..., 1] * weights[tap[2]][..., 2]
-        value = value + weight * flat[first + int(np.dot(tap, strides))]
-    return value
+    return [flat[first + int(np.dot(tap, strides))] for tap in product(range(2), repeat=3)], offset
+
+
+def _between(taps: list[AnyArray], t: AnyArray) -> list[AnyArray]:
+    """Neighbours, one after the other, taken together a part t of the way."""
+    return [(1 - t) * low + t * high for low, high in zip(taps[::2], taps[1::2], strict=True)]
+
+
+def _steps(taps: list[AnyArray]) -> list[AnyArray]:
+    """From each to its neighbour."""
+    return [high - low for low, high in zip(taps[::2], taps[1::2], strict=True)]
 
 
 @jax.custom_jvp

@@ -1,0 +1,129 @@
+"""The least time that a density can take on this machine, and how near to it ours comes.
+
+    python -m tests.benchmarks.floor [--chains 1 4 16]
+
+For every part of the algorithm the bytes that it has to read and write and its floating-point operations are counted, over
+the measured bandwidth and peak; the slower of the two bounds the part. All that a density of this size works on stays in
+the last cache, and so the bandwidth is that of sums of arrays of 8 MB; the peak is that of products of dense matrices.
+Matrices count once for all chains, vectors once for every pass. On the phantom of the paper's size.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayesreg.fem.equilibrium import equilibrium
+from bayesreg.fem.operators import SparseOperator
+from bayesreg.model.coordinates import complete
+from bayesreg.model.options import ModelConfig
+from bayesreg.model.posterior import Posterior
+from bayesreg.model.program import RegistrationData, _by_cell
+from tests.benchmarks.bench_sampling import _median, _posterior
+
+DOUBLE, SINGLE, INDEX = 8, 4, 4
+TAPS = 64
+
+
+class Machine(NamedTuple):
+    """Bytes and floating-point operations a second."""
+
+    bandwidth: float
+    double: float
+    single: float
+
+
+class Work(NamedTuple):
+    """Bytes, and operations in double and in single precision."""
+
+    bytes: float = 0.0
+    double: float = 0.0
+    single: float = 0.0
+
+    def seconds(self, machine: Machine) -> float:
+        """The least time."""
+        return max(self.bytes / machine.bandwidth, self.double / machine.double + self.single / machine.single)
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--chains", type=int, nargs="+", default=[1, 4, 16])
+    options = parser.parse_args()
+    machine = measured()
+    print(
+        f"{machine.bandwidth / 1e9:.1f} GB/s, {machine.double / 1e9:.0f} and {machine.single / 1e9:.0f} Gflop/s in "
+        "double and single precision"
+    )
+    posterior = _posterior(ModelConfig(interpolation="cubic"))
+    values = posterior.constrain(posterior.initial(jax.random.key(0)))
+    data = posterior.conditioned(posterior.estimands(values))
+    print("| chains | iterations | solve, floor ms | images, floor ms | energies, floor ms | density, ms | fraction |")
+    print("|---|---|---|---|---|---|---|")
+    for chains in options.chains:
+        positions = jax.vmap(posterior.initial)(jax.random.split(jax.random.key(0), chains))
+        iterations = _iterations(posterior, data, positions)
+        parts = [part.seconds(machine) for part in density_parts(data, chains, iterations)]
+        seconds = _median(jax.jit(jax.vmap(posterior.logdensity_of, in_axes=(None, 0))), data, positions)
+        row = " | ".join(f"{part * 1e3:.2f}" for part in parts)
+        print(f"| {chains} | {iterations} | {row} | {seconds * 1e3:.1f} | {sum(parts) / seconds:.0%} |", flush=True)
+
+
+def measured() -> Machine:
+    """What this machine does when it does nothing else."""
+    first, second = (jnp.full(2**20, float(k)) for k in (1, 2))
+    add = jax.jit(lambda x, y: jax.lax.fori_loop(0, 32, lambda _, x: x + 1e-9 * y, x))
+    matrices = [jnp.asarray(np.random.default_rng(0).normal(size=(2048, 2048)), kind) for kind in ("f8", "f4")]
+    product = jax.jit(lambda x: x @ x)
+    double, single = (2 * 2048**3 / _median(product, matrix) for matrix in matrices)
+    return Machine(32 * 3 * first.nbytes / _median(add, first, second), double, single)
+
+
+def density_parts(data: RegistrationData, chains: int, iterations: int) -> tuple[Work, Work, Work]:
+    """The elastic solve, the images, and the strain energy, of so many chains."""
+    system, cells = data.system, len(data.system.elements.volumes)
+    free, points = 3 * len(system.free), len(data.quadrature.weights)
+    hooke = Work((2 * 9 + 2) * cells * chains * DOUBLE, 30 * cells * chains)
+    apply = _sum(_product(system.free_derivative, 3 * chains), hooke, _product(system.free_derivative, 3 * chains))
+    inverse = Work(SINGLE * free**2, single=2 * free**2 * chains)
+    # x, residual and direction are read and written, image and z written and read.
+    vectors = Work(10 * free * chains * DOUBLE, 12 * free * chains)
+    load = _sum(_product(system.prescribed_derivative, 3 * chains), hooke, _product(system.free_derivative, 3 * chains))
+    solve = _sum(load, inverse, *[_sum(apply, inverse, vectors)] * iterations)
+    taps = Work((TAPS + 2) * points * chains * DOUBLE, 2 * (TAPS + 16 + 4) * points * chains)
+    images = _sum(_product(data.quadrature.interpolation, 3 * chains), taps)
+    energies = _sum(
+        _product(system.elements.derivative, 3 * chains), Work(2 * cells * chains * DOUBLE, 30 * cells * chains)
+    )
+    return solve, images, energies
+
+
+def _product(operator: SparseOperator, columns: int) -> Work:
+    """Of a sparse matrix and columns: matrix and columns are read once, the result is written."""
+    entries, rows = operator.matrix.entries.size, operator.matrix.starts.size - 1
+    inputs = operator.transposed.starts.size - 1
+    return Work(entries * (DOUBLE + INDEX) + (rows + inputs) * columns * DOUBLE, 2 * entries * columns)
+
+
+def _sum(*parts: Work) -> Work:
+    return Work(*(sum(each) for each in zip(*parts, strict=True)))
+
+
+def _iterations(posterior: Posterior, data: RegistrationData, positions: dict[str, jax.Array]) -> int:
+    """Of the slowest chain's solve."""
+
+    def count(position: dict[str, jax.Array]) -> jax.Array:
+        values = complete(data, posterior.constrain_of(data, position), posterior.free)
+        lam, mu = _by_cell(data, values["lam"], values["mu"])
+        given = data.held.at[data.slots].set(values["u_boundary"])
+        return equilibrium(data.system, lam, mu, given).iterations
+
+    return int(jax.jit(jax.vmap(count))(positions).max())
+
+
+if __name__ == "__main__":
+    main()
