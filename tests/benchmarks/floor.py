@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.floor [--chains 1 4 16]
 
-For every part of the algorithm the bytes that it has to read and write and its floating-point operations are counted, over
-the measured bandwidth and peak; the slower of the two bounds the part. All that a density of this size works on stays in
-the last cache, and so the bandwidth is that of sums of arrays of 8 MB; the peak is that of products of dense matrices.
-Matrices count once for all chains, vectors once for every pass. On the phantom of the paper's size.
+For every part of the algorithm the bytes that it has to read and write and its floating-point operations are counted,
+over the measured bandwidth and peak; the slower of the two bounds the part. All that a density of this size works on
+stays in the last cache, and so the bandwidth is that of sums of arrays of 8 MB; the peak is that of products of dense
+matrices. Matrices count once for all chains, vectors once for every pass. On the phantom of the paper's size.
 """
 
 from __future__ import annotations
