@@ -148,6 +148,7 @@ def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:
 class Interpolator:
     """An image as a function of world position, for use inside jitted code (it is a pytree).
 
+    Differentiable in the points, not in the coefficients.
     Trilinear (continuous, its gradient jumps between voxels) or cubic B-spline (twice continuously
     differentiable; `scipy.ndimage.map_coordinates` with order 3 and mode "mirror"). Outside the grid the
     image continues with its nearest value.

@@ -43,7 +43,12 @@ from bayesreg.types import InputError
 BLOCK = 100
 PROVENANCE = Path("inputs") / "provenance.json"
 # Where several processes wait for one another.
-BEGUN, KEPT, ENDED = "the run has begun", "a block of draws is kept", "the run has ended"
+BEGUN, KEPT, SAMPLED, ENDED = (
+    "the run has begun",
+    "a block of draws is kept",
+    "all draws are judged",
+    "the run has ended",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +141,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool) -> Re
 
     A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
     """
-    require_joined()
+    require_joined(config.sampler.chains)
     # Where a run is made is no part of it.
     config = config.model_copy(update={"distributed": None})
     if is_first():
@@ -148,6 +153,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool) -> Re
         begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
         posterior = posterior_of(begun, inputs)
         _sample(begun, posterior, _reached(begun, inputs, posterior, out, progress=False), out, progress=False)
+        wait(SAMPLED)
     wait(ENDED)
     return load_result(out)
 
@@ -170,6 +176,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
         write_text(out / "config.yaml", inputs.config)
         reached = _reached(config, inputs, posterior, out, progress)
+        _save_state(out, *reached)
         sampled = float(reached[0].seconds)
         began -= provenance["unsampled"] + sampled
         store.write_json(out / PROVENANCE, _timed(provenance, began + sampled))
@@ -188,6 +195,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
     say(_described(inputs))
     wait(BEGUN)
     samples = _sample(config, posterior, reached, out, progress)
+    wait(SAMPLED)
     say("writing the results")
     result = _finish(config, inputs, posterior, samples, provenance, out, began)
     say(f"{samples.reason}")
@@ -333,7 +341,7 @@ def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, prog
     found = first_checkpoint(
         posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
     )
-    return found, store.StoredBlocks(out, 0)
+    return found, store.StoredBlocks(out, 0, writes=is_first())
 
 
 def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:

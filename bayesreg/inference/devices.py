@@ -44,13 +44,14 @@ def join(coordinator: str | None = None, processes: int | None = None, process: 
         ) from error
 
 
-def require_joined() -> None:
-    """Raise InputError where `join` was not called."""
+def require_joined(chains: int) -> None:
+    """Raise InputError where `join` was not called, or the processes cannot share so many chains."""
     if not jax.distributed.is_initialized():
         raise InputError(
             "the section distributed asks for several processes, which were not joined: use `bayesreg run`, or call "
             "bayesreg.inference.devices.join before anything else of bayesreg is imported"
         )
+    devices_for(chains)
 
 
 def is_first() -> bool:
@@ -85,13 +86,15 @@ def devices_for(chains: int) -> Mesh | None:
     Raises
     ------
     InputError
-        If not even one of each process can.
+        If not even one of each process can, or one process has more devices than another.
     """
     processes, every = jax.process_count(), jax.devices()
     if chains % processes:
         raise InputError(f"{chains} chains cannot be shared by {processes} processes; let sampler.chains be a multiple")
     own = [[device for device in every if device.process_index == process] for process in range(processes)]
-    count = max(n for n in range(1, min(map(len, own)) + 1) if chains % (n * processes) == 0)
+    if len(set(map(len, own))) > 1:
+        raise InputError(f"processes must have equally many devices; they have {', '.join(str(len(d)) for d in own)}")
+    count = max(n for n in range(1, len(own[0]) + 1) if chains % (n * processes) == 0)
     chosen = [device for devices in own for device in devices[:count]]
     return Mesh(np.array(chosen), (_AXIS,)) if len(chosen) > 1 else None
 

@@ -93,16 +93,17 @@ def worst(blocks: Blocks) -> Worst:
 
 def _columns(blocks: Blocks) -> Iterator[np.ndarray]:
     """All draws of some of the estimands, (chain, draw, estimand), then of others."""
-    first = _flat(blocks[0])
-    width = max(1, AT_ONCE // (first.shape[0] * first.shape[1] * len(blocks)))
+    first, last = _flat(blocks[0]), _flat(blocks[len(blocks) - 1])
+    longest = max(first.shape[1], last.shape[1])
+    width = max(1, AT_ONCE // (first.shape[0] * longest * len(blocks)))
     for low in range(0, first.shape[-1], width):
         # Copies: a view would keep its whole block.
         yield np.concatenate([_flat(block)[..., low : low + width].copy() for block in blocks], axis=1)
 
 
 def _flat(block: Block) -> np.ndarray:
-    """All estimands of a block side by side."""
-    draws = [values for name, values in block.items() if name not in STATISTICS]
+    """All estimands of a block side by side, by name: blocks of one run need not agree in their order."""
+    draws = [block[name] for name in sorted(block) if name not in STATISTICS]
     return np.concatenate([values.reshape(*values.shape[:2], -1) for values in draws], axis=-1)
 
 

@@ -117,11 +117,14 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
-    _begin(to_inference_data(target, [blocks[0]]), partial)
-    with netCDF4.Dataset(partial, "a") as file:
-        for index in range(1, len(blocks)):
-            _extend(file, to_inference_data(target, [blocks[index]]))
-    partial.replace(path)
+    try:
+        _begin(to_inference_data(target, [blocks[0]]), partial)
+        with netCDF4.Dataset(partial, "a") as file:
+            for index in range(1, len(blocks)):
+                _extend(file, to_inference_data(target, [blocks[index]]))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _begin(idata: Any, path: Path) -> None:

@@ -84,13 +84,16 @@ def test_processes_share_chains_and_their_devices_equally(monkeypatch):
             self.process_index = process_index
 
     monkeypatch.setattr(jax, "process_count", lambda: 2)
-    monkeypatch.setattr(jax, "devices", lambda: [Device(process) for process in (0, 0, 0, 1, 1)])
+    monkeypatch.setattr(jax, "devices", lambda: [Device(process) for process in (0, 0, 0, 1, 1, 1)])
     assert [device.process_index for device in devices_for(8).devices] == [0, 0, 1, 1]
-    assert [device.process_index for device in devices_for(6).devices] == [0, 1]
+    assert [device.process_index for device in devices_for(10).devices] == [0, 1]
     with pytest.raises(ValueError, match="5 chains cannot be shared by 2 processes"):
         devices_for(5)
+    monkeypatch.setattr(jax, "devices", lambda: [Device(process) for process in (0, 0, 1)])
+    with pytest.raises(ValueError, match="equally many devices; they have 2, 1"):
+        devices_for(4)
 
 
 def test_processes_that_were_not_joined_are_told():
     with pytest.raises(ValueError, match="not joined: use `bayesreg run`, or call"):
-        require_joined()
+        require_joined(4)

@@ -18,7 +18,7 @@ from tests.phantoms import flat_skull, smooth_image
 
 
 def test_a_gaussian_posterior_is_its_own_approximation():
-    posterior, _, exact, _ = problem()
+    posterior, _, exact = problem()
     start = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
     mode = find_mode(posterior, np.asarray(start) + 0.5)
     reference = laplace(posterior, mode)
