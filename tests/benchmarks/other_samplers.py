@@ -10,9 +10,10 @@ unconstrained coordinates and in those that `hmc` has whitened by the end of its
 - Warm-up counts, and takes the others a third of the budget. Compilation does not, tracing included; it is told.
 - NumPyro's chains are vectorised. It has its diagonal mass and a warm-up of 1,000 transitions, cut off when the third
   is over, with the mass and the averaged step size that it has by then.
-- Chains of CUQIpy and tinyDA run in threads; of each as many draws are taken as the shortest has. CUQIpy's NUTS is
-  tuned after each transition, other scales every 25. pCN is about N(0, I). Steps are at first 0.008, the paper's, in
-  unconstrained coordinates, and 2.4 / √d in whitened ones.
+- Chains of CUQIpy and tinyDA run in threads; of each as many draws are taken as the shortest has, and a transition that
+  is not over in time is dropped. CUQIpy's NUTS is tuned after each transition, other scales every 25. pCN is about
+  N(0, I). Steps are at first 0.008, the paper's, in unconstrained coordinates, and 2.4 / √d in whitened ones.
+- Trees of both No-U-Turn samplers have up to 2¹⁰ − 1 gradients, NumPyro's default.
 - tinyDA's adaptive Metropolis learns a covariance once it has d draws, and draws by Cholesky's factor here: its own way
   is a singular value decomposition for each draw. Its MALA is handed the gradient with the density: its own way are
   finite differences.
@@ -294,7 +295,8 @@ def cuqi_nuts(density: Density, start: np.ndarray, step: float) -> Chain:
 
     height, slope = (lambda x: density.value_and_slope(x)[0]), (lambda x: density.value_and_slope(x)[1])
     target = UserDefinedDistribution(len(start), height, slope, name="x")
-    return _of_cuqi(ScalarSlice(target, initial_point=start, max_depth=TREE_DEPTH), 1)
+    # It counts depths from zero.
+    return _of_cuqi(ScalarSlice(target, initial_point=start, max_depth=TREE_DEPTH - 1), 1)
 
 
 def cuqi_pcn(density: Density, start: np.ndarray, step: float) -> Chain:
