@@ -176,7 +176,6 @@ def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
         write_text(out / "config.yaml", inputs.config)
         reached = _reached(config, inputs, posterior, out, progress)
-        _save_state(out, *reached)
         sampled = float(reached[0].seconds)
         began -= provenance["unsampled"] + sampled
         store.write_json(out / PROVENANCE, _timed(provenance, began + sampled))
@@ -191,7 +190,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
         reached = _first(config, inputs, posterior, out, progress)
         inputs = with_initial(inputs, config)
         _store(out, inputs, _timed(provenance, began))
-        _save_state(out, *reached)
+    _save_state(out, *reached)
     say(_described(inputs))
     wait(BEGUN)
     samples = _sample(config, posterior, reached, out, progress)

@@ -328,8 +328,8 @@ class StoredBlocks:
     def __init__(self, folder: str | Path, count: int, writes: bool = True) -> None:
         self.folder, self.count, self.writes = Path(folder), count, writes
         for index in range(count):
-            if not self._path(index).exists():
-                raise InputError(f"{self._path(index)} is missing; {RESUME_ANEW}")
+            if not _block_path(self.folder, index).exists():
+                raise InputError(f"{_block_path(self.folder, index)} is missing; {RESUME_ANEW}")
 
     def __len__(self) -> int:
         return self.count
@@ -337,7 +337,7 @@ class StoredBlocks:
     def __getitem__(self, index: int, /) -> dict[str, np.ndarray]:
         if not 0 <= index < self.count:
             raise IndexError(f"block {index} of {self.count}")
-        return load_arrays(self._path(index), RESUME_ANEW)
+        return load_arrays(_block_path(self.folder, index), RESUME_ANEW)
 
     def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
         return (self[index] for index in range(self.count))
@@ -347,9 +347,6 @@ class StoredBlocks:
         if self.writes:
             save_block(self.folder, self.count, block)
         self.count += 1
-
-    def _path(self, index: int) -> Path:
-        return _block_path(self.folder, index)
 
 
 def _block_path(folder: str | Path, index: int) -> Path:
