@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from bayesreg.chains import with_chains_as_columns
 from bayesreg.types import AnyArray, InputError
 
 Interpolation = Literal["linear", "cubic"]
@@ -226,40 +227,61 @@ def _steps(taps: list[AnyArray]) -> list[AnyArray]:
 @jax.custom_jvp
 def _cubic(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
     """Tricubic B-spline; its derivative is in the indices alone."""
-    return _cubic_and_gradient(coefficients, indices)[0]
+    return _cubic_and_gradient(coefficients, *_by_axis(indices))[0]
 
 
 @_cubic.defjvp
 def _cubic_jvp(primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
     # Value and gradient from one look at the taps: they are what costs.
-    value, gradient = _cubic_and_gradient(*primals)
-    return value, (gradient * tangents[1]).sum(axis=-1)
+    value, gradient = _cubic_and_gradient(primals[0], *_by_axis(primals[1]))
+    return value, sum(slope * change for slope, change in zip(gradient, _by_axis(tangents[1]), strict=True))
+
+
+def _by_axis(x: AnyArray) -> list[AnyArray]:
+    """Apart, so that under `vmap` the chains of each stay side by side."""
+    return [x[..., axis] for axis in range(3)]
+
+
+@jax.custom_jvp
+def _cubic_and_gradient(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
+    """Value, and its gradient in the indices, by axis."""
+    found = _cubic_of_chains(coefficients, *(index[..., None] for index in indices))
+    return jax.tree.map(lambda x: x[..., 0], found)
+
+
+@_cubic_and_gradient.defjvp
+def _cubic_and_gradient_jvp(primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]) -> tuple[Any, Any]:
+    return jax.jvp(partial(_in_batches, primals[0]), primals[1:], tangents[1:])
+
+
+@with_chains_as_columns
+def _cubic_of_chains(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
+    """Chains, the last axis, come one after the other: they look at the same voxels."""
+    return _in_batches(coefficients, *indices)
 
 
 # Points whose taps are looked at together.
 _BATCH = 1024
 
 
-def _cubic_and_gradient(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Value, and its gradient in the indices (last axis)."""
+def _in_batches(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
+    """Value and gradient at indices by axis, arrays of any shape."""
     # The 64 taps of so many points stay in the cache; those of all points at once do not, which costs three times as
     # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
-    flat = indices.reshape(-1, 3)
-    batches = max(-(-len(flat) // _BATCH), 1)
-    size = -(-len(flat) // batches)
-    filled = jnp.pad(flat, ((0, batches * size - len(flat)), (0, 0))).reshape(batches, size, 3)
-    found = jax.lax.map(jax.vmap(partial(_cubic_at, coefficients)), filled)
-    value, gradient = jax.lax.optimization_barrier(found)
-    value, gradient = value.reshape(-1)[: len(flat)], gradient.reshape(-1, 3)[: len(flat)]
-    return value.reshape(indices.shape[:-1]), gradient.reshape(indices.shape)
+    count, shape = indices[0].size, indices[0].shape
+    batches = max(-(-count // _BATCH), 1)
+    size = -(-count // batches)
+    filled = [jnp.pad(index.reshape(-1), (0, batches * size - count)).reshape(batches, size) for index in indices]
+    found = jax.lax.map(lambda batch: jax.vmap(partial(_cubic_at, coefficients))(*batch), filled)
+    return jax.tree.map(lambda x: x.reshape(-1)[:count].reshape(shape), jax.lax.optimization_barrier(found))
 
 
-def _cubic_at(coefficients: AnyArray, index: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _cubic_at(coefficients: AnyArray, *index: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
     """Value and gradient at one point: sums over its taps, one axis after the other."""
-    corner = jax.lax.stop_gradient(jnp.floor(index))
-    taps = jax.lax.dynamic_slice(coefficients, tuple(corner.astype(int)), (4, 4, 4))
-    weights = [_cubic_weights(t) for t in index - corner]
-    slopes = [_cubic_slopes(t) for t in index - corner]
+    corner = [jax.lax.stop_gradient(jnp.floor(i)) for i in index]
+    taps = jax.lax.dynamic_slice(coefficients, [first.astype(int) for first in corner], (4, 4, 4))
+    weights = [_cubic_weights(i - first) for i, first in zip(index, corner, strict=True)]
+    slopes = [_cubic_slopes(i - first) for i, first in zip(index, corner, strict=True)]
     # Without the barriers XLA fuses the stages and gathers every tap anew for each of the four results.
     taps, weights, slopes = jax.lax.optimization_barrier((taps, weights, slopes))
 
@@ -268,7 +290,7 @@ def _cubic_at(coefficients: AnyArray, index: AnyArray) -> tuple[AnyArray, AnyArr
 
     z, dz = jax.lax.optimization_barrier((along(2, taps, weights), along(2, taps, slopes)))
     y, dy, y_dz = jax.lax.optimization_barrier((along(1, z, weights), along(1, z, slopes), along(1, dz, weights)))
-    return along(0, y, weights), jnp.stack([along(0, y, slopes), along(0, dy, weights), along(0, y_dz, weights)])
+    return along(0, y, weights), (along(0, y, slopes), along(0, dy, weights), along(0, y_dz, weights))
 
 
 def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
+from bayesreg.chains import with_chains_as_columns
 from bayesreg.fem import preconditioners
 from bayesreg.fem.elasticity import (
     force_between,
@@ -25,7 +26,7 @@ from bayesreg.fem.elasticity import (
 )
 from bayesreg.fem.elements import Elements, derivative_matrix, displacement_gradient, elements_of
 from bayesreg.fem.multigrid import Multigrid, multigrid
-from bayesreg.fem.operators import SparseOperator, sparse_operator, with_chains_as_columns
+from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar

@@ -17,7 +17,7 @@ from bayesreg.fem.elasticity import (
     unknowns_of,
 )
 from bayesreg.fem.elements import derivative_matrix, displacement_gradient, elements_of, gauss_quadrature
-from bayesreg.fem.operators import sparse_operator, with_chains_as_columns
+from bayesreg.fem.operators import sparse_operator
 from tests.phantoms import LAM, MU, ball_mesh
 
 MESH = ball_mesh(spacing=20.0)
@@ -93,24 +93,11 @@ def test_a_chain_that_is_not_a_number_leaves_the_others_alone(matrix):
     np.testing.assert_allclose(found[[0, 1, 3, 4]], [matrix @ x[i] for i in (0, 1, 3, 4)], atol=1e-13)
 
 
-@with_chains_as_columns
-def weighted(shared, x, y):
-    return shared[:, None] * x * y
-
-
-def test_arguments_that_chains_do_not_have_are_repeated():
-    shared, x, y = np.arange(3.0), np.ones((3, 1)), RNG.normal(size=(4, 3, 1))
-    found = jax.vmap(lambda y: weighted(jnp.asarray(shared), jnp.asarray(x), y))(y)
-    np.testing.assert_allclose(found, shared[:, None] * y)
-
-
-def test_what_chains_share_cannot_differ(matrix):
+def test_the_matrix_cannot_differ_between_chains(matrix):
     operator = sparse_operator(matrix)
     entries = jnp.stack([operator.matrix.entries] * 2)
     with pytest.raises(NotImplementedError, match="matrix of a sparse product cannot differ"):
         jax.vmap(lambda e: operator._replace(matrix=operator.matrix._replace(entries=e))(jnp.ones((9, 1))))(entries)
-    with pytest.raises(NotImplementedError, match="what weighted shares among chains"):
-        jax.vmap(weighted)(np.ones((2, 3)), np.ones((2, 3, 1)), np.ones((2, 3, 1)))
 
 
 def test_columns_that_are_not_aligned_are_the_same(matrix):

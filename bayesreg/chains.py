@@ -1,0 +1,38 @@
+"""Chains side by side as the last axis of arrays, where `vmap` would give each its own place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Float
+
+from bayesreg.types import AnyArray
+
+
+def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate f(shared, *arrays) whose arrays, as what it returns, end in an axis of chains: `vmap` makes it longer.
+
+    `shared` is a pytree that all chains have in common. What is decorated has no derivative.
+    """
+    decorated = custom_vmap(function)
+
+    @decorated.def_vmap
+    def _(size: int, batched: Sequence[Any], shared: Any, *arrays: AnyArray) -> tuple[Any, Any]:
+        if any(jax.tree.leaves(batched[0])):
+            raise NotImplementedError(f"what {function.__name__} shares among chains cannot differ from chain to chain")
+        shapes = [(size, *array.shape[own:]) for array, own in zip(arrays, batched[1:], strict=True)]
+        longer = [_joined(jnp.broadcast_to(x, shape)) for x, shape in zip(arrays, shapes, strict=True)]
+        found = decorated(shared, *longer)
+        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size), -1, 0), found)
+        return parted, jax.tree.map(lambda _: True, found)
+
+    return decorated
+
+
+def _joined(x: Float[AnyArray, "size *rows chains"]) -> Float[AnyArray, "*rows all_chains"]:
+    moved = jnp.moveaxis(x, 0, -1)
+    return moved.reshape(*moved.shape[:-2], -1)

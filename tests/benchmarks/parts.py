@@ -1,0 +1,135 @@
+"""Where the time of a draw goes, and that of a gradient, at the end of a finished run of `hmc`.
+
+    python -m tests.benchmarks.parts RUN [--chains 16]
+
+RUN is a run's folder. A draw is timed with the run's own chains where they stand; density and gradient with so many
+chains, copies of these a little apart. Medians of nine, each part compiled by itself: together they may take less.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import bayesreg as br
+from bayesreg.assembly import posterior_of
+from bayesreg.fem.elasticity import total_strain_energy
+from bayesreg.fem.equilibrium import equilibrium
+from bayesreg.inference.hamiltonian import _quarter_turn
+from bayesreg.inference.loose import moved_alone
+from bayesreg.inference.reflection import rotated
+from bayesreg.inference.run import checkpoint_from_arrays
+from bayesreg.inference.samplers import chosen_sampler
+from bayesreg.inference.whitened import clearance_of, whitened_density, whitened_position
+from bayesreg.io import store
+from bayesreg.model.coordinates import complete
+from bayesreg.model.program import _by_cell
+from tests.benchmarks.bench_sampling import _median
+
+APART = 0.01  # In whitened coordinates.
+
+
+def main() -> None:
+    """Print a line for each part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--chains", type=int, default=16)
+    given = parser.parse_args()
+    config = br.load_config(given.run / "config.yaml")
+    posterior, options = posterior_of(config, store.read_inputs(given.run)), config.sampler
+    stored = np.load(given.run / "state.npz")
+    arrays = {name: stored[name] for name in stored.files if name.startswith("leaf")}
+    end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
+    sampler = chosen_sampler(options.name, posterior, options.settings).sampler
+    data, setup = sampler.data(end.setup), end.setup
+    print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled, {int(setup.steps)} gradients a draw")
+    print(f"\nA draw, {options.chains} chains")
+    of_a_draw(posterior, sampler, data, setup, end.state)
+    print(f"\nA gradient, {given.chains} chains")
+    of_a_gradient(posterior, data, setup, end.state.position, given.chains)
+
+
+def timed(name: str, of_chain: Callable[..., Any], shared: tuple[Any, ...], *chains: Any) -> None:
+    """Print the time that a function of what chains share and of what is each chain's takes for all of them."""
+    axes = (*[None] * len(shared), *[0] * len(chains))
+    seconds = _median(jax.jit(jax.vmap(of_chain, in_axes=axes)), *shared, *chains)
+    print(f"{name:40s} {1e3 * seconds:7.1f} ms", flush=True)
+
+
+def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -> None:
+    """The whole, then its parts."""
+    keys = jax.random.split(jax.random.key(0), len(state.position))
+    momentum = jax.random.normal(jax.random.key(1), state.position.shape)
+
+    def begin(data: Any, setup: Any, xi: jax.Array) -> Any:
+        return blackjax.mcmc.hmc.init(xi, whitened_density(posterior, data, setup))
+
+    def alone(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
+        return moved_alone(posterior, partial(begin, data, setup), data, setup.reference, setup.loose, key, state)
+
+    def turned(data: Any, setup: Any, xi: jax.Array, momentum: jax.Array) -> Any:
+        return rotated(setup.walls, clearance_of(posterior, data, setup), xi, momentum, setup.step_size)
+
+    def trajectory(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
+        return _quarter_turn(posterior, data, setup, key, state)[0]
+
+    shared = data, setup
+    timed("all but its energies", lambda *given: sampler.step(*given)[0], shared, keys, state)
+    timed("  trajectory", trajectory, shared, keys, state)
+    timed("    a gradient of it", begin, shared, state.position)
+    timed("    a rotation of it, with reflections", turned, shared, state.position, momentum)
+    timed("  nodes moved alone, with a gradient", alone, shared, keys, state)
+    timed("its energies", sampler.observe, shared, state)
+
+
+def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, chains: int) -> None:
+    """Density and gradient, then their parts, each as itself and with its derivative."""
+    places = jnp.resize(positions, (chains, positions.shape[1]))
+    places += APART * jax.random.normal(jax.random.key(2), places.shape)
+
+    def density(data: Any, setup: Any, xi: jax.Array) -> jax.Array:
+        return whitened_density(posterior, data, setup)(xi)
+
+    def values_of(xi: jax.Array) -> Any:
+        estimands = posterior.constrain_of(data, whitened_position(posterior, setup.reference, xi))
+        values = complete(data, estimands, posterior.free)
+        lam, mu = _by_cell(data, values["lam"], values["mu"])
+        return lam, mu, data.held.at[data.slots].set(values["u_boundary"])
+
+    lam, mu, given = jax.jit(jax.vmap(values_of))(places)
+    u = jax.jit(jax.vmap(lambda *x: equilibrium(data.system, *x).u))(lam, mu, given)
+    back = jax.random.normal(jax.random.key(3), u.shape)
+
+    def solve(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
+        return equilibrium(data.system, lam, mu, given).u
+
+    def adjoint(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array, back: jax.Array) -> Any:
+        return jax.vjp(partial(solve, data), lam, mu, given)[1](back)
+
+    def images(data: Any, u: jax.Array) -> jax.Array:
+        moved = data.moving(data.positions + data.quadrature.interpolation(u))
+        return data.quadrature.weights @ (data.fixed_values - moved) ** 2
+
+    def strain(data: Any, lam: jax.Array, mu: jax.Array, u: jax.Array) -> jax.Array:
+        return total_strain_energy(data.system.elements, lam, mu, u)
+
+    timed("density", density, (data, setup), places)
+    timed("density and gradient", jax.value_and_grad(density, argnums=2), (data, setup), places)
+    timed("  solve", solve, (data,), lam, mu, given)
+    timed("  solve and adjoint", adjoint, (data,), lam, mu, given, back)
+    timed("  images", images, (data,), u)
+    timed("  images and slope", jax.value_and_grad(images, argnums=1), (data,), u)
+    timed("  strain energy", strain, (data,), lam, mu, u)
+    timed("  strain energy and slopes", jax.value_and_grad(strain, argnums=(1, 2, 3)), (data,), lam, mu, u)
+
+
+if __name__ == "__main__":
+    main()
