@@ -1,22 +1,16 @@
 """The command line. Heavy imports stand inside the commands, so that help comes at once."""
 
 import errno
-import os
-import platform
-import time
-import zlib
 from pathlib import Path
 from typing import Annotated, Any
 
-import platformdirs
 import typer
 from typer.core import TyperGroup
 
 from bayesreg import __version__
+from bayesreg.programs import compile_quickly, keep_compiled_programs
 
 NOT_CONVERGED = 3
-# For so long are compiled programs kept, some 40 MB of them for a mesh.
-MOST_DAYS = 30
 STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
@@ -81,41 +75,8 @@ def _options(
     ] = False,
 ) -> None:
     """Registration of two images with posterior distributions of displacement and stiffness."""
+    compile_quickly()
     keep_compiled_programs()
-
-
-def keep_compiled_programs() -> None:
-    """Have JAX keep compiled programs in the user's cache for later runs, unless its own variable names a folder.
-
-    Each kind of processor has a folder of its own there: homes are shared on clusters, and what is compiled for one
-    kind may not run on another. Where there is no home, or none that can be written to, nothing is kept.
-    """
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
-    try:
-        kind = f"{zlib.crc32(_processor().encode()):08x}"
-        folder = platformdirs.user_cache_path("bayesreg") / "programs" / kind
-        folder.mkdir(parents=True, exist_ok=True)
-        oldest = time.time() - MOST_DAYS * 24 * 3600
-        for program in folder.iterdir():
-            if program.stat().st_mtime < oldest:
-                program.unlink()
-    except (OSError, RuntimeError):
-        return
-    if folder.is_absolute() and os.access(folder, os.W_OK):
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-
-
-def _processor() -> str:
-    """What tells kinds of processors apart."""
-    information = Path("/proc/cpuinfo")
-    if not information.exists():
-        return platform.processor() or platform.machine()
-    lines = information.read_text(encoding="utf-8", errors="replace").splitlines()
-    return "\n".join(
-        sorted({line for line in lines if line.startswith(("model name", "CPU part", "flags", "Features"))})
-    )
 
 
 @app.command()

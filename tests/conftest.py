@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+from bayesreg.programs import compile_quickly
+
 _ROOT = Path(__file__).parent.parent
 
 # Before anything imports JAX; `setdefault`, so that a caller may choose otherwise.
@@ -13,6 +15,7 @@ os.environ.setdefault("JAX_ENABLE_X64", "true")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
+compile_quickly()
 
 # Not for the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
 _MODULES = [f"bayesreg.{path.stem}" for path in (_ROOT / "bayesreg").iterdir() if path.stem[0] not in "_."]

@@ -3,7 +3,6 @@
 import errno
 import inspect
 import json
-import os
 import subprocess
 import sys
 import time
@@ -14,7 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 import bayesreg
-from bayesreg import cli
 from bayesreg.cli import app
 from bayesreg.types import InputError
 
@@ -181,52 +179,3 @@ def test_help_loads_nothing_heavy_and_comes_at_once():
         subprocess.run([PROGRAM, "--help"], capture_output=True, check=True)
         durations.append(time.perf_counter() - start)
     assert min(durations) < 1.5
-
-
-def test_compiled_programs_are_kept_in_the_users_cache_unless_a_folder_is_named(tmp_path):
-    code = (
-        "from bayesreg.cli import keep_compiled_programs; keep_compiled_programs();"
-        "import jax, jax.numpy as jnp; jax.block_until_ready(jax.jit(lambda x: jnp.linalg.eigh(x)[1])(jnp.eye(3)));"
-        "print(jax.config.jax_compilation_cache_dir)"
-    )
-
-    def named(**variables: str) -> str:
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-        environment = {**kept, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", **variables}
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-        return done.stdout.strip()
-
-    home, own, blocked = tmp_path / "home", tmp_path / "own", tmp_path / "a_file"
-    folder = named(XDG_CACHE_HOME=str(home))
-    assert folder.startswith(str(home / "bayesreg"))
-    programs = sorted(path.name for path in Path(folder).glob("*-cache"))
-    assert programs
-    assert named(XDG_CACHE_HOME=str(home)) == folder
-    assert sorted(path.name for path in Path(folder).glob("*-cache")) == programs
-    assert named(XDG_CACHE_HOME=str(home), JAX_COMPILATION_CACHE_DIR=str(own)) == str(own)
-    blocked.touch()
-    assert named(XDG_CACHE_HOME=str(blocked)) == "None"
-
-
-def test_without_a_home_nothing_is_kept_and_old_programs_go(tmp_path, monkeypatch):
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setattr(cli.platformdirs, "user_cache_path", lambda name: tmp_path / name)
-    # Set, so that it is put back afterwards.
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-    cli.keep_compiled_programs()
-    folder = Path(os.environ.pop("JAX_COMPILATION_CACHE_DIR"))
-    assert folder.is_relative_to(tmp_path / "bayesreg")
-    old, new = folder / "old-cache", folder / "new-cache"
-    old.touch()
-    new.touch()
-    os.utime(old, (0, time.time() - 40 * 24 * 3600))
-    cli.keep_compiled_programs()
-    assert [path.name for path in folder.iterdir()] == ["new-cache"]
-    del os.environ["JAX_COMPILATION_CACHE_DIR"]
-
-    def homeless(name):
-        raise RuntimeError("could not determine the home directory")
-
-    monkeypatch.setattr(cli.platformdirs, "user_cache_path", homeless)
-    cli.keep_compiled_programs()
-    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
