@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import arviz as az
 import numpy as np
 import xarray as xr
+from jaxtyping import Int
 
 from bayesreg.inference.checkpoint import Block, Blocks
 from bayesreg.inference.draws import OTHERS, STATISTICS, dataset
@@ -77,13 +78,15 @@ class Worst(NamedTuple):
     ess_tail: float
 
 
-def worst(blocks: Blocks) -> Worst:
-    """The worst figures of blocks of draws (see `to_inference_data`).
+def worst(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Worst:
+    """The worst figures of blocks of draws (see `to_inference_data`), of all estimands or of those chosen.
+
+    Estimands are numbered in the order of their names, each as it lies in memory.
 
     R̂ is infinite, and the effective sample sizes are zero, where there are too few draws, one is not a number, or an
     estimand has stood still in all chains.
     """
-    parts = [_worst(part) for part in _columns(blocks)] if len(blocks) else []
+    parts = [_worst(part) for part in _columns(blocks, chosen)] if len(blocks) else []
     return Worst(
         max((part.rhat for part in parts), default=np.inf),
         min((part.ess_bulk for part in parts), default=0.0),
@@ -91,14 +94,15 @@ def worst(blocks: Blocks) -> Worst:
     )
 
 
-def _columns(blocks: Blocks) -> Iterator[np.ndarray]:
+def _columns(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None) -> Iterator[np.ndarray]:
     """All draws of some of the estimands, (chain, draw, estimand), then of others."""
     first, last = _flat(blocks[0]), _flat(blocks[len(blocks) - 1])
     longest = max(first.shape[1], last.shape[1])
     width = max(1, AT_ONCE // (first.shape[0] * longest * len(blocks)))
-    for low in range(0, first.shape[-1], width):
-        # Copies: a view would keep its whole block.
-        yield np.concatenate([_flat(block)[..., low : low + width].copy() for block in blocks], axis=1)
+    places = np.arange(first.shape[-1]) if chosen is None else chosen
+    for low in range(0, len(places), width):
+        # Taken by their numbers and so copied: a view would keep its whole block.
+        yield np.concatenate([_flat(block)[..., places[low : low + width]] for block in blocks], axis=1)
 
 
 def _flat(block: Block) -> np.ndarray:

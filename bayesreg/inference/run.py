@@ -21,7 +21,7 @@ from bayesreg.inference.kernel import Draw
 from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
 from bayesreg.inference.samplers import SAMPLERS, Chosen, chosen_sampler
-from bayesreg.inference.stopping import StopRule, converged, out_of_time, reason
+from bayesreg.inference.stopping import StopRule, Verdict, judged, out_of_time, reason
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
 
@@ -138,12 +138,14 @@ def sample(
         _require_continuation(chosen, checkpoint, blocks)
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
-        for found, reached in _until(stop, advance, checkpoint, blocks, bar):
-            blocks.append(found)
-            checkpoint = reached
+        verdict, ended = _judged(stop, checkpoint, blocks, bar)
+        while not ended and (found := next(advance, None)) is not None:
+            drawn, checkpoint = found
+            blocks.append(drawn)
             if on_block is not None:
-                on_block(len(blocks) - 1, found, checkpoint)
-    return _samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, draws)
+                on_block(len(blocks) - 1, drawn, checkpoint)
+            verdict, ended = _judged(stop, checkpoint, blocks, bar)
+    return _samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
 
 
 def first_checkpoint(
@@ -321,34 +323,28 @@ def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:
     }
 
 
-def _until(
-    stop: StopRule,
-    advance: Iterator[tuple[Block, Checkpoint]],
-    checkpoint: Checkpoint,
-    blocks: Blocks,
-    bar: Progress,
-) -> Iterator[tuple[Block, Checkpoint]]:
-    """The blocks up to the one at which the stop rule holds; `blocks` are those before, which the caller extends."""
+def _judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
+    """The verdict on the draws so far, and whether they are enough or time is up; of several processes the first says.
+
+    What is known without judging them is shown.
+    """
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    while not from_first(np.array(is_first() and _ended(stop, checkpoint, blocks))):
-        found = next(advance, None)
-        if found is None:
-            return
-        checkpoint = found[1]
-        bar.show(checkpoint, scale_reduction(checkpoint.moments))
-        yield found
-
-
-def _ended(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> bool:
-    return converged(stop, checkpoint, blocks) or out_of_time(stop, checkpoint)
+    verdict = judged(stop, checkpoint, blocks) if is_first() else Verdict(holds=False)
+    holds, late = from_first(np.array([verdict.holds, out_of_time(stop, checkpoint)]))
+    return verdict._replace(holds=bool(holds)), bool(holds or late)
 
 
 def _samples(
-    posterior: Target, exact: bool, blocks: Blocks, checkpoint: Checkpoint, stop: StopRule, draws: int
+    posterior: Target,
+    exact: bool,
+    blocks: Blocks,
+    checkpoint: Checkpoint,
+    stop: StopRule,
+    verdict: Verdict,
+    draws: int,
 ) -> Samples:
     mean, sd = pooled(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
-    holds = None if stop.rhat is None else converged(stop, checkpoint, blocks)
     return Samples(
         posterior=posterior,
         blocks=blocks,
@@ -356,8 +352,8 @@ def _samples(
         u_sd=sd["u"],
         rhat=rhat,
         tally=jax.tree.map(np.asarray, checkpoint.tally),
-        converged=holds,
-        reason=reason(stop, checkpoint, blocks, holds, draws),
+        converged=None if stop.rhat is None else verdict.holds,
+        reason=reason(stop, checkpoint, blocks, verdict, draws),
         seconds=float(checkpoint.seconds),
         exact=exact,
     )

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
+
+import numpy as np
 
 from bayesreg.inference.checkpoint import Blocks, Checkpoint
 from bayesreg.inference.diagnostics import Worst, worst
 from bayesreg.inference.moments import greatest_rhat, scale_reduction
+from bayesreg.types import AnyArray
+
+# Estimands that are judged before all others.
+SUSPECTS = 32
 
 
 class StopRule(NamedTuple):
@@ -31,15 +38,32 @@ class StopRule(NamedTuple):
     min_draws: int = 100
 
 
-def converged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> bool:
-    """Whether the rule holds."""
+class Verdict(NamedTuple):
+    """Whether a rule holds, and the figures of all estimands where these had to be worked out."""
+
+    holds: bool
+    found: Worst | None = None
+
+
+def judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
+    """The verdict on all draws so far."""
     if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
-        return False
-    running = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
+        return Verdict(holds=False)
+    rhat = scale_reduction(checkpoint.moments)["estimands"]
+    running = greatest_rhat(rhat)
     if stop.ess is None:
-        return running < stop.rhat
-    # The running R̂ is cheap and close to the strict one: where it is far off, that need not be worked out.
-    return running < 1 + 1.5 * (stop.rhat - 1) and _meets(worst(blocks), stop)
+        return Verdict(running < stop.rhat)
+    # The running R̂ is cheap and close to the strict one: where it is far off, that need not be worked out. Nor need it
+    # for all estimands where one of the suspects fails.
+    if not running < 1 + 1.5 * (stop.rhat - 1) or not _meets(worst(blocks, _suspects(rhat)), stop):
+        return Verdict(holds=False)
+    found = worst(blocks)
+    return Verdict(_meets(found, stop), found)
+
+
+def _suspects(rhat: Mapping[str, AnyArray]) -> np.ndarray:
+    """Those of the greatest running R̂, by their place among all estimands, which are sorted by name."""
+    return np.argsort(-np.concatenate([rhat[name].ravel() for name in sorted(rhat)]), kind="stable")[:SUSPECTS]
 
 
 def _meets(found: Worst, stop: StopRule) -> bool:
@@ -55,16 +79,16 @@ def out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
     return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
 
 
-def reason(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, holds: bool | None, draws: int) -> str:
+def reason(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, verdict: Verdict, draws: int) -> str:
     """Why sampling stopped, in words; `draws` is the greatest number for each chain."""
     if stop.ess is None:
         greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
         state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"it below {stop.rhat}"
     else:
-        found = worst(blocks)
+        found = verdict.found or worst(blocks)
         state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"
         rule = f"R̂ below {stop.rhat} and both ESS above {stop.ess:g}"
-    if holds:
+    if verdict.holds:
         return f"every estimand has converged: {state}"
     limit = f"{draws} draws per chain"
     if out_of_time(stop, checkpoint):

@@ -91,7 +91,7 @@ def test_figures_of_draws_in_parts_are_those_of_all_at_once(found, tmp_path, mon
     idata = open_posterior(tmp_path / "posterior.nc")
     whole, extremes = convergence(idata), worst(given)
     monkeypatch.setattr(diagnostics, "AT_ONCE", 7 * CHAINS * DRAWS)
-    assert len(list(diagnostics._columns(given))) == -(-diagnostics._flat(given[0]).shape[-1] // 7)
+    assert len(list(diagnostics._columns(given, None))) == -(-diagnostics._flat(given[0]).shape[-1] // 7)
     assert worst(given) == extremes
     for expected, parts in zip(whole, convergence(idata), strict=True):
         assert set(parts.data_vars) == set(expected.data_vars)

@@ -1,0 +1,81 @@
+"""The stop rule: suspects first, and all estimands before it holds."""
+
+import numpy as np
+import pytest
+
+from bayesreg.inference import stopping
+from bayesreg.inference.checkpoint import Checkpoint, no_steps
+from bayesreg.inference.diagnostics import worst
+from bayesreg.inference.moments import Moments
+from bayesreg.inference.stopping import StopRule, judged, reason
+
+RULE = StopRule(rhat=1.01, ess=400)
+DRAWS = 600
+
+
+def drawn(shift=0.0, node=17):
+    """Four chains of 63 estimands, one of which is off by `shift` standard deviations in one chain."""
+    rng = np.random.default_rng(0)
+    draws = {name: rng.normal(size=(4, DRAWS, *shape)) for name, shape in (("u_boundary", (20, 3)), ("lam", (3,)))}
+    draws = {name: x - x.mean(axis=1, keepdims=True) for name, x in draws.items()}
+    draws["u_boundary"][0, :, node, 1] += shift
+    mean = {name: x.mean(axis=1) for name, x in draws.items()}
+    squares = {name: ((x - x.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) for name, x in draws.items()}
+    moments = Moments(np.full(4, DRAWS), {"estimands": mean}, {"estimands": squares})
+    blocks = [{name: x[:, part] for name, x in draws.items()} for part in (slice(0, 200), slice(200, None))]
+    return Checkpoint(np.array(DRAWS), None, None, moments, no_steps((4,)), np.array(0.0)), blocks
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """How many estimands were judged, each time."""
+    counts = []
+
+    def counted(blocks, chosen=None):
+        counts.append(63 if chosen is None else len(chosen))
+        return worst(blocks, chosen)
+
+    monkeypatch.setattr(stopping, "worst", counted)
+    monkeypatch.setattr(stopping, "SUSPECTS", 5)
+    return counts
+
+
+def test_the_rule_holds_of_all_estimands(asked):
+    checkpoint, blocks = drawn()
+    verdict = judged(RULE, checkpoint, blocks)
+    assert verdict.holds
+    assert asked == [5, 63]
+    assert verdict.found == worst(blocks)
+    assert f"greatest R̂ {verdict.found.rhat:.3f}" in reason(RULE, checkpoint, blocks, verdict, DRAWS)
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("node", [0, 17])
+def test_the_suspect_is_judged_alone(asked, node):
+    checkpoint, blocks = drawn(shift=0.32, node=node)
+    verdict = judged(RULE, checkpoint, blocks)
+    assert asked == [5]
+    assert (verdict.holds, verdict.found) == (False, None)
+    # Sorted by name: the three of lam stand before it.
+    assert worst(blocks, np.array([3 + 3 * node + 1])).rhat == worst(blocks).rhat > RULE.rhat
+    assert f"greatest R̂ {worst(blocks).rhat:.3f}" in reason(RULE, checkpoint, blocks, verdict, DRAWS)
+
+
+def test_what_no_suspect_shows_is_seen_with_all(asked):
+    """A chain of another width: its running R̂, of means, is no greater for it."""
+    checkpoint, blocks = drawn()
+    for block in blocks:
+        block["lam"][1, :, 2] *= 1.5
+    assert worst(blocks, np.array([2])).rhat == worst(blocks).rhat > RULE.rhat
+    verdict = judged(RULE, checkpoint, blocks)
+    assert asked == [5, 63]
+    assert not verdict.holds
+    assert verdict.found == worst(blocks)
+
+
+def test_what_is_far_off_is_not_judged(asked):
+    checkpoint, blocks = drawn(shift=3.0)
+    assert not judged(RULE, checkpoint, blocks).holds
+    assert not judged(RULE, checkpoint._replace(draws=np.array(50)), blocks).holds
+    assert not judged(StopRule(), checkpoint, blocks).holds
+    assert asked == []
