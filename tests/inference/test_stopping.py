@@ -52,7 +52,7 @@ def test_the_rule_holds_of_all_estimands(asked):
 
 @pytest.mark.parametrize("node", [0, 17])
 def test_the_suspect_is_judged_alone(asked, node):
-    checkpoint, blocks = drawn(shift=0.32, node=node)
+    checkpoint, blocks = drawn(shift=0.35, node=node)
     verdict = judged(RULE, checkpoint, blocks)
     assert asked == [5]
     assert (verdict.holds, verdict.found) == (False, None)
@@ -65,8 +65,8 @@ def test_what_no_suspect_shows_is_seen_with_all(asked):
     """A chain of another width: its running R̂, of means, is no greater for it."""
     checkpoint, blocks = drawn()
     for block in blocks:
-        block["lam"][1, :, 2] *= 1.5
-    assert worst(blocks, np.array([2])).rhat == worst(blocks).rhat > RULE.rhat
+        block["u_boundary"][1, :, 17, 1] *= 1.5
+    assert worst(blocks, np.array([3 + 3 * 17 + 1])).rhat == worst(blocks).rhat > RULE.rhat
     verdict = judged(RULE, checkpoint, blocks)
     assert asked == [5, 63]
     assert not verdict.holds
