@@ -87,19 +87,6 @@ def test_a_setting_that_is_no_number_is_refused():
         br.sample(posterior(), **OPTIONS | {"sigma_u": np.ones(3)})
 
 
-@pytest.mark.slow
-def test_a_resumed_run_about_the_mode_is_the_run_that_was_not_cut_off():
-    """Its checkpoint carries what was found before the first draw; see tests/inference/test_samplers.py."""
-    blocks = []
-    options = {"sampler": "laplace", "chains": 2, "seed": 5, "progress": False, "draws": 4, "block": 2}
-    whole = br.sample(posterior(), on_block=lambda *found: blocks.append(found), **options)
-    arrays = checkpoint_to_arrays(blocks[0][2])
-    checkpoint = checkpoint_from_arrays(arrays, posterior(), "laplace", 2)
-    resumed = br.sample(posterior(), resume=(checkpoint, [blocks[0][1]]), **options)
-    for name, values in draws(whole).items():
-        np.testing.assert_array_equal(values, draws(resumed)[name])
-
-
 def test_a_checkpoint_of_another_problem_is_refused():
     arrays = checkpoint_to_arrays(whole()[1][0][2])
     with pytest.raises(ValueError, match="another problem"):

@@ -170,8 +170,9 @@ def test_pathfinder_is_near_a_gaussian_and_called_approximate():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hmc", "mala", "mclmc", "smc", "pathfinder"])
+@pytest.mark.parametrize("name", ["hmc", "mala", "mclmc", "smc", "laplace", "pathfinder"])
 def test_a_resumed_run_is_the_run_that_was_not_cut_off(name):
+    """A checkpoint carries what was found before the first draw."""
     blocks = []
     settings = SETTINGS.get(name, {})
     options = {"chains": 3, "draws": 6, "seed": 5, "block": 3, "progress": False} | settings
