@@ -40,7 +40,8 @@ from bayesreg.report.html import write_report
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 
-BLOCK = 100
+# Draws between two looks at the stop rule, with up to so many quadrature points: some ten or twenty seconds.
+BLOCK, POINTS = 100, 20_000
 PROVENANCE = Path("inputs") / "provenance.json"
 # Where several processes wait for one another.
 BEGUN, KEPT, SAMPLED, ENDED = (
@@ -371,13 +372,21 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or BLOCK,
+        block=options.block or _block(len(posterior.data.quadrature.weights)),
         stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
         resume=reached,
         on_block=keep,
         **options.settings,
     )
+
+
+def _block(points: int) -> int:
+    """Fewer draws where a step costs more, or no look would come before a time limit is long over.
+
+    By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
+    """
+    return max(BLOCK * POINTS // max(points, POINTS), 1)
 
 
 def _finish(

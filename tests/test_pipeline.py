@@ -211,6 +211,11 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
     np.testing.assert_allclose(posterior.reference()["mu"], mu)
 
 
+@pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 1), (9_000_000, 1)])
+def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(points, draws):
+    assert pipeline._block(points) == draws
+
+
 def test_check_estimates_without_writing(folder):
     text = pipeline.check(folder / "run.yaml").text
     assert "steps per second" in text
