@@ -26,8 +26,8 @@ def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
             raise NotImplementedError(f"what {function.__name__} shares among chains cannot differ from chain to chain")
         shapes = [(size, *array.shape[own:]) for array, own in zip(arrays, batched[1:], strict=True)]
         longer = [_joined(jnp.broadcast_to(x, shape)) for x, shape in zip(arrays, shapes, strict=True)]
-        found = decorated(shared, *longer)
-        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size), -1, 0), found)
+        found, chains = decorated(shared, *longer), shapes[0][-1]
+        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], chains, size), -1, 0), found)
         return parted, jax.tree.map(lambda _: True, found)
 
     return decorated
@@ -35,4 +35,4 @@ def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _joined(x: Float[AnyArray, "size *rows chains"]) -> Float[AnyArray, "*rows all_chains"]:
     moved = jnp.moveaxis(x, 0, -1)
-    return moved.reshape(*moved.shape[:-2], -1)
+    return moved.reshape(*moved.shape[:-2], moved.shape[-2] * moved.shape[-1])

@@ -149,7 +149,8 @@ def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:
 class Interpolator:
     """An image as a function of world position, for use inside jitted code (it is a pytree).
 
-    Differentiable in the points, not in the coefficients.
+    Differentiable in the points, not in the coefficients. A cubic one is shared by all that `vmap` runs side by
+    side.
     Trilinear (continuous, its gradient jumps between voxels) or cubic B-spline (twice continuously
     differentiable; `scipy.ndimage.map_coordinates` with order 3 and mode "mirror"). Outside the grid the
     image continues with its nearest value.
@@ -245,13 +246,18 @@ def _by_axis(x: AnyArray) -> list[AnyArray]:
 @jax.custom_jvp
 def _cubic_and_gradient(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
     """Value, and its gradient in the indices, by axis."""
-    found = _cubic_of_chains(coefficients, *(index[..., None] for index in indices))
-    return jax.tree.map(lambda x: x[..., 0], found)
+    found = _cubic_of_chains(coefficients, *(index.reshape(-1, 1) for index in indices))
+    return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
 
 
 @_cubic_and_gradient.defjvp
 def _cubic_and_gradient_jvp(primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]) -> tuple[Any, Any]:
-    return jax.jvp(partial(_in_batches, primals[0]), primals[1:], tangents[1:])
+    # Of second derivatives; what chains have as columns has none of its own.
+    def of_points(*indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
+        found = _in_batches(primals[0], *(index.reshape(-1, 1) for index in indices))
+        return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
+
+    return jax.jvp(of_points, primals[1:], tangents[1:])
 
 
 @with_chains_as_columns
@@ -260,20 +266,20 @@ def _cubic_of_chains(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArr
     return _in_batches(coefficients, *indices)
 
 
-# Points whose taps are looked at together.
+# Points whose taps are looked at together, each by all chains.
 _BATCH = 1024
 
 
 def _in_batches(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-    """Value and gradient at indices by axis, arrays of any shape."""
+    """Value and gradient at indices (points, chains) by axis."""
     # The 64 taps of so many points stay in the cache; those of all points at once do not, which costs three times as
     # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
-    count, shape = indices[0].size, indices[0].shape
+    count, chains = indices[0].shape
     batches = max(-(-count // _BATCH), 1)
     size = -(-count // batches)
-    filled = [jnp.pad(index.reshape(-1), (0, batches * size - count)).reshape(batches, size) for index in indices]
+    filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
     found = jax.lax.map(lambda batch: jax.vmap(partial(_cubic_at, coefficients))(*batch), filled)
-    return jax.tree.map(lambda x: x.reshape(-1)[:count].reshape(shape), jax.lax.optimization_barrier(found))
+    return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(found))
 
 
 def _cubic_at(coefficients: AnyArray, *index: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import time
 from collections.abc import Callable
@@ -66,6 +67,7 @@ def manifest(
         "image_digests": {name: getattr(inputs, name).digest for name in ("fixed", "moving")},
         "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
         "devices": [str(device) for device in jax.devices()],
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "timings": {
             **provenance["timings"],
             "sampling": samples.seconds,

@@ -40,8 +40,9 @@ from bayesreg.report.html import write_report
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 
-# Draws between two looks at the stop rule, with up to so many quadrature points: some ten or twenty seconds.
-BLOCK, POINTS = 100, 20_000
+# Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
+# whole state is written.
+BLOCK, POINTS, FEWEST = 100, 20_000, 10
 PROVENANCE = Path("inputs") / "provenance.json"
 # Where several processes wait for one another.
 BEGUN, KEPT, SAMPLED, ENDED = (
@@ -386,7 +387,7 @@ def _block(points: int) -> int:
 
     By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
     """
-    return max(BLOCK * POINTS // max(points, POINTS), 1)
+    return max(BLOCK * POINTS // max(points, POINTS), FEWEST)
 
 
 def _finish(

@@ -12,7 +12,7 @@ import platformdirs
 
 # For so long are compiled programs kept, some 40 MB of them for a mesh.
 MOST_DAYS = 30
-# Half the time for compiling, and programs that are no slower (docs/speed.md).
+# Half the time for compiling, and programs that are no slower (docs/speed.md#compiling).
 QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 # XLA ends a process that names a flag which it does not know, and drops flags as it goes.
 KNOWN_TO = "0.10."

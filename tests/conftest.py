@@ -11,7 +11,6 @@ from bayesreg.programs import compile_quickly
 _ROOT = Path(__file__).parent.parent
 
 # Before anything imports JAX; `setdefault`, so that a caller may choose otherwise.
-os.environ.setdefault("JAX_ENABLE_X64", "true")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")

@@ -27,6 +27,12 @@ def test_chains_of_chains_are_columns_too():
     np.testing.assert_allclose(found, shared[:, None] * x * y)
 
 
+@pytest.mark.parametrize(("chains", "columns"), [(4, 0), (0, 3)])
+def test_nothing_stays_nothing(chains, columns):
+    found = jax.vmap(lambda y: weighted(jnp.zeros(columns), jnp.ones((columns, 2)), y))(jnp.ones((chains, columns, 2)))
+    assert found.shape == (chains, columns, 2)
+
+
 def test_what_chains_share_cannot_differ():
     with pytest.raises(NotImplementedError, match="what weighted shares among chains"):
         jax.vmap(weighted)(np.ones((2, 3)), np.ones((2, 3, 1)), np.ones((2, 3, 1)))

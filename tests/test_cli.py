@@ -165,6 +165,13 @@ def test_version_is_the_packages():
     assert done.stdout == f"bayesreg {bayesreg.__version__}\n"
 
 
+def test_programs_are_compiled_quickly(monkeypatch):
+    asked = []
+    monkeypatch.setattr("bayesreg.cli.compile_quickly", lambda: asked.append(True))
+    assert CliRunner().invoke(app, ["schema"]).exit_code == 0
+    assert asked == [True]
+
+
 def test_help_loads_nothing_heavy_and_comes_at_once():
     code = (
         "import sys; from typer.testing import CliRunner; from bayesreg.cli import app;"

@@ -116,6 +116,25 @@ class TestInterpolation:
         differences = np.stack([(value(points + e) - value(points - e)) / 2e-5 for e in step], axis=-1)
         np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-7)
 
+    def test_chains_side_by_side_are_each_by_itself(self, image, method):
+        """More points than are looked at together, and their values, slopes and, of cubic ones, second derivatives."""
+        value = image.interpolator(method)
+        points = image.voxel_to_world(indices_inside(3 * 1500).reshape(3, 1500, 3))
+
+        def energy(x):
+            return (value(x) ** 2).sum()
+
+        every = jax.vmap(jax.value_and_grad(energy))(points)
+        for chain in range(3):
+            height, slope = jax.value_and_grad(energy)(points[chain])
+            np.testing.assert_allclose(every[0][chain], height, rtol=1e-12)
+            np.testing.assert_allclose(every[1][chain], slope, rtol=1e-9, atol=1e-12)
+        if method == "cubic":
+            few = points[:, :4]
+            curved = jax.vmap(jax.hessian(energy))(few)
+            np.testing.assert_allclose(curved[2], jax.hessian(energy)(few[2]), rtol=1e-9, atol=1e-12)
+        assert jax.vmap(value)(np.zeros((2, 0, 3))).shape == (2, 0)
+
     def test_gradient_vanishes_outside(self, image, method):
         point = image.voxel_to_world(np.array([-4.0, 2.3, -2.0]))
         np.testing.assert_allclose(

@@ -211,7 +211,7 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
     np.testing.assert_allclose(posterior.reference()["mu"], mu)
 
 
-@pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 1), (9_000_000, 1)])
+@pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
 def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(points, draws):
     assert pipeline._block(points) == draws
 

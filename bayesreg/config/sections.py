@@ -156,7 +156,8 @@ class _Sampler(Section):
     thin: Count = 1
     """Every how many transitions a draw is kept."""
     block: Count | None = None
-    """Kept draws between two looks at the stop rule; null is 100, and fewer on meshes finer than the paper's."""
+    """Kept draws between two looks at the stop rule; null is 100, and fewer where many quadrature points make steps
+    slow."""
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -97,5 +97,6 @@ def scale_reduction(moments: Moments) -> Any:
 
 
 def greatest_rhat(rhat: Mapping[str, AnyArray]) -> float:
-    """The worst of all estimands; NaN where it cannot be told."""
-    return float(max((np.max(value, initial=0.0) for value in rhat.values()), default=np.nan))
+    """The worst of all estimands; NaN where it cannot be told, of one of them or because there is none."""
+    every = np.concatenate([np.zeros(0), *(np.ravel(value) for value in rhat.values())])
+    return float(every.max()) if every.size else np.nan

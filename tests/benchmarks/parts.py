@@ -3,12 +3,14 @@
     python -m tests.benchmarks.parts RUN [--chains 16]
 
 RUN is a run's folder. A draw is timed with the run's own chains where they stand; density and gradient with so many
-chains, copies of these a little apart. Medians of nine, each part compiled by itself: together they may take less.
+chains, copies of these a little apart. Medians of nine, each part compiled by itself: together they may take less. How
+long that takes stands beside them, with the flags that XLA_FLAGS has.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,7 +19,6 @@ from typing import Any
 import blackjax
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import bayesreg as br
 from bayesreg.assembly import posterior_of
@@ -45,8 +46,10 @@ def main() -> None:
     given = parser.parse_args()
     config = br.load_config(given.run / "config.yaml")
     posterior, options = posterior_of(config, store.read_inputs(given.run)), config.sampler
-    stored = np.load(given.run / "state.npz")
-    arrays = {name: stored[name] for name in stored.files if name.startswith("leaf")}
+    arrays = store.load_state(given.run)
+    if options.name != "hmc" or posterior.options.similarity != "ssd" or posterior.data.field is not None or not arrays:
+        parser.error("RUN must be a run of hmc that has begun, with Gaussian noise and without a field of stiffness")
+    arrays.pop("blocks")
     end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
     sampler = chosen_sampler(options.name, posterior, options.settings).sampler
     data, setup = sampler.data(end.setup), end.setup
@@ -58,10 +61,13 @@ def main() -> None:
 
 
 def timed(name: str, of_chain: Callable[..., Any], shared: tuple[Any, ...], *chains: Any) -> None:
-    """Print the time that a function of what chains share and of what is each chain's takes for all of them."""
+    """Print how long a function of what chains share and of what is each chain's takes for all, and to compile."""
     axes = (*[None] * len(shared), *[0] * len(chains))
-    seconds = _median(jax.jit(jax.vmap(of_chain, in_axes=axes)), *shared, *chains)
-    print(f"{name:40s} {1e3 * seconds:7.1f} ms", flush=True)
+    lowered = jax.jit(jax.vmap(of_chain, in_axes=axes)).lower(*shared, *chains)
+    began = time.perf_counter()
+    program = lowered.compile()
+    compiling = time.perf_counter() - began
+    print(f"{name:40s} {1e3 * _median(program, *shared, *chains):7.1f} ms {compiling:6.1f} s", flush=True)
 
 
 def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -> None:

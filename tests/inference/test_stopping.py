@@ -6,7 +6,7 @@ import pytest
 from bayesreg.inference import stopping
 from bayesreg.inference.checkpoint import Checkpoint, no_steps
 from bayesreg.inference.diagnostics import worst
-from bayesreg.inference.moments import Moments
+from bayesreg.inference.moments import Moments, greatest_rhat
 from bayesreg.inference.stopping import StopRule, judged, reason
 
 RULE = StopRule(rhat=1.01, ess=400)
@@ -71,6 +71,13 @@ def test_what_no_suspect_shows_is_seen_with_all(asked):
     assert asked == [5, 63]
     assert not verdict.holds
     assert verdict.found == worst(blocks)
+
+
+def test_nothing_is_said_of_one_chain_or_of_no_estimand():
+    assert np.isnan(greatest_rhat({"lam": np.zeros(0), "u_boundary": np.full((2, 3), np.nan)}))
+    assert np.isnan(greatest_rhat({"u_boundary": np.full((2, 3), np.nan), "lam": np.ones(2)}))
+    assert np.isnan(greatest_rhat({"u_boundary": np.zeros((0, 3))}))
+    assert greatest_rhat({"lam": np.zeros(0), "u_boundary": np.array([[1.2, np.inf, 1.0]])}) == np.inf
 
 
 def test_what_is_far_off_is_not_judged(asked):
