@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -246,24 +247,19 @@ def _by_axis(x: AnyArray) -> list[AnyArray]:
 @jax.custom_jvp
 def _cubic_and_gradient(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
     """Value, and its gradient in the indices, by axis."""
-    found = _cubic_of_chains(coefficients, *(index.reshape(-1, 1) for index in indices))
-    return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
+    return _of_one_chain(_cubic_of_chains, coefficients, *indices)
 
 
 @_cubic_and_gradient.defjvp
 def _cubic_and_gradient_jvp(primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]) -> tuple[Any, Any]:
-    # Of second derivatives; what chains have as columns has none of its own.
-    def of_points(*indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-        found = _in_batches(primals[0], *(index.reshape(-1, 1) for index in indices))
-        return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
-
-    return jax.jvp(of_points, primals[1:], tangents[1:])
+    # Of second derivatives; what has chains as columns has none of its own.
+    return jax.jvp(partial(_of_one_chain, _in_batches, primals[0]), primals[1:], tangents[1:])
 
 
-@with_chains_as_columns
-def _cubic_of_chains(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-    """Chains, the last axis, come one after the other: they look at the same voxels."""
-    return _in_batches(coefficients, *indices)
+def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices: AnyArray) -> Any:
+    """What a function of indices (points, chains) by axis gives for those of one chain, of any shape."""
+    found = function(coefficients, *(index.reshape(-1, 1) for index in indices))
+    return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
 
 
 # Points whose taps are looked at together, each by all chains.
@@ -280,6 +276,10 @@ def _in_batches(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, t
     filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
     found = jax.lax.map(lambda batch: jax.vmap(partial(_cubic_at, coefficients))(*batch), filled)
     return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(found))
+
+
+# Chains come one after the other at each point: they look at the same voxels.
+_cubic_of_chains = with_chains_as_columns(_in_batches)
 
 
 def _cubic_at(coefficients: AnyArray, *index: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
