@@ -99,7 +99,8 @@ def pair_from_model(
 ) -> tuple[Image, Image, float]:
     """A pair drawn from the model with quadrature "voxels": f(x_q) = m(x_q + u(x_q)) + N(0, sd²), m textured.
 
-    Cubic interpolation of m; a voxel of f outside the mesh is zero. Also the T_s = 2 w_q sd² of that noise.
+    Cubic interpolation of m. Outside the mesh f goes on with the displacement of the nearest voxel inside. Also the
+    T_s = 2 w_q sd² of that noise.
     """
     rng = np.random.default_rng(seed)
     low, high = mesh.points.min(axis=0) - 12, mesh.points.max(axis=0) + 12
@@ -109,12 +110,15 @@ def pair_from_model(
     moving = Image((texture - texture.min()) / np.ptp(texture), affine)
     cells, barycentric = locate(mesh.points, mesh.cells, moving.grid_points().reshape(-1, 3))
     inside = cells >= 0
-    displacement = np.einsum("qa,qai->qi", barycentric[inside], np.asarray(u)[mesh.cells[cells[inside]]])
-    values = np.zeros(len(cells))
-    points = moving.grid_points().reshape(-1, 3)[inside] + displacement
-    values[inside] = moving.interpolate(points, "cubic")
-    values[inside] += noise_sd * rng.normal(size=inside.sum())
-    return moving.with_voxels(values.reshape(moving.shape)), moving, 2 * voxel**3 * noise_sd**2
+    displacement = np.zeros((len(cells), 3))
+    displacement[inside] = np.einsum("qa,qai->qi", barycentric[inside], np.asarray(u)[mesh.cells[cells[inside]]])
+    away = ~inside.reshape(moving.shape)
+    nearest = ndimage.distance_transform_edt(away, return_distances=False, return_indices=True)
+    displacement = displacement.reshape(*moving.shape, 3)[tuple(nearest)]
+    values = np.array(moving.interpolate(moving.grid_points() + displacement, "cubic"))
+    values[~away] += noise_sd * rng.normal(size=inside.sum())
+    values[away] += noise_sd * rng.normal(size=away.sum())
+    return moving.with_voxels(values), moving, 2 * voxel**3 * noise_sd**2
 
 
 def linear_image(

@@ -79,6 +79,11 @@ def counted(tally: Tally, info: Info) -> Tally:
     return jax.tree.map(jnp.add, tally, Tally(jnp.ones(()), *info))
 
 
+def with_passed_over(tally: Tally, steps: AnyArray) -> Tally:
+    """The tally with so many steps more whose proposals lay outside the support, and cost nothing."""
+    return tally._replace(steps=tally.steps + steps, outside_support=tally.outside_support + steps)
+
+
 def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     """A checkpoint as named arrays, for a file."""
     return {f"leaf_{i:03d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(checkpoint))}

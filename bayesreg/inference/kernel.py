@@ -59,6 +59,9 @@ class Sampler(NamedTuple):
         (data, setup, state) → Draw.
     exact : bool
         Whether the posterior is its stationary distribution.
+    outside : callable, optional
+        (data, setup, key, state) → whether the step with this key proposes what lies outside the support, and so leaves
+        the state as it is. For samplers that can tell at a fraction of the price of a step: such steps are passed over.
     """
 
     prepare: Callable[[Any, AnyArray, Say], tuple[Any, Any]]
@@ -68,3 +71,4 @@ class Sampler(NamedTuple):
     step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Info]]
     observe: Callable[[Any, Any, Any], Draw]
     exact: bool
+    outside: Callable[[Any, Any, AnyArray, Any], AnyArray] | None = None

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import blackjax
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bayesreg.inference.kernel import Draw, Info, Sampler
 from bayesreg.inference.target import Estimands, Target
@@ -42,20 +43,27 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
     if warm:
         raise InputError(f"rwmh has no step for {', '.join(sorted(warm))}; use the sampler hmc")
 
-    def init(data: Any, _: None, estimands: Estimands) -> State:
+    def init(data: Any, _: Any, estimands: Estimands) -> State:
         evaluation = target.evaluate_estimands(data, estimands)
         kernel = blackjax.additive_step_random_walk(lambda _: evaluation.logdensity, lambda *_: estimands)
         return State(kernel.init(estimands), evaluation)
 
-    def step(data: Any, _: None, key: AnyArray, state: State) -> tuple[State, Info]:
+    def proposed(data: Any, key: AnyArray, position: Estimands) -> tuple[Estimands, Estimands, AnyArray]:
+        """A move, where it leads, and whether that lies in the support."""
+        move = _normal_step(key, position, sigma)
+        proposal = jax.tree.map(jnp.add, position, move)
+        return move, proposal, target.supports(data, proposal)
+
+    def outside(data: Any, _: Any, key: AnyArray, state: State) -> AnyArray:
+        return ~proposed(data, jax.random.split(key)[0], state.kernel.position)[-1]
+
+    def step(data: Any, _: Any, key: AnyArray, state: State) -> tuple[State, Info]:
         # The proposal is drawn and evaluated here, once, so that its energies and its solve are seen;
         # BlackJAX is handed both and decides.
         key_proposal, key_accept = jax.random.split(key)
         position, current = state.kernel.position, state.evaluation
-        move = _normal_step(key_proposal, position, sigma)
-        proposal = jax.tree.map(jnp.add, position, move)
+        move, proposal, inside = proposed(data, key_proposal, position)
         # A proposal outside the support needs no solve: the chain evaluates where it stands, at no iteration.
-        inside = target.supports(data, proposal)
         place = jax.tree.map(lambda new, old: jnp.where(inside, new, old), proposal, position)
         evaluation = target.evaluate_estimands(data, place, guess=current.u)
         logdensity = jnp.where(inside, evaluation.logdensity, -jnp.inf)
@@ -69,18 +77,20 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
             solver_iterations=evaluation.solver_iterations,
             diverging=jnp.zeros((), bool),
             gradients=jnp.zeros((), int),
-            densities=jnp.ones((), int),
+            densities=inside.astype(int),
         )
         return State(kernel_state, kept), info
 
     return Sampler(
-        prepare=lambda points, _key, _say: (None, points),
-        data=lambda _: target.data,
-        blank=lambda: None,
+        # The setup is where the chains start, on average: solves are preconditioned there.
+        prepare=lambda points, _key, _say: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
+        data=lambda start: target.conditioned(start, np.zeros(0, int)),
+        blank=lambda: target.estimands(target.reference()),
         init=init,
         step=step,
         observe=lambda _data, _setup, state: Draw(state.kernel.position, state.evaluation),
         exact=True,
+        outside=outside,
     )
 
 

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, counted, no_steps
+from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, counted, no_steps, with_passed_over
 from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host, side_by_side
 from bayesreg.inference.draws import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, starting_points
-from bayesreg.inference.kernel import Draw
+from bayesreg.inference.kernel import Draw, Sampler
 from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
 from bayesreg.inference.samplers import SAMPLERS, Chosen, chosen_sampler
@@ -289,13 +289,7 @@ def _run_block(  # type: ignore[no-untyped-def]
 
         def one_draw(carry, draw):  # type: ignore[no-untyped-def]
             state, moments, tally = carry
-
-            def one_step(i, carry):  # type: ignore[no-untyped-def]
-                state, window = carry
-                state, info = kernel.step(data, setup, jax.random.fold_in(key, draw * thin + i), state)
-                return state, counted(window, info)
-
-            state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
+            state, window = _steps(kernel, data, setup, key, draw * thin, thin, state)
             drawn = kernel.observe(data, setup, state)
             moments = updated(moments, _watched(drawn))
             return (state, moments, jax.tree.map(jnp.add, tally, window)), _kept(drawn, window)
@@ -304,6 +298,34 @@ def _run_block(  # type: ignore[no-untyped-def]
         return *carry, kept
 
     return side_by_side(chain, devices)(numbers, state, moments, tally)
+
+
+def _steps(
+    kernel: Sampler, data: Any, setup: Any, key: AnyArray, first: AnyArray, count: int, state: Any
+) -> tuple[Any, Tally]:
+    """So many steps of one chain; the key of each is that of the chain with the step's number since the start.
+
+    A chain passes over steps that propose what lies outside the support, where the sampler can tell: side by side, all
+    then evaluate at once, each a step of its own.
+    """
+
+    def key_of(i: AnyArray) -> AnyArray:
+        return jax.random.fold_in(key, first + i)
+
+    def next_inside(i: AnyArray, state: Any) -> AnyArray:
+        if kernel.outside is None:
+            return i
+        outside = partial(kernel.outside, data, setup)
+        return jax.lax.while_loop(lambda i: (i < count) & outside(key_of(i), state), lambda i: i + 1, i)
+
+    def one_step(carry):  # type: ignore[no-untyped-def]
+        i, state, window = carry
+        state, info = kernel.step(data, setup, key_of(i), state)
+        return next_inside(i + 1, state), state, counted(window, info)
+
+    begun = next_inside(jnp.zeros((), int), state), state, no_steps()
+    _, state, window = jax.lax.while_loop(lambda carry: carry[0] < count, one_step, begun)
+    return state, with_passed_over(window, count - window.steps)
 
 
 def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:

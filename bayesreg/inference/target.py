@@ -65,6 +65,13 @@ class Target(Protocol):
     def evaluate_estimands(self, data: Any, estimands: Estimands, guess: AnyArray | None = None) -> Any:
         """An `Evaluation` in the constrained space; a guess of its u makes it faster and costs the gradient."""
 
+    def conditioned(self, estimands: Estimands, alone: AnyArray, quick: bool = False) -> Any:
+        """The data of the same problem, prepared for fast densities near these estimands.
+
+        And for `local_logdensity` of the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
+        about as good and cheap.
+        """
+
     def supports(self, data: Any, estimands: Estimands) -> AnyArray:
         """Whether the density may be positive there."""
 
@@ -112,13 +119,6 @@ class SmoothTarget(Target, Protocol):
 
     def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
         """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
-
-    def conditioned(self, estimands: Estimands, alone: AnyArray, quick: bool = False) -> Any:
-        """The data of the same problem, prepared for fast densities near these estimands.
-
-        And for `local_logdensity` of the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
-        about as good and cheap.
-        """
 
     @property
     def knows_neighbourhoods(self) -> bool:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
-from bayesreg.image import Image, Interpolation
+from bayesreg.image import Image, Interpolation, Interpolator
 from bayesreg.model.program import RegistrationData
 
 # Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
@@ -27,11 +29,13 @@ def continuation(
     """
     if len(data.slots):
         for sigma, similarity, elastic in SMOOTHING:
-            smooth_fixed, smooth_moving = (image.smoothed(sigma) for image in (fixed, moving))
+            # SciPy's filters let other threads run.
+            with ThreadPoolExecutor() as pool:
+                smooth_fixed, smooth_moving = pool.map(partial(_smoothed, sigma, interpolation), (fixed, moving))
             yield (
                 data._replace(
-                    moving=smooth_moving.interpolator(interpolation),
-                    fixed_values=smooth_fixed.interpolate(data.positions, interpolation),
+                    moving=smooth_moving,
+                    fixed_values=smooth_fixed(data.positions),
                     t_similarity=similarity * data.t_similarity,
                     t_elastic=elastic * data.t_elastic,
                 ),
@@ -39,3 +43,7 @@ def continuation(
             )
         yield data, False
     yield data, True
+
+
+def _smoothed(sigma: float, interpolation: Interpolation, image: Image) -> Interpolator:
+    return image.smoothed(sigma).interpolator(interpolation)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -19,19 +20,25 @@ from bayesreg.model.similarity import SIMILARITIES, Noise
 from bayesreg.types import AnyArray
 
 
-class Curvature(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Curvature:
     """Of minus a log density.
 
     Attributes
     ----------
     gauss_newton : (r, r) array
         Positive semidefinite.
-    remainder : (r, r) array
-        What the exact one has besides: residuals times second derivatives. Small where the images agree.
+    second_derivatives : callable
+        () → `remainder`, which not everybody needs.
     """
 
     gauss_newton: Float[np.ndarray, "rows rows"]
-    remainder: Float[np.ndarray, "rows rows"]
+    second_derivatives: Callable[[], Float[np.ndarray, "rows rows"]]
+
+    @cached_property
+    def remainder(self) -> Float[np.ndarray, "rows rows"]:
+        """What the exact one has besides: residuals times second derivatives. Small where the images agree."""
+        return self.second_derivatives()
 
 
 def displacement_curvature(
@@ -80,22 +87,23 @@ def displacement_curvature(
     if len(free):
         W = -solved(K[free][:, free], np.hstack([load, coupling.toarray()]))
     schur = K[sampled][:, sampled] + coupling.T @ W[:, modes:]
-    # ∂u/∂(z, u_B): what is sampled moves by itself, the rest by W.
-    unit = np.hstack([np.zeros((len(sampled), modes)), np.eye(len(sampled))])
 
-    def reduced(points: np.ndarray) -> np.ndarray:
+    def reduced(points: AnyArray) -> np.ndarray:
         """The curvature in (z, u_B) of one in the places of the quadrature points."""
-        nodal = _assembled(mesh, data, points)
-        cross = unit.T @ (nodal[sampled][:, free] @ W)
-        found = unit.T @ (nodal[sampled][:, sampled] @ unit) + cross + cross.T + W.T @ (nodal[free][:, free] @ W)
+        # What is sampled moves by itself, and the rest by W.
+        nodal = _assembled(mesh, data, np.asarray(points))
+        cross = nodal[sampled][:, free] @ W
+        found = W.T @ (nodal[free][:, free] @ W)
+        found[modes:] += cross
+        found[:, modes:] += cross.T
+        found[modes:, modes:] += nodal[sampled][:, sampled].toarray()
         return (found + found.T) / 2
 
-    approximate, exact = (np.asarray(found) for found in _point_curvature(similarity, data, jnp.asarray(u)))
-    gauss_newton, remainder = reduced(approximate), reduced(exact - approximate)
+    gauss_newton = reduced(_first_order(data, jnp.asarray(u)))
     schur = np.asarray(schur) / float(data.t_elastic)
     gauss_newton[modes:, modes:] += (schur + schur.T) / 2
     gauss_newton[:modes, :modes] += np.eye(modes)
-    return Curvature(gauss_newton, remainder)
+    return Curvature(gauss_newton, lambda: reduced(_second_order(similarity, data, jnp.asarray(u))))
 
 
 def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:
@@ -123,28 +131,39 @@ def _assembled(
     return (P.T @ (C.tocsr() @ P)).tocsr()
 
 
+@jax.jit
+def _first_order(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3 3"]:
+    """Gauss–Newton's curvature of E_s/T_s in every place x_q + u(x_q), tempered: 2 w ∇m ∇mᵀ/T_s, 1/mm²."""
+    gradient = _slope(data, _places(data, u))
+    weights = data.independent_share / data.t_similarity * 2 * data.quadrature.weights
+    return weights[:, None, None] * gradient[:, :, None] * gradient[:, None]
+
+
 @partial(jax.jit, static_argnums=0)
-def _point_curvature(
+def _second_order(
     similarity: str, data: RegistrationData, u: Float[AnyArray, "nodes 3"]
-) -> tuple[Float[AnyArray, "points 3 3"], Float[AnyArray, "points 3 3"]]:
-    """Curvature of E_s/T_s in every place x_q + u(x_q), tempered, 1/mm²: 2 w ∇m ∇mᵀ/T_s, and the exact one.
-
-    With e(m) the energy of a point, e″ ∇m ∇mᵀ + e′ ∇²m.
-    """
-    quadrature = data.quadrature
-    moved = data.positions + quadrature.interpolation(u)
-
-    def slope(x: AnyArray) -> AnyArray:
-        return jax.grad(lambda x: data.moving(x).sum())(x)
+) -> Float[AnyArray, "points 3 3"]:
+    """What the exact curvature has besides. With e(m) the energy of a point it is e″ ∇m ∇mᵀ + e′ ∇²m."""
+    moved, weights = _places(data, u), data.quadrature.weights
 
     def energy_slope(values: AnyArray) -> AnyArray:
         noise = Noise(data.t_similarity, data.degrees_of_freedom)
         energy = SIMILARITIES[similarity].energy
-        return jax.grad(lambda m: energy(data.fixed_values, m, quadrature.weights, noise))(values)
+        return jax.grad(lambda m: energy(data.fixed_values, m, weights, noise))(values)
 
+    slope = partial(_slope, data)
     gradient, values = slope(moved), data.moving(moved)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
     first, second = jax.jvp(energy_slope, (values,), (jnp.ones_like(values),))
-    outer, scale = gradient[:, :, None] * gradient[:, None], data.independent_share / data.t_similarity
-    exact = second[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
-    return scale * 2 * quadrature.weights[:, None, None] * outer, scale * exact
+    outer = gradient[:, :, None] * gradient[:, None]
+    remainder = (second - 2 * weights)[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
+    return data.independent_share / data.t_similarity * remainder
+
+
+def _places(data: RegistrationData, u: AnyArray) -> AnyArray:
+    return data.positions + data.quadrature.interpolation(u)
+
+
+def _slope(data: RegistrationData, places: AnyArray) -> AnyArray:
+    """∇m."""
+    return jax.grad(lambda x: data.moving(x).sum())(places)

@@ -117,7 +117,7 @@ class GaussianTarget:
         return jax.tree.map(jnp.ones_like, position)
 
     def displacement_curvature(self, data, estimands):
-        return Curvature(np.asarray(data.precision), np.zeros((DIMENSION, DIMENSION)))
+        return Curvature(np.asarray(data.precision), lambda: np.zeros((DIMENSION, DIMENSION)))
 
     def exact_draws(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """(count, nodes, 3), by rejection."""

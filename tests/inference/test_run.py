@@ -12,7 +12,10 @@ from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.diagnostics import convergence
 from bayesreg.inference.draws import open_posterior, save_posterior
 from bayesreg.inference.initialise import starting_points
+from bayesreg.inference.random_walk import rwmh
 from bayesreg.inference.run import checkpoint_from_arrays
+from bayesreg.inference.samplers import SAMPLERS
+from tests.inference.gaussians import GaussianTarget
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)
@@ -45,6 +48,24 @@ def test_draws_do_not_depend_on_the_blocks():
     one = br.sample(posterior(), draws=12, block=12, **OPTIONS)
     for name, values in draws(whole()[0]).items():
         np.testing.assert_array_equal(values, draws(one)[name])
+
+
+def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_are(monkeypatch):
+    def drawn():
+        samples = br.sample(GaussianTarget(wall=0.1), "rwmh", 3, 20, 5, thin=4, block=10, progress=False, sigma_u=0.8)
+        names = ("lp", "outside_support", "acceptance_rate")
+        return samples.tally, {name: np.concatenate([block[name] for block in samples.blocks]) for name in names}
+
+    tally, found = drawn()
+    monkeypatch.setitem(SAMPLERS, "rwmh", lambda *given, **settings: rwmh(*given, **settings)._replace(outside=None))
+    tally_alone, expected = drawn()
+    for name in found:
+        np.testing.assert_array_equal(found[name], expected[name])
+    jax.tree.map(np.testing.assert_allclose, tally, tally_alone)
+    assert (tally.densities == tally.steps - tally.outside_support).all()
+    assert (tally.steps == 80).all()
+    assert (tally.outside_support > 8).all()
+    assert (tally.densities > 8).all()
 
 
 def test_a_resumed_run_is_the_run_that_was_not_cut_off():
