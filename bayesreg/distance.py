@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
 import numpy as np
 from scipy import ndimage
 
@@ -42,9 +45,12 @@ def signed_distance(skull: Image) -> Image:
     if not allowed.any():
         raise InputError("the skull image forbids every voxel: nonzero means forbidden, zero allowed")
     half = skull.voxel_sizes.min() / 2
-    inside = ndimage.distance_transform_edt(allowed, sampling=skull.voxel_sizes) - half
-    outside = ndimage.distance_transform_edt(~allowed, sampling=skull.voxel_sizes) - half
-    smooth = ndimage.gaussian_filter(np.where(allowed, inside, -outside), _SMOOTHING, mode="nearest", truncate=_END)
+    distance_to_zero = partial(ndimage.distance_transform_edt, sampling=skull.voxel_sizes)
+    # SciPy lets other threads run.
+    with ThreadPoolExecutor() as pool:
+        inside, outside = pool.map(distance_to_zero, (allowed, ~allowed))
+    smooth = np.where(allowed, inside - half, half - outside)
+    smooth = ndimage.gaussian_filter(smooth, _SMOOTHING, mode="nearest", truncate=_END)
     kept = _KEPT * skull.voxel_sizes.min()
     distance = np.where(allowed, np.maximum(smooth, kept), np.minimum(smooth, -kept))
     affine = skull.affine.copy()
