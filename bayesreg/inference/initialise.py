@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.inference.target import Evaluation, Target
+from bayesreg.inference.target import Estimands, Evaluation, Target
 from bayesreg.types import AnyArray, InputError
 
 
@@ -89,6 +89,14 @@ def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: T
         if index in target.free[name]:
             values = values.at[index].set(value)
     return values
+
+
+def require_numbers(points: Estimands) -> None:
+    """Raise InputError where a chain (leading axis) would start at what is not a finite number."""
+    for name, values in points.items():
+        for chain, value in enumerate(np.asarray(values)):
+            if not np.isfinite(value).all():
+                raise InputError(f"chain {chain} cannot start: {name} is not a number there; give another start")
 
 
 def require_density(found: Evaluation) -> None:

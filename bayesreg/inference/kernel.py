@@ -61,7 +61,8 @@ class Sampler(NamedTuple):
         Whether the posterior is its stationary distribution.
     outside : callable, optional
         (data, setup, key, state) → whether the step with this key proposes what lies outside the support, and so leaves
-        the state as it is. For samplers that can tell at a fraction of the price of a step: such steps are passed over.
+        the state as it is. For samplers that can tell at a fraction of the price of a step: such steps are passed over,
+        and counted as outside the support and nothing else.
     """
 
     prepare: Callable[[Any, AnyArray, Say], tuple[Any, Any]]

@@ -76,9 +76,11 @@ def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"
     and its mean over places would be that of the largest. In log T_r it is that at draws about the mode, which
     trajectories meet, though the posterior of T_r is wider.
     """
-    curvatures = [_curvature(target, target.data, flat) for flat in flats]
-    approximate = np.mean([found.gauss_newton for found in curvatures], axis=0)
-    curvature = _convex(_regular(approximate), np.mean([found.remainder for found in curvatures], axis=0))
+    # One after the other: each holds more than these two arrays.
+    curvatures = (_curvature(target, target.data, flat) for flat in flats)
+    pairs = [(found.gauss_newton, found.remainder) for found in curvatures]
+    approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
+    curvature = _convex(_regular(approximate), remainder)
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
     return pulled(target, gaussian(flats[0], precision), flats)
 

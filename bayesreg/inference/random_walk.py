@@ -82,7 +82,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
         return State(kernel_state, kept), info
 
     return Sampler(
-        # The setup is where the chains start, on average: solves are preconditioned there.
+        # The setup is where the chains start, on average: the data are prepared for that neighbourhood.
         prepare=lambda points, _key, _say: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
         data=lambda start: target.conditioned(start, np.zeros(0, int)),
         blank=lambda: target.estimands(target.reference()),

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, counted, no_steps, with_passed_over
 from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host, side_by_side
 from bayesreg.inference.draws import to_inference_data
-from bayesreg.inference.initialise import Start, require_density, starting_points
+from bayesreg.inference.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.kernel import Draw, Sampler
 from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
@@ -169,6 +169,7 @@ def first_checkpoint(
     began = time.perf_counter()
     key_start, _ = jax.random.split(jax.random.key(seed))
     points = starting_points(posterior, start or Start(), chains, key_start)
+    require_numbers(points)
     chosen = chosen_sampler(sampler, posterior, settings)
     setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), say)
     data = chosen.sampler.data(setup)

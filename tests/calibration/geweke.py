@@ -80,9 +80,8 @@ def compare(
     posterior = simulator.posterior if posterior is None else posterior
     first = of_posterior(posterior, simulator.draw_prior(np.random.default_rng(seed), chains))
     kernel = SAMPLERS[sampler](posterior, **(RANDOM_WALK if sampler == "rwmh" else {}))
-    setup, data = None, posterior.data
+    setup, data = None, conditioned(posterior)
     if sampler != "rwmh":
-        data = conditioned(posterior)
         reference = prior_reference(simulator, posterior)
         centre = np.asarray(reference.centre)[None]
         # Not where the chains start: a kernel must not know its starts.

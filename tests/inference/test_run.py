@@ -1,6 +1,6 @@
 """Blocks, budgets and checkpoints: what is kept, and that it does not depend on how the work was cut."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import numpy as np
@@ -50,18 +50,22 @@ def test_draws_do_not_depend_on_the_blocks():
         np.testing.assert_array_equal(values, draws(one)[name])
 
 
-def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_are(monkeypatch):
-    def drawn():
-        samples = br.sample(GaussianTarget(wall=0.1), "rwmh", 3, 20, 5, thin=4, block=10, progress=False, sigma_u=0.8)
-        names = ("lp", "outside_support", "acceptance_rate")
-        return samples.tally, {name: np.concatenate([block[name] for block in samples.blocks]) for name in names}
+@pytest.mark.parametrize("target", [GaussianTarget(wall=0.1), None], ids=["gaussian", "registration"])
+def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_are(monkeypatch, target):
+    monkeypatch.setitem(SAMPLERS, "each", lambda *given, **settings: rwmh(*given, **settings)._replace(outside=None))
+    # Often outside, and often not.
+    given, sigma_u = (posterior(), 0.05) if target is None else (target, 0.8)
 
-    tally, found = drawn()
-    monkeypatch.setitem(SAMPLERS, "rwmh", lambda *given, **settings: rwmh(*given, **settings)._replace(outside=None))
-    tally_alone, expected = drawn()
-    for name in found:
-        np.testing.assert_array_equal(found[name], expected[name])
-    jax.tree.map(np.testing.assert_allclose, tally, tally_alone)
+    def drawn(name):
+        samples = br.sample(given, name, 3, 20, 5, thin=4, block=10, progress=False, sigma_u=sigma_u)
+        return samples.tally, {
+            name: np.concatenate([block[name] for block in samples.blocks]) for name in samples.blocks[0]
+        }
+
+    (tally, found), (tally_alone, expected) = drawn("rwmh"), drawn("each")
+    for name in expected:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, atol=1e-12)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9), tally, tally_alone)
     assert (tally.densities == tally.steps - tally.outside_support).all()
     assert (tally.steps == 80).all()
     assert (tally.outside_support > 8).all()
@@ -174,6 +178,7 @@ def test_stop_rules():
         ({"sigma_u": -1.0}, "step of u_boundary must be positive"),
         ({"start": br.Start(field=np.zeros((2, 3)))}, "start field must have shape"),
         ({"start": br.Start(field=np.full((26, 3), np.nan))}, "chain 0 cannot start"),
+        ({"start": br.Start(lam={"gm": np.nan})}, "chain 0 cannot start: lam is not a number"),
         ({"start": br.Start(lam={"bone": 1.0})}, "names 'bone'"),
     ],
 )

@@ -81,3 +81,21 @@ def test_slopes_a_million_times_as_exact_are_accepted_no_more_often():
     # After one transition, before what is rounding to a trajectory grows.
     assert 0 < abs(found[0] - exact[0]).max() < 0.01
     assert abs(rate.mean() - best.mean()) < 0.01
+
+
+def test_steps_of_the_papers_kernel_are_as_probable_as_exact_ones():
+    """Its solves begin at the chain's present displacement, and end as early as those of the others."""
+    post, count = posterior(), 200
+    kernel = SAMPLERS["rwmh"](post, sigma_u=0.05)
+    start = post.estimands(post.reference())
+    near = kernel.data(start)
+    exact = with_tolerances(near, 1e4, 1)
+
+    def step(state, key):
+        found, expected = (kernel.step(data, start, key, state) for data in (near, exact))
+        return found[0], (found[1].acceptance_rate, expected[1].acceptance_rate)
+
+    keys = jax.random.split(jax.random.key(0), count)
+    found, expected = jax.jit(lambda state: jax.lax.scan(step, state, keys))(kernel.init(near, start, start))[1]
+    assert 0.1 < expected.mean() < 0.9
+    assert 0 < abs(found - expected).max() < 0.01
