@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
@@ -105,7 +104,7 @@ def make_pair(
     _require_one_grid(fixed, tissue, skull, mesh)
     if smoothing_mm < 0 or noise_sd < 0:
         raise InputError(f"smoothing_mm and noise_sd must not be negative, got {smoothing_mm} and {noise_sd}")
-    fixed = _smoothed(fixed, smoothing_mm)
+    fixed = fixed.smoothed(smoothing_mm)
     csf = _csf_intensity(fixed, tissue, mesh)
     truth = push_patch(
         mesh,
@@ -132,11 +131,6 @@ def make_pair(
         smoothing_mm=smoothing_mm,
         noise_sd=noise_sd,
     )
-
-
-def _smoothed(image: Image, sd_mm: float) -> Image:
-    values = np.asarray(image.voxels, float)
-    return image.with_voxels(ndimage.gaussian_filter(values, sd_mm / image.voxel_sizes, mode="nearest"))
 
 
 def _csf_intensity(fixed: Image, tissue: Image, mesh: TetMesh) -> float:

@@ -56,8 +56,8 @@ def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_ar
     # Often outside, and often not.
     given, sigma_u = (posterior(), 0.05) if target is None else (target, 0.8)
 
-    def drawn(name):
-        samples = br.sample(given, name, 3, 20, 5, thin=4, block=10, progress=False, sigma_u=sigma_u)
+    def drawn(sampler):
+        samples = br.sample(given, sampler, 3, 20, 5, thin=4, block=10, progress=False, sigma_u=sigma_u)
         return samples.tally, {
             name: np.concatenate([block[name] for block in samples.blocks]) for name in samples.blocks[0]
         }
