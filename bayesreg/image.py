@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -150,8 +149,7 @@ def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:
 class Interpolator:
     """An image as a function of world position, for use inside jitted code (it is a pytree).
 
-    Differentiable in the points, not in the coefficients. A cubic one is shared by all that `vmap` runs side by
-    side.
+    Differentiable in the points, not in the coefficients. All that `vmap` runs side by side share it.
     Trilinear (continuous, its gradient jumps between voxels) or cubic B-spline (twice continuously
     differentiable; `scipy.ndimage.map_coordinates` with order 3 and mode "mirror"). Outside the grid the
     image continues with its nearest value.
@@ -177,65 +175,21 @@ class Interpolator:
         """Values at world points, mm."""
         last = jnp.asarray([n - 1.0 for n in self.shape])
         indices = jnp.clip(points @ self.to_voxel[:3, :3].T + self.to_voxel[:3, 3], 0.0, last)
-        return (_trilinear if self.method == "linear" else _cubic)(self.coefficients, indices)
+        return _interpolated(self.method, self.coefficients, indices)
 
 
-def _first_tap(coefficients: AnyArray, indices: AnyArray) -> tuple[AnyArray, AnyArray, np.ndarray]:
-    """Flat index of the first tap of every point, its offset from there in voxels, and the strides."""
-    corner = jax.lax.stop_gradient(jnp.floor(indices))
-    strides = np.cumprod((1, *coefficients.shape[:0:-1]))[::-1]
-    return (corner.astype(int) * strides).sum(axis=-1), indices - corner, strides
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _interpolated(method: Interpolation, coefficients: AnyArray, indices: AnyArray) -> AnyArray:
+    """Sum of B-splines at voxel indices; its derivative is in the indices alone."""
+    return _of_one_chain(_VALUES[method], coefficients, *_by_axis(indices))
 
 
-@jax.custom_jvp
-def _trilinear(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
-    """Along one axis after the other; its derivative is in the indices alone."""
-    taps, offset = _corners(coefficients, indices)
-    return _between(_between(_between(taps, offset[..., 2]), offset[..., 1]), offset[..., 0])[0]
-
-
-@_trilinear.defjvp
-def _trilinear_jvp(
-    primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]
+@_interpolated.defjvp
+def _interpolated_jvp(
+    method: Interpolation, primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]
 ) -> tuple[AnyArray, AnyArray]:
-    taps, offset = _corners(*primals)
-    # Looked at once, not once for each of the four results.
-    taps = jax.lax.optimization_barrier(taps)
-    x, y, z = (offset[..., axis] for axis in range(3))
-    at_z, by_z = _between(taps, z), _steps(taps)
-    at_y, by_y = _between(at_z, y), _steps(at_z)
-    change = tangents[1]
-    slope = _steps(at_y)[0] * change[..., 0] + _between(by_y, x)[0] * change[..., 1]
-    return _between(at_y, x)[0], slope + _between(_between(by_z, y), x)[0] * change[..., 2]
-
-
-def _corners(coefficients: AnyArray, indices: AnyArray) -> tuple[list[AnyArray], AnyArray]:
-    """The eight voxels about every point, the last axis fastest, and its offset from the first."""
-    first, offset, strides = _first_tap(coefficients, indices)
-    flat = coefficients.reshape(-1)
-    return [flat[first + int(np.dot(tap, strides))] for tap in product(range(2), repeat=3)], offset
-
-
-def _between(taps: list[AnyArray], t: AnyArray) -> list[AnyArray]:
-    """Neighbours, one after the other, taken together a part t of the way."""
-    return [(1 - t) * low + t * high for low, high in zip(taps[::2], taps[1::2], strict=True)]
-
-
-def _steps(taps: list[AnyArray]) -> list[AnyArray]:
-    """From each to its neighbour."""
-    return [high - low for low, high in zip(taps[::2], taps[1::2], strict=True)]
-
-
-@jax.custom_jvp
-def _cubic(coefficients: AnyArray, indices: AnyArray) -> AnyArray:
-    """Tricubic B-spline; its derivative is in the indices alone."""
-    return _cubic_and_gradient(coefficients, *_by_axis(indices))[0]
-
-
-@_cubic.defjvp
-def _cubic_jvp(primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
     # Value and gradient from one look at the taps: they are what costs.
-    value, gradient = _cubic_and_gradient(primals[0], *_by_axis(primals[1]))
+    value, gradient = _with_gradient(method, primals[0], *_by_axis(primals[1]))
     return value, sum(slope * change for slope, change in zip(gradient, _by_axis(tangents[1]), strict=True))
 
 
@@ -244,16 +198,21 @@ def _by_axis(x: AnyArray) -> list[AnyArray]:
     return [x[..., axis] for axis in range(3)]
 
 
-@jax.custom_jvp
-def _cubic_and_gradient(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _with_gradient(
+    method: Interpolation, coefficients: AnyArray, *indices: AnyArray
+) -> tuple[AnyArray, tuple[AnyArray, ...]]:
     """Value, and its gradient in the indices, by axis."""
-    return _of_one_chain(_cubic_of_chains, coefficients, *indices)
+    return _of_one_chain(_VALUES_AND_GRADIENTS[method], coefficients, *indices)
 
 
-@_cubic_and_gradient.defjvp
-def _cubic_and_gradient_jvp(primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]) -> tuple[Any, Any]:
+@_with_gradient.defjvp
+def _with_gradient_jvp(
+    method: Interpolation, primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]
+) -> tuple[Any, Any]:
     # Of second derivatives; what has chains as columns has none of its own.
-    return jax.jvp(partial(_of_one_chain, _in_batches, primals[0]), primals[1:], tangents[1:])
+    looked = _in_batches(partial(_value_and_gradient_at, _SPLINES[method]))
+    return jax.jvp(partial(_of_one_chain, looked, primals[0]), primals[1:], tangents[1:])
 
 
 def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices: AnyArray) -> Any:
@@ -266,37 +225,59 @@ def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices
 _BATCH = 1024
 
 
-def _in_batches(coefficients: AnyArray, *indices: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-    """Value and gradient at indices (points, chains) by axis."""
-    # The 64 taps of so many points stay in the cache; those of all points at once do not, which costs three times as
-    # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
-    count, chains = indices[0].shape
-    batches = max(-(-count // _BATCH), 1)
-    size = -(-count // batches)
-    filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
-    found = jax.lax.map(lambda batch: jax.vmap(partial(_cubic_at, coefficients))(*batch), filled)
-    return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(found))
+def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
+    """What a function gives at single points, at indices (points, chains) by axis."""
+
+    def found(coefficients: AnyArray, *indices: AnyArray) -> Any:
+        # The taps of so many points stay in the cache; those of all points at once do not, which costs three times as
+        # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
+        count, chains = indices[0].shape
+        batches = max(-(-count // _BATCH), 1)
+        size = -(-count // batches)
+        filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
+        found = jax.lax.map(lambda batch: jax.vmap(partial(at, coefficients))(*batch), filled)
+        return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(found))
+
+    return found
 
 
-# Chains come one after the other at each point: they look at the same voxels.
-_cubic_of_chains = with_chains_as_columns(_in_batches)
+class _Spline(NamedTuple):
+    """The B-splines that reach between two voxels, by the place in between: their values, and their slopes there."""
+
+    width: int
+    weights: Callable[[AnyArray], tuple[AnyArray, ...]]
+    slopes: Callable[[AnyArray], tuple[AnyArray, ...]]
 
 
-def _cubic_at(coefficients: AnyArray, *index: AnyArray) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-    """Value and gradient at one point: sums over its taps, one axis after the other."""
+def _value_at(spline: _Spline, coefficients: AnyArray, *index: AnyArray) -> AnyArray:
+    """Value at one point: the sum over its taps, one axis after the other."""
+    taps, weights, _ = _taps(spline, coefficients, index)
+    for axis in (2, 1, 0):
+        taps = jax.lax.optimization_barrier(_along(taps, weights[axis]))
+    return taps
+
+
+def _value_and_gradient_at(
+    spline: _Spline, coefficients: AnyArray, *index: AnyArray
+) -> tuple[AnyArray, tuple[AnyArray, ...]]:
+    """Value and gradient at one point."""
+    taps, (wx, wy, wz), (sx, sy, sz) = _taps(spline, coefficients, index)
+    z, dz = jax.lax.optimization_barrier((_along(taps, wz), _along(taps, sz)))
+    y, dy, y_dz = jax.lax.optimization_barrier((_along(z, wy), _along(z, sy), _along(dz, wy)))
+    return _along(y, wx), (_along(y, sx), _along(dy, wx), _along(y_dz, wx))
+
+
+def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) -> Any:
+    """Coefficients about a point, and by axis what the spline makes of them, for the value and for the slope."""
     corner = [jax.lax.stop_gradient(jnp.floor(i)) for i in index]
-    taps = jax.lax.dynamic_slice(coefficients, [first.astype(int) for first in corner], (4, 4, 4))
-    weights = [_cubic_weights(i - first) for i, first in zip(index, corner, strict=True)]
-    slopes = [_cubic_slopes(i - first) for i, first in zip(index, corner, strict=True)]
+    taps = jax.lax.dynamic_slice(coefficients, [first.astype(int) for first in corner], (spline.width,) * 3)
+    places = [i - first for i, first in zip(index, corner, strict=True)]
     # Without the barriers XLA fuses the stages and gathers every tap anew for each of the four results.
-    taps, weights, slopes = jax.lax.optimization_barrier((taps, weights, slopes))
+    return jax.lax.optimization_barrier((taps, *([part(t) for t in places] for part in spline[1:])))
 
-    def along(axis: int, taps: AnyArray, weights: list[tuple[AnyArray, ...]]) -> AnyArray:
-        return sum(taps[..., k] * weights[axis][k] for k in range(4))
 
-    z, dz = jax.lax.optimization_barrier((along(2, taps, weights), along(2, taps, slopes)))
-    y, dy, y_dz = jax.lax.optimization_barrier((along(1, z, weights), along(1, z, slopes), along(1, dz, weights)))
-    return along(0, y, weights), (along(0, y, slopes), along(0, dy, weights), along(0, y_dz, weights))
+def _along(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:
+    return sum(taps[..., k] * weight for k, weight in enumerate(weights))
 
 
 def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:
@@ -309,6 +290,28 @@ def _cubic_slopes(t: AnyArray) -> tuple[AnyArray, ...]:
     """Derivatives of `_cubic_weights` in t."""
     s = 1 - t
     return -(s**2) / 2, t * (3 * t / 2 - 2), s * (2 - 3 * s / 2), t**2 / 2
+
+
+def _linear_weights(t: AnyArray) -> tuple[AnyArray, ...]:
+    """Hat functions of the two voxels that a point lies between, 0 ≤ t ≤ 1."""
+    return 1 - t, t
+
+
+def _linear_slopes(t: AnyArray) -> tuple[AnyArray, ...]:
+    """Derivatives of `_linear_weights` in t."""
+    return -jnp.ones_like(t), jnp.ones_like(t)
+
+
+_SPLINES: dict[Interpolation, _Spline] = {
+    "linear": _Spline(2, _linear_weights, _linear_slopes),
+    "cubic": _Spline(4, _cubic_weights, _cubic_slopes),
+}
+# Chains come one after the other at each point: they look at the same voxels.
+_VALUES = {name: with_chains_as_columns(_in_batches(partial(_value_at, spline))) for name, spline in _SPLINES.items()}
+_VALUES_AND_GRADIENTS = {
+    name: with_chains_as_columns(_in_batches(partial(_value_and_gradient_at, spline)))
+    for name, spline in _SPLINES.items()
+}
 
 
 class IntensityScale(NamedTuple):
