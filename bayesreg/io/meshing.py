@@ -18,8 +18,8 @@ from bayesreg.distance import signed_distance
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
 from bayesreg.io.domain import TISSUES, MeshError, domain_labels, mesh_domain
-from bayesreg.io.ears import without_ears
 from bayesreg.io.fitting import pull_inside
+from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, tissue_surfaces
 from bayesreg.io.tetwild import tetrahedralize
@@ -250,7 +250,7 @@ def _attempt(
         threads=options.threads,
         quiet=options.quiet,
     )
-    points, cells = without_ears(points, cells)
+    points, cells = without_loose_nodes(points, cells)
     mesh = TetMesh.from_arrays(points, cells, np.zeros(len(cells), int), TISSUES)
     if distance is not None:
         mesh = pull_inside(mesh, distance, options.skull_gap)

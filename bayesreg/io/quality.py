@@ -78,8 +78,7 @@ def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
         nearly flat (mean ratio below 0.05), a tissue has no tetrahedron, or the volume of Ω or a tissue
         differs from that of its labels by more than 0.75 h |Ω|^(2/3), h the median edge length.
     """
-    _check_connected(mesh)
-    genus = _check_boundary(mesh)
+    genus = check_topology(mesh)
     ratio = mean_ratio(mesh.points, mesh.cells)
     if ratio.min() < LEAST_MEAN_RATIO:
         raise MeshError(
@@ -88,6 +87,18 @@ def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
     quality = _measure(mesh, labels, ratio, genus)
     _check_tissues(quality)
     return quality
+
+
+def check_topology(mesh: TetMesh) -> int:
+    """The genus of the boundary of a mesh.
+
+    Raises
+    ------
+    MeshError
+        If the mesh has several parts, or its boundary is not one closed manifold surface.
+    """
+    _check_connected(mesh)
+    return _check_boundary(mesh)
 
 
 def mean_ratio(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> Float[np.ndarray, "cells"]:
