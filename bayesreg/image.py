@@ -228,7 +228,7 @@ _BATCH = 1024
 def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
     """What a function gives at single points, at indices (points, chains) by axis."""
 
-    def found(coefficients: AnyArray, *indices: AnyArray) -> Any:
+    def interpolation(coefficients: AnyArray, *indices: AnyArray) -> Any:
         # The taps of so many points stay in the cache; those of all points at once do not, which costs three times as
         # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
         count, chains = indices[0].shape
@@ -238,7 +238,7 @@ def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
         found = jax.lax.map(lambda batch: jax.vmap(partial(at, coefficients))(*batch), filled)
         return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(found))
 
-    return found
+    return interpolation
 
 
 class _Spline(NamedTuple):
