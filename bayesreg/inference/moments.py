@@ -26,11 +26,14 @@ def zero_moments(like: Any) -> Moments:
     return Moments(jnp.zeros(()), zeros, zeros)
 
 
-def updated(moments: Moments, draw: Any) -> Moments:
-    """Moments with one draw more."""
-    count = moments.count + 1
-    mean = jax.tree.map(lambda m, x: m + (x - m) / count, moments.mean, draw)
-    squares = jax.tree.map(lambda s, x, old, new: s + (x - old) * (x - new), moments.squares, draw, moments.mean, mean)
+def updated(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
+    """Moments with one draw more, or with so many that are all the same (West 1979)."""
+    count = moments.count + times
+    share = times / jnp.maximum(count, 1)
+    mean = jax.tree.map(lambda m, x: m + share * (x - m), moments.mean, draw)
+    squares = jax.tree.map(
+        lambda s, x, old, new: s + times * (x - old) * (x - new), moments.squares, draw, moments.mean, mean
+    )
     return Moments(count, mean, squares)
 
 

@@ -11,19 +11,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, counted, no_steps, with_passed_over
-from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host, side_by_side
+from bayesreg.inference.block import run_block, watched
+from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, no_steps
+from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host
 from bayesreg.inference.draws import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, require_numbers, starting_points
-from bayesreg.inference.kernel import Draw, Sampler
-from bayesreg.inference.moments import Moments, pooled, scale_reduction, updated, zero_moments
+from bayesreg.inference.kernel import Draw
+from bayesreg.inference.moments import pooled, scale_reduction, zero_moments
 from bayesreg.inference.progress import NoProgress, Progress, SamplingProgress
 from bayesreg.inference.samplers import SAMPLERS, Chosen, chosen_sampler
 from bayesreg.inference.stopping import StopRule, Verdict, judged, out_of_time, reason
 from bayesreg.inference.target import Target
-from bayesreg.types import AnyArray, InputError
+from bayesreg.types import InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,17 +218,13 @@ def _first(chosen: Chosen, data: Any, setup: Any, points: Any) -> Checkpoint:
     state = jax.vmap(partial(chosen.sampler.init, data, setup))(points)
     chains = len(next(iter(points.values())))
     shapes = jax.eval_shape(partial(_observed, chosen), data, setup, state)
-    moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), _watched(shapes)))
+    moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), watched(shapes)))
     return Checkpoint(np.array(0), setup, state, moments, no_steps((chains,)), np.array(0.0))
 
 
 @partial(jax.jit, static_argnums=0)
 def _observed(chosen: Chosen, data: Any, setup: Any, state: Any) -> Draw:
     return jax.vmap(partial(chosen.sampler.observe, data, setup))(state)
-
-
-def _watched(draw: Draw) -> dict[str, Any]:
-    return {"estimands": draw.estimands, "u": draw.evaluation.u}
 
 
 def _advance(
@@ -248,7 +244,7 @@ def _advance(
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
         state, moments, tally, found = gathered(
-            _run_block(
+            run_block(
                 chosen,
                 length,
                 thin,
@@ -265,85 +261,6 @@ def _advance(
         drawn = np.array(int(checkpoint.draws) + length)
         checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
         yield found, checkpoint
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _run_block(  # type: ignore[no-untyped-def]
-    chosen: Chosen,
-    length: int,
-    thin: int,
-    devices: Mesh | None,
-    data: Any,
-    seed: AnyArray | int,
-    numbers: AnyArray,
-    first: AnyArray | int,
-    setup: Any,
-    state: Any,
-    moments: Moments,
-    tally: Tally,
-):
-    kernel = chosen.sampler
-    _, key_chains = jax.random.split(jax.random.key(seed))
-
-    def chain(number: AnyArray, state: Any, moments: Moments, tally: Tally):  # type: ignore[no-untyped-def]
-        key = jax.random.fold_in(key_chains, number)
-
-        def one_draw(carry, draw):  # type: ignore[no-untyped-def]
-            state, moments, tally = carry
-            state, window = _steps(kernel, data, setup, key, draw * thin, thin, state)
-            drawn = kernel.observe(data, setup, state)
-            moments = updated(moments, _watched(drawn))
-            return (state, moments, jax.tree.map(jnp.add, tally, window)), _kept(drawn, window)
-
-        carry, kept = jax.lax.scan(one_draw, (state, moments, tally), first + jnp.arange(length))
-        return *carry, kept
-
-    return side_by_side(chain, devices)(numbers, state, moments, tally)
-
-
-def _steps(
-    kernel: Sampler, data: Any, setup: Any, key: AnyArray, first: AnyArray, count: int, state: Any
-) -> tuple[Any, Tally]:
-    """So many steps of one chain; the key of each is that of the chain with the step's number since the start.
-
-    A chain passes over steps that propose what lies outside the support, where the sampler can tell: side by side, all
-    then evaluate at once, each a step of its own.
-    """
-
-    def key_of(i: AnyArray) -> AnyArray:
-        return jax.random.fold_in(key, first + i)
-
-    def next_inside(i: AnyArray, state: Any) -> AnyArray:
-        if kernel.outside is None:
-            return i
-        outside = partial(kernel.outside, data, setup)
-        return jax.lax.while_loop(lambda i: (i < count) & outside(key_of(i), state), lambda i: i + 1, i)
-
-    def one_step(carry):  # type: ignore[no-untyped-def]
-        i, state, window = carry
-        state, info = kernel.step(data, setup, key_of(i), state)
-        return next_inside(i + 1, state), state, counted(window, info)
-
-    begun = next_inside(jnp.zeros((), int), state), state, no_steps()
-    _, state, window = jax.lax.while_loop(lambda carry: carry[0] < count, one_step, begun)
-    return state, with_passed_over(window, count - window.steps)
-
-
-def _kept(draw: Draw, window: Tally) -> dict[str, AnyArray]:
-    """One kept draw; rates and counts are over the steps since the draw before it."""
-    evaluation = draw.evaluation
-    return {
-        **draw.estimands,
-        "lp": evaluation.logdensity,
-        "similarity_energy": evaluation.similarity_energy,
-        "strain_energy": evaluation.strain_energy,
-        "acceptance_rate": window.acceptance / window.steps,
-        "solver_iterations": window.solver_iterations / window.steps,
-        "solver_failed": window.solver_failed.astype(int),
-        "outside_support": window.outside_support.astype(int),
-        "diverging": window.diverging.astype(int),
-        "gradients": window.gradients.astype(int),
-    }
 
 
 def _judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:

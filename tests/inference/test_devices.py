@@ -9,8 +9,9 @@ import jax
 import numpy as np
 import pytest
 
-from bayesreg.inference import run
+from bayesreg.inference.block import run_block
 from bayesreg.inference.devices import devices_for, require_joined
+from bayesreg.inference.run import first_checkpoint
 from bayesreg.inference.samplers import chosen_sampler
 from tests.inference.gaussians import GaussianTarget
 from tests.model.test_equality import posterior
@@ -24,14 +25,14 @@ def found(sampler):
     settings = {"warm_up": 5} if sampler == "hmc" else {}
     chosen, begun = (
         chosen_sampler(sampler, target, settings),
-        run.first_checkpoint(target, sampler, CHAINS, 0, **settings),
+        first_checkpoint(target, sampler, CHAINS, 0, **settings),
     )
     data = chosen.sampler.data(begun.setup)
 
     def draws(devices, order=(0, 1, 2, 3)):
         order = np.array(order)
         state, moments, tally = jax.tree.map(lambda x: x[order], (begun.state, begun.moments, begun.tally))
-        block = run._run_block(chosen, DRAWS, 2, devices, data, 1, order, 0, begun.setup, state, moments, tally)
+        block = run_block(chosen, DRAWS, 2, devices, data, 1, order, 0, begun.setup, state, moments, tally)
         jax.block_until_ready(block)
         kept = block[-1]["u_boundary"]
         return len(kept.sharding.device_set), np.asarray(kept)[np.argsort(order)]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference import run
+from bayesreg.inference.block import run_block
 from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.diagnostics import convergence
 from bayesreg.inference.draws import open_posterior, save_posterior
@@ -58,9 +58,8 @@ def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_ar
 
     def drawn(sampler):
         samples = br.sample(given, sampler, 3, 20, 5, thin=4, block=10, progress=False, sigma_u=sigma_u)
-        return samples.tally, {
-            name: np.concatenate([block[name] for block in samples.blocks]) for name in samples.blocks[0]
-        }
+        kept = {name: np.concatenate([block[name] for block in samples.blocks], 1) for name in samples.blocks[0]}
+        return samples.tally, kept | {"mean of u": samples.u_mean, "sd of u": samples.u_sd, **samples.rhat}
 
     (tally, found), (tally_alone, expected) = drawn("rwmh"), drawn("each")
     for name in expected:
@@ -70,6 +69,7 @@ def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_ar
     assert (tally.steps == 80).all()
     assert (tally.outside_support > 8).all()
     assert (tally.densities > 8).all()
+    assert (found["outside_support"] == 4).any()
 
 
 def test_a_resumed_run_is_the_run_that_was_not_cut_off():
@@ -89,16 +89,16 @@ def test_a_resumed_run_is_the_run_that_was_not_cut_off():
 
 def test_what_is_compiled_serves_another_seed_and_another_pair_on_the_mesh():
     whole()
-    compiled = run._run_block._cache_size()
+    compiled = run_block._cache_size()
     again = br.sample(posterior(), draws=12, block=4, **OPTIONS)
     np.testing.assert_array_equal(draws(again)["u_boundary"], draws(whole()[0])["u_boundary"])
     seeded = br.sample(posterior(), draws=12, block=4, **OPTIONS | {"seed": 6})
     paired = br.sample(posterior_of(3), draws=12, block=4, **OPTIONS)
-    assert run._run_block._cache_size() == compiled
+    assert run_block._cache_size() == compiled
     for found in (seeded, paired):
         assert (draws(found)["u_boundary"] != draws(again)["u_boundary"]).any()
     br.sample(posterior(), draws=12, block=4, **OPTIONS | {"sigma_u": 0.06})
-    assert run._run_block._cache_size() == compiled + 1
+    assert run_block._cache_size() == compiled + 1
 
 
 @pytest.mark.parametrize("value", [np.array(0.05), np.float64(0.05)])
