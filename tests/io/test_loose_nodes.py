@@ -12,7 +12,7 @@ from bayesreg.mesh import FACES, TetMesh
 from tests.io.balls import balls, grid
 from tests.phantoms import ball_mesh
 
-BALL = ball_mesh(spacing=18.0)
+BALL = ball_mesh(spacing=15.0)
 POINTS, CELLS = BALL.points, BALL.cells
 
 
