@@ -98,8 +98,8 @@ class Image:
 
     def grid_points(self) -> Float[np.ndarray, "X Y Z 3"]:
         """World position of every voxel centre, mm."""
-        indices = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in self.shape), indexing="ij"), axis=-1)
-        return self.voxel_to_world(indices)
+        x, y, z = (np.arange(n)[:, None] * self.affine[:3, axis] for axis, n in enumerate(self.shape))
+        return x[:, None, None] + y[:, None] + (z + self.affine[:3, 3])
 
     def contains(self, points: Float[AnyArray, "*batch 3"]) -> Bool[AnyArray, "*batch"]:
         """Which world points (mm) lie on the grid (its voxels' extent included)."""

@@ -17,7 +17,6 @@ import xarray as xr
 from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.config.sections import StopConfig
-from bayesreg.distance import signed_distance
 from bayesreg.inference.diagnostics import Convergence
 from bayesreg.inference.moments import greatest_rhat
 from bayesreg.inference.run import Samples
@@ -139,5 +138,5 @@ def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
 def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
     if inputs.skull is None:
         return None
-    places = inputs.mesh.points[posterior.sampled] + samples.u_mean[posterior.sampled]
-    return int((np.asarray(signed_distance(inputs.skull).interpolate(places)) < CONTACT).sum())
+    u, rows = samples.u_mean[posterior.sampled], np.arange(len(posterior.sampled))
+    return int((np.asarray(posterior.clearance(posterior.data, u, rows)) < CONTACT).sum())

@@ -403,8 +403,8 @@ def _finish(
     save_posterior(posterior, samples.blocks, out / "posterior.nc")
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)
-    mean_field = nodal_field_on_grid(inputs.mesh, samples.u_mean, inputs.fixed)
-    sd_field = nodal_field_on_grid(inputs.mesh, samples.u_sd, inputs.fixed)
+    moments = np.concatenate([samples.u_mean, samples.u_sd], axis=1)
+    mean_field, sd_field = np.split(nodal_field_on_grid(inputs.mesh, moments, inputs.fixed), 2, axis=-1)
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from bayesreg.io.store import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual, t_similarity_of
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.program import RegistrationData
 from bayesreg.types import AnyArray, InputError
 
 Landmarks = Mapping[str, tuple[float, float, float]]
@@ -61,15 +63,15 @@ def predict(
     cells, neighbours = posterior.data.quadrature.cells, jnp.asarray(mesh.neighbours)
     key = jax.random.key(seed)
 
-    def forward(draw: dict[str, AnyArray]) -> dict[str, AnyArray]:
-        number = draw.pop("number")
-        u = posterior.evaluate(draw).u
-        z = standardised_residual(posterior, u, t_similarity_of(posterior, draw))
+    def forward(draw: dict[str, AnyArray], data: RegistrationData) -> dict[str, AnyArray]:
+        number, here = draw.pop("number"), replace(posterior, data=data)
+        u = here.evaluate(draw).u
+        z = standardised_residual(here, u, t_similarity_of(here, draw))
         noise = jax.random.normal(jax.random.fold_in(key, number.astype(int)), z.shape)
         observed, replicated = (discrepancies(x, cells, neighbours, len(mesh.cells)) for x in (z, noise))
         distance = jnp.linalg.norm(u - u_mean, axis=1)
         marks = jnp.einsum("la,lai->li", weights, u[nodes])
-        stiffness = posterior.stiffness(draw)
+        stiffness = here.stiffness(draw)
         return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "landmarks": marks,
                 "observed": observed, "replicated": replicated,
                 "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
@@ -78,7 +80,7 @@ def predict(
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
     aside: dict[str, list[np.ndarray]] = {"landmarks": [], "observed": [], "replicated": []}
-    found = summarise(_without(push_forward(forward, some), aside), (REACH,))
+    found = summarise(_without(push_forward(forward, some, posterior.data), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
     at_mean = standardised_residual(posterior, jnp.asarray(u_mean), _median_t_similarity(posterior, some))
     return Predicted(

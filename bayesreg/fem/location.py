@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from bayesreg.mesh import TetMesh
 
-_CHUNK = 400_000
+_CHUNK, _THREADS = 400_000, 4
 
 
 class Location(NamedTuple):
@@ -61,9 +62,12 @@ def locate(
     origin, to_barycentric = corners[:, 0], _barycentric_maps(corners)
     bins = _Bins(corners, to_barycentric, pairs=min(max(2 * len(query), 30 * len(cells)), 3_000_000))
     cell, barycentric = np.empty(len(query), int), np.empty((len(query), 4))
-    for start in range(0, len(query), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        cell[part], barycentric[part] = _search(query[part], bins, origin, to_barycentric, tolerance)
+    parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
+    # NumPy lets other threads run.
+    with ThreadPoolExecutor(max_workers=_THREADS) as pool:
+        found = pool.map(lambda part: _search(query[part], bins, origin, to_barycentric, tolerance), parts)
+        for part, (cells_there, there) in zip(parts, found, strict=True):
+            cell[part], barycentric[part] = cells_there, there
     return Location(cell, barycentric)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,16 +35,25 @@ ITERATIONS, JUDGES = 30, 8
 def laplace_sampler(target: SmoothTarget, mode_search: str = "once") -> Sampler:
     """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
 
-    return about_reference(target, _turn, mode_search=mode_search, exact=False)
+    return about_reference(target, _turn, begin=_begin, mode_search=mode_search, exact=False)
 
 
-def _turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+class _Place(NamedTuple):
+    """Where a chain stands in the whitened coordinates."""
+
+    position: AnyArray
+
+
+def _begin(position: AnyArray, _density: Callable[[AnyArray], AnyArray]) -> _Place:
+    return _Place(position)
+
+
+def _turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: _Place) -> tuple[_Place, Moved]:
     momentum = jax.random.normal(key, state.position.shape)
     position, _ = rotated(setup.walls, clearance_of(target, data, setup), state.position, momentum, jnp.pi / 2)
     # A turn that was not over in time is refused, as everywhere.
     done = jnp.isfinite(position).all()
-    moved = state._replace(position=jnp.where(done, position, state.position))
-    return moved, Moved(done.astype(float), diverging=~done)
+    return _Place(jnp.where(done, position, state.position)), Moved(done.astype(float), diverging=~done)
 
 
 def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:

@@ -173,11 +173,16 @@ def precision_at(
 
 
 def _curvature(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
-    estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
+    estimands = _estimands_at(target, data, jnp.asarray(flat))
     expected = target.reference()
     for name in (name for name in estimands if name not in ("field", "u_boundary")):
         _require_an_end((np.asarray(estimands[name]) < FAR * np.asarray(expected[name]).max()).all())
     return target.displacement_curvature(data, estimands)
+
+
+@partial(jax.jit, static_argnums=0)
+def _estimands_at(target: SmoothTarget, data: Any, flat: AnyArray) -> Any:
+    return target.constrain_of(data, unravel(target)(flat))
 
 
 def _require_an_end(found: bool | np.bool_) -> None:

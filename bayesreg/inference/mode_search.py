@@ -70,17 +70,16 @@ def find_mode(
         If the density is not finite at the start.
     """
     flat = np.asarray(start)
-    *way, (data, moves) = target.continuation()
-    for each, moves_there in way:
-        flat = _improved(target, each, flat, moves_there, iterations, say, gain=ROUGH)
-    flat = settled(target, data, flat, moves, say, iterations)
+    for data in target.continuation():
+        flat = _improved(target, data, flat, False, iterations, say, gain=ROUGH)
+    flat = settled(target, target.data, flat, say, iterations)
     for _ in range(RESCUES):
         elsewhere, nodes = out_of_pockets(target, flat)
         if not len(nodes):
             break
         named = ", ".join(map(str, np.asarray(target.sampled)[nodes]))
         say(f"mode: moved to where they are more probable: nodes {named}")
-        flat = settled(target, data, elsewhere, moves, say, iterations)
+        flat = settled(target, target.data, elsewhere, say, iterations)
     else:
         say("mode: single nodes may be more probable elsewhere")
     return flat
@@ -90,21 +89,17 @@ def settled(
     target: SmoothTarget,
     data: Any,
     flat: Float[np.ndarray, "dimension"],
-    moves: bool = True,
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
-    """The mode next to a flat position: the last stage of `find_mode`, repeated, whitened anew, until it moves nothing.
-
-    `moves` says whether anything but displacements does.
-    """
+    """The mode next to a flat position: L-BFGS on the problem itself, whitened anew until it moves nothing."""
     # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
     # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
     # skull and not in it, however great the force that presses.
     shift = np.zeros(len(target.sampled))
     for _ in range(REPEATS):
         before, pressed = flat, shift
-        flat = _improved(target, data, flat, moves, iterations, say, shift)
+        flat = _improved(target, data, flat, True, iterations, say, shift)
         flat = _tempered(target, balanced(target, flat, partial(_factor, target, flat)))
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:

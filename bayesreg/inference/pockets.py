@@ -76,7 +76,7 @@ def _looked(target: SmoothTarget, data: Any, estimands: Estimands, rows: Int[Any
         width = jnp.linalg.norm(rest - here) / 2.0 ** (jnp.arange(PLACES) % WIDTHS)
         about = jax.random.normal(jax.random.fold_in(jax.random.key(0), row), (PLACES, 3))
         places = jnp.concatenate([here[None], rest[None], rest + width[:, None] * about])
-        heights = jax.lax.map(target.local_logdensity(data, estimands, which), places)
+        heights = jax.vmap(target.local_logdensity(data, estimands, which))(places)
         heights = jnp.where(jnp.isnan(heights), -jnp.inf, heights)
         best = heights.argmax()
         return heights[best] - heights[0], places[best]

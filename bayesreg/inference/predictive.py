@@ -1,7 +1,7 @@
 """Push posterior draws forward: any function of them, in blocks, with mean, sd and quantiles in bounded memory.
 
-Functions are handed in and take one draw, a mapping of arrays; what is large in them (a mesh, an image) must be an
-argument of something jitted inside, or it is compiled in as a constant.
+Functions are handed in and take one draw, a mapping of arrays, and what else they are given. They are compiled: what is
+large (a mesh, an image) is to be given, or it becomes a constant of the program.
 """
 
 from __future__ import annotations
@@ -65,15 +65,17 @@ def thinned(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str,
     return {str(name): np.asarray(some[name].to_numpy(), float) for name in some.data_vars}
 
 
-def push_forward(function: Callable[[dict[str, AnyArray]], Any], draws: Draws, block: int = BLOCK) -> Iterator[Any]:
+def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, block: int = BLOCK) -> Iterator[Any]:
     """A function of every draw, block by block.
 
     Parameters
     ----------
     function : callable
-        From one draw to a pytree of arrays; traceable by JAX.
+        (one draw, given) → a pytree of arrays; traceable by JAX.
     draws : mapping
         Arrays (chain, draw, …).
+    given : pytree
+        The same for all draws.
     block : int
         Draws evaluated side by side.
 
@@ -84,11 +86,11 @@ def push_forward(function: Callable[[dict[str, AnyArray]], Any], draws: Draws, b
     """
     chains, total = next(iter(draws.values())).shape[:2]
     stretch = max(1, min(total, block // chains))
-    batched = jax.vmap(jax.vmap(function))
+    batched = jax.jit(jax.vmap(jax.vmap(function, (0, None)), (0, None)))
     for first in range(0, total, stretch):
         # The last stretch is filled up with its last draw: another shape would be compiled anew.
         chosen = np.minimum(np.arange(first, first + stretch), total - 1)
-        found = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()})
+        found = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, given)
         wanted = slice(total - first)
         yield jax.tree.map(lambda leaf, wanted=wanted: np.asarray(leaf)[:, wanted], found)
 

@@ -137,8 +137,8 @@ class SmoothTarget(Target, Protocol):
     def without_walls(self, data: Any) -> Any:
         """The data of the same problem in which a node may be anywhere."""
 
-    def continuation(self) -> Iterable[tuple[Any, bool]]:
-        """Data of ever harder problems that end with this one, and whether each moves more than displacements."""
+    def continuation(self) -> Iterable[Any]:
+        """Data of ever harder problems, in the displacements alone, that lead to this one."""
 
     def least_curvature(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
         """Of minus the log density in every coordinate where next to nothing is known of it, positive."""

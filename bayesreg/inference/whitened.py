@@ -86,6 +86,7 @@ Transition = Callable[[SmoothTarget, Any, Setup, AnyArray, Any], tuple[Any, Move
 Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
+@partial(jax.jit, static_argnums=0)
 def setup_about(
     target: SmoothTarget, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
 ) -> Setup:

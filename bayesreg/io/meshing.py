@@ -12,7 +12,6 @@ from pathlib import Path
 import meshio
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import ndimage
 
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
@@ -129,7 +128,7 @@ def build_mesh(
     labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing))
     surfaces = tissue_surfaces(labels, options.edge_length)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
-    distance = None if intracranial is None else _skull_distance(intracranial)
+    distance = None if intracranial is None else signed_distance(_outside(intracranial))
     for attempt in range(1, options.attempts + 1):
         try:
             mesh = _attempt(labels, surfaces, sizing, distance, options)
@@ -257,15 +256,8 @@ def _attempt(
     return TetMesh.from_arrays(mesh.points, cells, tissue_of_cells(mesh.points, cells, labels), TISSUES)
 
 
-def _skull_distance(intracranial: Image) -> Image:
-    """Signed distance to the skull, on a grid cut to the mask, which saves half the time."""
-    inside = np.asarray(intracranial.voxels) != 0
-    box = ndimage.find_objects(inside.astype(np.int8))[0]
-    low = np.maximum([part.start - 3 for part in box], 0)
-    affine = intracranial.affine.copy()
-    affine[:3, 3] = intracranial.voxel_to_world(low.astype(float))
-    near = inside[tuple(slice(start, part.stop + 3) for start, part in zip(low, box, strict=True))]
-    return signed_distance(Image((~near).astype(np.uint8), affine))
+def _outside(mask: Image) -> Image:
+    return mask.with_voxels((np.asarray(mask.voxels) == 0).astype(np.uint8))
 
 
 def _inner_lattice(samples: int) -> Float[np.ndarray, "points 4"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -196,10 +197,16 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
     folder = Path(folder)
     images = folder / "inputs"
     images.mkdir(parents=True, exist_ok=True)
-    for name in ("fixed", "moving", "tissue", "skull"):
-        image = getattr(inputs, name)
-        if image is not None:
-            save_image(image, images / f"{name}.nii.gz")
+    kept = {name: getattr(inputs, name) for name in ("fixed", "moving", "tissue", "skull")}
+    # What compresses lets other threads run.
+    with ThreadPoolExecutor() as pool:
+        written = [
+            pool.submit(save_image, image, images / f"{name}.nii.gz")
+            for name, image in kept.items()
+            if image is not None
+        ]
+    for each in written:
+        each.result()
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
         save_arrays(images / "truth.npz", known)

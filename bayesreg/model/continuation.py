@@ -1,10 +1,9 @@
-"""The way to a mode: problems of growing difficulty that end with the posterior's own."""
+"""The way to a mode: problems of growing difficulty that lead to the posterior's own."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 from bayesreg.image import Image, Interpolation, Interpolator
 from bayesreg.model.program import RegistrationData
@@ -20,29 +19,29 @@ SMOOTHING = (
 
 def continuation(
     data: RegistrationData, fixed: Image, moving: Image, interpolation: Interpolation
-) -> Iterator[tuple[RegistrationData, bool]]:
-    """Data of every problem, and whether it moves λ, μ and the temperatures, too.
+) -> Iterator[RegistrationData]:
+    """Data of every problem, each to be solved for the displacements alone.
 
     Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement of
-    many times its posterior standard deviation is found step by step. The last two are the posterior itself, first in
-    the displacements alone. Where no node is sampled, the last is all there is.
+    many times its posterior standard deviation is found step by step. The last is the posterior's own. Where no node is
+    sampled there is none.
     """
     if len(data.slots):
-        for sigma, similarity, elastic in SMOOTHING:
-            # SciPy's filters let other threads run.
-            with ThreadPoolExecutor() as pool:
-                smooth_fixed, smooth_moving = pool.map(partial(_smoothed, sigma, interpolation), (fixed, moving))
-            yield (
-                data._replace(
+        # SciPy's filters let other threads run: images are smoothed while the problems before them are being solved.
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            smoothed = [
+                [pool.submit(_smoothed, sigma, interpolation, image) for image in (fixed, moving)]
+                for sigma, _, _ in SMOOTHING
+            ]
+            for images, (_, similarity, elastic) in zip(smoothed, SMOOTHING, strict=True):
+                smooth_fixed, smooth_moving = (image.result() for image in images)
+                yield data._replace(
                     moving=smooth_moving,
                     fixed_values=smooth_fixed(data.positions),
                     t_similarity=similarity * data.t_similarity,
                     t_elastic=elastic * data.t_elastic,
-                ),
-                False,
-            )
-        yield data, False
-    yield data, True
+                )
+        yield data
 
 
 def _smoothed(sigma: float, interpolation: Interpolation, image: Image) -> Interpolator:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -77,16 +77,12 @@ def displacement_curvature(
     """
     sampled = unknowns_of(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
     free = unknowns_of(np.asarray(data.system.free))
-    K = stiffness(mesh, lam, mu)
-    coupling = K[free][:, sampled]
-    load = np.zeros((len(free), 0))
+    W, schur = _following(mesh, *(tuple(np.asarray(x).tolist()) for x in (sampled, free, lam, mu)))
     if data.field is not None:
         load = (_element_forces(data, lam, mu, u) @ (field_sd * np.asarray(data.field.basis)))[free]
-    modes = load.shape[1]
-    W = np.zeros((0, modes + len(sampled)))
-    if len(free):
-        W = -solved(K[free][:, free], np.hstack([load, coupling.toarray()]))
-    schur = K[sampled][:, sampled] + coupling.T @ W[:, modes:]
+        by_field = -solved(stiffness(mesh, lam, mu)[free][:, free], load) if len(free) else load
+        W = np.hstack([by_field, W])
+    modes = W.shape[1] - len(sampled)
 
     def reduced(points: AnyArray) -> np.ndarray:
         """The curvature in (z, u_B) of one in the places of the quadrature points."""
@@ -100,10 +96,21 @@ def displacement_curvature(
         return (found + found.T) / 2
 
     gauss_newton = reduced(_first_order(data, jnp.asarray(u)))
-    schur = np.asarray(schur) / float(data.t_elastic)
-    gauss_newton[modes:, modes:] += (schur + schur.T) / 2
+    gauss_newton[modes:, modes:] += schur / float(data.t_elastic)
     gauss_newton[:modes, :modes] += np.eye(modes)
     return Curvature(gauss_newton, lambda: reduced(_second_order(similarity, data, jnp.asarray(u))))
+
+
+@lru_cache(maxsize=1)
+def _following(
+    mesh: TetMesh, sampled: tuple[int, ...], free: tuple[int, ...], lam: tuple[float, ...], mu: tuple[float, ...]
+) -> tuple[Float[np.ndarray, "free sampled"], Float[np.ndarray, "sampled sampled"]]:
+    """W and the Schur complement K_BB + K_BI W, which the stages of a search that leave λ and μ alone share."""
+    K, own, others = stiffness(mesh, np.array(lam), np.array(mu)), list(sampled), list(free)
+    coupling = K[others][:, own]
+    W = -solved(K[others][:, others], coupling.toarray()) if len(others) else np.zeros((0, len(own)))
+    schur = np.asarray(K[own][:, own] + coupling.T @ W)
+    return W, (schur + schur.T) / 2
 
 
 def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:

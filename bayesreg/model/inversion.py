@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from bayesreg.fem.elements import gauss_quadrature
-from bayesreg.fem.location import locate, nearest_on_surface
+from bayesreg.fem.location import nearest_on_surface
 from bayesreg.image import Image, Interpolation
 from bayesreg.mesh import TetMesh
+from bayesreg.model.warp import covered_voxels
 
 
 def deformed_image(
@@ -44,7 +45,8 @@ def deformed_image(
     deformed = mesh.moved(u)
     values = np.array(fixed.voxels, float)
     inside = np.zeros(fixed.shape, bool)
-    index, rest = _rest_positions(fixed, mesh, deformed)
+    index, cell, barycentric = covered_voxels(fixed, deformed)
+    rest = np.einsum("ka,kai->ki", barycentric, mesh.points[mesh.cells[cell]])
     inside[tuple(index.T)] = True
     values[tuple(index.T)] = _cubic(fixed, rest)
     beside = ndimage.binary_dilation(inside, np.ones((3, 3, 3))) & ~inside
@@ -72,20 +74,6 @@ def residuals(
     rest = quadrature.positions(mesh)
     moved = rest + np.einsum("qa,qai->qi", np.asarray(quadrature.barycentric), nodal)
     return np.asarray(fixed.interpolate(rest, interpolation) - moving.interpolate(moved, interpolation))
-
-
-def _rest_positions(
-    grid: Image, mesh: TetMesh, deformed: TetMesh
-) -> tuple[Int[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Voxels whose centres the deformed mesh covers, and where they come from in the mesh at rest, mm."""
-    corners = grid.world_to_voxel(deformed.points)
-    low = np.maximum(np.ceil(corners.min(axis=0)), 0).astype(int)
-    high = np.minimum(np.floor(corners.max(axis=0)), np.array(grid.shape) - 1).astype(int)
-    index = low + np.argwhere(np.ones(high - low + 1, bool))
-    cell, barycentric = locate(deformed.points, deformed.cells, grid.voxel_to_world(index.astype(float)))
-    found = cell >= 0
-    rest = np.einsum("ka,kai->ki", barycentric[found], mesh.points[mesh.cells[cell[found]]])
-    return index[found], rest
 
 
 def _surface_displacement(

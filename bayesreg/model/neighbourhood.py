@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 
 from bayesreg.fem.elasticity import stiffness, unknowns_of
@@ -22,8 +23,8 @@ from bayesreg.types import AnyArray
 CELLS = 128
 # The number of nodes near them is a multiple of this, so that what is compiled for some nodes serves others, too.
 ROUND = 128
-# Quadrature points that are ranked at a time: there may be millions.
-AT_A_TIME = 100_000
+# Numbers that are worked out at a time: there may be millions of quadrature points.
+AT_A_TIME = 2**22
 
 
 class Neighbourhoods(NamedTuple):
@@ -94,12 +95,9 @@ def neighbourhoods(
     def following(points: np.ndarray, which: int) -> np.ndarray:
         return np.einsum("pa,paij->pij", barycentric[points], own[mesh.cells[cell_of[points]], :, which])
 
-    def furthest(which: int) -> np.ndarray:
-        parts = np.array_split(np.arange(len(cell_of)), -(-len(cell_of) // AT_A_TIME))
-        reach = np.concatenate([(following(part, which) ** 2).sum(axis=(1, 2)) for part in parts])
-        return np.sort(np.argpartition(-np.asarray(quadrature.weights) * reach, count - 1)[:count])
-
-    points = np.stack([furthest(which) for which in range(len(nodes))])
+    reach = _reach(mesh.cells[cell_of], barycentric, own)
+    furthest = np.argpartition(-np.asarray(quadrature.weights)[:, None] * reach, count - 1, axis=0)[:count]
+    points = np.sort(furthest, axis=0).T
     follows = np.stack([following(points[which], which) for which in range(len(nodes))])
     touching = np.isin(mesh.cells, nodes).any(axis=1)
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
@@ -117,3 +115,19 @@ def neighbourhoods(
         jnp.asarray(follows),
         jnp.asarray(force.reshape(len(rows), 3, len(prescribed), 3)),
     )
+
+
+def _reach(
+    corners: Int[np.ndarray, "points 4"], barycentric: Float[np.ndarray, "points 4"], own: np.ndarray
+) -> Float[np.ndarray, "points k"]:
+    """How far every quadrature point follows each of k nodes, squared: own is (n, 3, k, 3), as `response`."""
+    nodes, count = len(own), own.shape[2]
+    starts = np.arange(0, 4 * len(corners) + 1, 4)
+    interpolation = scipy.sparse.csr_matrix((barycentric.ravel(), corners.ravel(), starts), (len(corners), nodes))
+    columns = own.transpose(0, 2, 1, 3).reshape(nodes, 9 * count)
+    width = max(1, AT_A_TIME // (9 * len(corners)))
+    reach = np.empty((len(corners), count))
+    for first in range(0, count, width):
+        part = interpolation @ columns[:, 9 * first : 9 * (first + width)]
+        reach[:, first : first + width] = (part**2).reshape(len(corners), -1, 9).sum(axis=2)
+    return reach

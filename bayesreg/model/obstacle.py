@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from bayesreg.distance import signed_distance
+from bayesreg.distance import MARGIN, signed_distance
 from bayesreg.image import Image
 
-# How far off the grid the distance still grows, so that a body that has strayed there is led back, mm.
+# How far off what is allowed the distance still grows, so that a body that has strayed there is led back, mm.
 _REACH = 10.0
 
 
@@ -29,11 +29,12 @@ class SmoothObstacle:
     Attributes
     ----------
     exact : Image
-        The signed distance itself (`bayesreg.distance.signed_distance`), mm, on a wider grid.
+        The signed distance itself (`bayesreg.distance.signed_distance`), mm.
     """
 
     def __init__(self, skull: Image, smoothing_mm: float) -> None:
-        self.exact = signed_distance(_with_border(skull, 3 * smoothing_mm + _REACH))
+        # The smoothing is another one where the distance ends.
+        self.exact = signed_distance(skull, max(MARGIN, 3 * smoothing_mm + _REACH))
         smooth = ndimage.gaussian_filter(self.exact.voxels, smoothing_mm / self.exact.voxel_sizes, mode="nearest")
         coefficients = ndimage.spline_filter(smooth, order=3, mode="mirror", output=float)
         self._coefficients = np.pad(coefficients, [(1, 2)] * 3, mode="reflect")
@@ -54,14 +55,6 @@ class SmoothObstacle:
         gradient = [np.einsum("kabc,ka,kb,kc->k", block, *(w[:, i] for i, w in enumerate(ws))) for ws in along]
         gap = np.einsum("kabc,ka,kb,kc->k", block, *np.moveaxis(value, 1, 0))
         return gap, np.stack(gradient, axis=1) @ self.exact.to_voxel[:3, :3]
-
-
-def _with_border(skull: Image, width_mm: float) -> Image:
-    """The same region on a wider grid: all that lies off the grid is forbidden."""
-    width = np.ceil(width_mm / skull.voxel_sizes).astype(int)
-    affine = skull.affine.copy()
-    affine[:3, 3] = skull.voxel_to_world(-width.astype(float))
-    return Image(np.pad(np.asarray(skull.voxels) != 0, [(n, n) for n in width], constant_values=True), affine)
 
 
 def _bspline(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -193,8 +193,8 @@ class Posterior:
         """The data of the same problem without a skull."""
         return data._replace(skull_distance=None)
 
-    def continuation(self) -> Iterator[tuple[RegistrationData, bool]]:
-        """Problems of growing difficulty that lead to this one, and whether each moves more than displacements."""
+    def continuation(self) -> Iterator[RegistrationData]:
+        """Problems of growing difficulty, in the displacements alone, that lead to this one."""
         return continuation(self.data, self.fixed, self.moving, self.options.interpolation)
 
     def conditioned(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayesreg.fem.elements import displacement_gradient, elements_of
 from bayesreg.fem.location import locate
@@ -23,15 +25,39 @@ def nodal_field_on_grid(
     mesh: TetMesh, values: Float[np.ndarray, "nodes channels"], grid: Image
 ) -> Float[np.ndarray, "X Y Z channels"]:
     """Linear interpolation of nodal values at the voxel centres of an image; zero outside the mesh."""
-    points = grid.grid_points().reshape(-1, 3)
-    lower, upper = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    near = np.flatnonzero(((points >= lower) & (points <= upper)).all(axis=1))
-    cells, barycentric = locate(mesh.points, mesh.cells, points[near])
-    inside = cells >= 0
-    field = np.zeros((len(points), values.shape[1]))
-    nodal = np.asarray(values)[mesh.cells[cells[inside]]]
-    field[near[inside]] = np.einsum("qa,qac->qc", barycentric[inside], nodal)
-    return field.reshape(*grid.shape, values.shape[1])
+    field = np.zeros((*grid.shape, values.shape[1]))
+    index, cells, barycentric = covered_voxels(grid, mesh)
+    nodal = np.asarray(values)[mesh.cells[cells]]
+    field[tuple(index.T)] = np.einsum("qa,qac->qc", barycentric, nodal)
+    return field
+
+
+class Covered(NamedTuple):
+    """Voxels whose centres lie in a mesh.
+
+    Attributes
+    ----------
+    voxel : (k, 3) int array
+    cell : (k,) int array
+        The tetrahedron that holds each.
+    barycentric : (k, 4) array
+        Where in it.
+    """
+
+    voxel: Int[np.ndarray, "k 3"]
+    cell: Int[np.ndarray, "k"]
+    barycentric: Float[np.ndarray, "k 4"]
+
+
+def covered_voxels(grid: Image, mesh: TetMesh) -> Covered:
+    """The voxels of an image whose centres lie in a mesh."""
+    corners = grid.world_to_voxel(mesh.points)
+    low = np.maximum(np.ceil(corners.min(axis=0)), 0).astype(int)
+    high = np.minimum(np.floor(corners.max(axis=0)), np.array(grid.shape) - 1).astype(int)
+    index = low + np.argwhere(np.ones(np.maximum(high - low + 1, 0), bool))
+    cell, barycentric = locate(mesh.points, mesh.cells, grid.voxel_to_world(index.astype(float)))
+    inside = cell >= 0
+    return Covered(index[inside], cell[inside], barycentric[inside])
 
 
 def warp_image(

@@ -212,14 +212,14 @@ def node_at_skull(run: Run, posterior: xr.Dataset) -> SkullNode:
     stride = max(1, draws.sizes["chain"] * draws.sizes["draw"] // SEARCH_DRAWS)
     some = draws.isel(draw=slice(None, None, stride)).to_numpy().reshape(-1, len(nodes), 3)
     at = run.mesh.points[nodes] + some
-    distance = np.stack([skull_distance(run.skull, at[:, k]) for k in range(len(nodes))], axis=1)
+    distance = skull_distance(run.skull, at.reshape(-1, 3)).reshape(len(at), len(nodes))
     near, mean = (np.abs(distance) < NEAR).mean(axis=0), np.abs(distance).mean(axis=0)
     entry = int(np.lexsort((mean, -near))[0])
     return SkullNode(entry, int(nodes[entry]), float(near[entry]))
 
 
 def skull_distance(skull: Image, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
-    """Signed distance to the skull (mm, negative inside it) of points close together, cut off at ±6 mm.
+    """Signed distance to the skull (mm, negative inside it) of some points, cut off at ±6 mm.
 
     Only the voxels about the points are looked at: the distance map of a whole image takes seconds.
     """

@@ -111,7 +111,7 @@ class GaussianTarget:
         return data._replace(wall=jnp.asarray(jnp.inf))
 
     def continuation(self):
-        yield self.data, True
+        yield self.data
 
     def least_curvature(self, data, position):
         return jax.tree.map(jnp.ones_like, position)

@@ -11,7 +11,7 @@ from bayesreg.inference.predictive import predictive_p, push_forward, summarise,
 DRAWS = {"u": np.random.default_rng(0).gamma(2.0, size=(3, 50, 4)), "scale": np.linspace(1, 2, 150).reshape(3, 50)}
 
 
-def function(draw):
+def function(draw, _=None):
     return {"scaled": jnp.sort(draw["u"]) * draw["scale"], "exceeds": (draw["u"] > 2).astype(float)}
 
 
@@ -21,13 +21,13 @@ def expected():
 
 @pytest.mark.parametrize("block", [1, 7, 21, 1000])
 def test_every_draw_is_evaluated_once_and_in_order(block):
-    found = list(push_forward(function, DRAWS, block))
+    found = list(push_forward(function, DRAWS, block=block))
     for name, values in expected().items():
         np.testing.assert_allclose(np.concatenate([part[name] for part in found], axis=1), values, rtol=1e-14)
 
 
 def test_mean_sd_and_quantiles_are_those_of_all_draws():
-    found = summarise(push_forward(function, DRAWS, 21), (0.1, 0.5, 0.9))
+    found = summarise(push_forward(function, DRAWS, block=21), (0.1, 0.5, 0.9))
     for name, values in expected().items():
         np.testing.assert_allclose(found.mean[name], values.mean((0, 1)), rtol=1e-12)
         np.testing.assert_allclose(found.sd[name], values.reshape(150, -1).std(axis=0, ddof=1), rtol=1e-12)
@@ -38,7 +38,7 @@ def test_mean_sd_and_quantiles_are_those_of_all_draws():
 def test_memory_is_bounded_and_quantiles_still_come_from_evenly_spaced_draws(monkeypatch):
     monkeypatch.setattr(predictive, "MOST_KEPT", 8)
     ramp = {"x": np.tile(np.arange(50.0), (2, 1))}
-    found = summarise(push_forward(lambda draw: draw["x"], ramp, 6), (0.0, 1.0))
+    found = summarise(push_forward(lambda draw, factor: factor * draw["x"], ramp, 1.0, block=6), (0.0, 1.0))
     # 8 of 50 are draws 0, 8, …, 48 by way of strides 2 and 4.
     np.testing.assert_array_equal(found.quantiles, [0, 48])
     assert found.mean == pytest.approx(24.5)
