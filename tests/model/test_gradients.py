@@ -130,3 +130,16 @@ def test_curvature_in_the_displacements_is_the_hessian(similarity):
         product, rest = (matrix @ direction.ravel() for matrix in (found.gauss_newton, found.remainder))
         np.testing.assert_allclose(product + rest, np.ravel(expected), atol=1e-4 * float(abs(expected).max()))
         assert abs(rest).max() > 0.01 * abs(product).max()
+
+
+def test_curvature_follows_lam_and_mu():
+    """The response of the free nodes is kept while these stay, and no longer: there and back, and at two places."""
+    post = posterior()
+    u = state(LAM, MU)["u_boundary"]
+    data = post.data._replace(t_similarity=jnp.asarray(1e12))
+    soft, stiff, again = (
+        post.displacement_curvature(data, {"u_boundary": u, "lam": factor * LAM, "mu": factor * MU}).gauss_newton
+        for factor in (1.0, 2.0, 1.0)
+    )
+    np.testing.assert_allclose(stiff, 2 * soft, atol=1e-6 * abs(soft).max())
+    np.testing.assert_array_equal(again, soft)

@@ -98,3 +98,17 @@ def test_a_sheet_of_one_voxel_stays_closed():
     distance = signed_distance(Image(voxels, np.eye(4))).interpolator("linear")
     across = np.random.default_rng(7).uniform((2, 2, 10), (17, 17, 10), (500, 3))
     assert not np.asarray(is_allowed(distance, across)).any()
+
+
+@pytest.mark.parametrize("left_handed", [True, False])
+def test_the_distance_is_the_same_whatever_its_margin(left_handed):
+    skull = blobs(left_handed=left_handed)
+    near, far = signed_distance(skull, 4.0), signed_distance(skull, 25.0)
+    assert np.all(np.subtract(far.shape, near.shape) > 20 / skull.voxel_sizes)
+    np.testing.assert_allclose(far.interpolate(near.grid_points()), near.voxels, atol=1e-9)
+
+
+def test_a_body_that_has_strayed_is_led_back_as_far_as_the_margin():
+    skull = flat_skull(CORNERS, axis=2, wall=7.0, voxel=2.0)
+    x = np.array([[0.0, 0.0, 7.0 + d] for d in (1.0, 5.0, 10.0, 15.0)])
+    np.testing.assert_allclose(signed_distance(skull, 16.0).interpolate(x), 7.0 - x[:, 2], atol=0.1)
