@@ -25,13 +25,13 @@ def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
     skull : Image
         Nonzero = forbidden. All that lies off its grid is forbidden too.
     margin : float
-        How far from all that is allowed the distance is still told, mm, rounded up to whole voxels.
+        How far from all that is allowed the distance is told at least, mm.
 
     Returns
     -------
     Image
-        mm, negative where forbidden, on the part of the skull's grid, or of its continuation, that holds what is
-        allowed and the margin; for affines whose axes are orthogonal.
+        mm, negative where forbidden, on the skull's grid with one voxel more on each side, or as many as the margin
+        asks for; for affines whose axes are orthogonal.
 
     Raises
     ------
@@ -45,18 +45,14 @@ def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
     aliasing artifacts in iso-surfaces of binary volumes"): sheets and ridges of one voxel remain. Where the surface is
     flat and along the grid, its trilinear zero level runs half-way between allowed and forbidden voxel centres.
     """
-    return _signed_distance(skull, float(margin))
-
-
-# A synthetic pair and the posterior ask for the same one.
-@lru_cache(maxsize=2)
-def _signed_distance(skull: Image, margin: float) -> Image:
     allowed = np.asarray(skull.voxels) == 0
     if not allowed.any():
         raise InputError("the skull image forbids every voxel: nonzero means forbidden, zero allowed")
-    box = ndimage.find_objects(allowed.astype(np.uint8))[0]
-    border = np.ceil(margin / skull.voxel_sizes).astype(int)
-    allowed = np.pad(allowed[box], [(n + _END, n + _END) for n in border], constant_values=False)
+    box, border = ndimage.find_objects(allowed.astype(np.uint8))[0], np.ceil(margin / skull.voxel_sizes).astype(int)
+    before = np.maximum(border - [part.start for part in box], 1)
+    after = np.maximum(border - np.subtract(allowed.shape, [part.stop for part in box]), 1)
+    width = [(low + _END, high + _END) for low, high in zip(before, after, strict=True)]
+    allowed = np.pad(allowed, width, constant_values=False)
     half = skull.voxel_sizes.min() / 2
     distance_to_zero = partial(ndimage.distance_transform_edt, sampling=skull.voxel_sizes)
     # SciPy lets other threads run.
@@ -67,5 +63,11 @@ def _signed_distance(skull: Image, margin: float) -> Image:
     kept = _KEPT * skull.voxel_sizes.min()
     distance = np.where(allowed, np.maximum(smooth, kept), np.minimum(smooth, -kept))
     affine = skull.affine.copy()
-    affine[:3, 3] = skull.voxel_to_world(np.array([part.start for part in box], float) - border)
-    return Image(distance[(slice(_END, -_END),) * 3], affine)
+    affine[:3, 3] = skull.voxel_to_world(-before.astype(float))
+    distance = distance[(slice(_END, -_END),) * 3]
+    distance.flags.writeable = False
+    return Image(distance, affine)
+
+
+# For a synthetic pair and its posterior, which ask for the same one.
+shared_distance = lru_cache(maxsize=1)(signed_distance)

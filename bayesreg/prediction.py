@@ -19,7 +19,6 @@ from bayesreg.io.store import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual, t_similarity_of
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.program import RegistrationData
 from bayesreg.types import AnyArray, InputError
 
 Landmarks = Mapping[str, tuple[float, float, float]]
@@ -60,11 +59,12 @@ def predict(
     mesh = posterior.mesh
     landmarks = landmarks or default_landmarks(mesh, u_mean, u_sd)
     nodes, weights = _interpolation(mesh, landmarks)
-    cells, neighbours = posterior.data.quadrature.cells, jnp.asarray(mesh.neighbours)
+    given = posterior.data, jnp.asarray(mesh.neighbours), jnp.asarray(u_mean), jnp.asarray(nodes), jnp.asarray(weights)
     key = jax.random.key(seed)
 
-    def forward(draw: dict[str, AnyArray], data: RegistrationData) -> dict[str, AnyArray]:
-        number, here = draw.pop("number"), replace(posterior, data=data)
+    def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
+        data, neighbours, u_mean, nodes, weights = given
+        number, here, cells = draw.pop("number"), replace(posterior, data=data), data.quadrature.cells
         u = here.evaluate(draw).u
         z = standardised_residual(here, u, t_similarity_of(here, draw))
         noise = jax.random.normal(jax.random.fold_in(key, number.astype(int)), z.shape)
@@ -80,7 +80,7 @@ def predict(
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
     aside: dict[str, list[np.ndarray]] = {"landmarks": [], "observed": [], "replicated": []}
-    found = summarise(_without(push_forward(forward, some, posterior.data), aside), (REACH,))
+    found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
     at_mean = standardised_residual(posterior, jnp.asarray(u_mean), _median_t_similarity(posterior, some))
     return Predicted(
@@ -92,7 +92,7 @@ def predict(
         landmark_points=np.array(list(landmarks.values()), float),
         landmark_draws=whole["landmarks"],
         residual=np.asarray(at_mean, np.float32),
-        residual_tissue=mesh.tissue[np.asarray(cells)].astype(np.int8),
+        residual_tissue=mesh.tissue[np.asarray(posterior.data.quadrature.cells)].astype(np.int8),
         discrepancies=np.array(DISCREPANCIES),
         observed=whole["observed"],
         replicated=whole["replicated"],

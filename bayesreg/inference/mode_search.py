@@ -72,14 +72,14 @@ def find_mode(
     flat = np.asarray(start)
     for data in target.continuation():
         flat = _improved(target, data, flat, False, iterations, say, gain=ROUGH)
-    flat = settled(target, target.data, flat, say, iterations)
+    flat = settled(target, flat, say, iterations)
     for _ in range(RESCUES):
         elsewhere, nodes = out_of_pockets(target, flat)
         if not len(nodes):
             break
         named = ", ".join(map(str, np.asarray(target.sampled)[nodes]))
         say(f"mode: moved to where they are more probable: nodes {named}")
-        flat = settled(target, target.data, elsewhere, say, iterations)
+        flat = settled(target, elsewhere, say, iterations)
     else:
         say("mode: single nodes may be more probable elsewhere")
     return flat
@@ -87,7 +87,6 @@ def find_mode(
 
 def settled(
     target: SmoothTarget,
-    data: Any,
     flat: Float[np.ndarray, "dimension"],
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
@@ -99,7 +98,7 @@ def settled(
     shift = np.zeros(len(target.sampled))
     for _ in range(REPEATS):
         before, pressed = flat, shift
-        flat = _improved(target, data, flat, True, iterations, say, shift)
+        flat = _improved(target, target.data, flat, True, iterations, say, shift)
         flat = _tempered(target, balanced(target, flat, partial(_factor, target, flat)))
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:

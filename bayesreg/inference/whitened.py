@@ -195,7 +195,8 @@ def about_reference(
     tuning : Tuning, optional
         Of the step size; without it there is no warm-up.
     begin : callable
-        (position, log density) → the state that the transition takes, with fields `position` and `logdensity`.
+        (position, log density) → the state that the transition takes, with a field `position`, and with
+        `logdensity` where nodes are moved alone.
     density : callable
         (target, data, setup) → the log density of a whitened position that `begin` is given.
     mode_search : str

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
-from bayesreg.fem.preconditioners import solved
+from bayesreg.fem.preconditioners import DENSE_LIMIT, solved
 from bayesreg.mesh import TetMesh
 from bayesreg.model.program import RegistrationData
 from bayesreg.model.similarity import SIMILARITIES, Noise
@@ -77,11 +77,14 @@ def displacement_curvature(
     """
     sampled = unknowns_of(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
     free = unknowns_of(np.asarray(data.system.free))
-    W, schur = _following(mesh, *(tuple(np.asarray(x).tolist()) for x in (sampled, free, lam, mu)))
+    parts = sampled, free, np.asarray(lam), np.asarray(mu)
     if data.field is not None:
-        load = (_element_forces(data, lam, mu, u) @ (field_sd * np.asarray(data.field.basis)))[free]
-        by_field = -solved(stiffness(mesh, lam, mu)[free][:, free], load) if len(free) else load
-        W = np.hstack([by_field, W])
+        load = _element_forces(data, lam, mu, u) @ (field_sd * np.asarray(data.field.basis))
+        W, schur = _response(mesh, *parts, load[free])
+    elif len(free) > DENSE_LIMIT:
+        W, schur = _response(mesh, *parts, np.zeros((len(free), 0)))
+    else:
+        W, schur = _kept_response(mesh, *(tuple(part.tolist()) for part in parts))
     modes = W.shape[1] - len(sampled)
 
     def reduced(points: AnyArray) -> np.ndarray:
@@ -101,16 +104,31 @@ def displacement_curvature(
     return Curvature(gauss_newton, lambda: reduced(_second_order(similarity, data, jnp.asarray(u))))
 
 
+def _response(
+    mesh: TetMesh,
+    sampled: Int[np.ndarray, "sampled"],
+    free: Int[np.ndarray, "free"],
+    lam: Float[np.ndarray, "cells"],
+    mu: Float[np.ndarray, "cells"],
+    load: Float[np.ndarray, "free loads"],
+) -> tuple[Float[np.ndarray, "free columns"], Float[np.ndarray, "sampled sampled"]]:
+    """−K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W."""
+    K = stiffness(mesh, lam, mu)
+    coupling = K[free][:, sampled]
+    W = np.hstack([load, coupling.toarray()])
+    if len(free):
+        W = -solved(K[free][:, free], W)
+    schur = np.asarray(K[sampled][:, sampled] + coupling.T @ W[:, load.shape[1] :])
+    return W, (schur + schur.T) / 2
+
+
 @lru_cache(maxsize=1)
-def _following(
+def _kept_response(
     mesh: TetMesh, sampled: tuple[int, ...], free: tuple[int, ...], lam: tuple[float, ...], mu: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "free sampled"], Float[np.ndarray, "sampled sampled"]]:
-    """W and the Schur complement K_BB + K_BI W, which the stages of a search that leave λ and μ alone share."""
-    K, own, others = stiffness(mesh, np.array(lam), np.array(mu)), list(sampled), list(free)
-    coupling = K[others][:, own]
-    W = -solved(K[others][:, others], coupling.toarray()) if len(others) else np.zeros((0, len(own)))
-    schur = np.asarray(K[own][:, own] + coupling.T @ W)
-    return W, (schur + schur.T) / 2
+    """The same without loads, which the stages of a search that leave λ and μ alone share."""
+    rows, others = np.array(sampled, int), np.array(free, int)
+    return _response(mesh, rows, others, np.array(lam), np.array(mu), np.zeros((len(others), 0)))
 
 
 def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:

@@ -95,9 +95,7 @@ def neighbourhoods(
     def following(points: np.ndarray, which: int) -> np.ndarray:
         return np.einsum("pa,paij->pij", barycentric[points], own[mesh.cells[cell_of[points]], :, which])
 
-    reach = _reach(mesh.cells[cell_of], barycentric, own)
-    furthest = np.argpartition(-np.asarray(quadrature.weights)[:, None] * reach, count - 1, axis=0)[:count]
-    points = np.sort(furthest, axis=0).T
+    points = _furthest(mesh.cells[cell_of], barycentric, np.asarray(quadrature.weights), own, count)
     follows = np.stack([following(points[which], which) for which in range(len(nodes))])
     touching = np.isin(mesh.cells, nodes).any(axis=1)
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
@@ -117,17 +115,21 @@ def neighbourhoods(
     )
 
 
-def _reach(
-    corners: Int[np.ndarray, "points 4"], barycentric: Float[np.ndarray, "points 4"], own: np.ndarray
-) -> Float[np.ndarray, "points k"]:
-    """How far every quadrature point follows each of k nodes, squared: own is (n, 3, k, 3), as `response`."""
-    nodes, count = len(own), own.shape[2]
+def _furthest(
+    corners: Int[np.ndarray, "points 4"],
+    barycentric: Float[np.ndarray, "points 4"],
+    weights: Float[np.ndarray, "points"],
+    own: Float[np.ndarray, "nodes 3 k 3"],
+    count: int,
+) -> Int[np.ndarray, "k count"]:
+    """The quadrature points, sorted, that follow each of k nodes the furthest, squared and by weight."""
     starts = np.arange(0, 4 * len(corners) + 1, 4)
-    interpolation = scipy.sparse.csr_matrix((barycentric.ravel(), corners.ravel(), starts), (len(corners), nodes))
-    columns = own.transpose(0, 2, 1, 3).reshape(nodes, 9 * count)
+    interpolation = scipy.sparse.csr_matrix((barycentric.ravel(), corners.ravel(), starts), (len(corners), len(own)))
     width = max(1, AT_A_TIME // (9 * len(corners)))
-    reach = np.empty((len(corners), count))
-    for first in range(0, count, width):
-        part = interpolation @ columns[:, 9 * first : 9 * (first + width)]
-        reach[:, first : first + width] = (part**2).reshape(len(corners), -1, 9).sum(axis=2)
-    return reach
+    found = []
+    for first in range(0, own.shape[2], width):
+        columns = own[:, :, first : first + width].transpose(0, 2, 1, 3)
+        follows = interpolation @ columns.reshape(len(own), -1)
+        reach = weights[:, None] * (follows**2).reshape(len(corners), -1, 9).sum(axis=2)
+        found.append(np.sort(np.argpartition(-reach, count - 1, axis=0)[:count], axis=0).T)
+    return np.concatenate(found)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from bayesreg.distance import MARGIN, signed_distance
+from bayesreg.distance import MARGIN, shared_distance
 from bayesreg.image import Image
 
 # How far off what is allowed the distance still grows, so that a body that has strayed there is led back, mm.
@@ -34,7 +34,7 @@ class SmoothObstacle:
 
     def __init__(self, skull: Image, smoothing_mm: float) -> None:
         # The smoothing is another one where the distance ends.
-        self.exact = signed_distance(skull, max(MARGIN, 3 * smoothing_mm + _REACH))
+        self.exact = shared_distance(skull, max(MARGIN, 3 * smoothing_mm + _REACH))
         smooth = ndimage.gaussian_filter(self.exact.voxels, smoothing_mm / self.exact.voxel_sizes, mode="nearest")
         coefficients = ndimage.spline_filter(smooth, order=3, mode="mirror", output=float)
         self._coefficients = np.pad(coefficients, [(1, 2)] * 3, mode="reflect")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import betaln
 
-from bayesreg.distance import signed_distance
+from bayesreg.distance import MARGIN, shared_distance
 from bayesreg.fem.determinant import schur_determinant
 from bayesreg.fem.elasticity import rigid_modes
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
@@ -131,7 +131,7 @@ def skull_distance(skull: Image, mesh: TetMesh, sampled: Int[np.ndarray, "sample
     InputError
         If a sampled node lies in the skull before it has moved.
     """
-    distance = signed_distance(skull).interpolator("linear")
+    distance = shared_distance(skull, MARGIN).interpolator("linear")
     inside = np.flatnonzero(~np.asarray(is_allowed(distance, jnp.asarray(mesh.points[sampled]))))
     if len(inside):
         node = sampled[inside[0]]

@@ -52,8 +52,9 @@ class Covered(NamedTuple):
 def covered_voxels(grid: Image, mesh: TetMesh) -> Covered:
     """The voxels of an image whose centres lie in a mesh."""
     corners = grid.world_to_voxel(mesh.points)
-    low = np.maximum(np.ceil(corners.min(axis=0)), 0).astype(int)
-    high = np.minimum(np.floor(corners.max(axis=0)), np.array(grid.shape) - 1).astype(int)
+    # What lies on the mesh's own bounding box by rounding is for `locate` to say.
+    low = np.maximum(np.ceil(corners.min(axis=0) - 1e-6), 0).astype(int)
+    high = np.minimum(np.floor(corners.max(axis=0) + 1e-6), np.array(grid.shape) - 1).astype(int)
     index = low + np.argwhere(np.ones(np.maximum(high - low + 1, 0), bool))
     cell, barycentric = locate(mesh.points, mesh.cells, grid.voxel_to_world(index.astype(float)))
     inside = cell >= 0

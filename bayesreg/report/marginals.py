@@ -232,7 +232,7 @@ def skull_distance(skull: Image, points: Float[np.ndarray, "points 3"]) -> Float
         return np.full(len(points), -REACH)
     affine = skull.affine.copy()
     affine[:3, 3] = skull.voxel_to_world(low.astype(float))
-    return np.clip(sample(signed_distance(Image(window, affine)), points, outside=-REACH), -REACH, REACH)
+    return np.clip(sample(signed_distance(Image(window, affine), REACH), points, outside=-REACH), -REACH, REACH)
 
 
 def skull_node(run: Run, posterior: xr.Dataset) -> Drawing:

@@ -200,7 +200,7 @@ def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
     found = []
     for k, problem in enumerate(problems):
         start = problem.unconstrain_of(problem.data, {name: x[k] for name, x in starts.items()})
-        found.append(settled(problem, problem.data, np.asarray(ravel_pytree(start)[0])))
+        found.append(settled(problem, np.asarray(ravel_pytree(start)[0])))
     return np.stack(found)
 
 

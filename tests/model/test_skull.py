@@ -105,6 +105,7 @@ def test_the_distance_is_the_same_whatever_its_margin(left_handed):
     skull = blobs(left_handed=left_handed)
     near, far = signed_distance(skull, 4.0), signed_distance(skull, 25.0)
     assert np.all(np.subtract(far.shape, near.shape) > 20 / skull.voxel_sizes)
+    assert np.all(near.shape > np.array(skull.shape))
     np.testing.assert_allclose(far.interpolate(near.grid_points()), near.voxels, atol=1e-9)
 
 
@@ -112,3 +113,9 @@ def test_a_body_that_has_strayed_is_led_back_as_far_as_the_margin():
     skull = flat_skull(CORNERS, axis=2, wall=7.0, voxel=2.0)
     x = np.array([[0.0, 0.0, 7.0 + d] for d in (1.0, 5.0, 10.0, 15.0)])
     np.testing.assert_allclose(signed_distance(skull, 16.0).interpolate(x), 7.0 - x[:, 2], atol=0.1)
+
+
+def test_on_a_wide_grid_a_body_deep_in_the_skull_is_led_back():
+    wide = Image(np.pad(np.zeros((10, 10, 10), np.uint8), 40, constant_values=1), np.eye(4))
+    x = np.array([[45.0, 45.0, 49.5 + depth] for depth in (18.0, 25.0, 35.0)])
+    np.testing.assert_allclose(signed_distance(wide).interpolate(x), 49.5 - x[:, 2], atol=0.2)
