@@ -17,6 +17,11 @@ MARGIN = 16.0
 _SMOOTHING, _END, _KEPT = 1.0, 4, 0.02
 
 
+def forbidden(intracranial: Image) -> Image:
+    """Ω_SK, nonzero = forbidden: everything outside the intracranial mask."""
+    return intracranial.with_voxels((np.asarray(intracranial.voxels) == 0).astype(np.uint8))
+
+
 def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
     """Distance to the forbidden region Ω_SK, positive outside it.
 

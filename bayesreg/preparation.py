@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.sections import BrainWebData, CalibratedPair, FilesData, MeshConfig
+from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
@@ -59,7 +60,7 @@ def prepare(config: Config) -> Prepared:
     mesh = _mesh(anatomy, domain, config.mesh)
     clock.lap("mesh")
     _require_start(config, mesh)
-    skull = None if anatomy.intracranial is None else _as_stored(_forbidden(anatomy.intracranial))
+    skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     scale = robust_scale(anatomy.image, domain.voxels != 0)
     fixed = scale(anatomy.image)
     if isinstance(config.data, FilesData):
@@ -130,11 +131,6 @@ def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: fl
         skull_gap=settings.skull_gap,
     )
     return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain)
-
-
-def _forbidden(intracranial: Image) -> Image:
-    """Ω_SK: everything outside the intracranial mask."""
-    return intracranial.with_voxels((np.asarray(intracranial.voxels) == 0).astype(np.uint8))
 
 
 def _as_stored(image: Image) -> Image:

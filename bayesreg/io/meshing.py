@@ -13,7 +13,7 @@ import meshio
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.distance import signed_distance
+from bayesreg.distance import forbidden, signed_distance
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
 from bayesreg.io.domain import TISSUES, MeshError, domain_labels, mesh_domain
@@ -128,7 +128,7 @@ def build_mesh(
     labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing))
     surfaces = tissue_surfaces(labels, options.edge_length)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
-    distance = None if intracranial is None else signed_distance(_outside(intracranial))
+    distance = None if intracranial is None else signed_distance(forbidden(intracranial))
     for attempt in range(1, options.attempts + 1):
         try:
             mesh = _attempt(labels, surfaces, sizing, distance, options)
@@ -254,10 +254,6 @@ def _attempt(
     if distance is not None:
         mesh = pull_inside(mesh, distance, options.skull_gap)
     return TetMesh.from_arrays(mesh.points, cells, tissue_of_cells(mesh.points, cells, labels), TISSUES)
-
-
-def _outside(mask: Image) -> Image:
-    return mask.with_voxels((np.asarray(mask.voxels) == 0).astype(np.uint8))
 
 
 def _inner_lattice(samples: int) -> Float[np.ndarray, "points 4"]:

@@ -197,16 +197,10 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
     folder = Path(folder)
     images = folder / "inputs"
     images.mkdir(parents=True, exist_ok=True)
-    kept = {name: getattr(inputs, name) for name in ("fixed", "moving", "tissue", "skull")}
+    names = [name for name in ("fixed", "moving", "tissue", "skull") if getattr(inputs, name) is not None]
     # What compresses lets other threads run.
     with ThreadPoolExecutor() as pool:
-        written = [
-            pool.submit(save_image, image, images / f"{name}.nii.gz")
-            for name, image in kept.items()
-            if image is not None
-        ]
-    for each in written:
-        each.result()
+        list(pool.map(lambda name: save_image(getattr(inputs, name), images / f"{name}.nii.gz"), names))
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
         save_arrays(images / "truth.npz", known)

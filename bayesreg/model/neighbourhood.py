@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jaxtyping import Float, Int
 
 from bayesreg.fem.elasticity import stiffness, unknowns_of
@@ -95,7 +94,7 @@ def neighbourhoods(
     def following(points: np.ndarray, which: int) -> np.ndarray:
         return np.einsum("pa,paij->pij", barycentric[points], own[mesh.cells[cell_of[points]], :, which])
 
-    points = _furthest(mesh.cells[cell_of], barycentric, np.asarray(quadrature.weights), own, count)
+    points = _furthest(quadrature, own, count)
     follows = np.stack([following(points[which], which) for which in range(len(nodes))])
     touching = np.isin(mesh.cells, nodes).any(axis=1)
     near = np.unique(np.concatenate([mesh.cells[cell_of[points]].ravel(), mesh.cells[touching].ravel()]))
@@ -115,21 +114,13 @@ def neighbourhoods(
     )
 
 
-def _furthest(
-    corners: Int[np.ndarray, "points 4"],
-    barycentric: Float[np.ndarray, "points 4"],
-    weights: Float[np.ndarray, "points"],
-    own: Float[np.ndarray, "nodes 3 k 3"],
-    count: int,
-) -> Int[np.ndarray, "k count"]:
+def _furthest(quadrature: Quadrature, own: Float[np.ndarray, "nodes 3 k 3"], count: int) -> Int[np.ndarray, "k count"]:
     """The quadrature points, sorted, that follow each of k nodes the furthest, squared and by weight."""
-    starts = np.arange(0, 4 * len(corners) + 1, 4)
-    interpolation = scipy.sparse.csr_matrix((barycentric.ravel(), corners.ravel(), starts), (len(corners), len(own)))
-    width = max(1, AT_A_TIME // (9 * len(corners)))
-    found = []
+    weights, found = np.asarray(quadrature.weights), []
+    width = max(1, AT_A_TIME // (9 * len(weights)))
     for first in range(0, own.shape[2], width):
         columns = own[:, :, first : first + width].transpose(0, 2, 1, 3)
-        follows = interpolation @ columns.reshape(len(own), -1)
-        reach = weights[:, None] * (follows**2).reshape(len(corners), -1, 9).sum(axis=2)
+        follows = np.asarray(quadrature.interpolation(jnp.asarray(columns.reshape(len(own), -1))))
+        reach = weights[:, None] * (follows**2).reshape(len(weights), -1, 9).sum(axis=2)
         found.append(np.sort(np.argpartition(-reach, count - 1, axis=0)[:count], axis=0).T)
     return np.concatenate(found)

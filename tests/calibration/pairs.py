@@ -20,6 +20,7 @@ import numpy as np
 
 import bayesreg as br
 from bayesreg.discretisation import PATCH_SHARE, Subject, register_body
+from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
 from bayesreg.inference.diagnostics import convergence
@@ -74,7 +75,7 @@ def brain() -> tuple[AnatomyOfData, br.Image]:
 def skull() -> br.Image:
     """Nonzero = forbidden."""
     found, _ = brain()
-    return found.intracranial.with_voxels((np.asarray(found.intracranial.voxels) == 0).astype(np.uint8))
+    return forbidden(found.intracranial)
 
 
 def meshes(folder: Path, edges: Sequence[float]) -> list[br.TetMesh]:
