@@ -173,29 +173,24 @@ class Interpolator:
     @jax.jit
     def __call__(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch"]:
         """Values at world points, mm."""
-        last = jnp.asarray([n - 1.0 for n in self.shape])
-        indices = jnp.clip(points @ self.to_voxel[:3, :3].T + self.to_voxel[:3, 3], 0.0, last)
-        return _interpolated(self.method, self.coefficients, indices)
+        along = [points[..., axis] for axis in range(3)]
+        indices = [sum(self.to_voxel[i, j] * along[j] for j in range(3)) + self.to_voxel[i, 3] for i in range(3)]
+        return _interpolated(self.method, self.coefficients, *indices)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _interpolated(method: Interpolation, coefficients: AnyArray, indices: AnyArray) -> AnyArray:
-    """Sum of B-splines at voxel indices; its derivative is in the indices alone."""
-    return _of_one_chain(_VALUES[method], coefficients, *_by_axis(indices))
+def _interpolated(method: Interpolation, coefficients: AnyArray, *indices: AnyArray) -> AnyArray:
+    """Sum of B-splines at voxel indices, given by axis; its derivative is in these alone."""
+    return _of_one_chain(_VALUES[method], coefficients, *indices)
 
 
 @_interpolated.defjvp
 def _interpolated_jvp(
-    method: Interpolation, primals: tuple[AnyArray, AnyArray], tangents: tuple[AnyArray, AnyArray]
+    method: Interpolation, primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]
 ) -> tuple[AnyArray, AnyArray]:
     # Value and gradient from one look at the taps: they are what costs.
-    value, gradient = _with_gradient(method, primals[0], *_by_axis(primals[1]))
-    return value, sum(slope * change for slope, change in zip(gradient, _by_axis(tangents[1]), strict=True))
-
-
-def _by_axis(x: AnyArray) -> list[AnyArray]:
-    """Apart, so that under `vmap` the chains of each stay side by side."""
-    return [x[..., axis] for axis in range(3)]
+    value, gradient = _with_gradient(method, *primals)
+    return value, sum(slope * change for slope, change in zip(gradient, tangents[1:], strict=True))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -221,18 +216,19 @@ def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices
     return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
 
 
-# Points whose taps are looked at together, each by all chains.
-_BATCH = 1024
+def _together() -> int:
+    """Lookups, those of all chains, whose taps are held at once: what stays in a processor's cache, or fills a GPU."""
+    return 2**13 if jax.default_backend() == "cpu" else 2**20
 
 
 def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
     """What a function gives at single points, at indices (points, chains) by axis."""
 
     def interpolation(coefficients: AnyArray, *indices: AnyArray) -> Any:
-        # The taps of so many points stay in the cache; those of all points at once do not, which costs three times as
-        # much. The batches are of one size, filled up with zeros: a smaller last one would be compiled as well.
+        # The taps of all points at once leave the cache, which costs three times as much. The batches are of one size,
+        # filled up with zeros: a smaller last one would be compiled as well.
         count, chains = indices[0].shape
-        batches = max(-(-count // _BATCH), 1)
+        batches = max(-(-count * chains // _together()), 1)
         size = -(-count // batches)
         filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
         found = jax.lax.map(lambda batch: jax.vmap(partial(at, coefficients))(*batch), filled)
@@ -252,8 +248,8 @@ class _Spline(NamedTuple):
 def _value_at(spline: _Spline, coefficients: AnyArray, *index: AnyArray) -> AnyArray:
     """Value at one point: the sum over its taps, one axis after the other."""
     taps, weights, _ = _taps(spline, coefficients, index)
-    for axis in (2, 1, 0):
-        taps = jax.lax.optimization_barrier(_along(taps, weights[axis]))
+    for weight in weights:
+        taps = jax.lax.optimization_barrier(_summed(taps, weight))
     return taps
 
 
@@ -262,22 +258,32 @@ def _value_and_gradient_at(
 ) -> tuple[AnyArray, tuple[AnyArray, ...]]:
     """Value and gradient at one point."""
     taps, (wx, wy, wz), (sx, sy, sz) = _taps(spline, coefficients, index)
-    z, dz = jax.lax.optimization_barrier((_along(taps, wz), _along(taps, sz)))
-    y, dy, y_dz = jax.lax.optimization_barrier((_along(z, wy), _along(z, sy), _along(dz, wy)))
-    return _along(y, wx), (_along(y, sx), _along(dy, wx), _along(y_dz, wx))
+    x, dx = jax.lax.optimization_barrier((_summed(taps, wx), _summed(taps, sx)))
+    y, dy, y_dx = jax.lax.optimization_barrier((_summed(x, wy), _summed(x, sy), _summed(dx, wy)))
+    return _summed(y, wz), (_summed(y_dx, wz), _summed(dy, wz), _summed(y, sz))
 
 
 def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) -> Any:
-    """Coefficients about a point, and by axis what the spline makes of them, for the value and for the slope."""
-    corner = [jax.lax.stop_gradient(jnp.floor(i)) for i in index]
+    """Coefficients about a point, and by axis what the spline makes of them, for the value and for the slope.
+
+    Off the grid the point is the nearest on it, and the slope across the border zero.
+    """
+    last = [length - spline.width for length in coefficients.shape]
+    nearest = [jnp.clip(i, 0.0, end) for i, end in zip(index, last, strict=True)]
+    corner = [jax.lax.stop_gradient(jnp.floor(i)) for i in nearest]
     taps = jax.lax.dynamic_slice(coefficients, [first.astype(int) for first in corner], (spline.width,) * 3)
-    places = [i - first for i, first in zip(index, corner, strict=True)]
+    places = [i - first for i, first in zip(nearest, corner, strict=True)]
+    slopes = [
+        tuple(jnp.where((i >= 0) & (i <= end), slope, 0.0) for slope in spline.slopes(place))
+        for i, end, place in zip(index, last, places, strict=True)
+    ]
     # Without the barriers XLA fuses the stages and gathers every tap anew for each of the four results.
-    return jax.lax.optimization_barrier((taps, *([part(t) for t in places] for part in spline[1:])))
+    return jax.lax.optimization_barrier((taps, [spline.weights(place) for place in places], slopes))
 
 
-def _along(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:
-    return sum(taps[..., k] * weight for k, weight in enumerate(weights))
+def _summed(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:
+    """Over the first axis; what is left lies together, and is summed side by side."""
+    return sum(taps[k] * weight for k, weight in enumerate(weights))
 
 
 def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:
