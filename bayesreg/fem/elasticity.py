@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
+from bayesreg.chains import with_chains_as_columns
 from bayesreg.fem.elements import Elements, Gradient, displacement_gradient, elements_of, shape_gradients
 from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh
@@ -102,6 +103,7 @@ def internal_force(
     return force_between(elements.derivative, elements.derivative, elements.volumes, lam, mu, u)
 
 
+@jax.custom_jvp
 def force_between(
     on: SparseOperator,
     of: SparseOperator,
@@ -117,7 +119,25 @@ def force_between(
     on, of : SparseOperator
         The columns of `Elements.derivative` that belong to the nodes on which forces act, and to those that move.
     """
-    return forces(on, of, volumes, lam[:, None], mu[:, None], u[:, :, None])[:, :, 0]
+    return _side_by_side((on, of, volumes), *(x[..., None] for x in (lam, mu, u)))[..., 0]
+
+
+@force_between.defjvp
+def _force_between_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[AnyArray, AnyArray]:
+    # What has chains as columns has no derivative: where one is asked for, the same formula gives it.
+    *shared, lam, mu, u = primals
+
+    def force(*given: AnyArray) -> AnyArray:
+        return forces(*shared, *(x[..., None] for x in given))[..., 0]
+
+    return jax.jvp(force, (lam, mu, u), tangents[3:])
+
+
+@with_chains_as_columns
+def _side_by_side(
+    shared: tuple[SparseOperator, SparseOperator, AnyArray], lam: AnyArray, mu: AnyArray, u: AnyArray
+) -> AnyArray:
+    return forces(*shared, lam, mu, u)
 
 
 def forces(

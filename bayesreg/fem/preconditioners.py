@@ -17,7 +17,8 @@ from jaxtyping import Float
 
 from bayesreg.types import AnyArray, InputError
 
-# Beyond this many unknowns the dense inverse (4 bytes × their square) outgrows caches and, soon, memory.
+# Up to this many unknowns a solve by the dense inverse is faster than by multigrid, in the measured range: to about
+# 10,000 with 4 or 16 chains. But its making grows with their cube, thrice in a run (docs/speed.md).
 DENSE_LIMIT = 6000
 
 SINGULAR = (
