@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -61,14 +62,7 @@ def locate(
     corners = points[cells]
     origin, to_barycentric = corners[:, 0], _barycentric_maps(corners)
     bins = _Bins(corners, to_barycentric, pairs=min(max(2 * len(query), 30 * len(cells)), 3_000_000))
-    cell, barycentric = np.empty(len(query), int), np.empty((len(query), 4))
-    parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
-    # NumPy lets other threads run.
-    with ThreadPoolExecutor(max_workers=_THREADS) as pool:
-        found = pool.map(lambda part: _search(query[part], bins, origin, to_barycentric, tolerance), parts)
-        for part, (cells_there, there) in zip(parts, found, strict=True):
-            cell[part], barycentric[part] = cells_there, there
-    return Location(cell, barycentric)
+    return _in_threads(lambda part: _search(part, bins, origin, to_barycentric, tolerance), query, _CHUNK, 4)
 
 
 def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
@@ -79,7 +73,7 @@ def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
 
 def _search(
     query: np.ndarray, bins: _Bins, origin: np.ndarray, to_barycentric: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Location:
     """Try the candidates of each point in turn, all points at once."""
     cell, barycentric = np.full(len(query), -1), np.full((len(query), 4), np.nan)
     first, last = bins.candidates(query)
@@ -93,7 +87,7 @@ def _search(
         first[left] += 1
         left = left[~inside]
         left = left[first[left] < last[left]]
-    return cell, barycentric
+    return Location(cell, barycentric)
 
 
 class _Bins:
@@ -172,16 +166,26 @@ def nearest_on_surface(
     lattice = _lattice(int(np.clip(np.sqrt(120_000 / len(triangles)), 2, 8)))
     tree = cKDTree(np.einsum("sa,tai->tsi", lattice, corners).reshape(-1, 3))
     owner = np.repeat(np.arange(len(triangles)), len(lattice))
-    cell = np.empty(len(query), int)
-    barycentric = np.empty((len(query), 3))
-    for start in range(0, len(query), _CHUNK // 4):
-        part = slice(start, start + _CHUNK // 4)
-        near = owner[tree.query(query[part], k=4)[1]]
-        trial = closest_in_triangles(corners[near], query[part][:, None])
-        gap = np.einsum("kca,kcai->kci", trial, corners[near]) - query[part][:, None]
-        best = (gap**2).sum(axis=2).argmin(axis=1)
-        rows = np.arange(len(best))
-        cell[part], barycentric[part] = near[rows, best], trial[rows, best]
+
+    def search(query: np.ndarray) -> Location:
+        near = owner[tree.query(query, k=4)[1]]
+        trial = closest_in_triangles(corners[near], query[:, None])
+        gap = np.einsum("kca,kcai->kci", trial, corners[near]) - query[:, None]
+        best, rows = (gap**2).sum(axis=2).argmin(axis=1), np.arange(len(query))
+        return Location(near[rows, best], trial[rows, best])
+
+    return _in_threads(search, query, _CHUNK // 16, 3)
+
+
+def _in_threads(
+    search: Callable[[np.ndarray], Location], query: Float[np.ndarray, "queries 3"], size: int, corners: int
+) -> Location:
+    """What a search finds at points, so many at a time. NumPy and SciPy let other threads run."""
+    cell, barycentric = np.empty(len(query), int), np.empty((len(query), corners))
+    parts = [slice(start, start + size) for start in range(0, len(query), size)]
+    with ThreadPoolExecutor(max_workers=_THREADS) as pool:
+        for part, found in zip(parts, pool.map(search, (query[part] for part in parts)), strict=True):
+            cell[part], barycentric[part] = found
     return Location(cell, barycentric)
 
 

@@ -13,6 +13,7 @@ import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse.linalg import splu
+from threadpoolctl import threadpool_limits
 
 from bayesreg.mesh import TetMesh
 
@@ -96,6 +97,8 @@ class ContactProblem:
         pushed[held] = held_u
         self._free = pushed - self._compliance.solve(stiffness @ pushed.ravel())
 
+    # Of matrices of a hundred rows a second thread makes factors ten to two hundred times as slow.
+    @threadpool_limits.wrap(limits=1, user_api="blas")
     def solve(
         self,
         floor: Float[np.ndarray, "nodes"],

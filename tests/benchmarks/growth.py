@@ -4,8 +4,8 @@
 
 A ball of radius 80 mm, three shells, boundary nodes sampled, cubic interpolation of images of 1.5 mm; chains stand near
 the reference (`Posterior.initial`), each with its own λ, μ and displacements; solves end where those of chains end.
-Every mesh has a process of its own, so that its peak memory is its own, too. With --voxels the quadrature is every voxel
-of a fixed image of 1 mm, two million of them, on the paper's mesh. Medians of seven.
+Every mesh has a process of its own, so that its peak memory is its own, too. With --voxels the quadrature is every
+voxel of a fixed image of 1 mm, two million of them, on the paper's mesh. Medians of seven.
 """
 
 from __future__ import annotations
