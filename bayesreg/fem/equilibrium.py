@@ -189,7 +189,10 @@ def _forward(
 def _backward(
     kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
 ) -> tuple[None, AnyArray, AnyArray, AnyArray]:
-    """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u."""
+    """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
+
+    One for all that depends on u. The strain energy asks for none: it is least in u_I, so that its ū_I is the residual.
+    """
     system, lam, mu, u = kept
     bar = cotangent.u
     if len(system.free) == 0:
