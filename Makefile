@@ -18,8 +18,14 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest
 
+# The table and figure of the docs; a part of it, say make bench ARGS="-k '0.8k'", leaves its own under runs/.
+# Types are not checked: that would be timed, too, and lowering a program passes what is of none.
+BENCH := $(if $(ARGS),runs/benchmarks.json,docs/benchmarks.json)
 bench: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s
+	@mkdir -p $(dir $(BENCH))
+	@JAXTYPING_DISABLE=1 $(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s \
+	--benchmark-columns=median,iqr,rounds --benchmark-sort=fullname --benchmark-json=$(BENCH) $(ARGS); status=$$?; \
+	$(BIN)/python -m tests.benchmarks.table $(BENCH) && exit $$status
 
 # Simulation-based calibration and Geweke's test. Threads of a linear algebra library only hinder such small matrices.
 calibrate: $(VENV)/.installed-dev
