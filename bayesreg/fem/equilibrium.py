@@ -46,6 +46,8 @@ class ElasticSystem(NamedTuple):
     elements : Elements
     prescribed, free : (b,), (f,) int arrays
         A partition of the nodes.
+    order : (n,) int array
+        Where each node stands among the prescribed and, after them, the free.
     free_derivative, prescribed_derivative : SparseOperator
         The columns of `elements.derivative` that belong to these nodes.
     preconditioner : ReferenceInverse, Multigrid or None
@@ -58,6 +60,7 @@ class ElasticSystem(NamedTuple):
     elements: Elements
     prescribed: Int[AnyArray, "prescribed"]
     free: Int[AnyArray, "free"]
+    order: Int[AnyArray, "nodes"]
     free_derivative: SparseOperator
     prescribed_derivative: SparseOperator
     preconditioner: ReferenceInverse | Multigrid | None
@@ -99,6 +102,7 @@ def elastic_system(
         elements=elements_of(mesh),
         prescribed=jnp.asarray(prescribed),
         free=jnp.asarray(free),
+        order=jnp.asarray(np.argsort(np.concatenate([np.asarray(prescribed), free]))),
         free_derivative=sparse_operator(derivative[:, free]),
         prescribed_derivative=sparse_operator(derivative[:, np.asarray(prescribed)]),
         preconditioner=preconditioner,
@@ -135,14 +139,13 @@ def equilibrium(
 def _settled(
     system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, guess: AnyArray | None = None
 ) -> Equilibrium:
-    nodes = len(system.prescribed) + len(system.free)
-    u_given = jnp.zeros((nodes, 3)).at[system.prescribed].set(u_prescribed)
     if len(system.free) == 0:
-        fine = jnp.isfinite(u_given).all()
-        return Equilibrium(u_given, jnp.zeros(()), jnp.zeros((), int), fine)
+        fine = jnp.isfinite(u_prescribed).all()
+        return Equilibrium(u_prescribed[system.order], jnp.zeros(()), jnp.zeros((), int), fine)
     load = -_force(system, system.free_derivative, system.prescribed_derivative, lam, mu, u_prescribed)
     u_free, info = _response(system, system.tolerance, lam, mu, load, guess)
-    u = u_given.at[system.free].set(u_free)
+    # Put together by a gather: XLA makes a loop of a scatter on the CPU.
+    u = jnp.concatenate([u_prescribed, u_free])[system.order]
     # A node whose cells have no free node never enters the solve, but must be finite all the same.
     return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
 

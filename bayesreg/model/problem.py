@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.special import betaln
 
@@ -15,6 +16,7 @@ from bayesreg.fem.elasticity import rigid_modes
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import locate
+from bayesreg.fem.operators import sparse_operator
 from bayesreg.image import Image, Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.constraint import is_allowed
@@ -48,6 +50,7 @@ def registration_data(
     displacement = np.zeros((len(prescribed), 3))
     displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
     distance = None if skull is None or not len(sampled) else skull_distance(skull, mesh, sampled)
+    slots = np.searchsorted(prescribed, sampled)
     data = RegistrationData(
         system=elastic_system(
             mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry], TOLERANCE
@@ -62,7 +65,8 @@ def registration_data(
         positions=jnp.asarray(positions),
         fixed_values=fixed.interpolate(positions, model.interpolation),
         points_sampled=jnp.asarray(mesh.points[sampled]),
-        slots=jnp.asarray(np.searchsorted(prescribed, sampled)),
+        slots=jnp.asarray(slots),
+        placed=sparse_operator(scipy.sparse.eye_array(len(prescribed), format="csc")[:, slots]),
         held=jnp.asarray(displacement),
         rigid_modes=jnp.asarray(rigid_modes(mesh.points[sampled]) if len(sampled) else np.zeros((0, 6))),
         rigid_sd=jnp.asarray(np.inf if model.rigid_sd is None else model.rigid_sd),

@@ -16,6 +16,7 @@ from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.elements import Quadrature
 from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
+from bayesreg.fem.operators import SparseOperator
 from bayesreg.image import Interpolator
 from bayesreg.model.constraint import is_allowed
 from bayesreg.model.field import StiffnessField
@@ -77,6 +78,8 @@ class RegistrationData(NamedTuple):
         Positions of the sampled nodes, mm.
     slots : (b,) int array
         Where the sampled nodes stand among `system.prescribed`.
+    placed : SparseOperator
+        (prescribed, b): what belongs to the sampled nodes, in their slots; zero in the others.
     held : (prescribed, 3) array
         Known displacements, zero in the rows of sampled nodes, mm.
     rigid_modes : (3b, 6) array
@@ -109,6 +112,7 @@ class RegistrationData(NamedTuple):
     fixed_values: Float[AnyArray, "points"]
     points_sampled: Float[AnyArray, "boundary 3"]
     slots: Int[AnyArray, "boundary"]
+    placed: SparseOperator
     held: Float[AnyArray, "prescribed 3"]
     rigid_modes: Float[AnyArray, "rows 6"]
     rigid_sd: Scalar
@@ -146,7 +150,7 @@ def registration(
 
     field = _field(data)
     lam_cells, mu_cells = _by_cell(data, lam, mu, **field)
-    u_prescribed = data.held.at[data.slots].set(u_boundary)
+    u_prescribed = prescribed(data, u_boundary)
     state = equilibrium(data.system, lam_cells, mu_cells, u_prescribed, guess)
 
     elements, quadrature = data.system.elements, data.quadrature
@@ -179,6 +183,11 @@ def registration(
     numpyro.deterministic("outside_support", ~inside)
 
 
+def prescribed(data: RegistrationData, u_boundary: Float[AnyArray, "boundary 3"]) -> Float[AnyArray, "prescribed 3"]:
+    """Displacements of all nodes that have given ones, mm. (A product: of a scatter XLA makes a loop on the CPU.)"""
+    return data.held + data.placed(u_boundary) if len(data.slots) else data.held
+
+
 def local_logdensity(
     data: RegistrationData, similarity: str, values: Mapping[str, AnyArray], which: Int[AnyArray, ""]
 ) -> Callable[[Float[AnyArray, "3"]], Scalar]:
@@ -200,7 +209,7 @@ def local_logdensity(
     t_similarity, t_elastic = (values.get(name, getattr(data, name)) for name in ("t_similarity", "t_elastic"))
     noise = Noise(t_similarity, data.degrees_of_freedom)
     u_boundary = values["u_boundary"].at[near.rows].set(near.at)
-    u_prescribed = data.held.at[data.slots].set(u_boundary)
+    u_prescribed = prescribed(data, u_boundary)
     around = jnp.tensordot(near.response, u_prescribed, 2)
 
     row, points, follows, at = near.rows[which], near.points[which], near.follows[which], near.at[which]
@@ -237,7 +246,7 @@ def local_equilibrium(
     assert near is not None
     row, force = near.rows[which], near.force[which]
     stiffness = force[:, data.slots[row]]
-    u_prescribed = data.held.at[data.slots].set(u_boundary)
+    u_prescribed = prescribed(data, u_boundary)
     return u_boundary[row] - jnp.linalg.solve(stiffness, jnp.tensordot(force, u_prescribed, 2))
 
 

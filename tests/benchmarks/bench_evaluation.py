@@ -35,7 +35,7 @@ from bayesreg.fem.equilibrium import equilibrium
 from bayesreg.model.coordinates import complete
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior, build_posterior
-from bayesreg.model.program import RegistrationData, _by_cell
+from bayesreg.model.program import RegistrationData, _by_cell, prescribed
 from tests.benchmarks import floor
 from tests.benchmarks.bench_sampling import _median, _posterior
 from tests.benchmarks.solves import mesh_of
@@ -155,7 +155,7 @@ def _places(mesh: str, interpolation: str, chains: int) -> Places:
     def settled(data: RegistrationData, position: dict[str, jax.Array]) -> Any:
         values = complete(data, posterior.constrain_of(data, position), posterior.free)
         lam, mu = _by_cell(data, values["lam"], values["mu"])
-        given = data.held.at[data.slots].set(values["u_boundary"])
+        given = prescribed(data, values["u_boundary"])
         return lam, mu, given, equilibrium(data.system, lam, mu, given).u
 
     return Places(positions, *jax.jit(jax.vmap(settled, in_axes=(None, 0)))(problem.data, positions))

@@ -22,7 +22,7 @@ from bayesreg.fem.operators import SparseOperator
 from bayesreg.model.coordinates import complete
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.program import RegistrationData, _by_cell
+from bayesreg.model.program import RegistrationData, _by_cell, prescribed
 from tests.benchmarks.bench_sampling import _median, _posterior
 
 DOUBLE, SINGLE, INDEX = 8, 4, 4
@@ -119,7 +119,7 @@ def _iterations(posterior: Posterior, data: RegistrationData, positions: dict[st
     def count(position: dict[str, jax.Array]) -> jax.Array:
         values = complete(data, posterior.constrain_of(data, position), posterior.free)
         lam, mu = _by_cell(data, values["lam"], values["mu"])
-        given = data.held.at[data.slots].set(values["u_boundary"])
+        given = prescribed(data, values["u_boundary"])
         return equilibrium(data.system, lam, mu, given).iterations
 
     return int(jax.jit(jax.vmap(count))(positions).max())

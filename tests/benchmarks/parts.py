@@ -32,7 +32,7 @@ from bayesreg.inference.samplers import chosen_sampler
 from bayesreg.inference.whitened import clearance_of, whitened_density, whitened_position
 from bayesreg.io import store
 from bayesreg.model.coordinates import complete
-from bayesreg.model.program import _by_cell
+from bayesreg.model.program import _by_cell, prescribed
 from tests.benchmarks.bench_sampling import _median
 
 APART = 0.01  # In whitened coordinates.
@@ -108,7 +108,7 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
         estimands = posterior.constrain_of(data, whitened_position(posterior, setup.reference, xi))
         values = complete(data, estimands, posterior.free)
         lam, mu = _by_cell(data, values["lam"], values["mu"])
-        return lam, mu, data.held.at[data.slots].set(values["u_boundary"])
+        return lam, mu, prescribed(data, values["u_boundary"])
 
     lam, mu, given = jax.jit(jax.vmap(values_of))(places)
     u = jax.jit(jax.vmap(lambda *x: equilibrium(data.system, *x).u))(lam, mu, given)
