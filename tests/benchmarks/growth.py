@@ -94,7 +94,8 @@ def phantom(nodes: int, voxels: bool) -> Posterior:
     mesh = mesh_of(nodes)
     shape = (184,) * 3 if voxels else (120,) * 3
     fixed, moving = (smooth_image(mesh.points, shape, seed=seed, blur=6.0) for seed in (0, 1))
-    return build_posterior(fixed, moving, mesh, ModelConfig(quadrature="voxels" if voxels else "gauss4"))
+    model = ModelConfig(interpolation="cubic", quadrature="voxels" if voxels else "gauss4")
+    return build_posterior(fixed, moving, mesh, model)
 
 
 def _median(function: Callable[..., Any], *arguments: Any) -> float:
