@@ -122,7 +122,7 @@ class Image:
             coefficients = np.pad(voxels, [(0, 1)] * 3, mode="edge")
         else:
             raise InputError(f"interpolation is 'linear' or 'cubic', got {method!r}")
-        return Interpolator(jnp.asarray(coefficients), jnp.asarray(self.to_voxel), self.shape, method)
+        return Interpolator(jnp.asarray(coefficients), jnp.asarray(self.to_voxel), method)
 
     def interpolate(
         self, points: Float[AnyArray, "*batch 3"], method: Interpolation = "linear"
@@ -143,7 +143,7 @@ def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["coefficients", "to_voxel"],
-    meta_fields=["shape", "method"],
+    meta_fields=["method"],
 )
 @dataclass(frozen=True)
 class Interpolator:
@@ -160,14 +160,11 @@ class Interpolator:
         Voxels, or B-spline coefficients.
     to_voxel : (4, 4) array
         World RAS mm to voxel index.
-    shape : tuple of int
-        Shape of the image before padding.
     method : {"linear", "cubic"}
     """
 
     coefficients: AnyArray
     to_voxel: AnyArray
-    shape: tuple[int, int, int]
     method: Interpolation
 
     @jax.jit

@@ -97,7 +97,7 @@ class ContactProblem:
         pushed[held] = held_u
         self._free = pushed - self._compliance.solve(stiffness @ pushed.ravel())
 
-    # Of matrices of a hundred rows a second thread makes factors ten to two hundred times as slow.
+    # Beside other work a second thread made factors of a hundred rows two hundred times as slow.
     @threadpool_limits.wrap(limits=1, user_api="blas")
     def solve(
         self,

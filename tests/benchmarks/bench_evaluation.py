@@ -3,8 +3,8 @@
     make bench ARGS="-k '0.8k'"
 
 "0.8k" is the phantom of the paper's size; the others are balls of three shells, all boundary nodes sampled, images of
-1.5 mm. Chains start as those of a run do, and their solves end where those of chains end. Every part is compiled by
-itself, anew, and its time and memory are those of all chains together:
+1.5 mm. Chains stand near the reference (`Posterior.initial`); solves end where those of chains end. Every part is
+compiled by itself, anew, and its time and memory are those of all chains together:
 
 - density; gradient, with its density;
 - solve: the elastic equilibrium at each chain's own λ, μ and displacements;

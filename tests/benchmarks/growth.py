@@ -5,7 +5,7 @@
 A ball of radius 80 mm, three shells, boundary nodes sampled, cubic interpolation of images of 1.5 mm; chains stand near
 the reference (`Posterior.initial`), each with its own λ, μ and displacements; solves end where those of chains end.
 Every mesh has a process of its own, so that its peak memory is its own, too. With --voxels the quadrature is every
-voxel of a fixed image of 1 mm, two million of them, on the paper's mesh. Medians of seven.
+voxel of a fixed image of 1 mm, two million of them, on the paper's mesh. Medians of nine.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,10 +23,10 @@ import numpy as np
 
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior, build_posterior
+from tests.benchmarks.bench_sampling import _median
 from tests.benchmarks.solves import mesh_of
 from tests.phantoms import smooth_image
 
-REPETITIONS = 7
 PAPER_SIZE = 801
 
 
@@ -96,15 +95,6 @@ def phantom(nodes: int, voxels: bool) -> Posterior:
     fixed, moving = (smooth_image(mesh.points, shape, seed=seed, blur=6.0) for seed in (0, 1))
     model = ModelConfig(interpolation="cubic", quadrature="voxels" if voxels else "gauss4")
     return build_posterior(fixed, moving, mesh, model)
-
-
-def _median(function: Callable[..., Any], *arguments: Any) -> float:
-    seconds = []
-    for _ in range(REPETITIONS):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.preconditioners [--nodes 800 1500 2500 4000 5500] [--chains 4 16]
 
 A ball of three shells; each chain has λ and μ of its own, scattered about the reference by a factor of 1.35, and
-displacements of the boundary at random. Solves end where those of chains do. Medians of seven.
+displacements of the boundary at random. Solves end where those of chains do. Medians of nine.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bayesreg.fem.elasticity import lame_by_cell
 from bayesreg.fem.equilibrium import ElasticSystem, elastic_system, equilibrium
 from bayesreg.mesh import TetMesh
 from bayesreg.model.posterior import CHAIN_TOLERANCE
-from tests.benchmarks.growth import _median
+from tests.benchmarks.bench_sampling import _median
 from tests.benchmarks.solves import SPREAD, mesh_of
 from tests.phantoms import LAM, MU
 

@@ -6,7 +6,8 @@ RUN is the folder of a run with three tissues that has ended; chains stand at dr
 
 Frozen: at fixed (λ, μ) the free nodes follow the sampled ones by one matrix R of the chain's own, and the strain energy
 is a quadratic form S. A gradient with R and S given is timed beside the usual one, with solve and adjoint, and so is
-making them by LAPACK. If the first is no faster, no number of moves of u between two of (λ, μ) pays for the second.
+making them by LAPACK. What this takes, over what a gradient saves, is how many gradients each (λ, μ) would have to
+serve.
 
 Two stages: a proposal of the paper's kernel is first held against a density whose solve is one iteration, the reference
 solve from the chain's present displacement, and evaluated in full if it passes (Christen and Fox 2005). Chains run side
