@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import lru_cache
 
+import edt
 import numpy as np
 from scipy import ndimage
 
@@ -59,14 +59,12 @@ def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
     width = [(low + _END, high + _END) for low, high in zip(before, after, strict=True)]
     allowed = np.pad(allowed, width, constant_values=False)
     half = skull.voxel_sizes.min() / 2
-    distance_to_zero = partial(ndimage.distance_transform_edt, sampling=skull.voxel_sizes)
-    # SciPy lets other threads run.
-    with ThreadPoolExecutor() as pool:
-        inside, outside = pool.map(distance_to_zero, (allowed, ~allowed))
-    smooth = np.where(allowed, inside - half, half - outside)
-    smooth = ndimage.gaussian_filter(smooth, _SMOOTHING, mode="nearest", truncate=_END)
+    distance = edt.sdf(allowed, anisotropy=tuple(skull.voxel_sizes))
+    distance -= np.copysign(half, distance, dtype=distance.dtype)
+    distance = ndimage.gaussian_filter(distance, _SMOOTHING, output=float, mode="nearest", truncate=_END)
     kept = _KEPT * skull.voxel_sizes.min()
-    distance = np.where(allowed, np.maximum(smooth, kept), np.minimum(smooth, -kept))
+    np.maximum(distance, kept, out=distance, where=allowed)
+    np.minimum(distance, -kept, out=distance, where=~allowed)
     affine = skull.affine.copy()
     affine[:3, 3] = skull.voxel_to_world(-before.astype(float))
     distance = distance[(slice(_END, -_END),) * 3]

@@ -1,4 +1,7 @@
-"""From a configuration to a run folder: the only place that wires everything together."""
+"""From a configuration to a run folder: the only place that wires everything together.
+
+Reports are imported where they are written: no run waits at its start for what draws them at its end.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +38,6 @@ from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
 from bayesreg.prediction import predict, require_inside
 from bayesreg.preparation import prepare
-from bayesreg.report.compare import write_comparison
-from bayesreg.report.html import write_report
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 
@@ -280,6 +281,8 @@ def load_result(folder: str | Path) -> Result:
 
 def report(folder: str | Path) -> Path:
     """Write the report of a finished run anew, and return its path."""
+    from bayesreg.report.html import write_report
+
     result = load_result(folder)
     write_report(result.run, result.idata, *result.convergence, result.report)
     return result.report
@@ -287,6 +290,8 @@ def report(folder: str | Path) -> Path:
 
 def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
     """Put runs side by side on one page, and return its path."""
+    from bayesreg.report.compare import write_comparison
+
     if not Path(out).absolute().parent.is_dir():
         raise InputError(f"{out} cannot be written: there is no folder {Path(out).parent}")
     results = [load_result(folder) for folder in folders]
@@ -400,6 +405,8 @@ def _finish(
     began: float,
 ) -> Result:
     """Everything after the last draw: the files of the run folder, run.json last but for the report."""
+    from bayesreg.report.html import write_report
+
     save_posterior(posterior, samples.blocks, out / "posterior.nc")
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)

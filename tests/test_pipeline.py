@@ -75,7 +75,7 @@ def folder(anatomy, tmp_path_factory):
 def no_report(finished):
     """Runs without their reports, whose pictures take longer than these runs; those of `finished` are looked at."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "write_report", lambda *arguments: None)
+        patch.setattr("bayesreg.report.html.write_report", lambda *arguments: None)
         yield
 
 

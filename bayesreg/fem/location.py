@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from bayesreg.mesh import TetMesh
 
-_CHUNK, _THREADS = 400_000, 4
+_CHUNK, _THREADS = 50_000, 4
 
 
 class Location(NamedTuple):
@@ -61,8 +61,8 @@ def locate(
     """
     corners = points[cells]
     origin, to_barycentric = corners[:, 0], _barycentric_maps(corners)
-    bins = _Bins(corners, to_barycentric, pairs=min(max(2 * len(query), 30 * len(cells)), 3_000_000))
-    return _in_threads(lambda part: _search(part, bins, origin, to_barycentric, tolerance), query, _CHUNK, 4)
+    bins = _Bins(corners, to_barycentric, pairs=min(max(len(query) // 4, 30 * len(cells)), 3_000_000))
+    return _in_threads(lambda part: _search(part, bins, origin, to_barycentric, tolerance), query, 4)
 
 
 def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
@@ -174,15 +174,15 @@ def nearest_on_surface(
         best, rows = (gap**2).sum(axis=2).argmin(axis=1), np.arange(len(query))
         return Location(near[rows, best], trial[rows, best])
 
-    return _in_threads(search, query, _CHUNK // 16, 3)
+    return _in_threads(search, query, 3)
 
 
 def _in_threads(
-    search: Callable[[np.ndarray], Location], query: Float[np.ndarray, "queries 3"], size: int, corners: int
+    search: Callable[[np.ndarray], Location], query: Float[np.ndarray, "queries 3"], corners: int
 ) -> Location:
-    """What a search finds at points, so many at a time. NumPy and SciPy let other threads run."""
+    """What a search finds at points, some at a time. NumPy and SciPy let other threads run."""
     cell, barycentric = np.empty(len(query), int), np.empty((len(query), corners))
-    parts = [slice(start, start + size) for start in range(0, len(query), size)]
+    parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
     with ThreadPoolExecutor(max_workers=_THREADS) as pool:
         for part, found in zip(parts, pool.map(search, (query[part] for part in parts)), strict=True):
             cell[part], barycentric[part] = found

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import arviz as az
 import numpy as np
 import xarray as xr
 from jaxtyping import Int
@@ -63,11 +62,7 @@ def _judged(draws: xr.DataArray) -> list[xr.DataArray]:
 def _figures(draws: xr.DataArray) -> list[xr.DataArray]:
     draws = draws.compute()
     constant = draws.min(("chain", "draw")) == draws.max(("chain", "draw"))
-    data = draws.to_dataset()
-    # ArviZ divides zero by zero for the known entries, which are left out below.
-    with np.errstate(invalid="ignore"):
-        found = (az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail"))
-    return [_plain(result)[draws.name].where(~constant) for result in found]
+    return [found[draws.name].where(~constant) for found in _diagnosed(draws.to_dataset())]
 
 
 class Worst(NamedTuple):
@@ -115,13 +110,17 @@ def _worst(draws: np.ndarray) -> Worst:
     if draws.shape[1] < 4:
         return Worst(np.inf, 0.0, 0.0)
     data = xr.Dataset({"draws": (["chain", "draw", "estimand"], draws)})
-    # ArviZ divides zero by zero for what has stood still.
-    with np.errstate(invalid="ignore"):
-        found = (az.rhat(data), az.ess(data), az.ess(data, method="tail"))
-    rhat, bulk, tail = (_plain(one)["draws"] for one in found)
+    rhat, bulk, tail = (found["draws"] for found in _diagnosed(data))
     least = (float(ess.where(rhat.notnull(), 0.0).min()) for ess in (bulk, tail))
     return Worst(float(rhat.fillna(np.inf).max()), *least)
 
 
-def _plain(result: Any) -> xr.Dataset:
-    return result if isinstance(result, xr.Dataset) else result.to_dataset()
+def _diagnosed(draws: xr.Dataset) -> list[xr.Dataset]:
+    """R̂, bulk and tail ESS of every variable."""
+    # Takes a second to import, which the first draws need not wait for.
+    import arviz as az
+
+    # ArviZ divides zero by zero for what has stood still.
+    with np.errstate(invalid="ignore"):
+        found = (az.rhat(draws), az.ess(draws, method="bulk"), az.ess(draws, method="tail"))
+    return [one if isinstance(one, xr.Dataset) else one.to_dataset() for one in found]

@@ -1,16 +1,17 @@
 """Draws to ArviZ and back, in memory and in files.
 
 The one module that knows which ArviZ it has: 0.23 (InferenceData) and 1.x (xarray.DataTree) differ in
-how draws are handed over, and read each other's NetCDF files.
+how draws are handed over, and read each other's NetCDF files. It takes a second to import, which sampling need not
+wait for: hence inside the functions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import arviz as az
 import netCDF4
 import numpy as np
 import xarray as xr
@@ -19,7 +20,7 @@ from bayesreg.inference.checkpoint import Block, Blocks
 from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 
-_OLD = int(az.__version__.split(".")[0]) < 1
+_OLD = int(version("arviz").split(".")[0]) < 1
 
 STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
@@ -61,6 +62,8 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
         field (chain, draw, mode), the components of the log-stiffness; sample_stats;
         constant_data.
     """
+    import arviz as az
+
     every = list(blocks)
     draws = {name: np.concatenate([block[name] for block in every], axis=1) for name in every[0]}
     estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
@@ -168,4 +171,6 @@ def open_posterior(path: str | Path) -> Any:
     """Read draws written by `save_posterior`; InputError where there are none."""
     if not Path(path).is_file():
         raise InputError(f"{path} is missing: the folder holds no draws")
+    import arviz as az
+
     return az.from_netcdf(str(path))

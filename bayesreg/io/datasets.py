@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import edt
 import nibabel as nib
 import numpy as np
-from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.domain import TISSUES, main_part
@@ -59,7 +59,7 @@ def mni152() -> Anatomy:
     brain = _from_nibabel(datasets.load_mni152_brain_mask(resolution=1)).voxels != 0
     likelihood = np.stack([1 - gm.voxels - wm.voxels, gm.voxels, wm.voxels])
     tissue = np.where(brain, likelihood.argmax(axis=0) + 1, 0)
-    inside = ndimage.distance_transform_edt(~brain, sampling=t1.voxel_sizes) <= MNI152_SKULL
+    inside = edt.edt(~brain, anisotropy=tuple(t1.voxel_sizes)) <= MNI152_SKULL
     return Anatomy(t1, t1.with_voxels(tissue.astype(np.int8)), t1.with_voxels(inside.astype(np.uint8)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+import edt
 import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
@@ -118,8 +119,8 @@ def _closed(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: fl
     box = ndimage.find_objects(mask.astype(np.int8))[0]
     margin = [(n, n) for n in np.ceil(radius / voxel_sizes).astype(int) + 1]
     near = np.pad(mask[box], margin)
-    grown = ndimage.distance_transform_edt(~near, sampling=voxel_sizes) <= radius
-    closed = ndimage.distance_transform_edt(grown, sampling=voxel_sizes) > radius
+    grown = edt.edt(~near, anisotropy=tuple(voxel_sizes)) <= radius
+    closed = edt.edt(grown, anisotropy=tuple(voxel_sizes)) > radius
     result = np.zeros_like(mask)
     result[box] = closed[tuple(slice(a, -b) for a, b in margin)]
     return result

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import permutations
 from typing import NamedTuple
 
+import edt
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
@@ -90,7 +91,7 @@ def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
     smallest = (edge_length / 2) ** 3 / grid.voxel_volume
     outer = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length)
     inside = main_part(outer > 0.5, f"region to mesh, smoothed for an edge length of {edge_length:g} mm,")
-    depth = ndimage.distance_transform_edt(inside, sampling=grid.spacing)
+    depth = edt.edt(inside, anisotropy=tuple(grid.spacing))
     deep = depth > edge_length / 2
     fluid = labels.voxels == CSF
     # Together with the fluid, lest the walls of the ventricles be there twice, a little apart.
@@ -115,7 +116,7 @@ def depth_sizing(labels: Image, edge_length: float, inner_edge_length: float) ->
     grid = _CoarseGrid.around(labels, 0.6 * edge_length, margin=2 * edge_length)
     inside = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length) > 0.5
     # The distance is to the next voxel outside; the surface runs half-way.
-    depth = np.maximum(ndimage.distance_transform_edt(inside, sampling=grid.spacing) - grid.spacing.mean() / 2, 0)
+    depth = np.maximum(edt.edt(inside, anisotropy=tuple(grid.spacing)) - grid.spacing.mean() / 2, 0)
     indices = np.stack(np.meshgrid(*map(np.arange, depth.shape), indexing="ij"), axis=-1).reshape(-1, 3)
     points = grid.to_world(indices)
     values = np.minimum(edge_length + GROWTH * depth, inner_edge_length)
