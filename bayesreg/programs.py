@@ -4,6 +4,7 @@ import os
 import platform
 import time
 import zlib
+from contextlib import suppress
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -40,15 +41,21 @@ def keep_compiled_programs() -> None:
         kind = f"{zlib.crc32(_processor().encode()):08x}"
         folder = platformdirs.user_cache_path("bayesreg") / "programs" / kind
         folder.mkdir(parents=True, exist_ok=True)
-        oldest = time.time() - MOST_DAYS * 24 * 3600
-        for program in folder.iterdir():
-            if program.stat().st_mtime < oldest:
-                program.unlink()
+        _remove_old(folder)
     except (OSError, RuntimeError):
         return
     if folder.is_absolute() and os.access(folder, os.W_OK):
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def _remove_old(folder: Path) -> None:
+    oldest = time.time() - MOST_DAYS * 24 * 3600
+    for program in folder.iterdir():
+        # Another run may be doing the same.
+        with suppress(FileNotFoundError):
+            if program.stat().st_mtime < oldest:
+                program.unlink()
 
 
 def _processor() -> str:

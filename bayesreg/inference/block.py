@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from bayesreg.inference.checkpoint import Tally, counted, no_steps, with_passed_over
+from bayesreg.inference.checkpoint import Tally, counted, no_steps, with_passed_over, with_solve
 from bayesreg.inference.devices import side_by_side
 from bayesreg.inference.kernel import Draw, Info
 from bayesreg.inference.moments import Moments, updated
@@ -128,6 +128,7 @@ def _in_step(
         state, moments = carry
         state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
         drawn = observe(state)
+        window = with_solve(window, drawn.evaluation, thin)
         return (state, updated(moments, watched(drawn))), (_place(drawn), window)
 
     (state, moments), (places, windows) = jax.lax.scan(one_draw, (state, moments), jnp.arange(length))

@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesreg.inference.kernel import Info
 from bayesreg.inference.moments import Moments
+from bayesreg.inference.target import Evaluation
 from bayesreg.types import AnyArray
 
 Block = Mapping[str, np.ndarray]
@@ -82,6 +83,14 @@ def counted(tally: Tally, info: Info) -> Tally:
 def with_passed_over(tally: Tally, steps: AnyArray) -> Tally:
     """The tally with so many steps more whose proposals lay outside the support, and cost nothing."""
     return tally._replace(steps=tally.steps + steps, outside_support=tally.outside_support + steps)
+
+
+def with_solve(tally: Tally, evaluation: Evaluation, steps: int) -> Tally:
+    """The tally of so many steps that do not tell of their solves, with that of the draw at their end for each."""
+    return tally._replace(
+        solver_failed=tally.solver_failed + evaluation.solver_failed,
+        solver_iterations=tally.solver_iterations + steps * evaluation.solver_iterations,
+    )
 
 
 def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:

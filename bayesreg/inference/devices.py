@@ -6,16 +6,20 @@ Processes, one per host, run the same program and know the same after every bloc
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from bayesreg.types import InputError
 
 _AXIS = "chains"
+# On a processor so many chains run side by side: what more of them work on leaves the cache, and each costs half as
+# much again (docs/speed.md).
+_TOGETHER = 16
 
 
 def join(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
@@ -99,14 +103,35 @@ def devices_for(chains: int) -> Mesh | None:
     return Mesh(np.array(chosen), (_AXIS,)) if len(chosen) > 1 else None
 
 
+def shared(tree: Any, devices: Mesh | None) -> Any:
+    """Arrays whose leading axis is that of the chains, on these devices, as a block of draws leaves them.
+
+    The first block would otherwise be compiled for other places than all after it.
+    """
+    if devices is None or jax.process_count() > 1:
+        return tree
+    return jax.device_put(tree, NamedSharding(devices, PartitionSpec(_AXIS)))
+
+
 def side_by_side(chain: Callable, devices: Mesh | None) -> Callable:
     """A function of one chain as one of many, whose leading axis is that of the chains, on these devices.
 
     What the function closes over is on each device.
     """
-    many = jax.vmap(chain)
+    many = partial(_in_groups, chain)
     if devices is None:
         return many
     # Not told apart: values that vary with the device, and those that do not, such as zeros that a sum begins with.
     share = PartitionSpec(_AXIS)
     return jax.shard_map(many, mesh=devices, in_specs=share, out_specs=share, check_vma=False)
+
+
+def _in_groups(chain: Callable, *each: Any) -> Any:
+    """One group after the other; all together on a GPU, or where no number of groups is a divisor."""
+    chains = len(jax.tree.leaves(each)[0])
+    size = chains
+    if jax.default_backend() == "cpu":
+        size = max((n for n in range(_TOGETHER // 2, _TOGETHER + 1) if chains % n == 0), default=chains)
+    if size == chains:
+        return jax.vmap(chain)(*each)
+    return jax.lax.map(lambda one: chain(*one), each, batch_size=size)

@@ -17,8 +17,9 @@ class Info(NamedTuple):
     Attributes
     ----------
     acceptance_rate : scalar
-    outside_support, solver_failed, diverging : scalar bool
-    solver_iterations : scalar
+    outside_support, diverging : scalar bool
+    solver_failed, solver_iterations : scalar bool, scalar
+        Of the proposal's solve; zero where a transition has many, and that of the draw is counted for it.
     gradients, densities : scalar integer
         Evaluations of the density with its gradient, and without.
     """

@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesreg.inference.block import run_block, watched
 from bayesreg.inference.checkpoint import Block, Blocks, Checkpoint, Tally, no_steps
-from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host
+from bayesreg.inference.devices import devices_for, from_first, gathered, is_first, on_host, shared
 from bayesreg.inference.draws import to_inference_data
 from bayesreg.inference.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.kernel import Draw
@@ -253,7 +253,8 @@ def _advance(
                 seed,
                 np.arange(chains),
                 int(checkpoint.draws),
-                *on_host(checkpoint[1:5]),
+                on_host(checkpoint.setup),
+                *shared(on_host(checkpoint[2:5]), devices),
             )
         )
         found = {name: np.asarray(value) for name, value in found.items()}

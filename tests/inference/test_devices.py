@@ -11,7 +11,7 @@ import pytest
 
 from bayesreg.inference.block import run_block
 from bayesreg.inference.devices import devices_for, require_joined
-from bayesreg.inference.run import first_checkpoint
+from bayesreg.inference.run import first_checkpoint, sample
 from bayesreg.inference.samplers import chosen_sampler
 from tests.inference.gaussians import GaussianTarget
 from tests.model.test_equality import posterior
@@ -43,12 +43,20 @@ def found(sampler):
     )  # fmt: skip
     return {
         "devices": count,
+        "programs": programs(target, sampler, settings),
         "spread": float(here.std()),
         "moved": float(abs(here[:, 1:] - here[:, :-1]).max()),
         "one": float(abs(here - there).max()),
         "again": float(abs(here - again).max()),
         "mixed": float(abs(here - mixed).max()),
     }
+
+
+def programs(target, sampler, settings):
+    """Compiled for a run of two blocks."""
+    before = run_block._cache_size()
+    sample(target, sampler, CHAINS, draws=8, block=4, progress=False, **settings)
+    return run_block._cache_size() - before
 
 
 @pytest.mark.parametrize("sampler", ["hmc", "rwmh"])
@@ -66,6 +74,7 @@ def test_the_same_draws_on_two_devices(sampler):
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["devices"] == 2
+    assert told["programs"] == 1
     assert told["moved"] > 0
     assert told["again"] == 0
     assert max(told["one"], told["mixed"]) < 1e-9 * told["spread"]
