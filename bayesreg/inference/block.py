@@ -101,7 +101,7 @@ def run_block(
 
         observe = partial(kernel.observe, data, setup)
         if kernel.outside is None:
-            drawn = _in_step(step, observe, length, thin, state, moments)
+            drawn = _in_step(step, observe, kernel.many_solves, length, thin, state, moments)
         else:
             drawn = _at_own_pace(step, outside, observe, length, thin, state, moments)
         tally = jax.tree.map(lambda before, window: before + window.sum(), tally, drawn.windows)
@@ -116,7 +116,13 @@ def watched(draw: Draw) -> dict[str, Any]:
 
 
 def _in_step(
-    step: Step, observe: Callable[[Any], Draw], length: int, thin: int, state: Any, moments: Moments
+    step: Step,
+    observe: Callable[[Any], Draw],
+    many_solves: bool,
+    length: int,
+    thin: int,
+    state: Any,
+    moments: Moments,
 ) -> _Drawn:
     """All chains take each step together."""
 
@@ -128,7 +134,8 @@ def _in_step(
         state, moments = carry
         state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
         drawn = observe(state)
-        window = with_solve(window, drawn.evaluation, thin)
+        if many_solves:
+            window = with_solve(window, drawn.evaluation, thin)
         return (state, updated(moments, watched(drawn))), (_place(drawn), window)
 
     (state, moments), (places, windows) = jax.lax.scan(one_draw, (state, moments), jnp.arange(length))

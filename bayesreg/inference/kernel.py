@@ -19,7 +19,7 @@ class Info(NamedTuple):
     acceptance_rate : scalar
     outside_support, diverging : scalar bool
     solver_failed, solver_iterations : scalar bool, scalar
-        Of the proposal's solve; zero where a transition has many, and that of the draw is counted for it.
+        Of the proposal's solve; zero where a transition has many (`Sampler.many_solves`).
     gradients, densities : scalar integer
         Evaluations of the density with its gradient, and without.
     """
@@ -64,6 +64,8 @@ class Sampler(NamedTuple):
         (data, setup, key, state) → whether the step with this key proposes what lies outside the support, and so leaves
         the state as it is. For samplers that can tell at a fraction of the price of a step: such steps are passed over,
         and counted as outside the support and nothing else.
+    many_solves : bool
+        Whether a step has many solves, of which it does not tell: that of the draw is counted in their place.
     """
 
     prepare: Callable[[Any, AnyArray, Say], tuple[Any, Any]]
@@ -74,3 +76,4 @@ class Sampler(NamedTuple):
     observe: Callable[[Any, Any, Any], Draw]
     exact: bool
     outside: Callable[[Any, Any, AnyArray, Any], AnyArray] | None = None
+    many_solves: bool = False

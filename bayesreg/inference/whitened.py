@@ -246,7 +246,8 @@ def about_reference(
         nothing = jnp.zeros(unknowns)
         return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
 
-    sampler = Sampler(prepare, partial(_conditioned, target), blank, walk.init, walk.step, walk.observe, exact)
+    data = partial(_conditioned, target)
+    sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
     # What is approximate anyway does without the normaliser's own value.
     if target.costly_normaliser and exact:
         sampler = _with_normaliser(target, sampler)

@@ -8,8 +8,6 @@ converged posterior; the formula is checked on a Gaussian of that covariance, wh
 
 import os
 import tempfile
-import time
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -19,8 +17,10 @@ import xarray as xr
 
 import bayesreg as br
 from bayesreg.assembly import posterior_of
-from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.samplers import SAMPLERS, chosen_sampler
 from bayesreg.io import store
+from tests.benchmarks.bench_samplers import PAPERS_THIN, block_from
+from tests.benchmarks.bench_sampling import _median
 from tests.inference.random_walk import ess_per_step, gaussian_walk
 
 CONFIG = Path(__file__).parents[2] / "configs" / "converged_tissues.yaml"
@@ -97,24 +97,11 @@ def papers_acceptance(posterior, draws):
 
 
 def papers_speed(posterior, draws):
-    """Steps per second of each of three chains, from draws of the posterior."""
-    kernel = SAMPLERS["rwmh"](posterior)
+    """Steps per second of each of three chains, from draws of the posterior, in blocks as a run makes them."""
     last = jax.tree.map(lambda x: x[-CHAINS:], estimands_of(posterior, draws))
-
-    @jax.jit
-    def walk(data, states, keys):
-        def step(states, keys):
-            return jax.vmap(partial(kernel.step, data, None))(keys, states)
-
-        return jax.lax.scan(step, states, keys)
-
-    data = kernel.data(jax.tree.map(lambda x: x.mean(axis=0), last))
-    states = jax.vmap(partial(kernel.init, data, None))(last)
-    keys = jax.random.split(jax.random.key(0), (STEPS_TIMED, CHAINS))
-    jax.block_until_ready(walk(data, states, keys))
-    began = time.perf_counter()
-    jax.block_until_ready(walk(data, states, keys))
-    return STEPS_TIMED / (time.perf_counter() - began)
+    setup = jax.tree.map(lambda x: x.mean(axis=0), last)
+    block = block_from(chosen_sampler("rwmh", posterior, {}), setup, last, STEPS_TIMED // PAPERS_THIN, PAPERS_THIN)
+    return STEPS_TIMED / _median(block)
 
 
 def check_formula(covariance, variances):

@@ -2,29 +2,33 @@
 
     BAYESREG_RUN=DIR make bench ARGS="-k draw"
 
-DIR is the folder of a run of `configs/converged_tissues.yaml` that has ended; without it there is nothing to time. All
-samplers but the paper's are given its reference, walls and steps, so that there is no search and no warm-up. `smc`
-draws as `hmc` does, once it has tempered.
+DIR is the folder of a run of `configs/converged_tissues.yaml` that has ended; without it there is nothing to time. A
+block of draws is timed, made as a run makes it. All samplers but the paper's are given the run's reference, walls and
+steps, so that there is no search and no warm-up. `smc` draws as `hmc` does, once it has tempered.
 """
 
 import os
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import bayesreg as br
 from bayesreg.assembly import posterior_of
+from bayesreg.inference.block import run_block
 from bayesreg.inference.checkpoint import Checkpoint
-from bayesreg.inference.run import checkpoint_from_arrays
-from bayesreg.inference.samplers import SAMPLERS, chosen_sampler
+from bayesreg.inference.run import _first, checkpoint_from_arrays
+from bayesreg.inference.samplers import SAMPLERS, Chosen, chosen_sampler
 from bayesreg.io import store
 from bayesreg.model.posterior import Posterior
 
 ROUNDS, DRAWS = 5, 3
+# Of the paper's kernel a draw is a step, and few are in the support.
+STEPS, PAPERS_THIN = 1_000, 10
 
 
 class Finished(NamedTuple):
@@ -53,22 +57,23 @@ def finished() -> Finished:
     return Finished(posterior, end, jax.vmap(lambda each: posterior.estimands(known | each))(values))
 
 
+def block_from(chosen: Chosen, setup: Any, places: dict[str, jax.Array], draws: int, thin: int) -> Callable[[], Any]:
+    """A block of draws, made as a run makes it, from chains at these places."""
+    data = chosen.sampler.data(setup)
+    begun = _first(chosen, data, setup, places)
+    numbers = np.arange(len(places["u_boundary"]))
+    return lambda: run_block(chosen, draws, thin, None, data, 0, numbers, 0, *begun[1:5])
+
+
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "smc"])
 def bench_draw(name: str, finished: Finished, timed: Any) -> None:
     posterior, end, places = finished
-    sampler = chosen_sampler(name, posterior, {}).sampler
+    sampler = chosen_sampler(name, posterior, {})
     setup = jax.tree.map(lambda x: x.mean(axis=0), places) if name == "rwmh" else end.setup
-    data = sampler.data(setup)
-    states = jax.jit(jax.vmap(sampler.init, in_axes=(None, None, 0)))(data, setup, places)
+    count, thin = (STEPS, PAPERS_THIN) if name == "rwmh" else (DRAWS, 1)
+    block = block_from(sampler, setup, places, count // thin, thin)
+    tally = block()[2]
+    gradients, densities = (float(getattr(tally, kind).mean()) / count for kind in ("gradients", "densities"))
     chains = len(places["u_boundary"])
-
-    @jax.jit
-    def walk(data: Any, setup: Any, states: Any, keys: jax.Array) -> Any:
-        return jax.lax.scan(
-            lambda states, keys: jax.vmap(partial(sampler.step, data, setup))(keys, states), states, keys
-        )
-
-    arguments = data, setup, states, jax.random.split(jax.random.key(0), (DRAWS, chains))
-    gradients, densities = (float(getattr(walk(*arguments)[1], kind).mean()) for kind in ("gradients", "densities"))
-    told = {"sampler": name, "chains": chains, "draws": DRAWS, "gradients": gradients, "densities": densities}
-    timed(walk, *arguments, rounds=ROUNDS, nodes=len(posterior.mesh.points), mesh="paper", **told)
+    told = {"sampler": name, "chains": chains, "draws": count, "gradients": gradients, "densities": densities}
+    timed(block, rounds=ROUNDS, nodes=len(posterior.mesh.points), mesh="paper", **told)

@@ -1,29 +1,22 @@
-"""The least time that a density can take on this machine, and how near to it ours comes.
-
-    python -m tests.benchmarks.floor [--chains 1 4 16]
+"""The least time that a density can take on this machine.
 
 For every part of the algorithm the bytes that it has to read and write and its floating-point operations are counted,
-over the measured bandwidth and peak; the slower of the two bounds the part. All that a density of this size works on
-stays in the last cache, and so the bandwidth is that of sums of arrays of 8 MB; the peak is that of products of dense
-matrices. Matrices count once for all chains, vectors once for every pass. On the phantom of the paper's size.
+over the measured bandwidth and peak; the slower of the two bounds the part. The bandwidth is that of sums of arrays of
+8 MB, which stay in the last cache, as vectors of the paper's size do; the peak is that of products of dense matrices.
+Matrices and the voxels about a point count once for all chains, vectors once for every pass.
 """
 
 from __future__ import annotations
 
-import argparse
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.fem.equilibrium import equilibrium
 from bayesreg.fem.operators import SparseOperator
-from bayesreg.model.coordinates import complete
-from bayesreg.model.options import ModelConfig
-from bayesreg.model.posterior import Posterior
-from bayesreg.model.program import RegistrationData, _by_cell, prescribed
-from tests.benchmarks.bench_sampling import _median, _posterior
+from bayesreg.model.program import RegistrationData
+from tests.benchmarks.bench_sampling import _median
 
 DOUBLE, SINGLE, INDEX = 8, 4, 4
 TAPS = 64
@@ -49,30 +42,6 @@ class Work(NamedTuple):
         return max(self.bytes / machine.bandwidth, self.double / machine.double + self.single / machine.single)
 
 
-def main() -> None:
-    """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--chains", type=int, nargs="+", default=[1, 4, 16])
-    options = parser.parse_args()
-    machine = measured()
-    print(
-        f"{machine.bandwidth / 1e9:.1f} GB/s, {machine.double / 1e9:.0f} and {machine.single / 1e9:.0f} Gflop/s in "
-        "double and single precision"
-    )
-    posterior = _posterior(ModelConfig(interpolation="cubic"))
-    values = posterior.constrain(posterior.initial(jax.random.key(0)))
-    data = posterior.conditioned(posterior.estimands(values))
-    print("| chains | iterations | solve, floor ms | images, floor ms | energies, floor ms | density, ms | fraction |")
-    print("|---|---|---|---|---|---|---|")
-    for chains in options.chains:
-        positions = jax.vmap(posterior.initial)(jax.random.split(jax.random.key(0), chains))
-        iterations = _iterations(posterior, data, positions)
-        parts = [part.seconds(machine) for part in density_parts(data, chains, iterations)]
-        seconds = _median(jax.jit(jax.vmap(posterior.logdensity_of, in_axes=(None, 0))), data, positions)
-        row = " | ".join(f"{part * 1e3:.2f}" for part in parts)
-        print(f"| {chains} | {iterations} | {row} | {seconds * 1e3:.1f} | {sum(parts) / seconds:.0%} |", flush=True)
-
-
 def measured() -> Machine:
     """What this machine does when it does nothing else."""
     first, second = (jnp.full(2**20, float(k)) for k in (1, 2))
@@ -94,7 +63,7 @@ def density_parts(data: RegistrationData, chains: int, iterations: int) -> tuple
     vectors = Work(10 * free * chains * DOUBLE, 12 * free * chains)
     load = _sum(_product(system.prescribed_derivative, 3 * chains), hooke, _product(system.free_derivative, 3 * chains))
     solve = _sum(load, inverse, *[_sum(apply, inverse, vectors)] * iterations)
-    taps = Work((TAPS + 2) * points * chains * DOUBLE, 2 * (TAPS + 16 + 4) * points * chains)
+    taps = Work((TAPS + 2 * chains) * points * DOUBLE, 2 * (TAPS + 16 + 4) * points * chains)
     images = _sum(_product(data.quadrature.interpolation, 3 * chains), taps)
     energies = _sum(
         _product(system.elements.derivative, 3 * chains), Work(2 * cells * chains * DOUBLE, 30 * cells * chains)
@@ -111,19 +80,3 @@ def _product(operator: SparseOperator, columns: int) -> Work:
 
 def _sum(*parts: Work) -> Work:
     return Work(*(sum(each) for each in zip(*parts, strict=True)))
-
-
-def _iterations(posterior: Posterior, data: RegistrationData, positions: dict[str, jax.Array]) -> int:
-    """Of the slowest chain's solve."""
-
-    def count(position: dict[str, jax.Array]) -> jax.Array:
-        values = complete(data, posterior.constrain_of(data, position), posterior.free)
-        lam, mu = _by_cell(data, values["lam"], values["mu"])
-        given = prescribed(data, values["u_boundary"])
-        return equilibrium(data.system, lam, mu, given).iterations
-
-    return int(jax.jit(jax.vmap(count))(positions).max())
-
-
-if __name__ == "__main__":
-    main()

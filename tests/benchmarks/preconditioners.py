@@ -22,7 +22,8 @@ from bayesreg.fem.equilibrium import ElasticSystem, elastic_system, equilibrium
 from bayesreg.mesh import TetMesh
 from bayesreg.model.posterior import CHAIN_TOLERANCE
 from tests.benchmarks.bench_sampling import _median
-from tests.benchmarks.solves import SPREAD, mesh_of
+from tests.benchmarks.places import SPREAD
+from tests.benchmarks.solves import mesh_of
 from tests.phantoms import LAM, MU
 
 WAYS = {"dense": 10**9, "multigrid": 0}

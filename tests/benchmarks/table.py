@@ -1,12 +1,15 @@
 """What `make bench` has found, as tables for the docs and a figure beside the file.
 
-python -m tests.benchmarks.table docs/benchmarks.json
+    python -m tests.benchmarks.table docs/benchmarks.json
+
+Ends with status 1 where the acceptance lines of issue 4 that it can tell do not hold.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +25,7 @@ COLOURS = {1: "#6ba3cf", 4: "#3f7cb0", 16: "#22527f", 64: "#0d2440"}
 PEER = "#a84a53"
 DRAWN = "cubic"
 DPI = 160
+LEAST_GAIN, MOST_DENSITIES = 5.0, 2.5
 # Labels of lines are kept apart by this factor.
 APART = 1.3
 
@@ -38,8 +42,10 @@ def main() -> None:
     found = [each["extra_info"] | {"seconds": each["stats"]["median"]} for each in report["benchmarks"]]
     parts = [each for each in found if "part" in each and "peer" not in each]
     peers = [each for each in found if "peer" in each]
-    print("\n\n".join(filter(None, (machine(report), evaluations(parts, peers), draws(found)))))
+    ratios, hold = acceptance(found)
+    print("\n\n".join(filter(None, (machine(report), evaluations(parts, peers), draws(found), ratios))))
     figure(path.with_suffix(".png"), parts, peers)
+    sys.exit(not hold)
 
 
 def machine(report: dict[str, Any]) -> str:
@@ -66,6 +72,21 @@ def evaluations(parts: Sequence[Found], peers: Sequence[Found]) -> str:
         lines.append([f"{nodes:,}", interpolation, part, *cells, f"{most['compiling']:.1f}", memory, beside])
     titles = "nodes", "image", "part", *(f"{chains}, ms" for chains in CHAINS), "compiling, s", "GiB", "best peer"
     return markdown(titles, lines)
+
+
+def acceptance(found: Iterable[Found]) -> tuple[str, bool]:
+    """What issue 4 asks at the paper's size, and whether it holds."""
+    lines, hold = [], True
+    for each in found:
+        if "gain" in each:
+            hold &= each["gain"] >= LEAST_GAIN and each["densities"] <= MOST_DENSITIES
+            gains, densities = (f"{min(x):.1f} to {max(x):.1f}" for x in zip(*each["passes"], strict=True))
+            lines.append(
+                f"{each['interpolation']}, {each['chains']} chains: a density {each['gain']:.1f} times as fast as the "
+                f"best peer (at least {LEAST_GAIN:g}; in single passes {gains}), a gradient {each['densities']:.2f} "
+                f"densities (at most {MOST_DENSITIES:g}; {densities})"
+            )
+    return "\n".join(lines), hold
 
 
 def same(one: Found, other: Found) -> bool:

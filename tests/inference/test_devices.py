@@ -6,11 +6,12 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from bayesreg.inference.block import run_block
-from bayesreg.inference.devices import devices_for, require_joined
+from bayesreg.inference.devices import devices_for, require_joined, side_by_side
 from bayesreg.inference.run import first_checkpoint, sample
 from bayesreg.inference.samplers import chosen_sampler
 from tests.inference.gaussians import GaussianTarget
@@ -78,6 +79,24 @@ def test_the_same_draws_on_two_devices(sampler):
     assert told["moved"] > 0
     assert told["again"] == 0
     assert max(told["one"], told["mixed"]) < 1e-9 * told["spread"]
+
+
+@pytest.mark.parametrize(("chains", "groups"), [(4, 1), (16, 1), (17, 1), (24, 2), (32, 2), (40, 4), (64, 4)])
+def test_many_chains_run_in_groups_and_find_the_same(chains, groups):
+    if jax.default_backend() != "cpu":
+        pytest.skip("groups are for the processor")
+    matrix, x = jax.random.normal(jax.random.key(0), (5, 5)), jax.random.normal(jax.random.key(1), (chains, 5))
+
+    def chain(number, x):
+        return number, jnp.tanh(matrix @ x)
+
+    numbers = jnp.arange(chains)
+    told = jax.make_jaxpr(side_by_side(chain, None))(numbers, x)
+    scans = [each.params["length"] for each in told.eqns if each.primitive.name == "scan"]
+    assert scans == ([] if groups == 1 else [groups])
+    same, found = side_by_side(chain, None)(numbers, x)
+    np.testing.assert_array_equal(same, numbers)
+    np.testing.assert_allclose(found, jnp.tanh(x @ matrix.T), rtol=1e-12)
 
 
 def test_chains_that_cannot_be_shared_stay_on_one_device(monkeypatch):

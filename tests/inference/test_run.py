@@ -217,6 +217,14 @@ def test_posterior_file_round_trip(tmp_path):
     np.testing.assert_array_equal(found.constant_data.cells, MESH.cells)
 
 
+def test_solves_of_samplers_about_the_mode_are_those_of_their_draws():
+    samples = br.sample(posterior(), "mala", chains=2, draws=3, thin=2, progress=False, warm_up=4)
+    told = samples.idata.sample_stats.solver_iterations.to_numpy()
+    assert (told >= 1).all()
+    assert (told == told.astype(int)).all()
+    assert float(samples.tally.solver_iterations.sum()) == 2 * told.sum()
+
+
 def test_known_entries_have_no_diagnostics():
     judged = convergence(whole()[0].idata)
     assert np.isnan(judged.rhat.mu.sel(tissue="gm"))

@@ -1,0 +1,24 @@
+"""Where chains of a benchmark stand: λ and μ about as far apart as those of a posterior."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from bayesreg.model.posterior import Posterior
+
+# Standard deviation of log λ and log μ: a factor of 1.35.
+SPREAD = 0.3
+
+
+def scattered(posterior: Posterior, chains: int) -> dict[str, jax.Array]:
+    """Positions near the reference (`Posterior.initial`), λ and μ scattered by `SPREAD`."""
+
+    def place(key: jax.Array) -> dict[str, jax.Array]:
+        key_near, *keys = jax.random.split(key, 3)
+        values = posterior.constrain(posterior.initial(key_near))
+        for name, own in zip(("lam", "mu"), keys, strict=True):
+            values[name] = values[name] * jnp.exp(SPREAD * jax.random.normal(own, values[name].shape))
+        return posterior.unconstrain(values)
+
+    return jax.block_until_ready(jax.vmap(place)(jax.random.split(jax.random.key(0), chains)))
