@@ -11,7 +11,7 @@ from pathlib import Path
 
 import platformdirs
 
-# For so long are compiled programs kept, some 40 MB of them for a mesh.
+# For so long are compiled programs kept, some 5 MB of them for a mesh.
 MOST_DAYS = 30
 # Half the time for compiling, and programs that are no slower (docs/speed.md#compiling).
 QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"

@@ -86,8 +86,11 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     compiling = time.perf_counter() - begun
     assert np.isfinite(compiled[0](data, positions)).all()
     density, gradient = (_median(function, data, positions) for function in compiled)
-    values = jax.vmap(posterior.constrain)(positions)
-    iterations = jax.jit(jax.vmap(posterior.evaluate_estimands, in_axes=(None, 0)))(data, values).solver_iterations
+
+    def evaluated(data: Any, position: Any) -> Any:
+        return posterior.evaluate_estimands(data, posterior.constrain_of(data, position))
+
+    iterations = jax.jit(jax.vmap(evaluated, in_axes=(None, 0)))(data, positions).solver_iterations
     return {
         "nodes": len(posterior.mesh.points),
         "points": len(posterior.data.quadrature.weights),

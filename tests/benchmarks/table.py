@@ -27,7 +27,7 @@ DRAWN = "cubic"
 DPI = 160
 LEAST_GAIN, MOST_DENSITIES = 5.0, 2.5
 # Labels of lines are kept apart by this factor.
-APART = 1.3
+APART = 1.5
 
 # Of one benchmark: what it told, and its median as "seconds".
 Found = dict[str, Any]
@@ -165,8 +165,8 @@ def panel(axis: Axes, parts: Sequence[Found], peers: Sequence[Found]) -> None:
     for name in sorted({peer["peer"] for peer in peers}):
         x, y = curve([peer for peer in peers if peer["peer"] == name])
         axis.plot(x, y, "D--", color=PEER, linewidth=1.0, markersize=4)
-        slower = y[-1] >= max(1e3 * peer["seconds"] for peer in peers if peer["nodes"] == x[-1])
-        named(axis, name, (x[-1], y[-1]), PEER, (8, 5 if slower else -5))
+        slower = y[0] >= max(1e3 * peer["seconds"] for peer in peers if peer["nodes"] == x[0])
+        named(axis, name, (x[0], y[0]), PEER, (-8, 6 if slower else -6), ha="right")
     if curves:
         least = min(1e3 * each["seconds"] / each["chains"] / each["nodes"] for each in parts)
         x = np.array([5_000.0, 100_000.0])
