@@ -12,8 +12,9 @@ from jaxtyping import Int
 from bayesreg.inference.checkpoint import Block, Blocks
 from bayesreg.inference.draws import OTHERS, STATISTICS, dataset
 
-# Numbers (32 MB of them) that are judged at once, so that memory does not grow with the draws.
-AT_ONCE = 2**22
+# Numbers (8 MB of them) that are judged at once, so that memory does not grow with the draws: ArviZ takes many times as
+# much.
+AT_ONCE = 2**20
 
 
 class Convergence(NamedTuple):
