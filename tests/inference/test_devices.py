@@ -23,7 +23,7 @@ CHAINS, DRAWS = 4, 12
 def found(sampler):
     """What differs between two devices, one, two again, and two with chains in another order."""
     target = GaussianTarget() if sampler == "hmc" else posterior()
-    settings = {"warm_up": 5} if sampler == "hmc" else {}
+    settings = {} if sampler == "rwmh" else {"warm_up": 5}
     chosen, begun = (
         chosen_sampler(sampler, target, settings),
         first_checkpoint(target, sampler, CHAINS, 0, **settings),
@@ -60,7 +60,7 @@ def programs(target, sampler, settings):
     return run_block._cache_size() - before
 
 
-@pytest.mark.parametrize("sampler", ["hmc", "rwmh"])
+@pytest.mark.parametrize("sampler", ["hmc", "mala", "rwmh"])
 def test_the_same_draws_on_two_devices(sampler):
     """To rounding; and the same bits on as many devices."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
