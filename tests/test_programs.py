@@ -64,6 +64,12 @@ def test_without_a_home_nothing_is_kept_and_old_programs_go(tmp_path, monkeypatc
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
 
 
+def test_a_run_begins_without_what_judges_and_draws_its_results():
+    code = "import sys, bayesreg.pipeline; print(*({'arviz', 'matplotlib', 'nilearn'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
 @pytest.mark.parametrize(
     ("jaxlib", "plugins", "given", "expected"),
     [

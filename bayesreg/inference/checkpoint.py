@@ -86,7 +86,7 @@ def with_passed_over(tally: Tally, steps: AnyArray) -> Tally:
 
 
 def with_solve(tally: Tally, evaluation: Evaluation, steps: int) -> Tally:
-    """The tally of so many steps that do not tell of their solves, with that of the draw at their end for each."""
+    """The tally of steps that do not tell of their solves: the draw's iterations for each of them, its failure once."""
     return tally._replace(
         solver_failed=tally.solver_failed + evaluation.solver_failed,
         solver_iterations=tally.solver_iterations + steps * evaluation.solver_iterations,

@@ -17,8 +17,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bayesreg.types import InputError
 
 _AXIS = "chains"
-# On a processor so many chains run side by side: what more of them work on leaves the cache, and each costs half as
-# much again (docs/speed.md).
+# On a processor so many chains run side by side: what more of them work on leaves the cache (docs/speed.md#groups).
 _TOGETHER = 16
 
 
@@ -127,11 +126,10 @@ def side_by_side(chain: Callable, devices: Mesh | None) -> Callable:
 
 
 def _in_groups(chain: Callable, *each: Any) -> Any:
-    """One group after the other; all together on a GPU, or where no number of groups is a divisor."""
+    """One group after the other; all together on a GPU, and where they are few or no size of a group divides them."""
     chains = len(jax.tree.leaves(each)[0])
-    size = chains
-    if jax.default_backend() == "cpu":
-        size = max((n for n in range(_TOGETHER // 2, _TOGETHER + 1) if chains % n == 0), default=chains)
+    sizes = range(_TOGETHER, _TOGETHER // 2 - 1, -1) if jax.default_backend() == "cpu" else ()
+    size = next((size for size in sizes if chains % size == 0), chains)
     if size == chains:
         return jax.vmap(chain)(*each)
     return jax.lax.map(lambda one: chain(*one), each, batch_size=size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bayesreg.model.posterior import Posterior
 
@@ -21,4 +22,6 @@ def scattered(posterior: Posterior, chains: int) -> dict[str, jax.Array]:
             values[name] = values[name] * jnp.exp(SPREAD * jax.random.normal(own, values[name].shape))
         return posterior.unconstrain(values)
 
-    return jax.block_until_ready(jax.vmap(place)(jax.random.split(jax.random.key(0), chains)))
+    found = jax.vmap(place)(jax.random.split(jax.random.key(0), chains))
+    assert all(np.isfinite(values).all() for values in found.values()), "a prior does not reach so far"
+    return found

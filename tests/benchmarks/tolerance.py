@@ -45,7 +45,7 @@ def tightened(folder: Path, out: Path) -> Result:
         return br.run(config, out)
 
 
-def compare(first: Result, second: br.pipeline.Result) -> None:
+def compare(first: Result, second: Result) -> None:
     """Print how far apart two posteriors are."""
     means = [result.run.manifest["solver"]["iterations_mean"] for result in (first, second)]
     print(f"{means[0]:.1f} and {means[1]:.1f} iterations")

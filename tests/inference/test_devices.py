@@ -81,10 +81,12 @@ def test_the_same_draws_on_two_devices(sampler):
     assert max(told["one"], told["mixed"]) < 1e-9 * told["spread"]
 
 
-@pytest.mark.parametrize(("chains", "groups"), [(4, 1), (16, 1), (17, 1), (24, 2), (32, 2), (40, 4), (64, 4)])
-def test_many_chains_run_in_groups_and_find_the_same(chains, groups):
-    if jax.default_backend() != "cpu":
-        pytest.skip("groups are for the processor")
+@pytest.mark.parametrize(
+    ("backend", "chains", "groups"),
+    [*[("cpu", *case) for case in ((4, 1), (16, 1), (17, 1), (24, 2), (32, 2), (40, 4), (64, 4))], ("gpu", 64, 1)],
+)
+def test_many_chains_run_in_groups_on_a_processor_and_find_the_same(monkeypatch, backend, chains, groups):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     matrix, x = jax.random.normal(jax.random.key(0), (5, 5)), jax.random.normal(jax.random.key(1), (chains, 5))
 
     def chain(number, x):
