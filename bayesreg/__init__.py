@@ -24,6 +24,8 @@ _HOME = {
     "TemperaturePrior": "model.options",
     "Posterior": "model.posterior",
     "build_posterior": "model.posterior",
+    "ImagePair": "model.terms.images",
+    "Landmarks": "model.terms.landmarks",
     "independent_points": "model.independence",
     "make_pair": "model.simulation",
     "Start": "inference.initialise",

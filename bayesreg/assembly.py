@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,13 +17,17 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.options import Lame, ModelConfig
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.problem import cell_entries, lame_parameter
+from bayesreg.model.terms.images import ImagePair
 
 
-def posterior_of(config: Config, inputs: Inputs) -> Posterior:
-    """The posterior of a run, its solver preconditioned at the start parameters."""
+def posterior_of(config: Config, inputs: Inputs, observations: Sequence[Any] = ()) -> Posterior:
+    """The posterior of a run, with observations besides its images; solves preconditioned at the start parameters."""
     reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
     model = _model(config.model, inputs)
-    return build_posterior(inputs.fixed, inputs.moving, inputs.mesh, model, inputs.skull, reference)
+    observed = [ImagePair(inputs.fixed, inputs.moving), *observations]
+    return build_posterior(
+        mesh=inputs.mesh, observations=observed, model=model, skull=inputs.skull, reference=reference
+    )
 
 
 def _model(model: ModelConfig, inputs: Inputs) -> ModelConfig:
@@ -34,7 +40,7 @@ def _model(model: ModelConfig, inputs: Inputs) -> ModelConfig:
 
 def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
     """All entries of λ or μ at the start: as the configuration gives them, else as the model chooses."""
-    values = np.array(lame_parameter(name, mesh, config.model, None).reference)
+    values = np.array(lame_parameter(name, mesh, config.model, None).reference())
     given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
     for index, tissue in enumerate(mesh.names):
         if tissue in given:

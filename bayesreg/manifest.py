@@ -75,6 +75,7 @@ def manifest(
         "pair": provenance["pair"],
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
         "model": config.model.model_dump(mode="json"),
+        "observations": list(posterior.observations),
         "exact": samples.exact,
         "stopped": {
             "reason": samples.reason,

@@ -109,7 +109,13 @@ class Result:
         return self.folder / "report.html"
 
 
-def run(config: str | Path | Config, out: str | Path, resume: bool = False, progress: bool = True) -> Result:
+def run(
+    config: str | Path | Config,
+    out: str | Path,
+    resume: bool = False,
+    progress: bool = True,
+    observations: Sequence[Any] = (),
+) -> Result:
     """Run a configuration from end to end.
 
     Parameters
@@ -122,6 +128,9 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
         begun with, the new one holds: a finished run is given more draws so.
     progress : bool
         Say what is being done, and show a progress bar.
+    observations : sequence
+        What was observed besides the two images, such as `bayesreg.Landmarks`; see `bayesreg.build_posterior`. A run
+        that began with some is resumed with the same.
 
     Returns
     -------
@@ -130,16 +139,16 @@ def run(config: str | Path | Config, out: str | Path, resume: bool = False, prog
     Raises
     ------
     InputError
-        If the configuration or a file is wrong, or the folder holds another run; if the section `distributed` is given
-        and `bayesreg.inference.devices.join` was not called.
+        If the configuration, a file or an observation is wrong, or the folder holds another run; if the section
+        `distributed` is given and `bayesreg.inference.devices.join` was not called.
     """
     config = config if isinstance(config, Config) else load_config(config)
     if config.distributed is not None:
-        return _run_together(config, Path(out), resume, progress)
-    return _run(config, Path(out), resume, progress)
+        return _run_together(config, Path(out), resume, progress, observations)
+    return _run(config, Path(out), resume, progress, observations)
 
 
-def _run_together(config: Config, out: Path, resume: bool, progress: bool) -> Result:
+def _run_together(config: Config, out: Path, resume: bool, progress: bool, observations: Sequence[Any]) -> Result:
     """The first of several processes runs, and the others join it as if they resumed what it began.
 
     A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
@@ -148,20 +157,20 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool) -> Re
     # Where a run is made is no part of it.
     config = config.model_copy(update={"distributed": None})
     if is_first():
-        result = _run(config, out, resume, progress)
+        result = _run(config, out, resume, progress, observations)
         wait(ENDED)
         return result
     wait(BEGUN)
     if not (out / "run.json").exists():
         begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
-        posterior = posterior_of(begun, inputs)
+        posterior = posterior_of(begun, inputs, observations)
         _sample(begun, posterior, _reached(begun, inputs, posterior, out, progress=False), out, progress=False)
         wait(SAMPLED)
     wait(ENDED)
     return load_result(out)
 
 
-def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
+def _run(config: Config, out: Path, resume: bool, progress: bool, observations: Sequence[Any]) -> Result:
     began = time.perf_counter()
     say = _narrator(progress)
     if resume and (out / "config.yaml").exists():
@@ -173,7 +182,8 @@ def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
             wait(BEGUN)
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
-        posterior = posterior_of(config, inputs)
+        _require_same_observations(out, provenance, observations)
+        posterior = posterior_of(config, inputs, observations)
         if (out / "run.json").exists():
             store.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
@@ -189,7 +199,8 @@ def _run(config: Config, out: Path, resume: bool, progress: bool) -> Result:
         say("reading the images, meshing")
         inputs, provenance = prepared_inputs(config)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
-        posterior = posterior_of(config, inputs)
+        posterior = posterior_of(config, inputs, observations)
+        provenance["observations"] = _names(observations)
         reached = _first(config, inputs, posterior, out, progress)
         inputs = with_initial(inputs, config)
         _store(out, inputs, _timed(provenance, began))
@@ -322,6 +333,20 @@ def _resumed_config(out: Path, config: Config) -> Config:
     return known
 
 
+def _names(observations: Sequence[Any]) -> list[str]:
+    return [observation.name for observation in observations]
+
+
+def _require_same_observations(out: Path, provenance: dict[str, Any], observations: Sequence[Any]) -> None:
+    """Raise InputError where a run would go on with other observations than it began with."""
+    begun, given = provenance.get("observations", []), _names(observations)
+    if begun != given:
+        raise InputError(
+            f"the run in {out} began with the observations {begun or 'none'} besides its images, and is resumed with "
+            f"{given or 'none'}: give the same to bayesreg.run(..., observations=[...])"
+        )
+
+
 def _narrator(progress: bool) -> Callable[[str], None]:
     console = Console(quiet=not progress, highlight=False)
     return lambda text: console.print(text)
@@ -378,7 +403,7 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or _block(len(posterior.data.quadrature.weights)),
+        block=options.block or _block(len(posterior.images.quadrature.weights)),
         stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
         resume=reached,

@@ -64,7 +64,8 @@ def predict(
 
     def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
         data, neighbours, u_mean, nodes, weights = given
-        number, here, cells = draw.pop("number"), replace(posterior, data=data), data.quadrature.cells
+        number, here = draw.pop("number"), replace(posterior, data=data)
+        cells = here.images.quadrature.cells
         u = here.evaluate(draw).u
         z = standardised_residual(here, u, t_similarity_of(here, draw))
         noise = jax.random.normal(jax.random.fold_in(key, number.astype(int)), z.shape)
@@ -92,11 +93,11 @@ def predict(
         landmark_points=np.array(list(landmarks.values()), float),
         landmark_draws=whole["landmarks"],
         residual=np.asarray(at_mean, np.float32),
-        residual_tissue=mesh.tissue[np.asarray(posterior.data.quadrature.cells)].astype(np.int8),
+        residual_tissue=mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
         discrepancies=np.array(DISCREPANCIES),
         observed=whole["observed"],
         replicated=whole["replicated"],
-        **(_stiffness(found) if posterior.data.field is not None else {}),
+        **(_stiffness(found) if posterior.data.body.field is not None else {}),
     )
 
 

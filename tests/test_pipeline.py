@@ -23,11 +23,13 @@ from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
+from bayesreg.model.state import interpolation_at
 from tests.phantoms import ball_mesh
 
 ROOT = Path(__file__).parent.parent
 BAYESREG = (sys.executable, "-c", "from bayesreg.cli import main; main()")
 CENTRE = np.array([5.0, -3.0, 8.0])
+REGION = CENTRE + np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
 STOP = {"rhat": 1.2, "ess": None, "max_steps": 36}
 PROPER = "model.priors={lam: {high: 60}, mu: {high: 5}}"
 SAMPLER = {"name": "rwmh", "chains": 2, "thin": 3, "block": 4, "sigma_u": 0.02}
@@ -356,3 +358,37 @@ def test_simulate_writes_the_pair(synthetic, folder):
     assert json.loads((out / "inputs" / "provenance.json").read_text())["pair"]["residual_sd_at_truth"] > 0
     begun = br.run(synthetic("paper"), out, resume=True, progress=False)
     np.testing.assert_allclose(begun.run.truth.initial, 0.5 * inputs.truth.u)
+
+
+class MeanDisplacement:
+    """An observation from outside the package: the mean displacement of a region was measured, mm."""
+
+    name = "region"
+
+    def log(self, state):
+        away = state.at(REGION).mean(axis=0) - np.array([0.0, 4.0, 0.0])
+        return -0.5 * (away @ away) / 0.01**2
+
+
+@pytest.mark.slow
+def test_an_observation_from_outside_goes_through_run_resume_and_report(folder, tmp_path):
+    def config(steps):
+        settings = [
+            "sampler={name: hmc, chains: 2, warm_up: 10}",
+            f"stop={{rhat: 1.01, ess: null, max_steps: {steps}}}",
+        ]
+        return br.load_config(folder / "run.yaml", [*settings, "model.interpolation=cubic"])
+
+    out, observed = tmp_path / "out", [MeanDisplacement()]
+    br.run(config(10), out, progress=False, observations=observed)
+    with pytest.raises(br.InputError, match="began with the observations \\['region'\\] besides its images"):
+        br.run(config(30), out, resume=True, progress=False)
+    found = br.run(config(30), out, resume=True, progress=False, observations=observed)
+    u = found.idata.posterior["u_boundary"]
+    assert u.sizes["draw"] == 30
+    # Without it the region moves by 0.8 mm, as the images do.
+    nodes, weights = interpolation_at(found.mesh, REGION)
+    moved = np.einsum("ka,kai->i", weights, found.u_mean[nodes]) / len(REGION)
+    np.testing.assert_allclose(moved, [0, 4, 0], atol=0.1)
+    assert json.loads((out / "run.json").read_text())["observations"] == ["images", "region"]
+    assert found.report.exists()

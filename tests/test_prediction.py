@@ -23,13 +23,16 @@ def problem() -> tuple[br.Posterior, xr.Dataset, np.ndarray]:
     rng = np.random.default_rng(0)
     moving = smooth_image(MESH.points, seed=2, blur=3.0)
     posterior = br.build_posterior(moving, moving, MESH, br.ModelConfig(t_similarity=0.05))
-    truth = {name: np.array(value) for name, value in posterior.reference().items()}
+    images = posterior.images
+    truth = {
+        name: np.array(value) for name, value in posterior.reference().items() if name in ("u_boundary", "lam", "mu")
+    }
     truth["u_boundary"] += 0.5 * np.sin(MESH.points[posterior.sampled] / 6)
     u = np.asarray(posterior.evaluate(truth).u)
-    weights = np.asarray(posterior.data.quadrature.weights)
+    weights = np.asarray(images.quadrature.weights)
     noise = np.sqrt(0.05 / (2 * weights)) * rng.normal(size=len(weights))
-    shown = posterior.data.fixed_values - posterior.residuals(u) + noise
-    posterior = replace(posterior, data=posterior.data._replace(fixed_values=shown))
+    shown = images.fixed_values - posterior.residuals(u) + noise
+    posterior = replace(posterior, data=posterior.data.with_term("images", images._replace(fixed_values=shown)))
     draws = {name: np.broadcast_to(value, (3, 12, *value.shape)) for name, value in truth.items()}
     draws["u_boundary"] = draws["u_boundary"] + 0.02 * rng.normal(size=draws["u_boundary"].shape)
     draws["u_boundary"][2, :6] += 2.5

@@ -18,12 +18,12 @@ def standardised_residual(
     posterior: Posterior, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float
 ) -> Float[AnyArray, "points"]:
     """(f(x_q) − m(x_q + u(x_q))) / √(T_s / 2w_q): independent standard Normal numbers where the model holds."""
-    return posterior.residuals(u) * jnp.sqrt(2 * posterior.data.quadrature.weights / t_similarity)
+    return posterior.residuals(u) * jnp.sqrt(2 * posterior.images.quadrature.weights / t_similarity)
 
 
 def t_similarity_of(posterior: Posterior, draw: Mapping[str, AnyArray]) -> Scalar | float:
     """T_s of a draw: its own where it is sampled, else that of the model."""
-    return draw.get("t_similarity", posterior.data.t_similarity)
+    return draw.get("t_similarity", posterior.data.blocks["t_similarity"].reference())
 
 
 def discrepancies(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TypeVar
 
-from bayesreg.image import Image, Interpolation, Interpolator
-from bayesreg.model.program import RegistrationData
+from bayesreg.image import Interpolation
+from bayesreg.model.program import Problem
+from bayesreg.model.terms.images import ImagePair
 
 Made = TypeVar("Made")
 
@@ -22,42 +23,35 @@ SMOOTHING = (
 
 
 def continuation(
-    data: RegistrationData, fixed: Image, moving: Image, interpolation: Interpolation
-) -> Iterator[RegistrationData]:
-    """Data of every problem, each to be solved for the displacements alone.
+    problem: Problem, observations: Mapping[str, object], interpolation: Interpolation
+) -> Iterator[Problem]:
+    """Every problem, each to be solved for the displacements alone.
 
     Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement of
     many times its posterior standard deviation is found step by step. The last is the posterior's own. Where no node is
-    sampled there is none.
+    sampled there is none, and without images, no easier one.
     """
-    if len(data.slots):
-        yield from _ahead([partial(_eased, data, fixed, moving, interpolation, *stage) for stage in SMOOTHING])
-        yield data
+    pairs = {name: pair for name, pair in observations.items() if isinstance(pair, ImagePair)}
+    if not len(problem.body.slots):
+        return
+    if pairs:
+        yield from _ahead([partial(_eased, problem, pairs, interpolation, *stage) for stage in SMOOTHING])
+    yield problem
 
 
 def _eased(
-    data: RegistrationData,
-    fixed: Image,
-    moving: Image,
+    problem: Problem,
+    pairs: Mapping[str, ImagePair],
     interpolation: Interpolation,
-    sigma: float,
+    sd: float,
     similarity: float,
     elastic: float,
-) -> RegistrationData:
-    """The problem with both images smoothed, and factors on T_s and T_r."""
-    # SciPy's filters let other threads run.
-    with ThreadPoolExecutor() as pool:
-        smooth_fixed, smooth_moving = pool.map(partial(_smoothed, sigma, interpolation), (fixed, moving))
-    return data._replace(
-        moving=smooth_moving,
-        fixed_values=smooth_fixed(data.positions),
-        t_similarity=similarity * data.t_similarity,
-        t_elastic=elastic * data.t_elastic,
-    )
-
-
-def _smoothed(sigma: float, interpolation: Interpolation, image: Image) -> Interpolator:
-    return image.smoothed(sigma).interpolator(interpolation)
+) -> Problem:
+    """The problem with all images smoothed, and factors on T_s and T_r."""
+    smooth = {name: pair.smoothed(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
+    warmer = problem.blocks["t_similarity"].times(similarity), problem.blocks["t_elastic"].times(elastic)
+    temperatures = dict(zip(("t_similarity", "t_elastic"), warmer, strict=True))
+    return problem._replace(blocks={**problem.blocks, **temperatures}, terms={**problem.terms, **smooth})
 
 
 def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:

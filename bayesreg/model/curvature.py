@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,11 @@ from jaxtyping import Float, Int
 from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
 from bayesreg.fem.preconditioners import DENSE_LIMIT, solved
 from bayesreg.mesh import TetMesh
-from bayesreg.model.program import RegistrationData
-from bayesreg.model.similarity import SIMILARITIES, Noise
-from bayesreg.types import AnyArray
+from bayesreg.model.blocks import Values
+from bayesreg.model.program import Problem
+from bayesreg.model.state import Body, State
+from bayesreg.model.terms.term import Curved, Outside, PointCurvature
+from bayesreg.types import AnyArray, Equilibrium
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,45 +43,36 @@ class Curvature:
         return self.second_derivatives()
 
 
-def displacement_curvature(
-    mesh: TetMesh,
-    data: RegistrationData,
-    similarity: str,
-    lam: Float[AnyArray, "cells"],
-    mu: Float[AnyArray, "cells"],
-    u: Float[AnyArray, "nodes 3"],
-    field_sd: float = 0.0,
-) -> Curvature:
-    """Curvature of E_s/T_s + E_r/T_r in the field's components z, if any, and the sampled displacements.
+def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> Curvature:
+    """Curvature of −log p in the field's components z, if any, and the sampled displacements.
 
-    With u_I = W u_B of eq. (7), W = −K_II⁻¹ K_IB, the elastic energy has the Hessian K_BB + K_BI W, and the sum of
-    squared residuals r the Gauss–Newton approximation 2 Jᵀ J of its own, J = ∂r/∂u [1; W]; the remainder is that of
-    [1; W]ᵀ ∇²E_s [1; W]. The field multiplies the stiffness of element e by exp(s_e), s = sd · basis · z, so that
-    ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I; z has the prior N(0, I), and E_r, small beside E_s in z and not convex, is left out
-    there, as are the second derivatives of u_I.
+    With u_I = W u_B of eq. (7), W = −K_II⁻¹ K_IB, the elastic energy has the Hessian K_BB + K_BI W, and an observation
+    with the curvature H in all nodes (Gauss and Newton's, such as 2 Jᵀ J of a sum of squares) that of [1; W]ᵀ H [1; W];
+    the remainder is what the exact H has besides. The field multiplies the stiffness of element e by exp(s_e),
+    s = sd · basis · z, so that ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I; z has the prior N(0, I), and E_r, small beside E_s in z
+    and not convex, is left out there, as are the second derivatives of u_I.
 
     Parameters
     ----------
-    mesh, data
-    similarity : str
-        Name of the similarity.
-    lam, mu : (m,) array
-        With the field's factor.
+    problem : Problem
+    values : mapping
+        Of all blocks.
     u : (n, 3) array
         The equilibrium, mm.
-    field_sd : float
-        Where there is a field.
 
     Returns
     -------
     Curvature
         First z, then row 3 · node + axis, 1/mm².
     """
-    sampled = unknowns_of(np.asarray(data.system.prescribed)[np.asarray(data.slots)])
-    free = unknowns_of(np.asarray(data.system.free))
-    parts = sampled, free, np.asarray(lam), np.asarray(mu)
-    if data.field is not None:
-        load = _element_forces(data, lam, mu, u) @ (field_sd * np.asarray(data.field.basis))
+    body, u = problem.body, jnp.asarray(u)
+    mesh = body.mesh.mesh
+    sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.slots)])
+    free = unknowns_of(np.asarray(body.system.free))
+    lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell(values))
+    parts = sampled, free, lam, mu
+    if body.field is not None:
+        load = _element_forces(body, lam, mu, u) @ (float(values["field_sd"]) * np.asarray(body.field.basis))
         W, schur = _response(mesh, *parts, load[free])
     elif len(free) > DENSE_LIMIT:
         W, schur = _response(mesh, *parts, np.zeros((len(free), 0)))
@@ -87,10 +80,9 @@ def displacement_curvature(
         W, schur = _kept_response(mesh, *(tuple(part.tolist()) for part in parts))
     modes = W.shape[1] - len(sampled)
 
-    def reduced(points: AnyArray) -> np.ndarray:
-        """The curvature in (z, u_B) of one in the places of the quadrature points."""
+    def reduced(nodal: scipy.sparse.csr_matrix) -> np.ndarray:
+        """The curvature in (z, u_B) of one in all nodes."""
         # What is sampled moves by itself, and the rest by W.
-        nodal = _assembled(mesh, data, np.asarray(points))
         cross = nodal[sampled][:, free] @ W
         found = W.T @ (nodal[free][:, free] @ W)
         found[modes:] += cross
@@ -98,10 +90,67 @@ def displacement_curvature(
         found[modes:, modes:] += nodal[sampled][:, sampled].toarray()
         return (found + found.T) / 2
 
-    gauss_newton = reduced(_first_order(data, jnp.asarray(u)))
-    gauss_newton[modes:, modes:] += schur / float(data.t_elastic)
+    gauss_newton = reduced(_observed_curvature(problem, values, u, lam, mu))
+    if "elastic" in problem.terms:
+        gauss_newton[modes:, modes:] += schur / float(values["t_elastic"])
+    if "rigid" in problem.terms:
+        gauss_newton[modes:, modes:] += np.asarray(problem.terms["rigid"].precision())
     gauss_newton[:modes, :modes] += np.eye(modes)
-    return Curvature(gauss_newton, lambda: reduced(_second_order(similarity, data, jnp.asarray(u))))
+    return Curvature(gauss_newton, lambda: reduced(_remaining_curvature(problem, values, u)))
+
+
+def _observed_curvature(
+    problem: Problem, values: Values, u: AnyArray, lam: AnyArray, mu: AnyArray
+) -> scipy.sparse.csr_matrix:
+    """Gauss and Newton's curvature of all observations in all nodes, row 3 · node + axis."""
+    nodes = len(problem.body.mesh.mesh.points)
+    total = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
+    for term in problem.terms.values():
+        if isinstance(term, Curved):
+            found = term.curvature(u, values, second_order=False)
+            total = total + _assembled(nodes, found, np.asarray(found.first_order))
+        elif isinstance(term, Outside):
+            total = total + _outside_curvature(problem, term, values, u, lam, mu)
+    return total
+
+
+def _remaining_curvature(problem: Problem, values: Values, u: AnyArray) -> scipy.sparse.csr_matrix:
+    nodes = len(problem.body.mesh.mesh.points)
+    total = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
+    for term in problem.terms.values():
+        if isinstance(term, Curved):
+            found = term.curvature(u, values, second_order=True)
+            total = total + _assembled(nodes, found, np.asarray(found.second_order))
+    return total
+
+
+def _outside_curvature(
+    problem: Problem, term: Outside, values: Values, u: AnyArray, lam: AnyArray, mu: AnyArray
+) -> scipy.sparse.csr_matrix:
+    """The convex part of the Hessian of −log in all nodes, for a term that knows nothing but its log."""
+    found = np.asarray(_hessian(term, problem, dict(values), jnp.asarray(u), jnp.asarray(lam), jnp.asarray(mu)))
+    touched = np.flatnonzero(np.abs(found).max(axis=0) > 0)
+    eigenvalues, vectors = np.linalg.eigh(found[np.ix_(touched, touched)])
+    convex = (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T
+    rows, columns = np.repeat(touched, len(touched)), np.tile(touched, len(touched))
+    return scipy.sparse.csr_matrix((convex.ravel(), (rows, columns)), shape=found.shape)
+
+
+@jax.jit
+def _hessian(
+    term: Outside, problem: Problem, values: dict[str, AnyArray], u: AnyArray, lam: AnyArray, mu: AnyArray
+) -> AnyArray:
+    elements, mesh = problem.body.system.elements, problem.body.mesh.mesh
+
+    def energy(flat: AnyArray) -> AnyArray:
+        solved = Equilibrium(flat.reshape(u.shape), jnp.zeros(()), jnp.zeros((), int), jnp.array(True))
+        return -term.log(State(values, lam, mu, solved, elements, mesh))
+
+    def row(direction: AnyArray) -> AnyArray:
+        return jax.jvp(jax.grad(energy), (u.ravel(),), (direction,))[1]
+
+    found = jax.lax.map(row, jnp.eye(u.size), batch_size=64)
+    return (found + found.T) / 2
 
 
 def _response(
@@ -131,9 +180,9 @@ def _kept_response(
     return _response(mesh, rows, others, np.array(lam), np.array(mu), np.zeros((len(others), 0)))
 
 
-def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:
+def _element_forces(body: Body, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:
     """Column e: the nodal forces K_e u of element e alone."""
-    elements = data.system.elements
+    elements = body.system.elements
     corners = jnp.moveaxis(jnp.asarray(u)[elements.cells], -1, 0)
     forces = jnp.einsum("aibjm,jbm->aim", element_stiffness(elements, jnp.asarray(lam), jnp.asarray(mu)), corners)
     rows = 3 * np.asarray(elements.cells)[:, None] + np.arange(3)[:, None]
@@ -143,52 +192,13 @@ def _element_forces(data: RegistrationData, lam: AnyArray, mu: AnyArray, u: AnyA
 
 
 def _assembled(
-    mesh: TetMesh, data: RegistrationData, points: Float[np.ndarray, "points 3 3"]
+    nodes: int, points: PointCurvature, curvature: Float[np.ndarray, "points 3 3"]
 ) -> scipy.sparse.csr_matrix:
-    """Σ_q C_q N_a N_b: a curvature in the places of the quadrature points as one in all nodes."""
-    quadrature = data.quadrature
-    count = len(points)
-    weights = np.broadcast_to(np.asarray(quadrature.barycentric)[:, None], (count, 3, 4))
-    columns = 3 * mesh.cells[np.asarray(quadrature.cells)][:, None] + np.arange(3)[:, None]
-    shape, starts = (3 * count, 3 * len(mesh.points)), np.arange(0, 12 * count + 1, 4)
+    """Σ_q C_q N_a N_b: a curvature in the places of points as one in all nodes."""
+    count = len(curvature)
+    weights = np.broadcast_to(np.asarray(points.weights)[:, None], (count, 3, 4))
+    columns = 3 * np.asarray(points.nodes)[:, None] + np.arange(3)[:, None]
+    shape, starts = (3 * count, 3 * nodes), np.arange(0, 12 * count + 1, 4)
     P = scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=shape)
-    C = scipy.sparse.bsr_matrix((points, np.arange(count), np.arange(count + 1)))
+    C = scipy.sparse.bsr_matrix((curvature, np.arange(count), np.arange(count + 1)))
     return (P.T @ (C.tocsr() @ P)).tocsr()
-
-
-@jax.jit
-def _first_order(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3 3"]:
-    """Gauss–Newton's curvature of E_s/T_s in every place x_q + u(x_q), tempered: 2 w ∇m ∇mᵀ/T_s, 1/mm²."""
-    gradient = _slope(data, _places(data, u))
-    weights = data.independent_share / data.t_similarity * 2 * data.quadrature.weights
-    return weights[:, None, None] * gradient[:, :, None] * gradient[:, None]
-
-
-@partial(jax.jit, static_argnums=0)
-def _second_order(
-    similarity: str, data: RegistrationData, u: Float[AnyArray, "nodes 3"]
-) -> Float[AnyArray, "points 3 3"]:
-    """What the exact curvature has besides. With e(m) the energy of a point it is e″ ∇m ∇mᵀ + e′ ∇²m."""
-    moved, weights = _places(data, u), data.quadrature.weights
-
-    def energy_slope(values: AnyArray) -> AnyArray:
-        noise = Noise(data.t_similarity, data.degrees_of_freedom)
-        energy = SIMILARITIES[similarity].energy
-        return jax.grad(lambda m: energy(data.fixed_values, m, weights, noise))(values)
-
-    slope = partial(_slope, data)
-    gradient, values = slope(moved), data.moving(moved)
-    columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    first, second = jax.jvp(energy_slope, (values,), (jnp.ones_like(values),))
-    outer = gradient[:, :, None] * gradient[:, None]
-    remainder = (second - 2 * weights)[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
-    return data.independent_share / data.t_similarity * remainder
-
-
-def _places(data: RegistrationData, u: AnyArray) -> AnyArray:
-    return data.positions + data.quadrature.interpolation(u)
-
-
-def _slope(data: RegistrationData, places: AnyArray) -> AnyArray:
-    """∇m."""
-    return jax.grad(lambda x: data.moving(x).sum())(places)

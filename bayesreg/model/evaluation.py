@@ -1,17 +1,16 @@
-"""The program evaluated: its log density, the terms of it, and what is found on the way."""
+"""The program evaluated: its log density, its terms, and what is found on the way."""
 
 from __future__ import annotations
 
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 from numpyro.infer.util import log_density
 
-from bayesreg.model.coordinates import FIELD, LAME
-from bayesreg.model.program import RegistrationData, log_elastic_normaliser, registration
+from bayesreg.model.program import Problem, registration
+from bayesreg.model.state import physical_values
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -25,7 +24,8 @@ class Evaluation(NamedTuple):
     u : (n, 3) array
         Displacement of every node, mm.
     similarity_energy, strain_energy : scalars
-        E_s and E_r; with "student_t" E_s is −T_s times the log of the likelihood without its normaliser.
+        E_s, summed over the pairs of images, and E_r; with "student_t" E_s is −T_s times the log of the likelihood
+        without its normaliser.
     solver_iterations : scalar integer
     solver_failed, outside_support : scalar bools
         Whether the elastic solve failed; whether a sampled node lies in Ω_SK or a parameter outside the
@@ -41,42 +41,43 @@ class Evaluation(NamedTuple):
     outside_support: Bool[AnyArray, ""]
 
 
-@partial(jax.jit, static_argnames="similarity")
+@jax.jit
 def evaluate(
-    data: RegistrationData,
-    values: dict[str, AnyArray],
-    similarity: str,
-    guess: Float[AnyArray, "nodes 3"] | None = None,
+    problem: Problem, values: dict[str, AnyArray], guess: Float[AnyArray, "nodes 3"] | None = None
 ) -> Evaluation:
     """The density of values and what was found on the way; a guess of u saves iterations and costs the derivative."""
-    total, trace = log_density(registration, (data, similarity, guess), {}, values)
-    found = {name: trace[name]["value"] for name in Evaluation._fields if name != "logdensity"}
+    total, trace = log_density(registration, (problem, guess), {}, values)
+    names = ("u", "strain_energy", "solver_iterations", "solver_failed", "outside_support")
+    found = {name: trace[name]["value"] for name in names}
     # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
-    return Evaluation(logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), **found)
-
-
-@partial(jax.jit, static_argnames="similarity")
-def terms(data: RegistrationData, values: dict[str, AnyArray], similarity: str) -> dict[str, Scalar]:
-    """Every term of the log density by name, and the energies behind them."""
-    _, trace = log_density(registration, (data, similarity), {}, values)
-    terms = {name: trace[name]["value"] for name in ("similarity_energy", "strain_energy")}
-    for name in (name for name in trace if name.startswith("log_")):
-        terms[name] = trace[name]["fn"].log_prob(trace[name]["value"])
-    for name in (name for name in (*LAME, *data.scales, "field") if name in values):
-        terms[f"log_prior_{name}"] = trace[name]["fn"].log_prob(values[name])
-    return terms
+    return Evaluation(
+        logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), similarity_energy=_similarity_energy(trace), **found
+    )
 
 
 @jax.jit
-def log_normaliser(data: RegistrationData, values: dict[str, AnyArray]) -> Scalar:
+def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
+    """Every factor of the density by name, and the energies behind them."""
+    _, trace = log_density(registration, (problem,), {}, values)
+    found = {"similarity_energy": _similarity_energy(trace), "strain_energy": trace["strain_energy"]["value"]}
+    for name in (*problem.terms, "support", "solved"):
+        found[name] = trace[name]["fn"].log_prob(trace[name]["value"]).sum()
+    for name, block in problem.blocks.items():
+        if block.is_sampled and name != "u_boundary":
+            found[f"prior_{name}"] = trace[name]["fn"].log_prob(values[name])
+    return found
+
+
+def _similarity_energy(trace: dict[str, Any]) -> Scalar:
+    sites = (site for site in trace.values() if hasattr(site.get("fn"), "energy"))
+    return sum((site["fn"].energy(site["value"]) for site in sites), jnp.zeros(()))
+
+
+@jax.jit
+def log_normaliser(problem: Problem, values: dict[str, AnyArray]) -> Scalar:
     """½ log pdet S(λ, μ) − r/2 log(2π T_r); zero where the density is not normalised."""
-    field = {name: values[name] for name in FIELD if name in values}
-    t_elastic = values.get("t_elastic", data.t_elastic)
-    return log_elastic_normaliser(data, values["lam"], values["mu"], t_elastic, **field)
-
-
-@jax.jit
-def residuals(data: RegistrationData, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
-    """f(x_q) − m(x_q + u(x_q))."""
-    displacement = data.quadrature.interpolation(u)
-    return data.fixed_values - data.moving(data.positions + displacement)
+    elastic = problem.terms.get("elastic")
+    if elastic is None or elastic.determinant is None:
+        return jnp.zeros(())
+    lam, mu = problem.body.lame_by_cell(physical_values(problem.body, problem.blocks, values))
+    return elastic.log_normaliser(problem.body.system.elements, lam, mu, values["t_elastic"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,79 +14,155 @@ from scipy.special import betaln
 from bayesreg.distance import MARGIN, shared_distance
 from bayesreg.fem.determinant import schur_determinant
 from bayesreg.fem.elasticity import rigid_modes
-from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
 from bayesreg.fem.equilibrium import elastic_system
-from bayesreg.fem.location import locate
 from bayesreg.fem.operators import sparse_operator
-from bayesreg.image import Image, Interpolation, Interpolator
+from bayesreg.image import Image, Interpolator
 from bayesreg.mesh import TetMesh
-from bayesreg.model.constraint import is_allowed
-from bayesreg.model.field import stiffness_field
+from bayesreg.model.blocks import (
+    LAME,
+    Blocks,
+    Displacement,
+    FieldComponents,
+    FieldScale,
+    FreeEntries,
+    LameParameter,
+    Scale,
+)
+from bayesreg.model.field import StiffnessField, stiffness_field
 from bayesreg.model.options import FieldConfig, Lame, ModelConfig, PriorConfig, TemperaturePrior, of_tissue
-from bayesreg.model.program import LameParameter, RegistrationData
+from bayesreg.model.program import Problem
+from bayesreg.model.state import Body, StaticMesh
+from bayesreg.model.terms.elastic import ElasticPrior
+from bayesreg.model.terms.images import ImagePair
+from bayesreg.model.terms.landmarks import Landmarks
+from bayesreg.model.terms.rigid import RigidPrior
+from bayesreg.model.terms.skull import Skull, is_allowed
+from bayesreg.model.terms.term import Outside, Term, Terms
 from bayesreg.types import AnyArray, InputError
 
+# Names of blocks and of the other factors of the program.
+TAKEN = (
+    "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "field", "field_sd", "elastic", "rigid", "skull",
+    "support", "solved", "u", "strain_energy", "similarity_energy",
+)  # fmt: skip
 # The solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
 TOLERANCE = 1e-10
 
 
-def registration_data(
-    fixed: Image,
-    moving: Image,
+def problem_of(
     mesh: TetMesh,
+    observations: Sequence[Any],
     model: ModelConfig,
     skull: Image | None,
     reference: Mapping[str, AnyArray] | None,
-) -> tuple[RegistrationData, Int[np.ndarray, "sampled"]]:
+) -> tuple[Problem, Int[np.ndarray, "sampled"]]:
     """All arrays of the problem, and the sampled nodes; see `bayesreg.build_posterior`."""
-    require_overlap(mesh, fixed, "fixed image")
-    require_overlap(mesh, moving, "moving image")
     sampled, held = sampled_nodes(mesh, model)
     require_proper(mesh, model)
+    field = stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None
+    blocks = _blocks(mesh, model, sampled, field, reference)
+    body = _body(mesh, model, sampled, held, field, blocks)
+    # The observations first: what is wrong with them is told before anything that takes long.
+    terms = {**observation_terms(mesh, observations, model), **_priors(mesh, model, sampled, held, skull)}
+    return Problem(body, blocks, terms), sampled
+
+
+def _blocks(
+    mesh: TetMesh,
+    model: ModelConfig,
+    sampled: Int[np.ndarray, "sampled"],
+    field: StiffnessField | None,
+    reference: Mapping[str, AnyArray] | None,
+) -> Blocks:
+    blocks: Blocks = {
+        "u_boundary": Displacement(jnp.asarray(mesh.points[sampled])),
+        "lam": lame_parameter("lam", mesh, model, reference),
+        "mu": lame_parameter("mu", mesh, model, reference),
+        "t_similarity": _temperature(model.t_similarity),
+        "t_elastic": _temperature(model.t_elastic),
+    }
+    if field is not None:
+        blocks |= {"field": FieldComponents(jnp.zeros(field.basis.shape[1])), "field_sd": FieldScale(field.sd_scale)}
+    return blocks
+
+
+def _temperature(given: float | TemperaturePrior) -> Scale:
+    if isinstance(given, TemperaturePrior):
+        return Scale(jnp.asarray(given.median), jnp.asarray(given.log_sd))
+    return Scale(jnp.asarray(given))
+
+
+def _body(
+    mesh: TetMesh,
+    model: ModelConfig,
+    sampled: Int[np.ndarray, "sampled"],
+    held: Mapping[int, tuple[float, float, float]],
+    field: StiffnessField | None,
+    blocks: Blocks,
+) -> Body:
     prescribed = np.union1d(sampled, list(held)).astype(int)
-    lam, mu = (lame_parameter(name, mesh, model, reference) for name in ("lam", "mu"))
-    entry = cell_entries(mesh, model)
-    quadrature = quadrature_of(mesh, fixed, model)
-    positions = quadrature.positions(mesh)
+    slots = np.searchsorted(prescribed, sampled)
     displacement = np.zeros((len(prescribed), 3))
     displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
-    distance = None if skull is None or not len(sampled) else skull_distance(skull, mesh, sampled)
-    slots = np.searchsorted(prescribed, sampled)
-    data = RegistrationData(
-        system=elastic_system(
-            mesh, prescribed, np.asarray(lam.reference)[entry], np.asarray(mu.reference)[entry], TOLERANCE
-        ),
+    entry = cell_entries(mesh, model)
+    lam, mu = (np.asarray(blocks[name].reference())[entry] for name in LAME)
+    return Body(
+        mesh=StaticMesh(mesh),
+        system=elastic_system(mesh, prescribed, lam, mu, TOLERANCE),
         cell_entry=jnp.asarray(entry),
-        lam=lam,
-        mu=mu,
-        field=stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None,
-        moving=moving.interpolator(model.interpolation),
-        skull_distance=distance,
-        quadrature=quadrature,
-        positions=jnp.asarray(positions),
-        fixed_values=fixed.interpolate(positions, model.interpolation),
-        points_sampled=jnp.asarray(mesh.points[sampled]),
+        field=field,
         slots=jnp.asarray(slots),
         placed=sparse_operator(scipy.sparse.eye_array(len(prescribed), format="csc")[:, slots]),
         held=jnp.asarray(displacement),
-        rigid_modes=jnp.asarray(rigid_modes(mesh.points[sampled]) if len(sampled) else np.zeros((0, 6))),
-        rigid_sd=jnp.asarray(np.inf if model.rigid_sd is None else model.rigid_sd),
-        t_similarity=jnp.asarray(_centre(model.t_similarity)),
-        t_elastic=jnp.asarray(_centre(model.t_elastic)),
-        temperature_log_sd={
-            name: jnp.asarray(prior.log_sd)
-            for name, prior in (("t_similarity", model.t_similarity), ("t_elastic", model.t_elastic))
-            if isinstance(prior, TemperaturePrior)
-        },
-        degrees_of_freedom=jnp.asarray(model.degrees_of_freedom),
-        independent_share=jnp.asarray(independent_share(model, len(positions))),
-        determinant=schur_determinant(mesh, sampled, np.array(list(held), int)) if model.normalised else None,
     )
-    return data, sampled
 
 
-def _centre(temperature: float | TemperaturePrior) -> float:
-    return temperature.median if isinstance(temperature, TemperaturePrior) else temperature
+def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelConfig) -> Terms:
+    """The terms of observations by name.
+
+    Raises
+    ------
+    InputError
+        If one is no observation, or two have one name, or one has a name that is taken.
+    """
+    terms: Terms = {}
+    for observation in observations:
+        term: Any
+        if isinstance(observation, ImagePair):
+            term = observation.on(mesh, model)
+        elif isinstance(observation, Landmarks):
+            term = observation.on(mesh)
+        elif isinstance(observation, Term):
+            term = Outside(observation)
+        else:
+            raise InputError(
+                f"an observation needs a name and a function log(state); got {type(observation).__name__}: use "
+                "ImagePair, Landmarks, or an object of your own with both"
+            )
+        if term.name in terms or term.name in TAKEN:
+            raise InputError(f"the name {term.name!r} of an observation is taken; give another one")
+        terms[term.name] = term
+    return terms
+
+
+def _priors(
+    mesh: TetMesh,
+    model: ModelConfig,
+    sampled: Int[np.ndarray, "sampled"],
+    held: Mapping[int, tuple[float, float, float]],
+    skull: Image | None,
+) -> Terms:
+    """Elastic prior, rigid prior and skull. Where u_B is given none is there: u_I follows from it, λ and μ."""
+    terms: Terms = {}
+    if not len(sampled):
+        return terms
+    determinant = schur_determinant(mesh, sampled, np.array(list(held), int)) if model.normalised else None
+    terms["elastic"] = ElasticPrior(determinant)
+    if model.rigid_sd is not None:
+        terms["rigid"] = RigidPrior(jnp.asarray(rigid_modes(mesh.points[sampled])), jnp.asarray(model.rigid_sd))
+    if skull is not None:
+        terms["skull"] = Skull(skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled]))
+    return terms
 
 
 def require_proper(mesh: TetMesh, model: ModelConfig) -> None:
@@ -94,37 +171,6 @@ def require_proper(mesh: TetMesh, model: ModelConfig) -> None:
         model.require_proper_priors(mesh.names)
     except ValueError as error:
         raise InputError(f"model.priors: {error}") from None
-
-
-def independent_share(model: ModelConfig, points: int) -> float:
-    """Effective number of independent quadrature points over the number of all.
-
-    Raises
-    ------
-    InputError
-        If there are fewer points than are said to be independent.
-    """
-    if model.independent_points is None:
-        return 1.0
-    if model.independent_points > points:
-        raise InputError(
-            f"model.independent_points is {model.independent_points:g}, but the quadrature has {points} points; "
-            "give at most as many, or null for all"
-        )
-    return model.independent_points / points
-
-
-def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
-    """Raise InputError if less than half of the mesh's nodes lie on the image's grid."""
-    inside = image.contains(mesh.points)
-    if inside.mean() < 0.5:
-        corners = image.voxel_to_world(np.array([(0, 0, 0), np.array(image.shape) - 1]))
-        raise InputError(
-            f"the {name} and the mesh do not overlap: {inside.sum()} of {len(inside)} nodes lie on its grid. It runs "
-            f"from {corners[0].round(1).tolist()} to {corners[1].round(1).tolist()} mm (world RAS), the mesh from "
-            f"{mesh.points.min(0).round(1).tolist()} to {mesh.points.max(0).round(1).tolist()} mm; "
-            "check the affines, or align the images first"
-        )
 
 
 def skull_distance(skull: Image, mesh: TetMesh, sampled: Int[np.ndarray, "sampled"]) -> Interpolator:
@@ -226,8 +272,8 @@ def lame_parameter(
         low=jnp.array([float(p.low) for p in prior]),
         high=jnp.array([float(p.high) for p in prior]),
         log_beta=jnp.asarray(betaln(alpha, beta)),
-        is_free=jnp.array([k is None for k in known]),
-        reference=jnp.asarray(values),
+        free=FreeEntries(np.array([k is None for k in known])),
+        at_rest=jnp.asarray(values),
     )
 
 
@@ -257,36 +303,3 @@ def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: 
     tissues = {"uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
     found = (of_tissue(model, given, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
     return [default if value is None else value for value in found]
-
-
-def sparsely_compared(
-    data: RegistrationData, mesh: TetMesh, fixed: Image, interpolation: Interpolation
-) -> RegistrationData:
-    """The data with the images compared at four points of every tetrahedron."""
-    quadrature = gauss_quadrature(mesh, "gauss4")
-    positions = quadrature.positions(mesh)
-    return data._replace(
-        quadrature=quadrature,
-        positions=jnp.asarray(positions),
-        fixed_values=fixed.interpolate(positions, interpolation),
-    )
-
-
-def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature:
-    """The rule that the options name.
-
-    Raises
-    ------
-    InputError
-        If the rule is "voxels" and no voxel centre lies inside the mesh.
-    """
-    if model.quadrature in GAUSS_SUBDIVISIONS:
-        return gauss_quadrature(mesh, model.quadrature)
-    centres = fixed.grid_points().reshape(-1, 3)
-    near = centres[((centres >= mesh.points.min(axis=0)) & (centres <= mesh.points.max(axis=0))).all(axis=1)]
-    cells, barycentric = locate(mesh.points, mesh.cells, near)
-    inside = cells >= 0
-    if not inside.any():
-        raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
-    weights = np.full(inside.sum(), fixed.voxel_volume)
-    return quadrature_at(mesh, cells[inside], barycentric[inside], weights)

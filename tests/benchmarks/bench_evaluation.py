@@ -43,10 +43,10 @@ from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh
 from bayesreg.io.store import Inputs
 from bayesreg.mesh import TetMesh
-from bayesreg.model.coordinates import complete
+from bayesreg.model.blocks import completed
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior, build_posterior
-from bayesreg.model.program import RegistrationData, _by_cell, prescribed
+from bayesreg.model.program import Problem as Data
 from bayesreg.preparation import prepare
 from tests.benchmarks import floor
 from tests.benchmarks.bench_sampling import _median
@@ -88,7 +88,7 @@ class Problem(NamedTuple):
     mesh: str
     interpolation: str
     posterior: Posterior
-    data: RegistrationData
+    data: Data
 
     @property
     def told(self) -> dict[str, Any]:
@@ -97,7 +97,7 @@ class Problem(NamedTuple):
             "mesh": self.mesh,
             "interpolation": self.interpolation,
             "nodes": len(self.posterior.mesh.points),
-            "quadrature_points": len(self.data.quadrature.weights),
+            "quadrature_points": len(self.posterior.images.quadrature.weights),
         }
 
     @property
@@ -184,11 +184,11 @@ def _places(mesh: str, interpolation: str, chains: int) -> Places:
     posterior = problem.posterior
     positions = scattered(posterior, chains)
 
-    def settled(data: RegistrationData, position: dict[str, jax.Array]) -> Any:
-        values = complete(data, posterior.constrain_of(data, position), posterior.free)
-        lam, mu = _by_cell(data, values["lam"], values["mu"])
-        given = prescribed(data, values["u_boundary"])
-        found = equilibrium(data.system, lam, mu, given)
+    def settled(data: Data, position: dict[str, jax.Array]) -> Any:
+        values = completed(data.blocks, posterior.constrain_of(data, position))
+        lam, mu = data.body.lame_by_cell(values)
+        given = data.body.prescribed(values["u_boundary"])
+        found = equilibrium(data.body.system, lam, mu, given)
         return lam, mu, given, found.u, found.iterations
 
     return Places(positions, *jax.jit(jax.vmap(settled, in_axes=(None, 0)))(problem.data, positions))
@@ -221,12 +221,12 @@ def bench_evaluation(problem: Problem, places: Places, part: str, peer: str | No
 def program(problem: Problem, places: Places, part: str) -> tuple[Any, tuple[Any, ...]]:
     """A part of the density of all chains, jitted, as a function of the data and of what is each chain's, and that."""
 
-    def solve(data: RegistrationData, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
-        return equilibrium(data.system, lam, mu, given).u
+    def solve(data: Data, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
+        return equilibrium(data.body.system, lam, mu, given).u
 
-    def similarity(data: RegistrationData, u: jax.Array) -> jax.Array:
-        moved = data.moving(data.positions + data.quadrature.interpolation(u))
-        return data.quadrature.weights @ (data.fixed_values - moved) ** 2
+    def similarity(data: Data, u: jax.Array) -> jax.Array:
+        images = data.terms["images"]
+        return images.quadrature.weights @ images.residuals(u) ** 2
 
     density = problem.posterior.logdensity_of
     one, each = {
@@ -261,10 +261,10 @@ def at_one_place(problem: Problem, places: Places, peer: str) -> tuple[Callable[
         density = log_density(posterior.mesh, posterior.fixed, posterior.moving, order, SOLVERS[peer])
         assert np.isclose(density(*arguments), float(posterior.logdensity_constrained(values)), rtol=1e-9)
         return density, arguments
-    data = problem.data
-    points = data.positions + data.quadrature.interpolation(posterior.evaluate(values).u)
+    images = posterior.images
+    points = images.places(posterior.evaluate(values).u)
     image, arguments = _image(posterior.moving, order), [np.asarray(points)]
-    assert np.allclose(image(*arguments), data.moving(points), rtol=1e-9)
+    assert np.allclose(image(*arguments), images.moving(points), rtol=1e-9)
     return image, arguments
 
 

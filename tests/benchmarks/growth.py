@@ -93,7 +93,7 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     iterations = jax.jit(jax.vmap(evaluated, in_axes=(None, 0)))(data, positions).solver_iterations
     return {
         "nodes": len(posterior.mesh.points),
-        "points": len(posterior.data.quadrature.weights),
+        "points": len(posterior.images.quadrature.weights),
         "iterations": int(iterations.max()),
         "density": density,
         "gradient": gradient,

@@ -80,7 +80,7 @@ def judged(found: Phantom, post: br.Posterior, idata) -> dict[str, float]:
     """The figures of the acceptance: means over the volume, shares of elements."""
     draws = idata.posterior
     stacked = [draws[name].values.reshape(-1, *draws[name].shape[2:]) for name in ("field_sd", "field")]
-    factor = np.exp(stacked[0][:, None] * (stacked[1] @ np.asarray(post.data.field.basis).T))
+    factor = np.exp(stacked[0][:, None] * (stacked[1] @ np.asarray(post.data.body.field.basis).T))
     mean, likely, stiff, volumes = factor.mean(axis=0), (factor > 1.5).mean(axis=0), found.stiff, found.mesh.volumes
     inside, outside = (float(np.average(mean[which], weights=volumes[which])) for which in (stiff, ~stiff))
     return {
@@ -121,7 +121,7 @@ def main() -> None:
     figures = judged(found, post, samples.idata)
     diagnosed = convergence(samples.idata)
     figures |= {
-        "share_of_variance": float(post.data.field.share),
+        "share_of_variance": float(post.data.body.field.share),
         "rhat": max(float(part.max()) for part in sampled(diagnosed.rhat)),
         "ess_bulk": min(float(part.min()) for part in sampled(diagnosed.ess_bulk)),
         "ess_tail": min(float(part.min()) for part in sampled(diagnosed.ess_tail)),

@@ -31,8 +31,7 @@ from bayesreg.inference.run import checkpoint_from_arrays
 from bayesreg.inference.samplers import chosen_sampler
 from bayesreg.inference.whitened import clearance_of, whitened_density, whitened_position
 from bayesreg.io import store
-from bayesreg.model.coordinates import complete
-from bayesreg.model.program import _by_cell, prescribed
+from bayesreg.model.blocks import completed
 from tests.benchmarks.bench_sampling import _median
 
 APART = 0.01  # In whitened coordinates.
@@ -47,7 +46,12 @@ def main() -> None:
     config = br.load_config(given.run / "config.yaml")
     posterior, options = posterior_of(config, store.read_inputs(given.run)), config.sampler
     arrays = store.load_state(given.run)
-    if options.name != "hmc" or posterior.options.similarity != "ssd" or posterior.data.field is not None or not arrays:
+    if (
+        options.name != "hmc"
+        or posterior.options.similarity != "ssd"
+        or posterior.data.body.field is not None
+        or not arrays
+    ):
         parser.error("RUN must be a run of hmc that has begun, with Gaussian noise and without a field of stiffness")
     arrays.pop("blocks")
     end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
@@ -106,26 +110,24 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
 
     def values_of(xi: jax.Array) -> Any:
         estimands = posterior.constrain_of(data, whitened_position(posterior, setup.reference, xi))
-        values = complete(data, estimands, posterior.free)
-        lam, mu = _by_cell(data, values["lam"], values["mu"])
-        return lam, mu, prescribed(data, values["u_boundary"])
+        values = completed(data.blocks, estimands)
+        return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 
     lam, mu, given = jax.jit(jax.vmap(values_of))(places)
-    u = jax.jit(jax.vmap(lambda *x: equilibrium(data.system, *x).u))(lam, mu, given)
+    u = jax.jit(jax.vmap(lambda *x: equilibrium(data.body.system, *x).u))(lam, mu, given)
     back = jax.random.normal(jax.random.key(3), u.shape)
 
     def solve(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
-        return equilibrium(data.system, lam, mu, given).u
+        return equilibrium(data.body.system, lam, mu, given).u
 
     def adjoint(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array, back: jax.Array) -> Any:
         return jax.vjp(partial(solve, data), lam, mu, given)[1](back)
 
     def images(data: Any, u: jax.Array) -> jax.Array:
-        moved = data.moving(data.positions + data.quadrature.interpolation(u))
-        return data.quadrature.weights @ (data.fixed_values - moved) ** 2
+        return data.terms["images"].quadrature.weights @ data.terms["images"].residuals(u) ** 2
 
     def strain(data: Any, lam: jax.Array, mu: jax.Array, u: jax.Array) -> jax.Array:
-        return total_strain_energy(data.system.elements, lam, mu, u)
+        return total_strain_energy(data.body.system.elements, lam, mu, u)
 
     timed("density", density, (data, setup), places)
     timed("density and gradient", jax.value_and_grad(density, argnums=2), (data, setup), places)

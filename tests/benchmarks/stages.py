@@ -34,7 +34,7 @@ from bayesreg.fem import equilibrium
 from bayesreg.fem.elasticity import stiffness, unknowns_of
 from bayesreg.inference.random_walk import _normal_step
 from bayesreg.io import store
-from bayesreg.model.coordinates import complete
+from bayesreg.model.blocks import completed
 from bayesreg.model.posterior import Posterior
 from tests.benchmarks.bench_effective_draws import STEPS, estimands_of
 from tests.benchmarks.parts import timed
@@ -60,14 +60,15 @@ def main() -> None:
 def frozen(posterior: Posterior, data: Any, places: dict[str, jax.Array]) -> None:
     """A gradient in the displacements with a chain's own R and S, beside one with solve and adjoint."""
     chains = len(places["u_boundary"])
-    every = jax.vmap(lambda place: complete(posterior.data, place, posterior.free))(places)
+    every = jax.vmap(lambda place: completed(posterior.data.blocks, place))(places)
     parameters = [{name: np.asarray(every[name][i]) for name in ("lam", "mu")} for i in range(chains)]
     began = time.perf_counter()
     made = [matrices(posterior, **each) for each in parameters]
     seconds = time.perf_counter() - began
     responses, forms = (jnp.asarray(np.stack(each)) for each in zip(*made, strict=True))
-    temperature = data.t_similarity, data.t_elastic
-    free, slots = np.asarray(data.system.free), np.asarray(posterior.sampled)
+    temperature = [data.blocks[name].reference() for name in ("t_similarity", "t_elastic")]
+    images = data.terms["images"]
+    free, slots = np.asarray(data.body.system.free), np.asarray(posterior.sampled)
 
     def usual(data: Any, place: dict[str, jax.Array], u: jax.Array) -> jax.Array:
         return posterior.evaluate_estimands(data, place | {"u_boundary": u}).logdensity
@@ -75,8 +76,7 @@ def frozen(posterior: Posterior, data: Any, places: dict[str, jax.Array]) -> Non
     def given(data: Any, response: jax.Array, form: jax.Array, u: jax.Array) -> jax.Array:
         nodes = jnp.zeros((len(posterior.mesh.points), 3)).at[slots].set(u)
         nodes = nodes.at[free].set((response @ u.ravel()).reshape(-1, 3))
-        moved = data.moving(data.positions + data.quadrature.interpolation(nodes))
-        similarity = data.quadrature.weights @ (data.fixed_values - moved) ** 2
+        similarity = images.quadrature.weights @ images.residuals(nodes) ** 2
         return -similarity / temperature[0] - u.ravel() @ form @ u.ravel() / (2 * temperature[1])
 
     u = places["u_boundary"]
@@ -92,7 +92,7 @@ def frozen(posterior: Posterior, data: Any, places: dict[str, jax.Array]) -> Non
 def matrices(posterior: Posterior, lam: np.ndarray, mu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """R = −K_II⁻¹ K_IB and S = K_BB + K_BI R."""
     matrix = stiffness(posterior.mesh, lam, mu)
-    free, sampled = (unknowns_of(np.asarray(x)) for x in (posterior.data.system.free, posterior.sampled))
+    free, sampled = (unknowns_of(np.asarray(x)) for x in (posterior.data.body.system.free, posterior.sampled))
     factor = scipy.linalg.cho_factor(matrix[free][:, free].toarray(), check_finite=False)
     response = -scipy.linalg.cho_solve(factor, matrix[free][:, sampled].toarray(), check_finite=False)
     return response, matrix[sampled][:, sampled].toarray() + matrix[sampled][:, free] @ response
@@ -116,14 +116,16 @@ def two_stages(posterior: Posterior, data: Any, places: dict[str, jax.Array], pr
         found = jax.tree.map(jnp.add, places, moves)
         return found, jax.vmap(posterior.supports, in_axes=(None, 0))(data, found)
 
+    images, values = data.terms["images"], posterior.reference()
     times: dict[str, list[float]] = {"first": [], "full": []}
     gains, off, iterations = [], [], []
     for key in jax.random.split(jax.random.key(0), proposals):
         proposal, inside = jax.block_until_ready(proposed(key))
         rough, exact = (_timed(f, times[n], data, proposal, states.u) for f, n in ((first, "first"), (whole, "full")))
         gain = np.asarray(exact.logdensity - states.logdensity)[np.asarray(inside)]
-        similarity = data.independent_share * (rough.similarity_energy - exact.similarity_energy) / data.t_similarity
-        error = similarity + (rough.strain_energy - exact.strain_energy) / data.t_elastic
+        similarity = rough.similarity_energy - exact.similarity_energy
+        similarity *= images.independent_share / values["t_similarity"]
+        error = similarity + (rough.strain_energy - exact.strain_energy) / values["t_elastic"]
         gains.append(gain)
         off.append(-np.asarray(error)[np.asarray(inside)])
         iterations.append(np.asarray(exact.solver_iterations))

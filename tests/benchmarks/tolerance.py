@@ -79,8 +79,9 @@ def at_draws(folder: Path) -> None:
     evaluate = jax.jit(posterior.evaluate_estimands)
 
     def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-        system = data.system._replace(tolerance=jnp.asarray(tolerance))
-        evaluations = [evaluate(data._replace(system=system), e) for e in estimands]
+        system = data.body.system._replace(tolerance=jnp.asarray(tolerance))
+        tight = data._replace(body=data.body._replace(system=system))
+        evaluations = [evaluate(tight, e) for e in estimands]
         return np.array([(float(e.logdensity), int(e.solver_iterations)) for e in evaluations]).T
 
     exact, _ = found(1e-12)

@@ -18,7 +18,7 @@ from bayesreg.inference.laplace import Reference, laplace
 from bayesreg.inference.loose import loose
 from bayesreg.inference.normaliser import stand_in
 from bayesreg.inference.whitened import Setup, setup_about
-from tests.calibration.simulator import MESH, Simulator, draw_data
+from tests.calibration.simulator import MESH, Simulator, draw_data, observing
 
 # Every third node's displacement is looked at: neighbours say much the same.
 NODES = np.arange(0, len(MESH.boundary), 3)
@@ -36,7 +36,7 @@ Estimands = dict[str, Any]
 def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
     """What is looked at: parameters, some displacements, E_s and the log density."""
     entries = [f"{name} {posterior.entry_names[i]}" for name, free in posterior.free.items() for i in free]
-    warm = [name for name in PARAMETERS if name in posterior.data.temperature_log_sd]
+    warm = [name for name in PARAMETERS if name not in posterior.free and posterior.data.blocks[name].is_sampled]
     nodes = [f"u{posterior.sampled[node]} {axis}" for node in NODES for axis in "xyz"]
     return (*entries, *warm, *nodes, "E_s", "log p")
 
@@ -49,7 +49,7 @@ def quantities(estimands: Estimands, evaluation: Any) -> Any:
 
 
 def quantities_at(posterior: br.Posterior, data: Any, observed: Any, estimands: Estimands) -> Any:
-    return quantities(estimands, posterior.evaluate_estimands(data._replace(fixed_values=observed), estimands))
+    return quantities(estimands, posterior.evaluate_estimands(observing(data, observed), estimands))
 
 
 def of_posterior(posterior: br.Posterior, estimands: Estimands) -> Estimands:
@@ -68,7 +68,7 @@ def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Reference:
     truth = simulator.draw_prior(np.random.default_rng(1000), 1)
     observed = simulated(simulator.posterior, simulator.posterior.data, truth, jax.random.key(1000))[0]
     at_rest = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
-    return laplace(posterior, np.asarray(at_rest), posterior.data._replace(fixed_values=observed))
+    return laplace(posterior, np.asarray(at_rest), observing(posterior.data, observed))
 
 
 def setups_about(

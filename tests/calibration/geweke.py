@@ -30,7 +30,7 @@ from tests.calibration.chains import (
     quantity_names,
     setups_about,
 )
-from tests.calibration.simulator import Simulator, draw_data
+from tests.calibration.simulator import Simulator, draw_data, observing
 
 SIGNIFICANCE = 0.01
 # In whitened coordinates, about a reference that knows none of the data.
@@ -112,7 +112,7 @@ def _successive(
     """Quantities (chain, k) before the first step and (chain, step, k) after each, and the acceptance of each."""
 
     def observed(key: Any, estimands: Any) -> Any:
-        return data._replace(fixed_values=draw_data(model, truth, key, estimands))
+        return observing(data, draw_data(model, truth, key, estimands))
 
     def chain(given: Any) -> Any:
         key, first = given

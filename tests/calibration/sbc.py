@@ -40,7 +40,7 @@ from tests.calibration.chains import (
     setups_about,
     simulated,
 )
-from tests.calibration.simulator import Simulator
+from tests.calibration.simulator import Simulator, observing
 
 BINS = 10
 LEVELS = (0.5, 0.9)
@@ -174,7 +174,7 @@ def _chains(
     """Quantities (draw, r, k) after the warm-up, and the mean acceptance of each replication."""
     kernel = SAMPLERS[sampler](posterior)
     say("a mode for each replication")
-    problems = [replace(posterior, data=posterior.data._replace(fixed_values=f)) for f in observed]
+    problems = [replace(posterior, data=observing(posterior.data, f)) for f in observed]
     modes = _modes(problems, starts)
     visited = modes[:, None]
     key, key_flight = jax.random.split(key)
@@ -213,7 +213,7 @@ def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, mode
 
     def one(given: Any) -> Estimands:
         setup, observed, mode, key = given
-        here = data._replace(fixed_values=observed)
+        here = observing(data, observed)
         begin = whitened(setup.reference, mode)
         xi, _ = rotated(
             setup.walls, clearance_of(posterior, here, setup), begin, jax.random.normal(key, begin.shape), jnp.pi / 2
@@ -228,7 +228,7 @@ def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, mode
 def _begin(kernel: Sampler, data: Any, setup: Setup, observed: Any, starts: Estimands) -> Any:
     def one(given: Any) -> Any:
         setup, observed, start = given
-        return kernel.init(data._replace(fixed_values=observed), setup, start)
+        return kernel.init(observing(data, observed), setup, start)
 
     return jax.lax.map(one, (setup, observed, starts), batch_size=BATCH)
 
@@ -239,7 +239,7 @@ def _advance(  # type: ignore[no-untyped-def]
 ):
     def one(given: Any) -> Any:
         setup, observed, key, state = given
-        here = data._replace(fixed_values=observed)
+        here = observing(data, observed)
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
         place = ravel_pytree(posterior.unconstrain_of(data, drawn.estimands))[0]

@@ -142,8 +142,12 @@ class Simulator:
 
 def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
     """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
-    u = posterior.evaluate_estimands(posterior.without_normaliser(data), estimands).u
-    predicted = data.moving(data.positions + data.quadrature.interpolation(u))
-    t_similarity = estimands.get("t_similarity", data.t_similarity)
-    sd = jnp.sqrt(t_similarity / (2 * data.quadrature.weights))
-    return predicted + sd * jax.random.normal(key, predicted.shape)
+    u, images = posterior.evaluate_estimands(posterior.without_normaliser(data), estimands).u, data.terms["images"]
+    t_similarity = estimands.get("t_similarity", data.blocks["t_similarity"].reference())
+    sd = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
+    return images.predicted(u) + sd * jax.random.normal(key, sd.shape)
+
+
+def observing(data: Any, fixed_values: Any) -> Any:
+    """The problem with another fixed image, given at the quadrature points."""
+    return data.with_term("images", data.terms["images"]._replace(fixed_values=fixed_values))

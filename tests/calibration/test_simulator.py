@@ -50,11 +50,12 @@ def test_displacements_have_the_pseudo_inverse_for_covariance():
 
 
 def test_energies_of_draws_are_chi_squared():
-    """Twice the elastic and the rigid term of the density under test, at draws of the simulator."""
+    """2 E_r / T_r and twice the rigid term of the density under test, at draws of the simulator."""
     posterior = simulator().posterior
     draws = simulator().draw_prior(np.random.default_rng(1), 150)
     terms = [posterior.energies({name: value[i] for name, value in draws.items()}) for i in range(150)]
-    elastic, rigid = (-2 * np.array([float(term[name]) for term in terms]) for name in ("log_elastic", "log_rigid"))
+    elastic = 2 / T_ELASTIC * np.array([float(term["strain_energy"]) for term in terms])
+    rigid = -2 * np.array([float(term["rigid"]) for term in terms])
     assert stats.kstest(elastic, stats.chi2(3 * len(MESH.boundary) - 6).cdf).pvalue > 1e-3
     assert stats.kstest(rigid, stats.chi2(6).cdf).pvalue > 1e-3
 
@@ -77,7 +78,7 @@ def test_data_are_the_moving_image_at_displaced_points_and_noise(name):
     draws = simulator(name).draw_prior(np.random.default_rng(3), 12)
     observed = np.asarray(simulated(posterior, posterior.data, draws, jax.random.key(0)))
     cells, barycentric, weights = paper.mesh_rule(MESH.points, MESH.cells, "gauss4")
-    moving, residuals = posterior.moving, []
+    moving, residuals = posterior.observations["images"].moving, []
     for i, f in enumerate(observed):
         estimands = {key: value[i] for key, value in draws.items()}
         values = posterior.constrain(posterior.unconstrain_of(posterior.data, estimands))

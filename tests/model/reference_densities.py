@@ -49,8 +49,9 @@ def posterior_of(case: str) -> br.Posterior:
     """The posterior of a case, its solves to 1e-12."""
     skull = flat_skull(MESH.points, 2, float(MESH.points[:, 2].max()) + 9.0) if case in ("tissue", "held") else None
     posterior = br.build_posterior(FIXED, MOVING, MESH, model=br.ModelConfig(**CASES[case]), skull=skull)
-    tight = posterior.data.system._replace(tolerance=jnp.asarray(TOLERANCE), adjoint_tolerance=jnp.asarray(TOLERANCE))
-    return replace(posterior, data=posterior.data._replace(system=tight))
+    body, tight = posterior.data.body, jnp.asarray(TOLERANCE)
+    body = body._replace(system=body.system._replace(tolerance=tight, adjoint_tolerance=tight))
+    return replace(posterior, data=posterior.data._replace(body=body))
 
 
 def flat_positions(case: str, dimension: int) -> np.ndarray:

@@ -60,9 +60,9 @@ def chains():
 
 
 def with_tolerances(data, solve, slope):
-    system = data.system
+    system = data.body.system
     tolerances = {"tolerance": system.tolerance / solve, "adjoint_tolerance": system.adjoint_tolerance / slope}
-    return data._replace(system=system._replace(**tolerances))
+    return data._replace(body=data.body._replace(system=system._replace(**tolerances)))
 
 
 def test_solves_a_hundred_times_as_exact_give_the_same_draws():

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
-from bayesreg.model.constraint import is_allowed
+from bayesreg.model.terms.skull import is_allowed
 from tests.oracles.paper import in_skull
 from tests.phantoms import flat_skull, rotated_affine
 

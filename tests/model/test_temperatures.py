@@ -37,12 +37,12 @@ def values(seed=0, **temperatures):
 def residuals_and_scales(post, state, t_similarity):
     """Residual and √(T_s / 2w) at every quadrature point."""
     r = np.asarray(post.residuals(post.evaluate(state).u))
-    return r, np.sqrt(t_similarity / (2 * np.asarray(post.data.quadrature.weights)))
+    return r, np.sqrt(t_similarity / (2 * np.asarray(post.images.quadrature.weights)))
 
 
 def log_likelihood(post, state):
     terms = post.energies(state)
-    return float(terms["log_similarity"] + terms["log_similarity_normaliser"])
+    return float(terms["images"])
 
 
 @pytest.mark.parametrize("t_similarity", [0.4, 7.0])
@@ -62,7 +62,7 @@ def test_students_t_is_scipys(t_similarity):
     assert log_likelihood(post, state) == pytest.approx(expected, rel=1e-10)
     # Of a known temperature the same but for a constant, and its energy alone.
     known = posterior(t_similarity=t_similarity, similarity="student_t", degrees_of_freedom=NU)
-    difference = log_likelihood(post, state) - float(known.energies(values())["log_similarity"])
+    difference = log_likelihood(post, state) - float(known.energies(values())["images"])
     at_zero = stats.t.logpdf(0 * residuals, NU, scale=scales).sum()
     assert difference == pytest.approx(at_zero, rel=1e-10)
 
@@ -98,7 +98,7 @@ def test_prior_is_scipys_log_normal(name):
     for value in (0.3, 20.0, 4e3):
         state = values(**({"t_similarity": 5.0, "t_elastic": 100.0} | {name: value}))
         expected = stats.lognorm.logpdf(value, prior.get("log_sd", 1.0), scale=prior["median"])
-        assert float(post.energies(state)[f"log_prior_{name}"]) == pytest.approx(expected, rel=1e-12)
+        assert float(post.energies(state)[f"prior_{name}"]) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("similarity", ["ssd", "student_t"])
@@ -110,14 +110,14 @@ def test_gradient(similarity):
 def test_terms_add_up_and_independent_points_temper_the_likelihood():
     options = BOTH | PROPER | {"similarity": "student_t"}
     every = posterior(**options)
-    count = len(every.data.quadrature.weights)
+    count = len(every.images.quadrature.weights)
     few = posterior(**options, independent_points=count / 8)
     state = values(t_similarity=3.0, t_elastic=60.0)
     terms, tempered = every.energies(state), few.energies(state)
     for name, value in terms.items():
-        share = 1 / 8 if name in ("log_similarity", "log_similarity_normaliser") else 1
+        share = 1 / 8 if name == "images" else 1
         assert float(tempered[name]) == pytest.approx(share * float(value), rel=1e-12), name
-    total = sum(float(value) for name, value in tempered.items() if name.startswith("log_"))
+    total = sum(float(value) for name, value in tempered.items() if not name.endswith("_energy"))
     assert float(few.logdensity_constrained(state)) == pytest.approx(total, rel=1e-12)
     with pytest.raises(ValueError, match=f"the quadrature has {count} points"):
         posterior(independent_points=count + 1.0)
@@ -165,7 +165,7 @@ def test_a_temperature_that_is_not_positive_is_outside_the_support(name, value):
 
 
 def test_noise_that_a_temperature_stands_for():
-    weight = float(np.mean(posterior().data.quadrature.weights))
+    weight = float(np.mean(posterior().images.quadrature.weights))
     assert posterior(t_similarity=0.8).implied_noise_sd == pytest.approx(np.sqrt(0.8 / (2 * weight)))
     inferred = posterior(t_similarity={"median": 0.8}, similarity="student_t", degrees_of_freedom=NU)
     assert inferred.implied_noise_sd == pytest.approx(stats.t.std(NU, scale=np.sqrt(0.8 / (2 * weight))))

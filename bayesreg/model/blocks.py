@@ -1,0 +1,424 @@
+"""Blocks of unknowns: what each kind of unknown is called, its prior, and its map to the real line.
+
+Three sets of coordinates name one state (see `bayesreg.Posterior`). A *value* has all entries of a block, known ones
+included; an *estimand* has the sampled entries alone; a *position* is the estimand mapped to the real line. A block
+says how one becomes another. It is a pytree; what decides on shapes is static.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+from jaxtyping import Bool, Float, Int
+from numpyro.distributions import constraints
+
+from bayesreg.model.priors import RangeTransform, ScaledBeta
+from bayesreg.types import AnyArray, Scalar
+
+Values = Mapping[str, AnyArray]
+
+LAME = ("lam", "mu")
+
+
+@runtime_checkable
+class Block(Protocol):
+    """One kind of unknown."""
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether any of its entries is unknown."""
+
+    def draw(self, name: str) -> AnyArray:
+        """Its value in a NumPyro program: a sample site of that name, or what is known."""
+
+    def reference(self) -> AnyArray:
+        """Its value at rest, where chains may start."""
+
+    def complete(self, estimand: AnyArray) -> AnyArray:
+        """The value of an estimand."""
+
+    def estimand(self, value: AnyArray) -> AnyArray:
+        """The sampled entries of a value."""
+
+    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
+        """The estimand of a position, and the logarithm of the Jacobian."""
+
+    def unconstrain(self, estimand: AnyArray) -> AnyArray:
+        """The position of an estimand."""
+
+    def least_curvature(self, position: AnyArray) -> AnyArray:
+        """The curvature of −log density in every coordinate where the data say next to nothing."""
+
+    def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
+        """Whether every sampled entry lies in the range of its prior."""
+
+
+class Displacement(NamedTuple):
+    """Displacements of the sampled nodes, mm, with a flat base measure.
+
+    Attributes
+    ----------
+    points : (b, 3) array
+        Positions of these nodes at rest, mm.
+    """
+
+    points: Float[AnyArray, "sampled 3"]
+
+    @property
+    def is_sampled(self) -> bool:
+        """Always: there may be no node, but what there is is sampled."""
+        return True
+
+    def draw(self, name: str) -> AnyArray:
+        """See `Block`."""
+        return numpyro.sample(name, dist.ImproperUniform(constraints.real_matrix, (), event_shape=self.points.shape))
+
+    def reference(self) -> AnyArray:
+        """No displacement."""
+        return jnp.zeros(self.points.shape)
+
+    def complete(self, estimand: AnyArray) -> AnyArray:
+        """The estimand itself."""
+        return estimand
+
+    def estimand(self, value: AnyArray) -> AnyArray:
+        """The value itself."""
+        return jnp.asarray(value, float)
+
+    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
+        """The position itself."""
+        return position, jnp.zeros(())
+
+    def unconstrain(self, estimand: AnyArray) -> AnyArray:
+        """The estimand itself."""
+        return estimand
+
+    def least_curvature(self, position: AnyArray) -> AnyArray:
+        """One, 1/mm²."""
+        return jnp.ones_like(position)
+
+    def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
+        """Anywhere: walls are a term."""
+        return jnp.array(True)
+
+
+@jax.tree_util.register_static
+class FreeEntries:
+    """Which entries of a block are sampled: static, for shapes follow from it.
+
+    Parameters
+    ----------
+    is_free : (entries,) bool array
+    """
+
+    def __init__(self, is_free: Bool[np.ndarray, "entries"]) -> None:
+        self.is_free = np.asarray(is_free, bool)
+        self.index: Int[np.ndarray, "free"] = np.flatnonzero(self.is_free)
+        self._key = self.is_free.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FreeEntries) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+class LameParameter(NamedTuple):
+    """λ or μ: prior, known entries, and where they start.
+
+    Attributes
+    ----------
+    alpha, beta, low, high : (entries,) arrays
+        Of the scaled Beta prior of each entry.
+    log_beta : (entries,) array
+        log B(α, β).
+    free : FreeEntries
+        The entries that are sampled.
+    at_rest : (entries,) array
+        The known value, or the one at which the interior solve is preconditioned and chains may start, and which is
+        the scale of the coordinate where there is no upper bound.
+    """
+
+    alpha: Float[AnyArray, "entries"]
+    beta: Float[AnyArray, "entries"]
+    low: Float[AnyArray, "entries"]
+    high: Float[AnyArray, "entries"]
+    log_beta: Float[AnyArray, "entries"]
+    free: FreeEntries
+    at_rest: Float[AnyArray, "entries"]
+
+    @property
+    def is_sampled(self) -> bool:
+        """See `Block`."""
+        return bool(self.free.is_free.any())
+
+    def prior(self) -> dist.Distribution:
+        """p(λ) or p(μ); known entries are no part of the density."""
+        beta = ScaledBeta(self.alpha, self.beta, self.low, self.high, self.log_beta)
+        return beta.mask(self.free.is_free).to_event(1)
+
+    def draw(self, name: str) -> AnyArray:
+        """See `Block`."""
+        return numpyro.sample(name, self.prior())
+
+    def reference(self) -> AnyArray:
+        """See `at_rest`."""
+        return jnp.asarray(self.at_rest)
+
+    def complete(self, estimand: AnyArray) -> AnyArray:
+        """All entries."""
+        return jnp.asarray(self.at_rest).at[self.free.index].set(estimand)
+
+    def estimand(self, value: AnyArray) -> AnyArray:
+        """The sampled entries."""
+        return jnp.asarray(value, float)[self.free.index]
+
+    @property
+    def transform(self) -> RangeTransform:
+        """The map from the real line to the sampled entries."""
+        index = self.free.index
+        low, high, scale = (jnp.asarray(x)[index] for x in (self.low, self.high, self.at_rest))
+        return RangeTransform(low, high, scale)
+
+    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
+        """Normal scores to λ or μ."""
+        to_range = self.transform
+        estimand = to_range(position)
+        return estimand, to_range.log_abs_det_jacobian(position, estimand).sum()
+
+    def unconstrain(self, estimand: AnyArray) -> AnyArray:
+        """λ or μ to Normal scores."""
+        return self.transform.inv(estimand)
+
+    def least_curvature(self, position: AnyArray) -> AnyArray:
+        """That of a Normal score, one.
+
+        Without an upper bound a score is scale · z²/2 far out, where its logarithm, which knows no scale, has one.
+        """
+        to_range = self.transform
+        x = to_range(position)
+        growth = jnp.exp(to_range.log_abs_det_jacobian(position, x)) / (x - to_range.low)
+        return jnp.where(jnp.isinf(to_range.high), jnp.minimum(growth, 1.0) ** 2, 1.0)
+
+    def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
+        """Whether the sampled entries lie in [low, high]."""
+        return (~self.free.is_free | ((value >= self.low) & (value <= self.high))).all()
+
+
+class _Positive:
+    """What the positive scalars share: their position is the logarithm."""
+
+    def complete(self, estimand: AnyArray | float) -> AnyArray:
+        """The estimand itself."""
+        return jnp.asarray(estimand)
+
+    def estimand(self, value: AnyArray | float) -> AnyArray:
+        """The value itself."""
+        return jnp.asarray(value, float)
+
+    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
+        """The exponential."""
+        return jnp.exp(position), position
+
+    def unconstrain(self, estimand: AnyArray | float) -> AnyArray:
+        """The logarithm."""
+        return jnp.log(estimand)
+
+    def least_curvature(self, position: AnyArray) -> AnyArray:
+        """One."""
+        return jnp.ones_like(position)
+
+    def allows(self, value: AnyArray | float) -> Bool[AnyArray, ""]:
+        """Whether it is positive and finite."""
+        return jnp.isfinite(value) & (value > 0)
+
+
+@jax.tree_util.register_pytree_node_class
+class Scale(_Positive):
+    """A positive scalar, such as a temperature: known, or with a log-normal prior.
+
+    Parameters
+    ----------
+    median : scalar
+        The known value, or the median of the prior.
+    log_sd : scalar, optional
+        Standard deviation of the logarithm; None means that the value is known.
+    """
+
+    def __init__(self, median: Any, log_sd: Any = None) -> None:
+        self.median, self.log_sd = median, log_sd
+
+    @property
+    def is_sampled(self) -> bool:
+        """See `Block`."""
+        return self.log_sd is not None
+
+    def draw(self, name: str) -> AnyArray:
+        """See `Block`."""
+        if not self.is_sampled:
+            return self.median
+        return numpyro.sample(name, dist.LogNormal(jnp.log(self.median), self.log_sd))
+
+    def reference(self) -> AnyArray:
+        """The median."""
+        return jnp.asarray(self.median)
+
+    def times(self, factor: float) -> Scale:
+        """The same scale, so many times as great."""
+        return Scale(factor * self.median, self.log_sd)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        """Both are data."""
+        return (self.median, self.log_sd), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: Any) -> Scale:
+        """The inverse."""
+        return cls(*children)
+
+
+@jax.tree_util.register_pytree_node_class
+class FieldScale(_Positive):
+    """Standard deviation of the field of log-stiffness, with a half-normal prior.
+
+    Parameters
+    ----------
+    width : scalar
+        Scale of the prior.
+    """
+
+    def __init__(self, width: Any) -> None:
+        self.width = width
+
+    @property
+    def is_sampled(self) -> bool:
+        """Always."""
+        return True
+
+    def draw(self, name: str) -> AnyArray:
+        """See `Block`."""
+        return numpyro.sample(name, dist.HalfNormal(self.width))
+
+    def reference(self) -> AnyArray:
+        """The scale of the prior."""
+        return jnp.asarray(self.width)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        """All of it is data."""
+        return (self.width,), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: Any) -> FieldScale:
+        """The inverse."""
+        return cls(*children)
+
+
+class FieldComponents(NamedTuple):
+    """Whitened components of the field of log-stiffness, independent standard Normal numbers.
+
+    Attributes
+    ----------
+    zero : (k,) array
+        All of them at rest.
+    """
+
+    zero: Float[AnyArray, "modes"]
+
+    @property
+    def is_sampled(self) -> bool:
+        """Always."""
+        return True
+
+    def draw(self, name: str) -> AnyArray:
+        """See `Block`."""
+        return numpyro.sample(name, dist.Normal(jnp.zeros_like(self.zero), 1.0).to_event(1))
+
+    def reference(self) -> AnyArray:
+        """Zero."""
+        return jnp.asarray(self.zero)
+
+    def complete(self, estimand: AnyArray) -> AnyArray:
+        """The estimand itself."""
+        return estimand
+
+    def estimand(self, value: AnyArray) -> AnyArray:
+        """The value itself."""
+        return jnp.asarray(value, float)
+
+    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
+        """The position itself."""
+        return position, jnp.zeros(())
+
+    def unconstrain(self, estimand: AnyArray) -> AnyArray:
+        """The estimand itself."""
+        return estimand
+
+    def least_curvature(self, position: AnyArray) -> AnyArray:
+        """One."""
+        return jnp.ones_like(position)
+
+    def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
+        """Anywhere."""
+        return jnp.array(True)
+
+
+# Blocks by name; what is particular to one kind is asked of it by those who know that it is there.
+Blocks = dict[str, Any]
+
+
+def sampled_blocks(blocks: Blocks) -> Blocks:
+    """The blocks that have unknown entries."""
+    return {name: block for name, block in blocks.items() if block.is_sampled}
+
+
+def reference_values(blocks: Blocks) -> dict[str, AnyArray]:
+    """The value of every block at rest."""
+    return {name: block.reference() for name, block in blocks.items()}
+
+
+def filled(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
+    """Values in which blocks without unknowns that were left out are filled in."""
+    return {name: values[name] if name in values else block.reference() for name, block in blocks.items()}
+
+
+def completed(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
+    """The values of estimands: known entries and known blocks are filled in."""
+    return {
+        name: block.complete(estimands[name]) if block.is_sampled else block.reference()
+        for name, block in blocks.items()
+    }
+
+
+def estimands_of(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
+    """The sampled entries of values."""
+    return {name: block.estimand(values[name]) for name, block in sampled_blocks(blocks).items()}
+
+
+def constrained(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
+    """The estimands of a position, and the logarithm of the Jacobian."""
+    found = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
+    return {name: estimand for name, (estimand, _) in found.items()}, sum(log for _, log in found.values())
+
+
+def unconstrained(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
+    """The position of estimands."""
+    return {name: block.unconstrain(estimands[name]) for name, block in sampled_blocks(blocks).items()}
+
+
+def least_curvatures(blocks: Blocks, position: Values) -> dict[str, AnyArray]:
+    """Of −log density, in every coordinate, where the data say next to nothing; shaped as the position."""
+    return {name: block.least_curvature(position[name]) for name, block in sampled_blocks(blocks).items()}
+
+
+def allowed(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
+    """Whether every value lies in the range of its prior."""
+    found = jnp.array(True)
+    for name, block in blocks.items():
+        found &= block.allows(values[name])
+    return found

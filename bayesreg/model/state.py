@@ -1,0 +1,191 @@
+"""The state of a body: the values of all blocks, and the elastic equilibrium that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from bayesreg.fem.elasticity import total_strain_energy
+from bayesreg.fem.elements import Elements
+from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
+from bayesreg.fem.location import locate
+from bayesreg.fem.operators import SparseOperator
+from bayesreg.mesh import TetMesh
+from bayesreg.model.blocks import LAME, Blocks, Values
+from bayesreg.model.field import StiffnessField
+from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
+
+
+@jax.tree_util.register_static
+class StaticMesh:
+    """A mesh as a part of pytrees that has no arrays; two are equal if their content is."""
+
+    def __init__(self, mesh: TetMesh) -> None:
+        self.mesh = mesh
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StaticMesh) and self.mesh.digest == other.mesh.digest
+
+    def __hash__(self) -> int:
+        return hash(self.mesh.digest)
+
+
+class Body(NamedTuple):
+    """What turns values into a state (a pytree).
+
+    Attributes
+    ----------
+    mesh : StaticMesh
+    system : ElasticSystem
+    cell_entry : (m,) int array
+        Index of each cell's entry in λ and μ.
+    field : StiffnessField or None
+        Prior of the logarithm of a factor on λ and μ of every cell.
+    slots : (b,) int array
+        Where the sampled nodes stand among `system.prescribed`.
+    placed : SparseOperator
+        (prescribed, b): what belongs to the sampled nodes, in their slots; zero in the others.
+    held : (prescribed, 3) array
+        Known displacements, zero in the rows of sampled nodes, mm.
+    """
+
+    mesh: StaticMesh
+    system: ElasticSystem
+    cell_entry: Int[AnyArray, "cells"]
+    field: StiffnessField | None
+    slots: Int[AnyArray, "sampled"]
+    placed: SparseOperator
+    held: Float[AnyArray, "prescribed 3"]
+
+    def prescribed(self, u_boundary: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "prescribed 3"]:
+        """Displacements of all nodes that have given ones, mm. (XLA makes a loop of a scatter on the CPU.)"""
+        return self.held + self.placed(u_boundary) if len(self.slots) else self.held
+
+    def stiffness_factor(self, values: Values) -> Float[AnyArray, "cells"]:
+        """exp(sd · basis · z), by which the field multiplies λ and μ of every cell."""
+        if self.field is None:
+            return jnp.ones(self.cell_entry.shape)
+        return jnp.exp(values["field_sd"] * (self.field.basis @ values["field"]))
+
+    def is_physical(self, values: Values) -> Bool[AnyArray, ""]:
+        """Whether K is positive definite up to rigid motions: λ ≥ 0, μ > 0 and the field's factor > 0, all finite."""
+        lam, mu = values["lam"], values["mu"]
+        found = ((lam >= 0) & jnp.isfinite(lam)).all() & ((mu > 0) & jnp.isfinite(mu)).all()
+        if self.field is not None:
+            factor = self.stiffness_factor(values)
+            found &= (jnp.isfinite(factor) & (factor > 0)).all()
+        return found
+
+    def lame_by_cell(self, values: Values) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
+        """λ and μ of every cell."""
+        lam, mu = (jnp.asarray(values[name])[self.cell_entry] for name in LAME)
+        if self.field is None:
+            return lam, mu
+        factor = self.stiffness_factor(values)
+        return lam * factor, mu * factor
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What every term of the posterior sees; made anew in every evaluation.
+
+    Attributes
+    ----------
+    values : mapping
+        Of every block by its name, known ones included: "u_boundary" (b, 3) in mm, "lam", "mu", "t_similarity", …
+    lam, mu : (m,) arrays
+        Lamé parameters by cell.
+    equilibrium : Equilibrium
+    elements : Elements
+    mesh : TetMesh
+    """
+
+    values: Mapping[str, AnyArray]
+    lam: Float[AnyArray, "cells"]
+    mu: Float[AnyArray, "cells"]
+    equilibrium: Equilibrium
+    elements: Elements
+    mesh: TetMesh
+
+    @property
+    def u(self) -> Float[AnyArray, "nodes 3"]:
+        """Displacement of every node, mm."""
+        return self.equilibrium.u
+
+    @cached_property
+    def strain_energy(self) -> Scalar:
+        """E_r, eq. (3)."""
+        energy = total_strain_energy(self.elements, self.lam, self.mu, self.u)
+        # Without the barrier XLA computes it twice, for the density and for the record.
+        return jax.lax.optimization_barrier(energy)
+
+    def at(self, points: Float[np.ndarray, "k 3"]) -> Float[AnyArray, "k 3"]:
+        """Displacements of points inside the mesh, mm.
+
+        Parameters
+        ----------
+        points : (k, 3) array
+            World RAS mm, known before anything is compiled: not an array that JAX traces.
+
+        Raises
+        ------
+        InputError
+            If a point lies outside the mesh.
+        """
+        points = np.asarray(points, float)
+        nodes, weights = _located(StaticMesh(self.mesh), points.tobytes(), len(points))
+        return jnp.einsum("ka,kai->ki", weights, self.u[nodes])
+
+
+def state_of(body: Body, blocks: Blocks, values: Values, guess: Float[AnyArray, "nodes 3"] | None = None) -> State:
+    """The state of values. Where K may be indefinite, the reference λ and μ let the solve end soon.
+
+    A `guess` of the displacement of every node speeds up the solve (see `bayesreg.fem.equilibrium.equilibrium`) and has
+    no derivative.
+    """
+    lam, mu = body.lame_by_cell(physical_values(body, blocks, values))
+    found = equilibrium(body.system, lam, mu, body.prescribed(values["u_boundary"]), guess)
+    return State(values, lam, mu, found, body.system.elements, body.mesh.mesh)
+
+
+def physical_values(body: Body, blocks: Blocks, values: Values) -> Values:
+    """The values, with λ, μ and field at their references where K may be indefinite: the density is −∞ there."""
+    physical = body.is_physical(values)
+    names = LAME if body.field is None else (*LAME, "field")
+    return {**values, **{name: jnp.where(physical, values[name], blocks[name].reference()) for name in names}}
+
+
+@lru_cache(maxsize=64)
+def _located(mesh: StaticMesh, points: bytes, count: int) -> tuple[np.ndarray, np.ndarray]:
+    return interpolation_at(mesh.mesh, np.frombuffer(points).reshape(count, 3))
+
+
+def interpolation_at(
+    mesh: TetMesh, points: Float[np.ndarray, "k 3"], names: tuple[str, ...] | None = None
+) -> tuple[Int[np.ndarray, "k 4"], Float[np.ndarray, "k 4"]]:
+    """Nodes and barycentric weights of points inside a mesh.
+
+    Raises
+    ------
+    InputError
+        If a point lies outside the mesh, where no displacement is estimated.
+    """
+    # Nodes on a curved boundary may lie outside every cell by rounding.
+    cell, barycentric = locate(mesh.points, mesh.cells, points, tolerance=1e-6)
+    outside = np.flatnonzero(cell < 0)
+    if len(outside):
+        first = outside[0]
+        name = f"point {names[first]!r}" if names else f"point {first}"
+        raise InputError(
+            f"{name} at {points[first].round(2).tolist()} mm lies outside the mesh ({len(outside)} of {len(points)} "
+            f"do), which runs from {mesh.points.min(axis=0).round(1).tolist()} to "
+            f"{mesh.points.max(axis=0).round(1).tolist()} mm (world RAS, in the fixed image)"
+        )
+    return mesh.cells[cell], barycentric

@@ -1,0 +1,1 @@
+"""Terms: the factors of the joint density, a file each."""

@@ -1,0 +1,306 @@
+"""A pair of images as an observation: the likelihood exp(−E_s / T_s) of eqs. (1) and (11)."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jaxtyping import Float, Int
+from numpyro.distributions import constraints
+
+from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
+from bayesreg.fem.location import locate
+from bayesreg.image import Image, Interpolation, Interpolator
+from bayesreg.mesh import TetMesh
+from bayesreg.model.blocks import Values
+from bayesreg.model.options import ModelConfig, TemperaturePrior
+from bayesreg.model.similarity import SIMILARITIES, Noise, Similarity
+from bayesreg.model.state import State
+from bayesreg.model.terms.term import PointCurvature
+from bayesreg.types import AnyArray, InputError, Scalar
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """Two images of one contrast; how they are compared stands in `ModelConfig`.
+
+    Attributes
+    ----------
+    fixed, moving : Image
+        f and m; their intensities are taken as they are.
+    name : str, default "images"
+        Its name in tables and in the NumPyro program.
+    """
+
+    fixed: Image
+    moving: Image
+    name: str = "images"
+
+    def on(self, mesh: TetMesh, model: ModelConfig) -> ComparedImages:
+        """The term on a mesh.
+
+        Raises
+        ------
+        InputError
+            If the mesh does not overlap an image, or the quadrature has no points or fewer than are independent.
+        """
+        require_overlap(mesh, self.fixed, f"fixed image of {self.name!r}" if self.name != "images" else "fixed image")
+        require_overlap(
+            mesh, self.moving, f"moving image of {self.name!r}" if self.name != "images" else "moving image"
+        )
+        quadrature = quadrature_of(mesh, self.fixed, model)
+        positions = quadrature.positions(mesh)
+        comparison = Comparison(
+            self.name, SIMILARITIES[model.similarity], isinstance(model.t_similarity, TemperaturePrior)
+        )
+        return ComparedImages(
+            comparison=comparison,
+            fixed_values=self.fixed.interpolate(positions, model.interpolation),
+            moving=self.moving.interpolator(model.interpolation),
+            quadrature=quadrature,
+            nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
+            positions=jnp.asarray(positions),
+            degrees_of_freedom=jnp.asarray(model.degrees_of_freedom),
+            independent_share=jnp.asarray(independent_share(model, len(positions))),
+        )
+
+    def smoothed(self, term: ComparedImages, sd: float, interpolation: Interpolation) -> ComparedImages:
+        """The term with both images smoothed, sd in mm."""
+        # SciPy's filters let other threads run.
+        with ThreadPoolExecutor() as pool:
+            fixed, moving = pool.map(partial(_smoothed, sd, interpolation), (self.fixed, self.moving))
+        return term._replace(moving=moving, fixed_values=fixed(term.positions))
+
+    def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
+        """The term with the images compared at four points of every tetrahedron."""
+        quadrature = gauss_quadrature(mesh, "gauss4")
+        positions = quadrature.positions(mesh)
+        return term._replace(
+            quadrature=quadrature,
+            nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
+            positions=jnp.asarray(positions),
+            fixed_values=self.fixed.interpolate(positions, interpolation),
+        )
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Comparison:
+    """What is static of a comparison of two images.
+
+    Attributes
+    ----------
+    name : str
+    similarity : Similarity
+    normalised : bool
+        Whether the likelihood's normaliser is part of the density: where T_s is inferred.
+    """
+
+    name: str
+    similarity: Similarity
+    normalised: bool
+
+
+class ComparedImages(NamedTuple):
+    """A pair of images on a mesh (a pytree).
+
+    Attributes
+    ----------
+    comparison : Comparison
+    fixed_values : (q,) array
+        f(x_q).
+    moving : Interpolator
+        m.
+    quadrature : Quadrature
+    nodes : (q, 4) int array
+        Nodes of the cell of every quadrature point.
+    positions : (q, 3) array
+        World positions x_q of the quadrature points, mm.
+    degrees_of_freedom : scalar
+        ν of Student's t noise.
+    independent_share : scalar
+        Effective number of independent quadrature points over that of all: tempers the likelihood.
+    """
+
+    comparison: Comparison
+    fixed_values: Float[AnyArray, "points"]
+    moving: Interpolator
+    quadrature: Quadrature
+    nodes: Int[AnyArray, "points 4"]
+    positions: Float[AnyArray, "points 3"]
+    degrees_of_freedom: Scalar
+    independent_share: Scalar
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.comparison.name
+
+    def log(self, state: State) -> Scalar:
+        """−E_s / T_s, tempered, and the normaliser where T_s is inferred."""
+        return self.likelihood(state).log_prob(self.fixed_values)
+
+    def observed(self) -> Float[AnyArray, "points"]:
+        """f(x_q)."""
+        return self.fixed_values
+
+    def likelihood(self, state: State) -> ImageLikelihood:
+        """The distribution of f(x_q), given m(x_q + u(x_q))."""
+        # Without the barrier XLA interpolates twice, for the density and for the record.
+        predicted = jax.lax.optimization_barrier(self.predicted(state.u))
+        return ImageLikelihood(self, predicted, self.noise(state.values))
+
+    def noise(self, values: Values) -> Noise:
+        """Temperature and degrees of freedom."""
+        return Noise(values["t_similarity"], self.degrees_of_freedom)
+
+    def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
+        """x_q + u(x_q), mm."""
+        return self.positions + self.quadrature.interpolation(u)
+
+    def predicted(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+        """m(x_q + u(x_q))."""
+        return self.moving(self.places(u))
+
+    def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+        """f(x_q) − m(x_q + u(x_q))."""
+        return self.fixed_values - self.predicted(u)
+
+    def noise_sd(self, t_similarity: float) -> float:
+        """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
+        noise = Noise(jnp.asarray(t_similarity), self.degrees_of_freedom)
+        variance = self.comparison.similarity.variance(noise) * t_similarity
+        return float(np.sqrt(variance / (2 * np.mean(self.quadrature.weights))))
+
+    def curvature(self, u: Float[AnyArray, "nodes 3"], values: Values, second_order: bool) -> PointCurvature:
+        """Of E_s / T_s: Gauss and Newton's 2 w ∇m ∇mᵀ / T_s, and what the exact one has besides."""
+        first = _first_order(self, u, values["t_similarity"])
+        second = _second_order(self, u, values["t_similarity"]) if second_order else jnp.zeros_like(first)
+        return PointCurvature(self.nodes, self.quadrature.barycentric, first, second)
+
+
+class ImageLikelihood(dist.Distribution):
+    """Intensities of the fixed image at the quadrature points, independent given the moving image's there.
+
+    Parameters
+    ----------
+    term : ComparedImages
+    predicted : (q,) array
+        m(x_q + u(x_q)).
+    noise : Noise
+    """
+
+    support = constraints.real_vector
+
+    def __init__(self, term: ComparedImages, predicted: Float[AnyArray, "points"], noise: Noise) -> None:
+        self.term, self.predicted, self.noise = term, predicted, noise
+        super().__init__(event_shape=jnp.shape(predicted), validate_args=False)
+
+    def energy(self, value: Float[AnyArray, "points"]) -> Scalar:
+        """E_s, mm³ times squared intensity."""
+        weights = self.term.quadrature.weights
+        return self.term.comparison.similarity.energy(value, self.predicted, weights, self.noise)
+
+    def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
+        """The tempered log density; its normaliser is part of it where T_s is inferred."""
+        found = -self.energy(value) / self.noise.temperature
+        if self.term.comparison.normalised:
+            found += self.term.comparison.similarity.log_normaliser(self.term.quadrature.weights, self.noise)
+        return self.term.independent_share * found
+
+
+@jax.jit
+def _first_order(
+    term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
+) -> Float[AnyArray, "points 3 3"]:
+    """Gauss–Newton's curvature of E_s/T_s in every place x_q + u(x_q), tempered: 2 w ∇m ∇mᵀ/T_s, 1/mm²."""
+    gradient = _slope(term, term.places(u))
+    weights = term.independent_share / t_similarity * 2 * term.quadrature.weights
+    return weights[:, None, None] * gradient[:, :, None] * gradient[:, None]
+
+
+@jax.jit
+def _second_order(
+    term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
+) -> Float[AnyArray, "points 3 3"]:
+    """What the exact curvature has besides. With e(m) the energy of a point it is e″ ∇m ∇mᵀ + e′ ∇²m."""
+    moved, weights = term.places(u), term.quadrature.weights
+    noise = Noise(t_similarity, term.degrees_of_freedom)
+
+    def energy_slope(values: AnyArray) -> AnyArray:
+        energy = term.comparison.similarity.energy
+        return jax.grad(lambda m: energy(term.fixed_values, m, weights, noise))(values)
+
+    slope = partial(_slope, term)
+    gradient, values = slope(moved), term.moving(moved)
+    columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
+    first, second = jax.jvp(energy_slope, (values,), (jnp.ones_like(values),))
+    outer = gradient[:, :, None] * gradient[:, None]
+    remainder = (second - 2 * weights)[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
+    return term.independent_share / t_similarity * remainder
+
+
+def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
+    """∇m."""
+    return jax.grad(lambda x: term.moving(x).sum())(places)
+
+
+def _smoothed(sd: float, interpolation: Interpolation, image: Image) -> Interpolator:
+    return image.smoothed(sd).interpolator(interpolation)
+
+
+def independent_share(model: ModelConfig, points: int) -> float:
+    """Effective number of independent quadrature points over the number of all.
+
+    Raises
+    ------
+    InputError
+        If there are fewer points than are said to be independent.
+    """
+    if model.independent_points is None:
+        return 1.0
+    if model.independent_points > points:
+        raise InputError(
+            f"model.independent_points is {model.independent_points:g}, but the quadrature has {points} points; "
+            "give at most as many, or null for all"
+        )
+    return model.independent_points / points
+
+
+def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
+    """Raise InputError if less than half of the mesh's nodes lie on the image's grid."""
+    inside = image.contains(mesh.points)
+    if inside.mean() < 0.5:
+        corners = image.voxel_to_world(np.array([(0, 0, 0), np.array(image.shape) - 1]))
+        raise InputError(
+            f"the {name} and the mesh do not overlap: {inside.sum()} of {len(inside)} nodes lie on its grid. It runs "
+            f"from {corners[0].round(1).tolist()} to {corners[1].round(1).tolist()} mm (world RAS), the mesh from "
+            f"{mesh.points.min(0).round(1).tolist()} to {mesh.points.max(0).round(1).tolist()} mm; "
+            "check the affines, or align the images first"
+        )
+
+
+def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature:
+    """The rule that the options name.
+
+    Raises
+    ------
+    InputError
+        If the rule is "voxels" and no voxel centre lies inside the mesh.
+    """
+    if model.quadrature in GAUSS_SUBDIVISIONS:
+        return gauss_quadrature(mesh, model.quadrature)
+    centres = fixed.grid_points().reshape(-1, 3)
+    near = centres[((centres >= mesh.points.min(axis=0)) & (centres <= mesh.points.max(axis=0))).all(axis=1)]
+    cells, barycentric = locate(mesh.points, mesh.cells, near)
+    inside = cells >= 0
+    if not inside.any():
+        raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
+    weights = np.full(inside.sum(), fixed.voxel_volume)
+    return quadrature_at(mesh, cells[inside], barycentric[inside], weights)

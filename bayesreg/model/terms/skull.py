@@ -1,0 +1,52 @@
+"""The hard skull constraint: no sampled node lies in Ω_SK."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from bayesreg.image import Interpolator
+from bayesreg.model.blocks import Values
+from bayesreg.model.state import State
+from bayesreg.types import AnyArray, Scalar
+
+
+class Skull(NamedTuple):
+    """Zero where a sampled node lies in the forbidden region, one elsewhere: such a state cannot have made the image.
+
+    Attributes
+    ----------
+    distance : Interpolator
+        Signed distance to Ω_SK, mm, positive outside it.
+    points : (b, 3) array
+        Positions of the sampled nodes at rest, mm.
+    """
+
+    distance: Interpolator
+    points: Float[AnyArray, "sampled 3"]
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return "skull"
+
+    def log(self, state: State) -> Scalar:
+        """Zero or −∞."""
+        return jnp.where(self.allows(state.values), 0.0, -jnp.inf)
+
+    def allows(self, values: Values) -> Bool[AnyArray, ""]:
+        """Whether no sampled node lies in Ω_SK."""
+        return is_allowed(self.distance, self.points + values["u_boundary"]).all()
+
+    def clearance(
+        self, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
+    ) -> Float[AnyArray, "*batch nodes"]:
+        """Signed distance to Ω_SK, mm, of some rows of "u_boundary" displaced by u."""
+        return self.distance(self.points[nodes] + u)
+
+
+def is_allowed(distance: Interpolator, points: Float[AnyArray, "nodes 3"]) -> Bool[AnyArray, "nodes"]:
+    """Which points (world, mm) lie outside Ω_SK, by the signed distance."""
+    return distance(points) >= 0

@@ -1,0 +1,112 @@
+"""What a term is, and what it may know besides.
+
+A term is one factor of the joint density. It has a `name` and `log(state)`. The other classes here are what a term may
+know besides, each asked for by `isinstance`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import numpyro.distributions as dist
+from jaxtyping import Bool, Float, Int
+
+from bayesreg.model.blocks import Values
+from bayesreg.model.state import State
+from bayesreg.types import AnyArray, Scalar
+
+
+@runtime_checkable
+class Term(Protocol):
+    """One factor of the joint density; an observation from outside the package needs no more than this."""
+
+    @property
+    def name(self) -> str:
+        """Its name in tables and in the NumPyro program."""
+
+    def log(self, state: State) -> Scalar:
+        """Its logarithm, up to a constant; traceable by JAX."""
+
+
+@runtime_checkable
+class Likelihood(Protocol):
+    """A term that is the density of something observed."""
+
+    def observed(self) -> AnyArray:
+        """What was observed."""
+
+    def likelihood(self, state: State) -> dist.Distribution:
+        """Its distribution, of which replicates can be drawn."""
+
+
+@runtime_checkable
+class Support(Protocol):
+    """A term that is zero at some values, which is cheap to tell."""
+
+    def allows(self, values: Values) -> Bool[AnyArray, ""]:
+        """Whether the density may be positive there."""
+
+
+class PointCurvature(NamedTuple):
+    """Curvature of −log in the displacements of some points of the mesh.
+
+    Attributes
+    ----------
+    nodes : (q, 4) int array
+        Nodes of the cell that holds each point.
+    weights : (q, 4) array
+        Barycentric coordinates there.
+    first_order : (q, 3, 3) array
+        Gauss and Newton's part, positive semidefinite, 1/mm².
+    second_order : (q, 3, 3) array
+        The rest: residuals times second derivatives.
+    """
+
+    nodes: Int[AnyArray, "points 4"]
+    weights: Float[AnyArray, "points 4"]
+    first_order: Float[AnyArray, "points 3 3"]
+    second_order: Float[AnyArray, "points 3 3"]
+
+
+@runtime_checkable
+class Curved(Protocol):
+    """A term that knows its curvature in the displacements of points."""
+
+    def curvature(self, u: Float[AnyArray, "nodes 3"], values: Values, second_order: bool) -> PointCurvature:
+        """The curvature where the nodes are displaced by u, mm; without `second_order` that part is zero."""
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Label:
+    """A name, as a part of pytrees that has no arrays."""
+
+    name: str
+
+
+@jax.tree_util.register_static
+class Outside:
+    """A term from outside the package, as a part of pytrees that has no arrays: its own are constants when compiled."""
+
+    def __init__(self, term: Term) -> None:
+        self.term = term
+
+    @property
+    def name(self) -> str:
+        """The term's own."""
+        return self.term.name
+
+    def log(self, state: State) -> Any:
+        """The term's own."""
+        return self.term.log(state)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Outside) and self.term is other.term
+
+    def __hash__(self) -> int:
+        return id(self.term)
+
+
+Terms = dict[str, Any]

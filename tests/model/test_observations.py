@@ -1,0 +1,212 @@
+"""Landmarks and observations from outside the package, against the exact Gaussian that they give."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import bayesreg as br
+from tests.oracles import paper
+from tests.phantoms import box_mesh, smooth_image
+
+MESH = box_mesh(2)
+LAM, MU = np.array([0.5, 1.0, 1.5]), np.array([0.7, 1.0, 1.4])
+T_ELASTIC, RIGID_SD = 20.0, 0.8
+CHAINS = 32
+MODEL = br.ModelConfig(
+    fixed={name: dict(zip(MESH.names, values.tolist(), strict=True)) for name, values in (("lam", LAM), ("mu", MU))},
+    t_elastic=T_ELASTIC,
+    rigid_sd=RIGID_SD,
+)
+
+
+class MeanDisplacement:
+    """From outside the package: the mean displacement of a region was measured."""
+
+    name = "region"
+
+    def __init__(self, points, measured, sd):
+        self.points, self.measured, self.sd = points, measured, sd
+
+    def log(self, state):
+        away = state.at(self.points).mean(axis=0) - self.measured
+        return -0.5 * (away @ away) / self.sd**2
+
+
+def places(count=9):
+    rng = np.random.default_rng(5)
+    points = rng.uniform(2, 18, (count, 3))
+    return points, points + rng.normal(0.4, 0.5, (count, 3)), rng.uniform(0.2, 0.6, count)
+
+
+REGION = np.array([[5.0, 6.0, 7.0], [6.0, 6.0, 8.0], [5.5, 7.0, 7.5]]), np.array([1.0, -0.5, 0.2]), 0.15
+
+
+def landmarks():
+    points, moved, sd = places()
+    return br.Landmarks(points, moved, sd)
+
+
+@cache
+def posterior(with_region=False):
+    observed = [landmarks(), *([MeanDisplacement(*REGION)] if with_region else [])]
+    return br.build_posterior(mesh=MESH, observations=observed, model=MODEL)
+
+
+def barycentric(points):
+    """Rows that take nodal values to points, by a linear solve in every cell."""
+    rows = np.zeros((len(points), len(MESH.points)))
+    for row, point in zip(rows, points, strict=True):
+        for cell in MESH.cells:
+            weights = np.linalg.solve(np.vstack([MESH.points[cell].T, np.ones(4)]), [*point, 1.0])
+            if weights.min() > -1e-9:
+                row[cell] = weights
+                break
+    return rows
+
+
+@cache
+def exact(with_region=False):
+    """Mean and covariance of the flat u_B, by dense matrices of its own."""
+    K = np.asarray(paper.stiffness(MESH.points, MESH.cells, LAM[MESH.tissue], MU[MESH.tissue]).todense())
+    boundary = (3 * MESH.boundary[:, None] + np.arange(3)).ravel()
+    interior = np.setdiff1d(np.arange(len(K)), boundary)
+    whole = np.zeros((len(K), len(boundary)))
+    whole[boundary] = np.eye(len(boundary))
+    whole[interior] = -np.linalg.solve(K[np.ix_(interior, interior)], K[np.ix_(interior, boundary)])
+    modes = np.linalg.qr(rigid(MESH.points[MESH.boundary]))[0]
+    precision = whole.T @ K @ whole / T_ELASTIC + modes @ modes.T / (len(MESH.boundary) * RIGID_SD**2)
+    force = np.zeros(len(boundary))
+    points, moved, sd = places()
+    observed = [(np.kron(barycentric(points), np.eye(3)), (moved - points).ravel(), np.repeat(sd, 3))]
+    if with_region:
+        region, measured, error = REGION
+        mean = barycentric(region).mean(axis=0, keepdims=True)
+        observed.append((np.kron(mean, np.eye(3)), measured, np.full(3, error)))
+    for rows, value, error in observed:
+        J = rows @ whole / error[:, None]
+        precision, force = precision + J.T @ J, force + J.T @ (value / error)
+    return np.linalg.solve(precision, force), np.linalg.inv(precision)
+
+
+def rigid(points):
+    """Three shifts and three infinitesimal turns, as columns."""
+    shifts = np.tile(np.eye(3), (len(points), 1))
+    turns = [np.cross(np.broadcast_to(axis, points.shape), points).ravel() for axis in np.eye(3)]
+    return np.column_stack([shifts, *turns])
+
+
+@pytest.mark.parametrize("with_region", [False, True])
+def test_density_is_the_gaussian(with_region):
+    mean, covariance = exact(with_region)
+    post, precision = posterior(with_region), np.linalg.inv(covariance)
+
+    def density(flat):
+        return float(post.logdensity_constrained({"u_boundary": flat.reshape(-1, 3), "lam": LAM, "mu": MU}))
+
+    at_mean = density(mean)
+    for step in np.random.default_rng(0).normal(size=(5, len(mean))):
+        for sign in (-1, 1):
+            assert density(mean + sign * step) - at_mean == pytest.approx(-0.5 * step @ precision @ step, rel=1e-6)
+
+
+@pytest.mark.parametrize("with_region", [False, True])
+def test_curvature_is_the_gaussians(with_region):
+    post = posterior(with_region)
+    found = post.displacement_curvature(post.data, post.estimands(post.reference()))
+    np.testing.assert_allclose(found.gauss_newton, np.linalg.inv(exact(with_region)[1]), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(found.remainder, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("with_region", [False, True])
+@pytest.mark.parametrize("sampler", ["hmc", "laplace"])
+def test_samplers_meet_mean_and_covariance(sampler, with_region):
+    found = br.sample(posterior(with_region), sampler, chains=CHAINS, draws=160, seed=1, block=160, progress=False)
+    draws = found.idata.posterior["u_boundary"].values.reshape(CHAINS, 160, -1)[:, 40:]
+    mean, covariance = exact(with_region)
+    whitened = (draws - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
+    for moment, expected in ((whitened, 0.0), (whitened**2, 1.0)):
+        per_chain = moment.mean(axis=1)
+        z = (per_chain.mean(axis=0) - expected) / (per_chain.std(axis=0, ddof=1) / np.sqrt(CHAINS))
+        assert abs(z).max() < 5
+        assert (z**2).mean() == pytest.approx(1.0, abs=0.6)
+
+
+def test_the_papers_kernel_runs_with_them():
+    found = br.sample(posterior(True), "rwmh", chains=2, draws=40, thin=2, seed=1, progress=False, sigma_u=0.05)
+    assert 0.05 < float(found.idata.sample_stats["acceptance_rate"].mean()) < 0.99
+
+
+def test_terms_have_their_names_and_add_up():
+    post = posterior(True)
+    values = {"u_boundary": 0.1 * np.ones((len(MESH.boundary), 3)), "lam": LAM, "mu": MU}
+    terms = {name: float(value) for name, value in post.energies(values).items()}
+    assert {"landmarks", "region", "elastic", "rigid", "support", "solved"} <= set(terms)
+    points, moved, sd = places()
+    assert terms["landmarks"] == pytest.approx(-0.5 * ((((moved - points) - 0.1) / sd[:, None]) ** 2).sum())
+    total = sum(value for name, value in terms.items() if not name.endswith("_energy"))
+    assert float(post.logdensity_constrained(values)) == pytest.approx(total)
+
+
+def test_images_and_landmarks_are_one_density():
+    fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    both = br.build_posterior(mesh=MESH, observations=[br.ImagePair(fixed, moving), landmarks()], model=MODEL)
+    short = br.build_posterior(fixed, moving, MESH, model=MODEL)
+    values = {"u_boundary": 0.3 * np.sin(MESH.points[MESH.boundary]), "lam": LAM, "mu": MU}
+    parts = both.energies(values)
+    expected = float(short.logdensity_constrained(values)) + float(parts["landmarks"])
+    assert float(both.logdensity_constrained(values)) == pytest.approx(expected, rel=1e-12)
+    curvature = both.displacement_curvature(both.data, both.estimands(values))
+    alone = short.displacement_curvature(short.data, short.estimands(values))
+    assert np.linalg.eigvalsh(curvature.gauss_newton - alone.gauss_newton).min() > -1e-8
+
+
+class Wrong:
+    name = "wrong"
+
+    def log(self, state):
+        return jnp.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("observations", "message"),
+    [
+        ([], "nothing observed"),
+        ([3], "needs a name and a function log"),
+        ([Wrong()], "must give one real number, got shape"),
+        ([landmarks(), landmarks()], "'landmarks' of an observation is taken"),
+        ([br.Landmarks([[1.0, 1, 1]], [[1.0, 1, 1]], 1.0, name="elastic")], "'elastic' of an observation is taken"),
+        ([br.Landmarks([[1.0, 1, 99]], [[1.0, 1, 1]], 1.0)], "outside the mesh"),
+        ([MeanDisplacement(np.array([[0.0, 0.0, 99.0]]), np.zeros(3), 1.0)], "outside the mesh"),
+    ],
+)
+def test_wrong_observations_are_told(observations, message):
+    with pytest.raises(br.InputError, match=message):
+        br.build_posterior(mesh=MESH, observations=observations, model=MODEL)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.zeros((2, 3)), np.zeros((3, 3)), 1.0), "must both have shape"),
+        ((np.zeros((2, 3)), np.zeros((2, 3)), [1.0, 2.0, 3.0]), "one for each point"),
+        ((np.zeros((2, 3)), np.zeros((2, 3)), 0.0), "must be positive"),
+        ((np.zeros((1, 3)), np.full((1, 3), np.nan), 1.0), "finite number"),
+    ],
+)
+def test_wrong_landmarks_are_told(arguments, message):
+    with pytest.raises(br.InputError, match=message):
+        br.Landmarks(*arguments)
+
+
+def test_two_forms_at_once_and_half_a_pair_are_told():
+    image = smooth_image(MESH.points)
+    with pytest.raises(br.InputError, match="either fixed and moving, or observations"):
+        br.build_posterior(image, image, MESH, observations=[landmarks()])
+    with pytest.raises(br.InputError, match="needs both"):
+        br.build_posterior(fixed=image, mesh=MESH)
+    with pytest.raises(br.InputError, match="needs a mesh"):
+        br.build_posterior(observations=[landmarks()])
