@@ -68,7 +68,8 @@ def predict(
         cells = here.images.quadrature.cells
         u = here.evaluate(draw).u
         z = standardised_residual(here, u, t_similarity_of(here, draw))
-        noise = jax.random.normal(jax.random.fold_in(key, number.astype(int)), z.shape)
+        values = {"t_similarity": t_similarity_of(here, draw)}
+        noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
         observed, replicated = (discrepancies(x, cells, neighbours, len(mesh.cells)) for x in (z, noise))
         distance = jnp.linalg.norm(u - u_mean, axis=1)
         marks = jnp.einsum("la,lai->li", weights, u[nodes])

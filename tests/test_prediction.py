@@ -3,9 +3,11 @@
 from dataclasses import replace
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
+from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.predictive import predictive_p
@@ -171,3 +173,35 @@ def test_chosen_landmarks_are_where_their_names_say():
     assert np.minimum(place - low, high - place).min() > 0.7 * depth.max()
     require_inside(MESH, found)
     assert [name for name in found if name.startswith("middle")] == ["middle of CSF", "middle of GM", "middle of WM"]
+
+
+def test_replicates_follow_students_t_where_the_model_does():
+    """The data are drawn from the model: no discrepancy is extreme, as all were with Normal replicates."""
+    rng, nu = np.random.default_rng(1), 3.0
+    moving = smooth_image(MESH.points, seed=2, blur=3.0)
+    model = br.ModelConfig(t_similarity=0.05, similarity="student_t", degrees_of_freedom=nu, quadrature="gauss32")
+    posterior = br.build_posterior(moving, moving, MESH, model)
+    images = posterior.images
+    noise = np.sqrt(0.05 / (2 * np.asarray(images.quadrature.weights))) * rng.standard_t(nu, len(images.fixed_values))
+    shown = images._replace(fixed_values=images.fixed_values + noise)
+    posterior = replace(posterior, data=posterior.data.with_term("images", shown))
+    at_rest = {name: np.asarray(posterior.reference()[name]) for name in ("u_boundary", "lam", "mu")}
+    dims = {"u_boundary": ["node", "axis"], "lam": ["tissue"], "mu": ["tissue"]}
+    draws = xr.Dataset(
+        {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
+    )
+    zero = np.zeros_like(MESH.points)
+    found = predict(posterior, draws, zero, zero, LANDMARKS, seed=0)
+    for k in range(len(found.discrepancies)):
+        assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, found.discrepancies[k]
+
+
+@pytest.mark.parametrize(
+    ("similarity", "distribution"), [("ssd", stats.norm()), ("student_t", stats.t(4.0))], ids=["ssd", "student_t"]
+)
+def test_replicated_noise_has_the_distribution_of_the_likelihood(similarity, distribution):
+    image = smooth_image(MESH.points, seed=2)
+    model = br.ModelConfig(t_similarity=0.05, similarity=similarity, quadrature="gauss32")
+    posterior = br.build_posterior(image, image, MESH, model)
+    noise = posterior.images.standardised_noise(jax.random.key(0), posterior.reference())
+    assert stats.kstest(np.asarray(noise), distribution.cdf).pvalue > 1e-3

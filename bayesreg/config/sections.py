@@ -174,8 +174,9 @@ class _AboutMode(_Sampler):
 class _Tuned(_AboutMode):
     warm_up: Count = 80
     """Transitions that tune the step size and are not kept."""
-    target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.75
-    """Acceptance towards which the step size is tuned."""
+    target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
+    """Acceptance towards which the step size is tuned; null takes the sampler's own: 0.8 for nuts, 0.75 for the
+    others."""
 
 
 class Hamiltonian(_Tuned):

@@ -10,7 +10,7 @@ import xarray as xr
 from jaxtyping import Int
 
 from bayesreg.inference.checkpoint import Block, Blocks
-from bayesreg.inference.draws import OTHERS, STATISTICS, dataset
+from bayesreg.inference.draws import OTHERS, STATISTICS, arviz, dataset
 
 # Numbers (8 MB of them) that are judged at once, so that memory does not grow with the draws: ArviZ takes many times as
 # much.
@@ -118,9 +118,8 @@ def _worst(draws: np.ndarray) -> Worst:
 
 def _diagnosed(draws: xr.Dataset) -> list[xr.Dataset]:
     """R̂, bulk and tail ESS of every variable."""
-    # Takes a second to import, which the first draws need not wait for.
-    import arviz as az
-
+    # It takes a second to import, for which the first draws need not wait.
+    az = arviz()
     # ArviZ divides zero by zero for what has stood still.
     with np.errstate(invalid="ignore"):
         found = (az.rhat(draws), az.ess(draws, method="bulk"), az.ess(draws, method="tail"))

@@ -7,6 +7,7 @@ wait for: hence inside the functions.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -62,8 +63,7 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
         field (chain, draw, mode), the components of the log-stiffness; sample_stats;
         constant_data.
     """
-    import arviz as az
-
+    az = arviz()
     every = list(blocks)
     draws = {name: np.concatenate([block[name] for block in every], axis=1) for name in every[0]}
     estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
@@ -105,6 +105,15 @@ def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np
             full[..., np.asarray(target.free[name])] = estimands[name]
         found[name] = full
     return found
+
+
+def arviz() -> Any:
+    """ArviZ, without its announcement of version 1, which is written for those who call it themselves."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
+        import arviz
+
+    return arviz
 
 
 def dataset(idata: Any, group: str) -> xr.Dataset:
@@ -171,6 +180,4 @@ def open_posterior(path: str | Path) -> Any:
     """Read draws written by `save_posterior`; InputError where there are none."""
     if not Path(path).is_file():
         raise InputError(f"{path} is missing: the folder holds no draws")
-    import arviz as az
-
-    return az.from_netcdf(str(path))
+    return arviz().from_netcdf(str(path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -47,6 +48,7 @@ class SamplingProgress(NoProgress):
     def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
         self._draws, self._max_seconds, self._threshold = draws, max_seconds, threshold
         self._first: tuple[float, float] | None = None
+        self._worst: list[tuple[int, float]] = []
         self._bar = RichProgress(
             TextColumn("sampling"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
             TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
@@ -74,11 +76,39 @@ class SamplingProgress(NoProgress):
         self._first = self._first or (draws, seconds)
         figures = f"accepted {accepted / steps:.0%} (in support {accepted / inside:.0%})  R̂ {worst:.2f}{target}"
         left = ""
+        self._worst.append((draws, worst))
         if draws > self._first[0]:
             rate = (draws - self._first[0]) / max(seconds - self._first[1], 1e-9)
             figures += f"  {rate * steps / draws / len(tally.steps):.0f} steps/s"
-            remaining = (self._draws - draws) / rate
+            budget = (self._draws - draws) / rate
             if self._max_seconds is not None:
-                remaining = min(remaining, self._max_seconds - seconds)
-            left = f"{max(remaining, 0) / 60:.1f} min left"
+                budget = min(budget, self._max_seconds - seconds)
+            needed = draws_until(self._worst, self._threshold)
+            left = time_left(budget, None if needed is None else (needed - draws) / rate)
         self._bar.update(self._task, completed=draws, figures=figures, left=left)
+
+
+def draws_until(seen: Sequence[tuple[int, float]], threshold: float | None) -> float | None:
+    """About how many draws of each chain R̂ needs to fall to a threshold; None where that cannot be told.
+
+    What R̂ exceeds one by falls like one over the draws once chains forget where they began. The median over the latest
+    looks is taken, which one lucky or unlucky look does not move.
+
+    Parameters
+    ----------
+    seen : sequence of (int, float)
+        Draws and the greatest R̂ at every look so far.
+    threshold : float, optional
+    """
+    latest = [draws * (rhat - 1) for draws, rhat in seen[-5:] if np.isfinite(rhat) and rhat > 1]
+    if threshold is None or not latest:
+        return None
+    return float(np.median(latest)) / (threshold - 1)
+
+
+def time_left(budget: float, convergence: float | None) -> str:
+    """The seconds until convergence, where they are known and fewer, and those of the budget, in words."""
+    of_budget = f"{max(budget, 0) / 60:.1f} min to the budget"
+    if convergence is None or convergence > budget:
+        return of_budget
+    return f"about {max(convergence, 0) / 60:.1f} min to convergence, {of_budget}"

@@ -17,7 +17,8 @@ DISCREPANCIES = ("sd", "greatest", "neighbours")
 def standardised_residual(
     posterior: Posterior, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float
 ) -> Float[AnyArray, "points"]:
-    """(f(x_q) − m(x_q + u(x_q))) / √(T_s / 2w_q): independent standard Normal numbers where the model holds."""
+    """(f(x_q) − m(x_q + u(x_q))) / √(T_s / 2w_q): where the model holds independent numbers, standard
+    Normal or of Student's t."""
     return posterior.residuals(u) * jnp.sqrt(2 * posterior.images.quadrature.weights / t_similarity)
 
 

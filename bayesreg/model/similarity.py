@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Float
@@ -38,11 +39,14 @@ class Similarity(NamedTuple):
         (weights, noise) → −log Z_s, with which exp(−E_s / T_s) is a density of the residuals.
     variance : callable
         (noise) → variance of the residual in units of its squared scale.
+    draw : callable
+        (key, shape, noise) → independent residuals in units of their scale √(T_s / 2w).
     """
 
     energy: Callable[[AnyArray, AnyArray, AnyArray, Noise], Scalar]
     log_normaliser: Callable[[AnyArray, Noise], Scalar]
     variance: Callable[[Noise], Scalar]
+    draw: Callable[[AnyArray, tuple[int, ...], Noise], AnyArray]
 
 
 def sum_of_squared_differences(
@@ -94,10 +98,16 @@ def student_t_log_normaliser(weights: Float[AnyArray, "points"], noise: Noise) -
 
 
 SIMILARITIES: dict[str, Similarity] = {
-    "ssd": Similarity(sum_of_squared_differences, gaussian_log_normaliser, lambda _: jnp.ones(())),
+    "ssd": Similarity(
+        sum_of_squared_differences,
+        gaussian_log_normaliser,
+        lambda _: jnp.ones(()),
+        lambda key, shape, _: jax.random.normal(key, shape),
+    ),
     "student_t": Similarity(
         student_t_energy,
         student_t_log_normaliser,
         lambda noise: noise.degrees_of_freedom / (noise.degrees_of_freedom - 2),
+        lambda key, shape, noise: jax.random.t(key, noise.degrees_of_freedom, shape),
     ),
 }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -96,16 +97,33 @@ def residual(view: View) -> Drawing | None:
             _discrepancy(panel, run.predicted, k)
         below[1].legend(loc="upper left", bbox_to_anchor=(0, 1.04), ncols=2, handlelength=1.0, columnspacing=1.0)
         uri = style.data_uri(figure)
-    z = run.predicted.residual
+    z, expected = run.predicted.residual, noise_of(run.manifest)
     beyond = f"{float((np.abs(z) > 3).mean()):.2%}".replace("%", " %")
     caption = (
         "Top: residual at the posterior mean, in units of the noise sd that T_s stands for at a quadrature point of "
         f"average weight; where the model holds nearly all of it is pale. Below, left: the residual at the {len(z):,} "
-        "quadrature points, each over its own implied sd, by tissue, and the standard Normal density that it should "
-        f"follow; {beyond} lie beyond ±3 (0.27 % if Normal). Right: the three discrepancies of the table below."
+        "quadrature points, each over the scale that T_s implies there, by tissue, and the density that it should "
+        f"follow, {expected.name}; {beyond} lie beyond ±3 ({expected.beyond_three:.2%} if it does). "
+        "Right: the three discrepancies of the table below."
     )
     alt = f"Residual maps and histograms; sd of the standardised residual {number(float(z.std()))}."
     return Drawing("residual", "The residual", caption, alt, uri)
+
+
+class ExpectedNoise(NamedTuple):
+    """The distribution of standardised residuals where the model holds: its name, density, and share beyond ±3."""
+
+    name: str
+    density: Callable[[np.ndarray], np.ndarray]
+    beyond_three: float
+
+
+def noise_of(manifest: Mapping[str, Any]) -> ExpectedNoise:
+    """The noise of a run's model, in units of the scale √(T_s / 2w)."""
+    if part(manifest, "model", "similarity") == "student_t":
+        nu = float(part(manifest, "model", "degrees_of_freedom"))
+        return ExpectedNoise(f"Student’s t with ν = {nu:g}", stats.t(nu).pdf, float(2 * stats.t.sf(3, nu)))
+    return ExpectedNoise("standard Normal", stats.norm.pdf, float(2 * stats.norm.sf(3)))
 
 
 def _picture(view: View, plane: Plane) -> np.ndarray:
@@ -129,7 +147,8 @@ def _histogram(axes: Axes, view: View) -> None:
                 density, edges, color=colour, lw=1.3, label=f"{tissue_label(name)}, sd {number(inside.std(), 2)}"
             )
     x = np.linspace(-reach, reach, 300)
-    axes.fill_between(x, stats.norm.pdf(x), color=style.FAINT, lw=0, label="standard Normal", zorder=0)
+    expected = noise_of(view.run.manifest)
+    axes.fill_between(x, expected.density(x), color=style.FAINT, lw=0, label=expected.name, zorder=0)
     axes.set(xlim=(-reach, reach), ylim=(0, None), yticks=[], xlabel="standardised residual at the mean")
     axes.spines["left"].set_visible(False)
     axes.legend(loc="upper left", handlelength=1.2)

@@ -220,19 +220,17 @@ def approximation(manifest: Mapping[str, Any]) -> str:
 
 
 def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
-    """What to beware of, beyond convergence: the manifest's own warnings, then those that its numbers call for.
+    """What to beware of, beyond convergence.
 
     Parameters
     ----------
     manifest : mapping
-        Of which `warnings`, `solver`, `inverted_elements`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
+        Of which `solver`, `inverted_elements`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
     mesh : TetMesh
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.
     """
-    found = list(part(manifest, "warnings") or [])
-    found += _solver(manifest) + _folding(manifest) + _noise(manifest) + _locking(mesh, posterior)
-    return list(dict.fromkeys(found))
+    return _solver(manifest) + _folding(manifest) + _noise(manifest) + _locking(mesh, posterior)
 
 
 def _solver(manifest: Mapping[str, Any]) -> list[str]:
@@ -241,7 +239,8 @@ def _solver(manifest: Mapping[str, Any]) -> list[str]:
         return []
     return [
         f"{int(failed):,} elastic solves failed and counted as density zero: the posterior near those states is "
-        "under-explored. Allow more iterations or a stronger preconditioner."
+        "under-explored. Most often λ or μ of a tissue comes close to zero there: give it a prior with a lower bound "
+        "(model.priors), or a known value (model.fixed)."
     ]
 
 

@@ -1,5 +1,6 @@
 """Every sampler of the registry on a small Gaussian behind a wall; `test_closed_form` has them on a real posterior."""
 
+import inspect
 from functools import cache
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.config.sections import sampler_section
 from bayesreg.inference import loose, whitened
 from bayesreg.inference.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.kernel import Sampler
@@ -290,3 +292,10 @@ def test_places_have_the_density_that_is_said():
         expected = density[np.linalg.norm(grid - centre, axis=1) < radius].sum() / density.sum()
         found = (np.linalg.norm(places - centre, axis=1) < radius).mean()
         assert found == pytest.approx(expected, abs=0.015)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_settings_left_out_are_the_same_from_a_configuration_and_from_python(name):
+    defaults = {key: given.default for key, given in inspect.signature(SAMPLERS[name]).parameters.items()}
+    for key, value in sampler_section(name).settings.items():
+        assert value == defaults[key], key

@@ -245,7 +245,6 @@ def manifest(uniform: bool, converged: bool) -> dict:
             "interpolation": "linear",
             "normalised": False,
         },
-        "warnings": [],
     }
 
 

@@ -1,9 +1,13 @@
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
+import bayesreg as br
+from bayesreg.report import verdict as verdict_module
 from bayesreg.report.estimands import Estimand
 from bayesreg.report.verdict import approximation, duration, fixed, key_facts, number, percent, verdict, warnings_of
 from tests.phantoms import box_mesh
@@ -119,13 +123,20 @@ def test_locking_names_the_tissue_and_poissons_ratio():
     assert warnings_of({}, box_mesh(), elastic([30.0], [1.0]))[0].startswith("Poisson’s ratio of uniform")
 
 
-def test_failed_solves_are_warned_of_and_nothing_is_said_twice():
-    manifest = {"solver": {"failed": 3}, "warnings": ["The mesh is coarse."]}
+def test_failed_solves_are_warned_of():
     quiet = elastic([1.0] * 3, [1.0] * 3)
-    first = warnings_of(manifest, box_mesh(), quiet)
-    assert first[0] == "The mesh is coarse."
-    assert any(text.startswith("3 elastic solves failed") for text in first)
-    assert warnings_of(manifest | {"warnings": first}, box_mesh(), quiet) == first
+    (text,) = warnings_of({"solver": {"failed": 3}}, box_mesh(), quiet)
+    assert text.startswith("3 elastic solves failed")
+
+
+def test_options_that_advice_names_exist():
+    """Every dotted name in the source of the advice is a key of a configuration."""
+    config = br.load_config(Path(__file__).parents[2] / "configs" / "quickstart.yaml")
+    source = Path(verdict_module.__file__).read_text()
+    named = set(re.findall(rf"\(({'|'.join(type(config).model_fields)})\.(\w+)\)", source))
+    assert {("model", "priors"), ("start", "field")} <= named
+    for section, key in named:
+        assert key in type(getattr(config, section)).model_fields, (section, key)
 
 
 def test_folded_tetrahedra_are_warned_of():

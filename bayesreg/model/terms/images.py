@@ -172,6 +172,10 @@ class ComparedImages(NamedTuple):
         """f(x_q) − m(x_q + u(x_q))."""
         return self.fixed_values - self.predicted(u)
 
+    def standardised_noise(self, key: AnyArray, values: Values) -> Float[AnyArray, "points"]:
+        """Noise of the model in units of its scale √(T_s / 2w), one number for each quadrature point."""
+        return self.comparison.similarity.draw(key, self.fixed_values.shape, self.noise(values))
+
     def noise_sd(self, t_similarity: float) -> float:
         """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
         noise = Noise(jnp.asarray(t_similarity), self.degrees_of_freedom)
@@ -206,6 +210,12 @@ class ImageLikelihood(dist.Distribution):
         """E_s, mm³ times squared intensity."""
         weights = self.term.quadrature.weights
         return self.term.comparison.similarity.energy(value, self.predicted, weights, self.noise)
+
+    def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
+        """Replicates of the fixed image, all points being independent."""
+        shape = (*sample_shape, *self.event_shape)
+        scale = jnp.sqrt(self.noise.temperature / (2 * self.term.quadrature.weights))
+        return self.predicted + scale * self.term.comparison.similarity.draw(key, shape, self.noise)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
         """The tempered log density; its normaliser is part of it where T_s is inferred."""
