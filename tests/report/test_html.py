@@ -70,7 +70,7 @@ def full(tmp_path_factory, study):
 def clinical(tmp_path_factory, uniform_study):
     """Uniform parameters, not converged, no truth, no skull, nothing predicted, and a name that is no markup."""
     run = uniform_study.run
-    stopped = run.manifest["stopped"] | {"reason": "of <i>this</i>"}
+    stopped = run.manifest["stopped"] | {"reason": "the budget of 5 min was spent. And <i>this</i>"}
     manifest = run.manifest | {"name": '<script>alert("x")</script> & Ω', "stopped": stopped}
     run = replace(run, manifest=manifest, config="a: </pre><b>bold</b>\n", truth=None, skull=None, metrics=None)
     run = replace(run, predicted=None)
@@ -163,7 +163,7 @@ def test_without_truth_and_skull_the_page_is_whole(clinical):
 
 def test_names_reasons_and_config_are_text_not_markup(clinical):
     assert '<script>alert("x")</script> & Ω' in clinical.text
-    assert "It stopped because of <i>this</i>" in clinical.text
+    assert "And <i>this</i>" in clinical.text
     assert "a: </pre><b>bold</b>" in clinical.text
     assert not clinical.tags & {"script", "i", "b"}
 
