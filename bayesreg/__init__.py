@@ -32,6 +32,7 @@ _HOME = {
     "StopRule": "inference.stopping",
     "sample": "inference.run",
     "load_image": "io.volumes",
+    "read_point_pairs": "io.points",
     "save_image": "io.volumes",
     "MeshOptions": "io.meshing",
     "build_mesh": "io.meshing",

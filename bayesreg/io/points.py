@@ -1,0 +1,252 @@
+"""Points and pairs of points from files: CSV, 3D Slicer's .fcsv and .mrk.json, MNI's .tag; in world RAS, mm.
+
+A CSV has a header: `fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z` for pairs or `x, y, z` for points, RAS,
+and where wanted `sd` (mm) and `name`. The other formats say by themselves whether they are LPS or RAS; MNI's is RAS.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.types import InputError
+
+FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
+PLAIN = ("x", "y", "z")
+# What takes points in a file's system to RAS.
+SYSTEMS = {"RAS": (1.0, 1.0, 1.0), "0": (1.0, 1.0, 1.0), "LPS": (-1.0, -1.0, 1.0), "1": (-1.0, -1.0, 1.0)}
+
+
+class Points(NamedTuple):
+    """Points in one space.
+
+    Attributes
+    ----------
+    points : (k, 3) array
+        World RAS, mm.
+    names : tuple of str
+        Empty where a point has none.
+    sd : (k,) array or None
+        Standard deviation of each coordinate, mm, where the file gives it.
+    """
+
+    points: Float[np.ndarray, "k 3"]
+    names: tuple[str, ...]
+    sd: Float[np.ndarray, "k"] | None = None
+
+
+class PointPairs(NamedTuple):
+    """Pairs of points that show the same place.
+
+    Attributes
+    ----------
+    fixed, moving : (k, 3) arrays
+        World RAS, mm.
+    names : tuple of str
+    sd : (k,) array or None
+        Standard deviation of each coordinate, mm, where the file gives it.
+    """
+
+    fixed: Float[np.ndarray, "k 3"]
+    moving: Float[np.ndarray, "k 3"]
+    names: tuple[str, ...]
+    sd: Float[np.ndarray, "k"] | None = None
+
+
+def read_points(path: str | Path) -> Points:
+    """Read points of one space.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, of an unknown kind, or something in it is wrong.
+    """
+    found = _read(Path(path))
+    if isinstance(found, PointPairs):
+        raise InputError(f"{path} holds pairs of points; expected points of one space")
+    return found
+
+
+def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> PointPairs:
+    """Read pairs of points, from one file or from two.
+
+    Parameters
+    ----------
+    path : path
+        Both points of each pair (CSV, or a .tag of two volumes), or the points in the fixed image.
+    moving : path, optional
+        The points in the moving image: those of the same names where all names differ and are the same in both files,
+        else in the same order.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, of an unknown kind, or something in it is wrong; if the files do not fit each other.
+    """
+    found = _read(Path(path))
+    if isinstance(found, PointPairs):
+        if moving is not None:
+            raise InputError(f"{path} holds both points of each pair; expected no second file, got {moving}")
+        return found
+    if moving is None:
+        raise InputError(f"{path} holds points of one space; give the points of the moving image, too")
+    other = read_points(moving)
+    if len(other.points) != len(found.points):
+        raise InputError(f"{path} holds {len(found.points)} points and {moving} {len(other.points)}: they are no pairs")
+    return PointPairs(found.points, other.points[_order(found.names, other.names)], found.names, found.sd)
+
+
+def _order(names: tuple[str, ...], others: tuple[str, ...]) -> list[int]:
+    """Where the partner of each point stands in the other file."""
+    if len(set(names)) == len(names) and set(names) == set(others):
+        return [others.index(name) for name in names]
+    return list(range(len(names)))
+
+
+def _read(path: Path) -> Points | PointPairs:
+    name = path.name.lower()
+    suffix = next((suffix for suffix in READERS if name.endswith(suffix)), None)
+    if suffix is None:
+        raise InputError(f"{path}: unknown kind of file with points; known are {', '.join(READERS)}")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file with points")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not UTF-8 text ({error.reason} at byte {error.start})") from None
+    found = READERS[suffix](text, str(path))
+    _require_sound(found, path)
+    return found
+
+
+def _require_sound(found: Points | PointPairs, path: Path) -> None:
+    places = found.points if isinstance(found, Points) else np.hstack([found.fixed, found.moving])
+    if not len(places):
+        raise InputError(f"{path} holds no point")
+    if not np.isfinite(places).all():
+        raise InputError(f"{path}: point {1 + int(np.argwhere(~np.isfinite(places))[0, 0])} is not finite")
+    if found.sd is not None and not (np.isfinite(found.sd) & (found.sd > 0)).all():
+        raise InputError(f"{path}: every sd must be a positive number of mm, got {found.sd.min():g} as the least")
+
+
+def _read_csv(text: str, path: str) -> Points | PointPairs:
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    if not lines:
+        raise InputError(f"{path} is empty; expected a header such as {','.join(PLAIN)}")
+    header, *rows = [(number, [cell.strip() for cell in next(csv.reader([line]))]) for number, line in lines]
+    columns = [column.lower() for column in header[1]]
+    wanted = FIXED + MOVING if set(FIXED + MOVING) <= set(columns) else PLAIN
+    if not set(wanted) <= set(columns):
+        raise InputError(
+            f"{path}: expected a header with {', '.join(FIXED + MOVING)}, or with {', '.join(PLAIN)}; got "
+            f"{', '.join(header[1])}"
+        )
+    for number, cells in rows:
+        if len(cells) != len(columns):
+            raise InputError(f"{path}, line {number}: expected {len(columns)} columns, got {len(cells)}")
+
+    def values(names: Sequence[str]) -> np.ndarray:
+        places = [columns.index(name) for name in names]
+        return np.array([[_number(cells[k], f"{path}, line {n}") for k in places] for n, cells in rows]).reshape(
+            -1, len(names)
+        )
+
+    names = tuple(cells[columns.index("name")] if "name" in columns else "" for _, cells in rows)
+    sd = values(["sd"])[:, 0] if "sd" in columns else None
+    if wanted == PLAIN:
+        return Points(values(PLAIN), names, sd)
+    return PointPairs(values(FIXED), values(MOVING), names, sd)
+
+
+def _read_fcsv(text: str, path: str) -> Points:
+    system, columns, points, names = "RAS", ["id", "x", "y", "z"], [], []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.startswith("#"):
+            key, _, value = line[1:].partition("=")
+            system = value.strip() if key.strip() == "CoordinateSystem" else system
+            columns = [c.strip() for c in value.split(",")] if key.strip() == "columns" else columns
+        elif line.strip():
+            cells = next(csv.reader([line]))
+            if len(cells) < 4:
+                raise InputError(f"{path}, line {number}: expected four columns or more, got {len(cells)}")
+            where = [columns.index(axis) for axis in "xyz"]
+            points.append([_number(cells[k], f"{path}, line {number}") for k in where])
+            label = columns.index("label") if "label" in columns else len(cells)
+            names.append(cells[label] if label < len(cells) else "")
+    return Points(_in_ras(points, system, path), tuple(names))
+
+
+def _read_markups(text: str, path: str) -> Points:
+    try:
+        markups = json.loads(text)["markups"]
+    except (json.JSONDecodeError, KeyError, TypeError):
+        raise InputError(f"{path} is no file of 3D Slicer's markups: expected JSON with the key markups") from None
+    points, names = [], []
+    for markup in markups:
+        if markup.get("coordinateUnits", "mm") not in ("mm", ["mm", "UCUM", "millimeter"]):
+            raise InputError(f"{path}: expected coordinates in mm, got {markup['coordinateUnits']!r}")
+        defined = [
+            point for point in markup.get("controlPoints", []) if point.get("positionStatus", "defined") == "defined"
+        ]
+        own = [_position(point, path) for point in defined]
+        points.append(_in_ras(own, str(markup.get("coordinateSystem", "LPS")), path))
+        names += [str(point.get("label", "")) for point in defined]
+    return Points(np.concatenate(points) if points else np.zeros((0, 3)), tuple(names))
+
+
+def _position(point: Any, path: str) -> list[float]:
+    position = point.get("position")
+    if not isinstance(position, list) or len(position) != 3:
+        raise InputError(f"{path}: a control point needs a position of three numbers, got {position!r:.60}")
+    return [_number(value, path) for value in position]
+
+
+def _read_tag(text: str, path: str) -> Points | PointPairs:
+    """MNI's tag points: one row of three coordinates for each volume, RAS, and perhaps weights, ids and a label."""
+    plain = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("%"))
+    volumes, body = re.search(r"Volumes\s*=\s*(\d+)\s*;", plain), re.search(r"Points\s*=(.*?);", plain, re.DOTALL)
+    if not plain.lstrip().startswith("MNI Tag Point File") or volumes is None or body is None:
+        raise InputError(f"{path} is no MNI tag file: expected 'MNI Tag Point File', 'Volumes = 2;' and 'Points = …;'")
+    count = int(volumes[1])
+    if count not in (1, 2):
+        raise InputError(f"{path}: expected tags of one or two volumes, got {count}")
+    rows, names = [], []
+    for number, line in enumerate((line for line in body[1].splitlines() if line.strip()), 1):
+        label = re.search(r'"([^"]*)"', line)
+        cells = re.sub(r'"[^"]*"', "", line).split()
+        if len(cells) < 3 * count:
+            raise InputError(f"{path}, point {number}: expected {3 * count} coordinates, got {len(cells)}")
+        rows.append([_number(cell, f"{path}, point {number}") for cell in cells[: 3 * count]])
+        names.append(label[1] if label else "")
+    table = np.array(rows, float).reshape(-1, 3 * count)
+    if count == 1:
+        return Points(table, tuple(names))
+    return PointPairs(table[:, :3], table[:, 3:], tuple(names))
+
+
+def _in_ras(points: Sequence[Sequence[float]], system: str, path: str) -> Float[np.ndarray, "k 3"]:
+    if system not in SYSTEMS:
+        raise InputError(f"{path}: unknown coordinate system {system!r}; known are {', '.join(SYSTEMS)}")
+    return np.array(points, float).reshape(-1, 3) * SYSTEMS[system]
+
+
+def _number(value: Any, where: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: expected a number, got {value!r:.40}") from None
+
+
+READERS: dict[str, Callable[[str, str], Points | PointPairs]] = {
+    ".csv": _read_csv,
+    ".fcsv": _read_fcsv,
+    ".mrk.json": _read_markups,
+    ".tag": _read_tag,
+}

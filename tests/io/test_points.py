@@ -1,0 +1,129 @@
+"""Points and pairs of points from the files that users have."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bayesreg as br
+from bayesreg.io.points import read_point_pairs, read_points
+
+PLACES = np.array([[1.0, -2.0, 3.0], [4.5, 5.0, -6.0]])
+MOVED = PLACES + np.array([0.5, 0.0, -1.0])
+
+
+def written(folder, name, text):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def fcsv(system, points, labels=("a", "b")):
+    rows = "".join(
+        f"id{i},{x},{y},{z},0,0,0,1,1,1,0,{n},,\n" for i, ((x, y, z), n) in enumerate(zip(points, labels, strict=True))
+    )
+    columns = "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+    return f"# Markups fiducial file version = 4.11\n# CoordinateSystem = {system}\n{columns}{rows}"
+
+
+def markups(system, points, labels=("a", "b"), **more):
+    control = [
+        {"label": n, "position": list(p), "positionStatus": "defined"} for p, n in zip(points, labels, strict=True)
+    ]
+    control.append({"label": "planned", "position": [0, 0, 0], "positionStatus": "undefined"})
+    return json.dumps({"markups": [{"type": "Fiducial", "coordinateSystem": system, "controlPoints": control, **more}]})
+
+
+LPS = PLACES * [-1, -1, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("p.csv", "name,x,y,z\na,1,-2,3\nb,4.5,5,-6\n"),
+        ("p.csv", "\ufeffx , y,z,Name\n# a comment\n1,-2,3,a\n\n4.5,5,-6,b\n"),
+        ("p.fcsv", fcsv("RAS", PLACES)),
+        ("p.fcsv", fcsv("0", PLACES)),
+        ("p.fcsv", fcsv("LPS", LPS)),
+        ("p.fcsv", fcsv("1", LPS)),
+        ("p.mrk.json", markups("RAS", PLACES)),
+        ("p.mrk.json", markups("LPS", LPS, coordinateUnits="mm")),
+        ("P.TAG", 'MNI Tag Point File\nVolumes = 1;\n% seen\nPoints =\n 1 -2 3 "a"\n 4.5 5 -6 1 1 1 "b";\n'),
+    ],
+)
+def test_points_are_read_in_ras(tmp_path, name, text):
+    found = read_points(written(tmp_path, name, text))
+    np.testing.assert_allclose(found.points, PLACES)
+    assert found.names == ("a", "b")
+    assert found.sd is None
+
+
+def test_pairs_from_one_file(tmp_path):
+    rows = "".join(",".join(map(str, [*p, *q, 0.5])) + "\n" for p, q in zip(PLACES, MOVED, strict=True))
+    path = written(tmp_path, "p.csv", "fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z,sd\n" + rows)
+    found = read_point_pairs(path)
+    np.testing.assert_allclose(found.fixed, PLACES)
+    np.testing.assert_allclose(found.moving, MOVED)
+    np.testing.assert_allclose(found.sd, 0.5)
+    rows = "".join(" " + " ".join(map(str, [*p, *q])) + ' ""\n' for p, q in zip(PLACES, MOVED, strict=True))
+    found = read_point_pairs(written(tmp_path, "p.tag", f"MNI Tag Point File\nVolumes = 2;\nPoints =\n{rows};\n"))
+    np.testing.assert_allclose(found.moving, MOVED)
+    with pytest.raises(br.InputError, match="expected points of one space"):
+        read_points(path)
+
+
+def test_pairs_from_two_files_go_by_name_or_by_order(tmp_path):
+    first = written(tmp_path, "f.fcsv", fcsv("LPS", LPS))
+    named = written(tmp_path, "m.mrk.json", markups("RAS", MOVED[::-1], labels=("b", "a")))
+    np.testing.assert_allclose(read_point_pairs(first, named).moving, MOVED)
+    unnamed = written(tmp_path, "m.csv", "x,y,z\n" + "".join(",".join(map(str, q)) + "\n" for q in MOVED))
+    np.testing.assert_allclose(read_point_pairs(first, unnamed).moving, MOVED)
+    with pytest.raises(br.InputError, match="give the points of the moving image"):
+        read_point_pairs(first)
+    one = written(tmp_path, "one.csv", "x,y,z\n1,2,3\n")
+    with pytest.raises(br.InputError, match=r"holds 2 points and .*one\.csv 1"):
+        read_point_pairs(first, one)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("p.txt", "1 2 3", r"unknown kind of file with points; known are \.csv"),
+        ("p.csv", "", "is empty; expected a header"),
+        ("p.csv", "1,2,3\n", "expected a header with fixed_x"),
+        ("p.csv", "x,y,z\n1,2\n", "line 2: expected 3 columns, got 2"),
+        ("p.csv", "x,y,z\n1,2,three\n", "line 2: expected a number, got 'three'"),
+        ("p.csv", "x,y,z\n", "holds no point"),
+        ("p.csv", "x,y,z\n1,2,nan\n", "point 1 is not finite"),
+        ("p.csv", "x,y,z,sd\n1,2,3,0\n", "every sd must be a positive number of mm, got 0"),
+        ("p.fcsv", fcsv("IJK", PLACES), "unknown coordinate system 'IJK'"),
+        ("p.fcsv", "id0,1,2\n", "line 1: expected four columns or more"),
+        ("p.mrk.json", "{}", "no file of 3D Slicer's markups"),
+        ("p.mrk.json", markups("LPS", LPS, coordinateUnits="voxel"), "expected coordinates in mm"),
+        ("p.tag", "Points = 1 2 3;", "is no MNI tag file"),
+        ("p.tag", "MNI Tag Point File\nVolumes = 2;\nPoints =\n 1 2 3;\n", "point 1: expected 6 coordinates, got 3"),
+    ],
+)
+def test_what_is_wrong_is_told(tmp_path, name, text, message):
+    with pytest.raises(br.InputError, match=message):
+        read_points(written(tmp_path, name, text))
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(br.InputError, match="no such file with points"):
+        read_points(tmp_path / "none.csv")
+
+
+@pytest.mark.skipif("BAYESREG_DATA" not in os.environ, reason="BAYESREG_DATA does not name the folder of RESECT")
+def test_resects_files_are_read():
+    files = sorted(Path(os.environ["BAYESREG_DATA"], "resect").glob("*.tag"))
+    if not files:
+        pytest.skip("the folder that BAYESREG_DATA names has no resect/*.tag")
+    assert len(files) == 12
+    for path in files:
+        pairs = read_point_pairs(path)
+        rows = [line.split() for line in path.read_text().splitlines() if line.rstrip(";").rstrip().endswith('""')]
+        np.testing.assert_allclose(np.hstack([pairs.fixed, pairs.moving]), [[float(x) for x in r[:6]] for r in rows])
+        assert np.linalg.norm(pairs.moving - pairs.fixed, axis=1).max() < 25
