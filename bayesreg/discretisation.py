@@ -16,7 +16,7 @@ from bayesreg import pipeline
 from bayesreg.config import model_of
 from bayesreg.image import Image
 from bayesreg.inference.draws import dataset
-from bayesreg.inference.laplace import unravel
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.mode_search import find_mode
 from bayesreg.inference.recalibration import RANGE, least_bodies
 from bayesreg.io import store

@@ -14,7 +14,8 @@ from blackjax.vi.pathfinder import approximate
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Sampler, Say
-from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.mode_search import penalty
 from bayesreg.inference.reflection import rotated
 from bayesreg.inference.target import SmoothTarget

@@ -16,9 +16,9 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from bayesreg.inference.layout import slices
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
 
@@ -29,6 +29,9 @@ _MOST = 1.0
 @runtime_checkable
 class Placed(Protocol):
     """What is asked of a target here."""
+
+    def __hash__(self) -> int:
+        """See `Target`."""
 
     def reference(self) -> dict[str, AnyArray]:
         """Values at rest."""
@@ -110,6 +113,8 @@ def gained(shares: Float[np.ndarray, "rows rows"]) -> float:
 
 
 def _marked(target: Placed, wanted: str) -> Float[np.ndarray, "dimension"]:
-    position = target.unconstrain(target.reference())
-    marks = {name: np.full(np.shape(value), float(name == wanted)) for name, value in position.items()}
-    return np.asarray(ravel_pytree(marks)[0])
+    parts = slices(target)
+    marks = np.zeros(sum(part.stop - part.start for part in parts.values()))
+    if wanted in parts:
+        marks[parts[wanted]] = 1.0
+    return marks

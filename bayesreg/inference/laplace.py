@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.inference.hierarchy import gained, is_scale, is_temperature
+from bayesreg.inference.layout import others, slices, unravel
 from bayesreg.inference.target import Curvature, SmoothTarget
 from bayesreg.types import AnyArray, InputError
 
@@ -28,7 +29,7 @@ LEAST_RATIO = 0.25
 
 
 class Reference(NamedTuple):
-    """The Gaussian N(centre, factor · factorᵀ) of a flat position, whose last 3b entries are "u_boundary" (a pytree).
+    """The Gaussian N(centre, factor · factorᵀ) of a flat position (a pytree).
 
     Attributes
     ----------
@@ -43,12 +44,6 @@ class Reference(NamedTuple):
     def place(self, xi: AnyArray) -> AnyArray:
         """The flat position at whitened coordinates ξ."""
         return self.centre + self.factor @ xi
-
-
-@lru_cache(maxsize=8)
-def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
-    """The map from flat positions to positions."""
-    return ravel_pytree(target.unconstrain(target.reference()))[1]
 
 
 def prior_shares(
@@ -243,10 +238,11 @@ def _jointly(
 
 def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
     """Entries of a flat position whose curvature the target knows: "u_boundary" and, jointly, "field"."""
-    known = ("field", "u_boundary") if joint else ("u_boundary",)
-    position = target.unconstrain(target.reference())
-    marked = {name: jnp.full(jnp.shape(value), float(name in known)) for name, value in position.items()}
-    return np.asarray(ravel_pytree(marked)[0]) > 0
+    marked = np.ones(len(others(target)) + 3 * len(target.sampled), bool)
+    marked[others(target)] = False
+    if joint and "field" in slices(target):
+        marked[slices(target)["field"]] = True
+    return marked
 
 
 def hessian_rows(

@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import Estimands, SmoothTarget
 from bayesreg.types import AnyArray
 
@@ -102,14 +103,14 @@ def slowest(path: Float[AnyArray, "draw chain node 3"], count: int) -> Int[np.nd
     return np.sort(np.argsort(mobility)[:count])
 
 
-def loose(reference: Reference, sampled: int, nodes: Int[AnyArray, "k"], seen: Float[AnyArray, "k seen 3"]) -> Loose:
+def loose(reference: Reference, first: int, nodes: Int[AnyArray, "k"], seen: Float[AnyArray, "k seen 3"]) -> Loose:
     """How the nodes stand in the whitened coordinates, and where places are drawn for them.
 
     Parameters
     ----------
     reference : Reference
-    sampled : int
-        Number of rows of "u_boundary".
+    first : int
+        Where "u_boundary" begins in a flat position.
     nodes : (k,) int array
         Some of these rows.
     seen : (k, s, 3) array
@@ -117,7 +118,7 @@ def loose(reference: Reference, sampled: int, nodes: Int[AnyArray, "k"], seen: F
         added where the others stay.
     """
     dimension = len(reference.centre)
-    rows = dimension - 3 * sampled + 3 * jnp.asarray(nodes, int)[:, None] + jnp.arange(3)
+    rows = first + 3 * jnp.asarray(nodes, int)[:, None] + jnp.arange(3)
     unit = jnp.zeros((dimension, rows.size)).at[rows.ravel(), jnp.arange(rows.size)].set(1.0)
     columns = jax.scipy.linalg.solve_triangular(reference.factor, unit, lower=False)
     columns = jnp.moveaxis(columns.reshape(dimension, len(nodes), 3), 1, 0)

@@ -22,8 +22,8 @@ from bayesreg.inference.laplace import (
     precision_at,
     prior_shares,
     slope_at,
-    unravel,
 )
+from bayesreg.inference.layout import displacements, others, unravel
 from bayesreg.inference.pockets import out_of_pockets
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -144,17 +144,17 @@ def _improved(
     if not moves:
         # The same for all displacements.
         data = target.without_normaliser(data)
-    moving, first = 1 - is_scale(target), len(flat) - 3 * len(target.sampled)
+    moving, own = 1 - is_scale(target), displacements(target)
     if not moves:
-        moving[:first] = 0.0
+        moving[others(target)] = 0.0
     best: list[tuple[Any, float, Any, float]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
         there = np.asarray(_place(reference, moving * xi))
         height, slope = height_and_slope(target, data, there)
-        pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[first:].reshape(-1, 3)), shift)
+        pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[own].reshape(-1, 3)), shift)
         value, slope = float(pressed) - height, -slope
-        slope[first:] += np.asarray(push).ravel()
+        slope[own] += np.asarray(push).ravel()
         gradient = moving * np.asarray(_pulled_back(reference, slope))
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
@@ -199,13 +199,15 @@ _penalty_with_slope = jax.jit(jax.value_and_grad(penalty, argnums=2), static_arg
 
 def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
-    count = 3 * len(target.sampled)
-    u = np.array(flat[len(flat) - count :].reshape(-1, 3))
+    own = displacements(target)
+    u = np.array(flat[own].reshape(-1, 3))
     for _ in range(100):
         gap, slope = (np.asarray(found) for found in _clearance_with_slope(target, target.data, jnp.asarray(u)))
         inside = gap < GAP / 2
         if not inside.any():
-            return np.concatenate([flat[: len(flat) - count], u.ravel()])
+            moved = np.array(flat)
+            moved[own] = u.ravel()
+            return moved
         steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
         u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
     raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")

@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from bayesreg.inference.kernel import Say
-from bayesreg.inference.laplace import Reference, laplace, unravel
+from bayesreg.inference.laplace import Reference, laplace
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.mode_search import find_mode
 from bayesreg.inference.target import SmoothTarget
 

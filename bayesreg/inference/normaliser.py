@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.layout import others, unravel
 from bayesreg.inference.target import SmoothTarget
 from bayesreg.types import AnyArray, Scalar
 
@@ -30,17 +31,19 @@ class StandIn(NamedTuple):
 
     Attributes
     ----------
+    entries : (k,) int array
+        Of a flat position, that are no displacements.
     slope : (k,) array
-        In the coordinates of a flat position that are no displacements.
     curvature : (k, k) array
     """
 
+    entries: Int[AnyArray, "parameters"]
     slope: Float[AnyArray, "parameters"]
     curvature: Float[AnyArray, "parameters parameters"]
 
     def __call__(self, away: Float[AnyArray, "dimension"]) -> Scalar:
         """Its value at a flat position, given less the middle."""
-        x = away[: len(self.slope)]
+        x = away[self.entries]
         return self.slope @ x + 0.5 * (x @ self.curvature @ x)
 
 
@@ -58,32 +61,27 @@ class Delayed(NamedTuple):
     log_normaliser: Scalar
 
 
-def parameters_of(target: SmoothTarget, reference: Reference) -> int:
-    """Number of coordinates that are no displacements."""
-    return len(reference.centre) - 3 * len(target.sampled)
-
-
-def no_stand_in(target: SmoothTarget, reference: Reference) -> StandIn:
+def no_stand_in(target: SmoothTarget) -> StandIn:
     """That of a density without a normaliser, or before it is found."""
-    count = parameters_of(target, reference)
-    return StandIn(jnp.zeros(count), jnp.zeros((count, count)))
+    entries = others(target)
+    return StandIn(jnp.asarray(entries), jnp.zeros(len(entries)), jnp.zeros((len(entries), len(entries))))
 
 
 def stand_in(target: SmoothTarget, reference: Reference, middle: AnyArray) -> StandIn:
     """The normaliser's slope at a flat position, and its curvature by differences over one sd of the reference."""
-    found = no_stand_in(target, reference)
-    count = len(found.slope)
+    found, entries = no_stand_in(target), others(target)
+    count = len(entries)
     if not target.costly_normaliser or not count:
         return found
     slope_at = partial(_slope, target, target.data)
-    found = found._replace(slope=slope_at(middle)[:count])
+    found = found._replace(slope=slope_at(middle)[entries])
     if count > MOST_CURVED:
         return found
-    sd = np.minimum(np.linalg.norm(np.asarray(reference.factor[:count]), axis=1), 1.0)
+    sd = np.minimum(np.linalg.norm(np.asarray(reference.factor)[entries], axis=1), 1.0)
     rows = []
-    for index, h in enumerate(sd):
+    for index, h in zip(entries, sd, strict=True):
         step = jnp.zeros_like(middle).at[index].set(h)
-        rows.append((slope_at(middle + step) - slope_at(middle - step))[:count] / (2 * h))
+        rows.append((slope_at(middle + step) - slope_at(middle - step))[entries] / (2 * h))
     curvature = jnp.stack(rows)
     return found._replace(curvature=(curvature + curvature.T) / 2)
 

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.inference.laplace import height_and_slope, unravel
+from bayesreg.inference.laplace import height_and_slope
+from bayesreg.inference.layout import displacements, unravel
 from bayesreg.inference.target import Estimands, SmoothTarget
 from bayesreg.types import AnyArray
 
@@ -58,7 +59,7 @@ def out_of_pockets(
         gains, places = (np.asarray(found) for found in _looked(target, near, estimands, jnp.asarray(rows)))
         # Approximate, and said of a node while all others stay: the density itself decides, one node after the other.
         for which in (candidate for candidate in np.argsort(-gains) if gains[candidate] > GAIN):
-            there, at = flat.copy(), len(flat) - 3 * (count - rows[which])
+            there, at = flat.copy(), displacements(target).start + 3 * rows[which]
             there[at : at + 3] = places[which]
             if height_and_slope(target, data, there)[0] > height_and_slope(target, data, flat)[0] + GAIN:
                 flat = there

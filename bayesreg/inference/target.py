@@ -92,7 +92,7 @@ class Target(Protocol):
 class SmoothTarget(Target, Protocol):
     """What samplers that follow gradients know besides.
 
-    A *position* holds the estimands mapped to the real line; "u_boundary" stays as it is and is its last entry.
+    A *position* holds the estimands mapped to the real line; "u_boundary" stays as it is.
     """
 
     def logdensity_of(self, data: Any, position: Estimands) -> AnyArray:

@@ -19,7 +19,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
-from bayesreg.inference.laplace import Reference, averaged, pulled, slope_at, unravel
+from bayesreg.inference.laplace import Reference, averaged, pulled, slope_at
+from bayesreg.inference.layout import displacements, unravel
 from bayesreg.inference.loose import Loose, loose, moved_alone, searched, slowest
 from bayesreg.inference.modes import search_modes
 from bayesreg.inference.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
@@ -91,14 +92,13 @@ def setup_about(
     target: SmoothTarget, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
 ) -> Setup:
     """A setup before its tuning; the nodes in the rows `alone` of "u_boundary" are moved alone."""
-    nodes = len(target.sampled)
-    first = len(reference.centre) - 3 * nodes
-    centre = reference.centre[first:].reshape(nodes, 3)
-    rows = reference.factor[first:].reshape(nodes, 3, len(reference.centre))
-    nothing = no_stand_in(target, reference)
+    nodes, own = len(target.sampled), displacements(target)
+    centre = reference.centre[own].reshape(nodes, 3)
+    rows = reference.factor[own].reshape(nodes, 3, len(reference.centre))
+    nothing = no_stand_in(target)
     held = walls(centre, rows, jnp.arange(nodes))
-    at = middle[first:].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
-    nodes_alone = loose(reference, nodes, jnp.asarray(alone, int), at)
+    at = middle[own].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
+    nodes_alone = loose(reference, own.start, jnp.asarray(alone, int), at)
     step_size, steps = jnp.asarray(FIRST_STEP), jnp.asarray(1, int)
     return Setup(reference, jnp.asarray(middle), held, step_size, steps, nothing, nodes_alone)
 
@@ -282,10 +282,10 @@ def _warmed_up(
     say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
     late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])
     seen = np.moveaxis(late.reshape(-1, alone, 3), 1, 0)
-    setup = setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen))
+    setup = setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen))
     beyond = searched(target, _conditioned(target, setup), setup.loose, points, key_search)
     seen = np.concatenate([seen, beyond], axis=1)
-    return setup._replace(loose=loose(setup.reference, len(target.sampled), nodes, seen)), points
+    return setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen)), points
 
 
 def _with_loose_nodes(target: SmoothTarget, sampler: Sampler, begin: Callable, density: Density) -> Sampler:

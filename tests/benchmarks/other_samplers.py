@@ -47,7 +47,8 @@ from bayesreg.assembly import posterior_of, start_of
 from bayesreg.inference.checkpoint import Block, Checkpoint
 from bayesreg.inference.diagnostics import worst
 from bayesreg.inference.initialise import Start
-from bayesreg.inference.laplace import Reference, unravel
+from bayesreg.inference.laplace import Reference
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.run import first_checkpoint, sample
 from bayesreg.inference.whitened import whitened
 from bayesreg.io import store

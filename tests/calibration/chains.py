@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.inference.laplace import Reference, laplace
+from bayesreg.inference.layout import displacements
 from bayesreg.inference.loose import loose
 from bayesreg.inference.normaliser import stand_in
 from bayesreg.inference.whitened import Setup, setup_about
@@ -86,7 +87,7 @@ def setups_about(
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
     def about(reference: Reference, middle: Any, seen: Any) -> Setup:
-        alone = loose(reference, len(posterior.sampled), ALONE, seen)
+        alone = loose(reference, displacements(posterior).start, ALONE, seen)
         return setup_about(posterior, reference, middle)._replace(loose=alone, **size)
 
     return jax.vmap(about)(stacked, jnp.asarray(middles), jnp.asarray(seen))._replace(stand_in=normalisers)

@@ -75,7 +75,7 @@ def log_normaliser(data, flat):
 @pytest.mark.parametrize(("slope", "curvature"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.3)])
 def test_draws_are_of_the_density_with_the_normaliser(slope, curvature):
     """Whatever the stand-in: against sums over a grid."""
-    approximate = StandIn(jnp.array([slope]), jnp.array([[curvature]]))
+    approximate = StandIn(jnp.array([0]), jnp.array([slope]), jnp.array([[curvature]]))
     setup = Setup(jnp.zeros(1), approximate)
     kernel = blackjax.additive_step_random_walk(
         lambda x: -0.5 * (x @ x) + approximate(x), blackjax.mcmc.random_walk.normal(jnp.array([1.5]))

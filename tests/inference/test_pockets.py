@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.inference import mode_search, pockets
-from bayesreg.inference.laplace import unravel
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.mode_search import find_mode
 from bayesreg.inference.pockets import out_of_pockets
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget

@@ -66,7 +66,7 @@ def after_steps(name: str, alone: Any = ()) -> np.ndarray:
     else:
         setup = setup_about(target(), poor_reference(), poor_reference().centre)
         seen = np.moveaxis(exact()[CHAINS:][:300, alone], 1, 0)
-        nodes = loose.loose(poor_reference(), len(target().sampled), np.asarray(alone, int), seen)
+        nodes = loose.loose(poor_reference(), 0, np.asarray(alone, int), seen)
         setup = setup._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps), loose=nodes)
         kernel = nodes_alone() if name == "nodes alone" else SAMPLERS[name](target())
 
