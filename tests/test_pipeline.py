@@ -295,7 +295,7 @@ def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
 @pytest.mark.slow
 def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeypatch, capsys):
     """On a phantom in place of MNI152, from a quickstart made small, with a field of stiffness, which is mapped."""
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    code, of_points = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
     monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38, spacing=24))
     monkeypatch.chdir(tmp_path)
@@ -308,7 +308,8 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     (tmp_path / "configs").mkdir()
     extended = {"extends": str(ROOT / "configs" / "quickstart.yaml"), **small}
     YAML(typ="safe").dump(extended, tmp_path / "configs" / "quickstart.yaml")
-    exec(compile(code, "README.md", "exec"), {})
+    names: dict = {}
+    exec(compile(code, "README.md", "exec"), names)
     said = capsys.readouterr().out
     assert "converged: False" in said
     assert [line.split()[0] for line in said.splitlines() if re.match(r"(csf|gm|wm) +\d", line)] == ["csf", "gm", "wm"]
@@ -320,6 +321,12 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     assert mean.min() > 0
     assert sd.min() > 0
     assert 0 <= stiffer.min() <= stiffer.max() <= 1
+    places = CENTRE + np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
+    rows = np.hstack([places, places + np.array([2.0, 0.0, 0.0])])
+    header = "fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z"
+    np.savetxt(tmp_path / "points.csv", rows, delimiter=",", header=header, comments="")
+    exec(compile(of_points, "README.md", "exec"), names)
+    assert names["draws"].u_mean[:, 0].mean() == pytest.approx(2.0, abs=0.8)
 
 
 @pytest.mark.slow
