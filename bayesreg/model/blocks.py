@@ -8,7 +8,7 @@ says how one becomes another. It is a pytree; what decides on shapes is static.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -59,21 +59,67 @@ class Block(Protocol):
         """Whether every sampled entry lies in the range of its prior."""
 
 
-class Displacement(NamedTuple):
-    """Displacements of the sampled nodes, mm, with a flat base measure.
+class _Arrays:
+    """What blocks share whose arrays are all data: they are sampled as a whole, and their position is themselves.
 
-    Attributes
+    A subclass names its arrays in `arrays`, in the order of its arguments.
+    """
+
+    arrays: ClassVar[tuple[str, ...]]
+
+    @property
+    def is_sampled(self) -> bool:
+        """See `Block`."""
+        return True
+
+    def complete(self, estimand: AnyArray | float) -> AnyArray:
+        """The estimand itself."""
+        return jnp.asarray(estimand)
+
+    def estimand(self, value: AnyArray | float) -> AnyArray:
+        """The value itself."""
+        return jnp.asarray(value, float)
+
+    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
+        """The position itself."""
+        return position, jnp.zeros(())
+
+    def unconstrain(self, estimand: AnyArray | float) -> AnyArray:
+        """The estimand itself."""
+        return jnp.asarray(estimand)
+
+    def least_curvature(self, position: AnyArray) -> AnyArray:
+        """One."""
+        return jnp.ones_like(position)
+
+    def allows(self, value: AnyArray | float) -> Bool[AnyArray, ""]:
+        """Anywhere."""
+        return jnp.array(True)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        """Its arrays."""
+        return tuple(getattr(self, name) for name in self.arrays), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: Any) -> Any:
+        """The inverse."""
+        return cls(*children)
+
+
+@jax.tree_util.register_pytree_node_class
+class Displacement(_Arrays):
+    """Displacements of the sampled nodes, mm, with a flat base measure; walls are a term.
+
+    Parameters
     ----------
     points : (b, 3) array
         Positions of these nodes at rest, mm.
     """
 
-    points: Float[AnyArray, "sampled 3"]
+    arrays = ("points",)
 
-    @property
-    def is_sampled(self) -> bool:
-        """Always: there may be no node, but what there is is sampled."""
-        return True
+    def __init__(self, points: Any) -> None:
+        self.points = points
 
     def draw(self, name: str) -> AnyArray:
         """See `Block`."""
@@ -82,30 +128,6 @@ class Displacement(NamedTuple):
     def reference(self) -> AnyArray:
         """No displacement."""
         return jnp.zeros(self.points.shape)
-
-    def complete(self, estimand: AnyArray) -> AnyArray:
-        """The estimand itself."""
-        return estimand
-
-    def estimand(self, value: AnyArray) -> AnyArray:
-        """The value itself."""
-        return jnp.asarray(value, float)
-
-    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
-        """The position itself."""
-        return position, jnp.zeros(())
-
-    def unconstrain(self, estimand: AnyArray) -> AnyArray:
-        """The estimand itself."""
-        return estimand
-
-    def least_curvature(self, position: AnyArray) -> AnyArray:
-        """One, 1/mm²."""
-        return jnp.ones_like(position)
-
-    def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
-        """Anywhere: walls are a term."""
-        return jnp.array(True)
 
 
 @jax.tree_util.register_static
@@ -211,16 +233,8 @@ class LameParameter(NamedTuple):
         return (~self.free.is_free | ((value >= self.low) & (value <= self.high))).all()
 
 
-class _Positive:
+class _Positive(_Arrays):
     """What the positive scalars share: their position is the logarithm."""
-
-    def complete(self, estimand: AnyArray | float) -> AnyArray:
-        """The estimand itself."""
-        return jnp.asarray(estimand)
-
-    def estimand(self, value: AnyArray | float) -> AnyArray:
-        """The value itself."""
-        return jnp.asarray(value, float)
 
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
         """The exponential."""
@@ -229,10 +243,6 @@ class _Positive:
     def unconstrain(self, estimand: AnyArray | float) -> AnyArray:
         """The logarithm."""
         return jnp.log(estimand)
-
-    def least_curvature(self, position: AnyArray) -> AnyArray:
-        """One."""
-        return jnp.ones_like(position)
 
     def allows(self, value: AnyArray | float) -> Bool[AnyArray, ""]:
         """Whether it is positive and finite."""
@@ -250,6 +260,8 @@ class Scale(_Positive):
     log_sd : scalar, optional
         Standard deviation of the logarithm; None means that the value is known.
     """
+
+    arrays = ("median", "log_sd")
 
     def __init__(self, median: Any, log_sd: Any = None) -> None:
         self.median, self.log_sd = median, log_sd
@@ -273,15 +285,6 @@ class Scale(_Positive):
         """The same scale, so many times as great."""
         return Scale(factor * self.median, self.log_sd)
 
-    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """Both are data."""
-        return (self.median, self.log_sd), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, children: Any) -> Scale:
-        """The inverse."""
-        return cls(*children)
-
 
 @jax.tree_util.register_pytree_node_class
 class FieldScale(_Positive):
@@ -293,13 +296,10 @@ class FieldScale(_Positive):
         Scale of the prior.
     """
 
+    arrays = ("width",)
+
     def __init__(self, width: Any) -> None:
         self.width = width
-
-    @property
-    def is_sampled(self) -> bool:
-        """Always."""
-        return True
 
     def draw(self, name: str) -> AnyArray:
         """See `Block`."""
@@ -309,31 +309,21 @@ class FieldScale(_Positive):
         """The scale of the prior."""
         return jnp.asarray(self.width)
 
-    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """All of it is data."""
-        return (self.width,), None
 
-    @classmethod
-    def tree_unflatten(cls, _: None, children: Any) -> FieldScale:
-        """The inverse."""
-        return cls(*children)
-
-
-class FieldComponents(NamedTuple):
+@jax.tree_util.register_pytree_node_class
+class FieldComponents(_Arrays):
     """Whitened components of the field of log-stiffness, independent standard Normal numbers.
 
-    Attributes
+    Parameters
     ----------
     zero : (k,) array
         All of them at rest.
     """
 
-    zero: Float[AnyArray, "modes"]
+    arrays = ("zero",)
 
-    @property
-    def is_sampled(self) -> bool:
-        """Always."""
-        return True
+    def __init__(self, zero: Any) -> None:
+        self.zero = zero
 
     def draw(self, name: str) -> AnyArray:
         """See `Block`."""
@@ -342,30 +332,6 @@ class FieldComponents(NamedTuple):
     def reference(self) -> AnyArray:
         """Zero."""
         return jnp.asarray(self.zero)
-
-    def complete(self, estimand: AnyArray) -> AnyArray:
-        """The estimand itself."""
-        return estimand
-
-    def estimand(self, value: AnyArray) -> AnyArray:
-        """The value itself."""
-        return jnp.asarray(value, float)
-
-    def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
-        """The position itself."""
-        return position, jnp.zeros(())
-
-    def unconstrain(self, estimand: AnyArray) -> AnyArray:
-        """The estimand itself."""
-        return estimand
-
-    def least_curvature(self, position: AnyArray) -> AnyArray:
-        """One."""
-        return jnp.ones_like(position)
-
-    def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
-        """Anywhere."""
-        return jnp.array(True)
 
 
 # Blocks by name; what is particular to one kind is asked of it by those who know that it is there.
