@@ -1,7 +1,8 @@
 """Points and pairs of points from files: CSV, 3D Slicer's .fcsv and .mrk.json, MNI's .tag; in world RAS, mm.
 
-A CSV has a header: `fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z` for pairs or `x, y, z` for points, RAS,
-and where wanted `sd` (mm) and `name`. The other formats say by themselves whether they are LPS or RAS; MNI's is RAS.
+A CSV has a header: `fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z` for pairs or `x, y, z` for points,
+and where wanted `sd` (mm) and `name`. It is RAS unless a line `# CoordinateSystem = LPS` says otherwise. The other
+formats say by themselves whether they are LPS or RAS; MNI's is RAS.
 """
 
 from __future__ import annotations
@@ -22,6 +23,10 @@ FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed",
 PLAIN = ("x", "y", "z")
 # What takes points in a file's system to RAS.
 SYSTEMS = {"RAS": (1.0, 1.0, 1.0), "0": (1.0, 1.0, 1.0), "LPS": (-1.0, -1.0, 1.0), "1": (-1.0, -1.0, 1.0)}
+
+
+# The rows of a tag file: up to the first semicolon outside of quotes.
+TAG_ROWS = r'Points\s*=((?:"[^"]*"|[^";])*);'
 
 
 class Points(NamedTuple):
@@ -83,7 +88,7 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
         Both points of each pair (CSV, or a .tag of two volumes), or the points in the fixed image.
     moving : path, optional
         The points in the moving image: those of the same names where all names differ and are the same in both files,
-        else in the same order.
+        else in the same order. Names that differ within each file and agree in part alone are an error.
 
     Raises
     ------
@@ -98,16 +103,23 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
     if moving is None:
         raise InputError(f"{path} holds points of one space; give the points of the moving image, too")
     other = read_points(moving)
+    if other.sd is not None:
+        raise InputError(f"{moving} gives an sd; expected it in the file of the fixed points, {path}, for each pair")
     if len(other.points) != len(found.points):
         raise InputError(f"{path} holds {len(found.points)} points and {moving} {len(other.points)}: they are no pairs")
-    return PointPairs(found.points, other.points[_order(found.names, other.names)], found.names, found.sd)
+    return PointPairs(found.points, other.points[_order(found, other, f"{path} and {moving}")], found.names, found.sd)
 
 
-def _order(names: tuple[str, ...], others: tuple[str, ...]) -> list[int]:
+def _order(found: Points, other: Points, files: str) -> list[int]:
     """Where the partner of each point stands in the other file."""
-    if len(set(names)) == len(names) and set(names) == set(others):
-        return [others.index(name) for name in names]
-    return list(range(len(names)))
+    names, others = found.names, other.names
+    unique = len(set(names)) == len(names) and len(set(others)) == len(others)
+    shared = set(names) & set(others) - {""}
+    if not unique or not shared:
+        return list(range(len(names)))
+    if alone := sorted(set(names) ^ set(others)):
+        raise InputError(f"{files} share some names only; {alone[0]!r} stands in one of them: give both the same names")
+    return [others.index(name) for name in names]
 
 
 def _read(path: Path) -> Points | PointPairs:
@@ -132,17 +144,24 @@ def _require_sound(found: Points | PointPairs, path: Path) -> None:
         raise InputError(f"{path} holds no point")
     if not np.isfinite(places).all():
         raise InputError(f"{path}: point {1 + int(np.argwhere(~np.isfinite(places))[0, 0])} is not finite")
-    if found.sd is not None and not (np.isfinite(found.sd) & (found.sd > 0)).all():
-        raise InputError(f"{path}: every sd must be a positive number of mm, got {found.sd.min():g} as the least")
+    if found.sd is not None and len(bad := np.flatnonzero(~(np.isfinite(found.sd) & (found.sd > 0)))):
+        raise InputError(
+            f"{path}: every sd must be a positive number of mm, got {found.sd[bad[0]]:g} at point {bad[0] + 1}"
+        )
 
 
 def _read_csv(text: str, path: str) -> Points | PointPairs:
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    lines = [
+        (number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"
+    ]
+    system = _named_system(text, "RAS")
     if not lines:
         raise InputError(f"{path} is empty; expected a header such as {','.join(PLAIN)}")
     header, *rows = [(number, [cell.strip() for cell in next(csv.reader([line]))]) for number, line in lines]
     columns = [column.lower() for column in header[1]]
     wanted = FIXED + MOVING if set(FIXED + MOVING) <= set(columns) else PLAIN
+    if twice := [column for column in (*wanted, "sd", "name") if columns.count(column) > 1]:
+        raise InputError(f"{path}: expected one column {twice[0]}; got {', '.join(header[1])}")
     if not set(wanted) <= set(columns):
         raise InputError(
             f"{path}: expected a header with {', '.join(FIXED + MOVING)}, or with {', '.join(PLAIN)}; got "
@@ -161,22 +180,26 @@ def _read_csv(text: str, path: str) -> Points | PointPairs:
     names = tuple(cells[columns.index("name")] if "name" in columns else "" for _, cells in rows)
     sd = values(["sd"])[:, 0] if "sd" in columns else None
     if wanted == PLAIN:
-        return Points(values(PLAIN), names, sd)
-    return PointPairs(values(FIXED), values(MOVING), names, sd)
+        return Points(_in_ras(values(PLAIN), system, path), names, sd)
+    fixed, moving = (_in_ras(values(side), system, path) for side in (FIXED, MOVING))
+    return PointPairs(fixed, moving, names, sd)
 
 
 def _read_fcsv(text: str, path: str) -> Points:
-    system, columns, points, names = "RAS", ["id", "x", "y", "z"], [], []
+    system, columns, points, names = _named_system(text, "RAS"), ["id", "x", "y", "z"], [], []
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith("#"):
             key, _, value = line[1:].partition("=")
-            system = value.strip() if key.strip() == "CoordinateSystem" else system
             columns = [c.strip() for c in value.split(",")] if key.strip() == "columns" else columns
+            if not set(PLAIN) <= set(columns):
+                raise InputError(f"{path}, line {number}: expected columns x, y, z; got {', '.join(columns)}")
         elif line.strip():
             cells = next(csv.reader([line]))
             if len(cells) < 4:
                 raise InputError(f"{path}, line {number}: expected four columns or more, got {len(cells)}")
-            where = [columns.index(axis) for axis in "xyz"]
+            where = [columns.index(axis) for axis in PLAIN]
+            if len(cells) <= max(where):
+                raise InputError(f"{path}, line {number}: expected {max(where) + 1} columns or more, got {len(cells)}")
             points.append([_number(cells[k], f"{path}, line {number}") for k in where])
             label = columns.index("label") if "label" in columns else len(cells)
             names.append(cells[label] if label < len(cells) else "")
@@ -189,16 +212,24 @@ def _read_markups(text: str, path: str) -> Points:
     except (json.JSONDecodeError, KeyError, TypeError):
         raise InputError(f"{path} is no file of 3D Slicer's markups: expected JSON with the key markups") from None
     points, names = [], []
-    for markup in markups:
+    for markup in _require_objects(markups, "markups", path):
         if markup.get("coordinateUnits", "mm") not in ("mm", ["mm", "UCUM", "millimeter"]):
             raise InputError(f"{path}: expected coordinates in mm, got {markup['coordinateUnits']!r}")
         defined = [
-            point for point in markup.get("controlPoints", []) if point.get("positionStatus", "defined") == "defined"
+            point
+            for point in _require_objects(markup.get("controlPoints", []), "controlPoints", path)
+            if point.get("positionStatus", "defined") == "defined"
         ]
         own = [_position(point, path) for point in defined]
         points.append(_in_ras(own, str(markup.get("coordinateSystem", "LPS")), path))
         names += [str(point.get("label", "")) for point in defined]
     return Points(np.concatenate(points) if points else np.zeros((0, 3)), tuple(names))
+
+
+def _require_objects(value: Any, key: str, path: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise InputError(f"{path}: expected {key} to be a list of JSON objects, got {value!r:.60}")
+    return value
 
 
 def _position(point: Any, path: str) -> list[float]:
@@ -210,28 +241,47 @@ def _position(point: Any, path: str) -> list[float]:
 
 def _read_tag(text: str, path: str) -> Points | PointPairs:
     """MNI's tag points: one row of three coordinates for each volume, RAS, and perhaps weights, ids and a label."""
-    plain = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("%"))
-    volumes, body = re.search(r"Volumes\s*=\s*(\d+)\s*;", plain), re.search(r"Points\s*=(.*?);", plain, re.DOTALL)
+    plain = "\n".join("" if line.lstrip().startswith("%") else line for line in text.splitlines())
+    volumes, body = re.search(r"Volumes\s*=\s*(\d+)\s*;", plain), re.search(TAG_ROWS, plain)
     if not plain.lstrip().startswith("MNI Tag Point File") or volumes is None or body is None:
         raise InputError(f"{path} is no MNI tag file: expected 'MNI Tag Point File', 'Volumes = 2;' and 'Points = …;'")
     count = int(volumes[1])
     if count not in (1, 2):
         raise InputError(f"{path}: expected tags of one or two volumes, got {count}")
     rows, names = [], []
-    for number, line in enumerate((line for line in body[1].splitlines() if line.strip()), 1):
-        label = re.search(r'"([^"]*)"', line)
-        cells = re.sub(r'"[^"]*"', "", line).split()
-        if len(cells) < 3 * count:
-            raise InputError(f"{path}, point {number}: expected {3 * count} coordinates, got {len(cells)}")
-        rows.append([_number(cell, f"{path}, point {number}") for cell in cells[: 3 * count]])
-        names.append(label[1] if label else "")
+    for number, line in enumerate(body[1].split("\n"), 1 + plain.count("\n", 0, body.start(1))):
+        if line.strip():
+            row, name = _tag_row(line, 3 * count, f"{path}, line {number}")
+            rows.append(row)
+            names.append(name)
     table = np.array(rows, float).reshape(-1, 3 * count)
     if count == 1:
         return Points(table, tuple(names))
     return PointPairs(table[:, :3], table[:, 3:], tuple(names))
 
 
-def _in_ras(points: Sequence[Sequence[float]], system: str, path: str) -> Float[np.ndarray, "k 3"]:
+def _tag_row(line: str, wanted: int, where: str) -> tuple[list[float], str]:
+    """Coordinates and label of a row; a weight and two ids may stand between them, and a comment at the end."""
+    numbers, *quoted = re.split(r'"([^"]*)"', line)
+    if "%" in numbers:
+        numbers, quoted = numbers.partition("%")[0], []
+    cells = numbers.split()
+    if len(cells) not in (wanted, wanted + 3):
+        raise InputError(
+            f"{where}: expected {wanted} coordinates, and a weight and two ids or none; got {len(cells)} values"
+        )
+    if len(quoted) > 1 and "".join(quoted[1:]).strip():
+        raise InputError(f"{where}: expected one point a line, got more after the label {quoted[0]!r:.40}")
+    return [_number(cell, where) for cell in cells[:wanted]], quoted[0] if quoted else ""
+
+
+def _named_system(text: str, default: str) -> str:
+    """The coordinate system that a line such as `# CoordinateSystem = LPS` names."""
+    named = re.findall(r"^\s*#\s*CoordinateSystem\s*=\s*(.*?)[\s,]*$", text, re.MULTILINE)
+    return str(named[-1]) if named else default
+
+
+def _in_ras(points: Sequence[Sequence[float]] | np.ndarray, system: str, path: str) -> Float[np.ndarray, "k 3"]:
     if system not in SYSTEMS:
         raise InputError(f"{path}: unknown coordinate system {system!r}; known are {', '.join(SYSTEMS)}")
     return np.array(points, float).reshape(-1, 3) * SYSTEMS[system]

@@ -44,6 +44,7 @@ LPS = PLACES * [-1, -1, 1]
     [
         ("p.csv", "name,x,y,z\na,1,-2,3\nb,4.5,5,-6\n"),
         ("p.csv", "\ufeffx , y,z,Name\n# a comment\n1,-2,3,a\n\n4.5,5,-6,b\n"),
+        ("p.csv", "# CoordinateSystem = LPS\nname,x,y,z\na,-1,2,3\nb,-4.5,-5,-6\n"),
         ("p.fcsv", fcsv("RAS", PLACES)),
         ("p.fcsv", fcsv("0", PLACES)),
         ("p.fcsv", fcsv("LPS", LPS)),
@@ -51,6 +52,8 @@ LPS = PLACES * [-1, -1, 1]
         ("p.mrk.json", markups("RAS", PLACES)),
         ("p.mrk.json", markups("LPS", LPS, coordinateUnits="mm")),
         ("P.TAG", 'MNI Tag Point File\nVolumes = 1;\n% seen\nPoints =\n 1 -2 3 "a"\n 4.5 5 -6 1 1 1 "b";\n'),
+        ("p.tag", 'MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 -2 3 1 0 7 "a"\n 4.5 5 -6 "b"\n;\n'),
+        ("p.csv", "name,x,y,z,,\na,1,-2,3,,\nb,4.5,5,-6,,\n"),
     ],
 )
 def test_points_are_read_in_ras(tmp_path, name, text):
@@ -58,6 +61,20 @@ def test_points_are_read_in_ras(tmp_path, name, text):
     np.testing.assert_allclose(found.points, PLACES)
     assert found.names == ("a", "b")
     assert found.sd is None
+
+
+def test_a_label_may_hold_what_ends_a_tag_file(tmp_path):
+    text = 'MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 -2 3 "a;b % c"\n 4.5 5 -6 % last\n;\n'
+    found = read_points(written(tmp_path, "p.tag", text))
+    np.testing.assert_allclose(found.points, PLACES)
+    assert found.names == ("a;b % c", "")
+
+
+def test_pairs_of_a_csv_may_be_lps(tmp_path):
+    header = "# CoordinateSystem = LPS\nfixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z\n"
+    found = read_point_pairs(written(tmp_path, "p.csv", header + "1,2,3,4,5,6\n"))
+    np.testing.assert_allclose(found.fixed, [[-1, -2, 3]])
+    np.testing.assert_allclose(found.moving, [[-4, -5, 6]])
 
 
 def test_pairs_from_one_file(tmp_path):
@@ -82,6 +99,14 @@ def test_pairs_from_two_files_go_by_name_or_by_order(tmp_path):
     np.testing.assert_allclose(read_point_pairs(first, unnamed).moving, MOVED)
     with pytest.raises(br.InputError, match="give the points of the moving image"):
         read_point_pairs(first)
+    other = written(tmp_path, "o.fcsv", fcsv("RAS", MOVED, labels=("b", "c")))
+    with pytest.raises(br.InputError, match="share some names only; 'a' stands in one of them"):
+        read_point_pairs(first, other)
+    other = written(tmp_path, "o.fcsv", fcsv("RAS", MOVED, labels=("m1", "m2")))
+    np.testing.assert_allclose(read_point_pairs(first, other).moving, MOVED)
+    own = written(tmp_path, "sd.csv", "x,y,z,sd\n1,2,3,1\n1,2,4,1\n")
+    with pytest.raises(br.InputError, match=r"sd\.csv gives an sd; expected it in the file of the fixed points"):
+        read_point_pairs(first, own)
     one = written(tmp_path, "one.csv", "x,y,z\n1,2,3\n")
     with pytest.raises(br.InputError, match=r"holds 2 points and .*one\.csv 1"):
         read_point_pairs(first, one)
@@ -97,13 +122,31 @@ def test_pairs_from_two_files_go_by_name_or_by_order(tmp_path):
         ("p.csv", "x,y,z\n1,2,three\n", "line 2: expected a number, got 'three'"),
         ("p.csv", "x,y,z\n", "holds no point"),
         ("p.csv", "x,y,z\n1,2,nan\n", "point 1 is not finite"),
-        ("p.csv", "x,y,z,sd\n1,2,3,0\n", "every sd must be a positive number of mm, got 0"),
+        ("p.csv", "x,y,z,sd\n1,2,3,0\n", "every sd must be a positive number of mm, got 0 at point 1"),
+        ("p.csv", "x,y,z,sd\n1,2,3,1\n1,2,3,inf\n", "every sd must be a positive number of mm, got inf at point 2"),
+        ("p.csv", "x,y,z,X\n1,2,3,4\n", "expected one column x; got x, y, z, X"),
+        ("p.csv", "# CoordinateSystem = IJK\nx,y,z\n1,2,3\n", "unknown coordinate system 'IJK'"),
+        ("p.fcsv", "# columns = id,r,a,s\nq,1,2,3\n", "line 1: expected columns x, y, z; got id, r, a, s"),
+        ("p.fcsv", "# columns = id,ow,x,y,z\nq,1,2,3\n", "line 2: expected 5 columns or more, got 4"),
+        ("p.mrk.json", '{"markups": null}', "expected markups to be a list of JSON objects, got None"),
+        ("p.mrk.json", '{"markups": [{"controlPoints": ["a"]}]}', "expected controlPoints to be a list"),
+        ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [1, 2]}]}]}', "a position of three numbers"),
         ("p.fcsv", fcsv("IJK", PLACES), "unknown coordinate system 'IJK'"),
         ("p.fcsv", "id0,1,2\n", "line 1: expected four columns or more"),
         ("p.mrk.json", "{}", "no file of 3D Slicer's markups"),
         ("p.mrk.json", markups("LPS", LPS, coordinateUnits="voxel"), "expected coordinates in mm"),
         ("p.tag", "Points = 1 2 3;", "is no MNI tag file"),
-        ("p.tag", "MNI Tag Point File\nVolumes = 2;\nPoints =\n 1 2 3;\n", "point 1: expected 6 coordinates, got 3"),
+        ("p.tag", "MNI Tag Point File\nVolumes = 2;\nPoints =\n 1 2 3;\n", "line 4: expected 6 coordinates"),
+        (
+            "p.tag",
+            'MNI Tag Point File\nVolumes = 1;\n% a\nPoints =\n 1 2 x "";\n',
+            "line 5: expected a number, got 'x'",
+        ),
+        (
+            "p.tag",
+            'MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 2 3 "" 4 5 6 "";\n',
+            "line 4: expected one point a line",
+        ),
     ],
 )
 def test_what_is_wrong_is_told(tmp_path, name, text, message):
