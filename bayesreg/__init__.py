@@ -27,10 +27,10 @@ _HOME = {
     "ImagePair": "model.terms.images",
     "Landmarks": "model.terms.landmarks",
     "independent_points": "model.independence",
-    "make_pair": "model.simulation",
-    "Start": "inference.initialise",
-    "StopRule": "inference.stopping",
-    "sample": "inference.run",
+    "make_pair": "synthetic.pair",
+    "Start": "inference.chains.initialise",
+    "StopRule": "inference.chains.stopping",
+    "sample": "inference.chains.run",
     "load_image": "io.volumes",
     "read_point_pairs": "io.points",
     "save_image": "io.volumes",
@@ -39,8 +39,8 @@ _HOME = {
     "load_mesh": "io.meshing",
     "save_mesh": "io.meshing",
     "load_config": "config",
-    "load_result": "pipeline",
-    "run": "pipeline",
+    "load_result": "workflow.result",
+    "run": "workflow.run",
 }
 
 __all__ = ["__version__", *sorted(_HOME)]

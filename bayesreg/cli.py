@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from bayesreg import __version__
-from bayesreg.programs import compile_quickly, keep_compiled_programs
+from bayesreg.compilation import compile_quickly, keep_compiled_programs
 
 NOT_CONVERGED = 3
 STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
@@ -89,12 +89,12 @@ def run(
     settings = load_config(config, overrides or ())
     if settings.distributed is not None:
         # BlackJAX computes something when it is imported, after which no process can join any more.
-        from bayesreg.inference.devices import join
+        from bayesreg.inference.chains.devices import join
 
         join(**settings.distributed.model_dump())
-    from bayesreg import pipeline
+    from bayesreg.workflow.run import run
 
-    result = pipeline.run(settings, out, resume=resume, progress=not quiet)
+    result = run(settings, out, resume=resume, progress=not quiet)
     typer.echo(f"Report: {Path(result.folder) / 'report.html'}")
     if result.converged is False:
         typer.echo("Not converged; the results are written, and the report says how far it came.")
@@ -107,9 +107,9 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     from bayesreg.config import load_config
 
     settings = load_config(config, overrides or ())
-    from bayesreg import pipeline
+    from bayesreg.workflow.check import check
 
-    typer.echo(pipeline.check(settings).text)
+    typer.echo(check(settings).text)
 
 
 @app.command()
@@ -118,18 +118,18 @@ def simulate(config: ConfigFile, out: OutFolder, overrides: Overrides = None) ->
     from bayesreg.config import load_config
 
     settings = load_config(config, overrides or ())
-    from bayesreg import pipeline
+    from bayesreg.workflow.simulate import simulate
 
-    pipeline.simulate(settings, out)
+    simulate(settings, out)
     typer.echo(f"Pair: {out}")
 
 
 @app.command()
 def report(folder: RunFolder) -> None:
     """Write the report of a run once more."""
-    from bayesreg import pipeline
+    from bayesreg.workflow.result import report
 
-    typer.echo(f"Report: {pipeline.report(folder)}")
+    typer.echo(f"Report: {report(folder)}")
 
 
 @app.command()
@@ -137,9 +137,9 @@ def compare(folders: RunFolders, out: Page = Path("compare.html")) -> None:
     """Put runs side by side, as the paper does with three tissues and one."""
     if len(folders) < 2:
         raise typer.BadParameter("expected the folders of at least two runs", param_hint="DIR DIR...")
-    from bayesreg import pipeline
+    from bayesreg.workflow.result import compare
 
-    typer.echo(f"Comparison: {pipeline.compare(folders, out)}")
+    typer.echo(f"Comparison: {compare(folders, out)}")
 
 
 @app.command()
@@ -155,10 +155,10 @@ def compare_samplers(
     from bayesreg.config import load_config
 
     settings = load_config(config, overrides or ())
-    from bayesreg import comparison
+    from bayesreg.workflow.compare_samplers import compare_samplers
 
     chosen = {} if samplers is None else {"samplers": [name.strip() for name in samplers.split(",")]}
-    comparison.compare_samplers(settings, out, minutes=minutes, progress=not quiet, **chosen)
+    compare_samplers(settings, out, minutes=minutes, progress=not quiet, **chosen)
     typer.echo(f"Comparison: {out / 'samplers.html'}")
 
 
@@ -167,10 +167,10 @@ def mesh_error(folder: RunFolder, bodies: Bodies = 24, quiet: Quiet = False) -> 
     """Tell what its mesh does to the λ/μ of a run: bodies of known stiffness are registered on it."""
     from rich.console import Console
 
-    from bayesreg import discretisation
     from bayesreg.report.tables import in_terminal
+    from bayesreg.workflow.mesh_error import mesh_error
 
-    Console().print(in_terminal(discretisation.mesh_error(folder, bodies, progress=not quiet)))
+    Console().print(in_terminal(mesh_error(folder, bodies, progress=not quiet)))
     typer.echo(f"Report: {folder / 'report.html'}")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from bayesreg.chains import with_chains_as_columns
+from bayesreg.columns import with_chains_as_columns
 from bayesreg.types import AnyArray, InputError
 
 Interpolation = Literal["linear", "cubic"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-from bayesreg.programs import compile_quickly
+from bayesreg.compilation import compile_quickly
 
 _ROOT = Path(__file__).parent.parent
 

@@ -6,8 +6,8 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from bayesreg import preparation
 from bayesreg.cli import app
+from bayesreg.workflow import preparation
 
 SHAPE = (24, 24, 24)
 

@@ -1,6 +1,7 @@
 """The command line: its statuses, what it says, and how fast help comes."""
 
 import errno
+import importlib
 import inspect
 import json
 import subprocess
@@ -12,17 +13,19 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-import bayesreg
+from bayesreg import __version__
 from bayesreg.cli import app
 from bayesreg.types import InputError
 
 QUICK = str(Path(__file__).parent.parent / "configs" / "quickstart.yaml")
+# The module of `bayesreg.workflow` that holds each verb.
+HOMES = {"run": "run", "check": "check", "simulate": "simulate", "report": "result", "compare": "result"}
 PROGRAM = str(Path(sys.executable).parent / "bayesreg")
 
 
 @pytest.fixture
-def pipeline(monkeypatch):
-    """A pipeline that keeps what it was asked to do."""
+def workflow(monkeypatch):
+    """Verbs that keep what they were asked to do."""
     calls = {}
 
     def run(config, out, resume=False, progress=True):
@@ -43,47 +46,50 @@ def pipeline(monkeypatch):
         calls["compare"] = (folders, out)
         return out
 
-    stub = SimpleNamespace(run=run, check=check, simulate=simulate, report=report, compare=compare)
-    monkeypatch.setattr(bayesreg, "pipeline", stub, raising=False)
-    return SimpleNamespace(stub=stub, calls=calls)
+    def replace(verb, function):
+        monkeypatch.setattr(f"bayesreg.workflow.{HOMES[verb]}.{verb}", function)
+
+    for function in (run, check, simulate, report, compare):
+        replace(function.__name__, function)
+    return SimpleNamespace(replace=replace, calls=calls)
 
 
 def invoke(*arguments: str):
     return CliRunner().invoke(app, arguments)
 
 
-def test_run_passes_overrides_and_flags_on_and_names_the_report(pipeline):
+def test_run_passes_overrides_and_flags_on_and_names_the_report(workflow):
     result = invoke(
         "run", QUICK, "-o", "out", "--set", "sampler.chains=7", "--set", "stop.max_steps=50", "--resume", "-q"
     )
-    config, out, resume, progress = pipeline.calls["run"]
+    config, out, resume, progress = workflow.calls["run"]
     assert result.exit_code == 0
     assert (config.sampler.chains, config.stop.max_steps) == (7, 50)
     assert (out, resume, progress) == (Path("out"), True, False)
     assert f"Report: {Path('out') / 'report.html'}" in result.output
 
 
-def test_run_that_did_not_converge_says_so_with_status_3(pipeline):
+def test_run_that_did_not_converge_says_so_with_status_3(workflow):
     result = invoke("run", QUICK, "-o", "out", "--set", "seed=2")
     assert result.exit_code == 3
     assert "Not converged" in result.output
     assert "report.html" in result.output
 
 
-def test_other_commands_call_the_pipeline(pipeline):
+def test_other_commands_call_their_verbs(workflow):
     assert "about 3 minutes" in invoke("check", QUICK, "--set", "seed=4").output
-    assert pipeline.calls["check"][0].seed == 4
+    assert workflow.calls["check"][0].seed == 4
     assert invoke("simulate", QUICK, "-o", "pair").exit_code == 0
-    assert pipeline.calls["simulate"][1] == Path("pair")
+    assert workflow.calls["simulate"][1] == Path("pair")
     assert str(Path("a") / "report.html") in invoke("report", "a").output
     assert invoke("compare", "a", "b", "c", "-o", "page.html").exit_code == 0
-    assert pipeline.calls["compare"] == ([Path("a"), Path("b"), Path("c")], Path("page.html"))
+    assert workflow.calls["compare"] == ([Path("a"), Path("b"), Path("c")], Path("page.html"))
 
 
 def test_samplers_to_compare_are_named_or_all(monkeypatch):
     calls = []
-    stub = SimpleNamespace(compare_samplers=lambda *given, **options: calls.append((given, options)))
-    monkeypatch.setattr(bayesreg, "comparison", stub, raising=False)
+    verb = "bayesreg.workflow.compare_samplers.compare_samplers"
+    monkeypatch.setattr(verb, lambda *given, **options: calls.append((given, options)))
     done = invoke("compare-samplers", QUICK, "--samplers", "hmc, nuts", "--minutes", "2", "--set", "seed=4", "-q")
     assert done.exit_code == 0
     (config, out), options = calls[0]
@@ -92,9 +98,7 @@ def test_samplers_to_compare_are_named_or_all(monkeypatch):
     assert "samplers" not in (invoke("compare-samplers", QUICK), calls[1])[1][1]
 
 
-def test_the_real_pipeline_takes_what_the_commands_give():
-    from bayesreg import pipeline
-
+def test_the_real_verbs_take_what_the_commands_give():
     for name, arguments in {
         "run": ("config", "out", "resume", "progress"),
         "check": ("config",),
@@ -102,24 +106,25 @@ def test_the_real_pipeline_takes_what_the_commands_give():
         "report": ("folder",),
         "compare": ("folders", "out"),
     }.items():
-        assert set(arguments) <= set(inspect.signature(getattr(pipeline, name)).parameters)
+        verb = getattr(importlib.import_module(f"bayesreg.workflow.{HOMES[name]}"), name)
+        assert set(arguments) <= set(inspect.signature(verb).parameters)
 
 
-def test_bad_input_is_one_message_with_status_2(pipeline):
+def test_bad_input_is_one_message_with_status_2(workflow):
     def run(config, out, resume, progress):
         raise InputError(f"{out} holds another run; choose another folder, or go on with --resume")
 
-    pipeline.stub.run = run
+    workflow.replace("run", run)
     result = invoke("run", QUICK, "-o", "out")
     assert result.exit_code == 2
     assert result.stderr == "bayesreg: out holds another run; choose another folder, or go on with --resume\n"
 
 
-def test_a_full_disk_is_one_message_that_names_the_way_on(pipeline):
+def test_a_full_disk_is_one_message_that_names_the_way_on(workflow):
     def run(config, out, resume, progress):
         raise OSError(errno.ENOSPC, "No space left on device", f"{out}/draws/block_00003.npz")
 
-    pipeline.stub.run = run
+    workflow.replace("run", run)
     result = invoke("run", QUICK, "-o", "out")
     assert result.exit_code == 1
     assert "No space left on device: 'out/draws/block_00003.npz'" in result.stderr
@@ -127,11 +132,11 @@ def test_a_full_disk_is_one_message_that_names_the_way_on(pipeline):
     assert "Traceback" not in result.stderr
 
 
-def test_a_bug_is_not_taken_for_bad_input(pipeline):
+def test_a_bug_is_not_taken_for_bad_input(workflow):
     def check(config):
         raise ValueError("shapes do not match")
 
-    pipeline.stub.check = check
+    workflow.replace("check", check)
     result = invoke("check", QUICK)
     assert result.exit_code == 1
     assert isinstance(result.exception, ValueError)
@@ -162,7 +167,7 @@ def test_program_shows_no_traceback_for_a_bad_configuration(tmp_path, command):
 
 def test_version_is_the_packages():
     done = subprocess.run([PROGRAM, "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout == f"bayesreg {bayesreg.__version__}\n"
+    assert done.stdout == f"bayesreg {__version__}\n"
 
 
 def test_programs_are_compiled_quickly(monkeypatch):

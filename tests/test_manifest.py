@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 import bayesreg as br
-from bayesreg.manifest import implied_noise_sd
+from bayesreg.workflow.manifest import implied_noise_sd
 from tests.phantoms import ball_mesh, smooth_image
 
 

@@ -17,13 +17,16 @@ import xarray as xr
 from ruamel.yaml import YAML
 
 import bayesreg as br
-from bayesreg import pipeline, preparation
-from bayesreg.assembly import posterior_of
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
 from bayesreg.model.state import interpolation_at
+from bayesreg.workflow import preparation
+from bayesreg.workflow import run as run_module
+from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.check import check
+from bayesreg.workflow.simulate import simulate
 from tests.phantoms import ball_mesh
 
 ROOT = Path(__file__).parent.parent
@@ -147,14 +150,14 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
     monkeypatch.undo()
     with pytest.raises(br.InputError, match="another configuration"):
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "cut", resume=True, progress=False)
-    provenance = store.read_json(folder / "cut" / pipeline.PROVENANCE)
+    provenance = store.read_json(folder / "cut" / preparation.PROVENANCE)
     assert 0 < provenance["unsampled"] < 600
-    store.write_json(folder / "cut" / pipeline.PROVENANCE, provenance | {"unsampled": 3600})
+    store.write_json(folder / "cut" / preparation.PROVENANCE, provenance | {"unsampled": 3600})
     resumed = br.run(folder / "run.yaml", folder / "cut", resume=True, progress=False)
     timings = resumed.run.manifest["timings"]
     assert 3600 + timings["sampling"] < timings["total"] < 3600 + timings["sampling"] + 600
     # What the resumed run spent on getting ready counts, should it be cut off itself.
-    assert store.read_json(folder / "cut" / pipeline.PROVENANCE)["unsampled"] > 3600
+    assert store.read_json(folder / "cut" / preparation.PROVENANCE)["unsampled"] > 3600
     np.testing.assert_array_equal(resumed.idata.posterior.u_boundary, finished.idata.posterior.u_boundary)
     np.testing.assert_array_equal(resumed.u_sd, finished.u_sd)
 
@@ -183,7 +186,7 @@ def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(syntheti
     monkeypatch.setattr(preparation, "make_pair", None)
     np.savez(folder / "other.npz", u=np.zeros((9, 3)))
     with pytest.raises(br.InputError, match=r"other\.npz has shape \(9, 3\); expected \(\d\d+, 3\)"):
-        pipeline.check(synthetic("paper", "start.field=other.npz"))
+        check(synthetic("paper", "start.field=other.npz"))
 
 
 def test_nothing_is_written_where_a_chain_cannot_start(folder):
@@ -215,11 +218,11 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
 
 @pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
 def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(points, draws):
-    assert pipeline._block(points) == draws
+    assert run_module._block(points) == draws
 
 
 def test_check_estimates_without_writing(folder):
-    text = pipeline.check(folder / "run.yaml").text
+    text = check(folder / "run.yaml").text
     assert "steps per second" in text
     assert "MB on the device" in text
 
@@ -228,10 +231,10 @@ def test_uniform_beside_tissues(finished, folder):
     uniform = br.load_config(folder / "run.yaml", ["model.elasticity=uniform"])
     result = br.run(uniform, folder / "uniform", progress=False)
     assert result.idata.posterior.sizes["tissue"] == 1
-    page = pipeline.compare([folder / "out", folder / "uniform"], folder / "compare.html").read_text()
+    page = result_module.compare([folder / "out", folder / "uniform"], folder / "compare.html").read_text()
     assert "Uniform" in page
     assert "By tissue" in page
-    report = pipeline.report(folder / "uniform")
+    report = result_module.report(folder / "uniform")
     assert report.stat().st_size > 100_000
 
 
@@ -358,7 +361,7 @@ def test_two_processes_draw_what_one_draws(finished, folder):
 
 @pytest.mark.usefixtures("no_report")
 def test_simulate_writes_the_pair(synthetic, folder):
-    out = pipeline.simulate(synthetic("paper"), folder / "simulated")
+    out = simulate(synthetic("paper"), folder / "simulated")
     inputs = store.read_inputs(out)
     assert inputs.truth is not None
     assert inputs.moving.shape == inputs.fixed.shape

@@ -10,9 +10,9 @@ import xarray as xr
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.predictive import predictive_p
+from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
-from bayesreg.prediction import default_landmarks, predict, require_inside
+from bayesreg.workflow.prediction import default_landmarks, predict, require_inside
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(3)

@@ -1,6 +1,6 @@
 """What a run is to do: pydantic models of the configuration, and their YAML form.
 
-A configuration holds no arrays and builds nothing; `bayesreg.pipeline` does that.
+A configuration holds no arrays and builds nothing; `bayesreg.workflow.run` does that.
 """
 
 from bayesreg.config.errors import ConfigError

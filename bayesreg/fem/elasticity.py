@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from bayesreg.chains import with_chains_as_columns
+from bayesreg.columns import with_chains_as_columns
 from bayesreg.fem.elements import Elements, Gradient, displacement_gradient, elements_of, shape_gradients
 from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.chains import with_chains_as_columns
+from bayesreg.columns import with_chains_as_columns
 from bayesreg.fem import preconditioners
 from bayesreg.fem.elasticity import (
     force_between,

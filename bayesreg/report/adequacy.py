@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from scipy import stats
 
-from bayesreg.inference.predictive import predictive_p
+from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.io.store import Predicted
 from bayesreg.report import panels, style
 from bayesreg.report.panels import View

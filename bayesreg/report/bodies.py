@@ -1,4 +1,4 @@
-"""λ/μ allowing for the mesh: what simulated bodies tell of a registration on it (see `bayesreg.discretisation`)."""
+"""λ/μ allowing for the mesh: what simulated bodies (`bayesreg.synthetic.bodies`) tell of a registration on it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import xarray as xr
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from bayesreg.inference.recalibration import RANGE, Response, least_bodies, recalibrated, response
 from bayesreg.mesh import TetMesh
 from bayesreg.report import style
 from bayesreg.report.estimands import parameter_groups
@@ -19,6 +18,7 @@ from bayesreg.report.places import tissue_label
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import number
+from bayesreg.synthetic.recalibration import RANGE, Response, least_bodies, recalibrated, response
 
 
 class Allowed(NamedTuple):

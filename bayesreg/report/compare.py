@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from bayesreg.inference.draws import dataset
+from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Run
 from bayesreg.report import panels, style, tables

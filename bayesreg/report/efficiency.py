@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from rich.table import Table as TerminalTable
 
-from bayesreg.inference.efficiency import Efficiency
+from bayesreg.inference.chains.efficiency import Efficiency
 from bayesreg.io.atomic import write_json, write_text
 from bayesreg.report import style
 from bayesreg.report.html import render

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from bayesreg import __version__
-from bayesreg.inference.draws import dataset
+from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.atomic import write_text
 from bayesreg.io.store import Run
 from bayesreg.report import (

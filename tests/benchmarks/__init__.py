@@ -1,5 +1,5 @@
 """Compiled as the command line has it, before anything imports JAX."""
 
-from bayesreg.programs import compile_quickly
+from bayesreg.compilation import compile_quickly
 
 compile_quickly()

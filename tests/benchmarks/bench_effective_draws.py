@@ -16,9 +16,9 @@ import numpy as np
 import xarray as xr
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of
-from bayesreg.inference.samplers import SAMPLERS, chosen_sampler
+from bayesreg.inference.samplers.registry import SAMPLERS, chosen_sampler
 from bayesreg.io import store
+from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_samplers import PAPERS_THIN, block_from
 from tests.benchmarks.bench_sampling import _median
 from tests.inference.random_walk import ess_per_step, gaussian_walk

@@ -37,7 +37,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import bayesreg as br
 from bayesreg.fem.equilibrium import equilibrium
-from bayesreg.inference.devices import side_by_side
+from bayesreg.inference.chains.devices import side_by_side
 from bayesreg.io.datasets import mni152
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh
@@ -47,7 +47,7 @@ from bayesreg.model.blocks import completed
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior, build_posterior
 from bayesreg.model.program import Problem as Data
-from bayesreg.preparation import prepare
+from bayesreg.workflow.preparation import prepare
 from tests.benchmarks import floor
 from tests.benchmarks.bench_sampling import _median
 from tests.benchmarks.places import scattered

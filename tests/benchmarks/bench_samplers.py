@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of
-from bayesreg.inference.block import run_block
-from bayesreg.inference.checkpoint import Checkpoint
-from bayesreg.inference.run import _first, checkpoint_from_arrays
-from bayesreg.inference.samplers import SAMPLERS, Chosen, chosen_sampler
+from bayesreg.inference.chains.block import run_block
+from bayesreg.inference.chains.checkpoint import Checkpoint
+from bayesreg.inference.chains.run import _first, checkpoint_from_arrays
+from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, chosen_sampler
 from bayesreg.io import store
 from bayesreg.model.posterior import Posterior
+from bayesreg.workflow.assembly import posterior_of
 
 ROUNDS, DRAWS = 5, 3
 # Of the paper's kernel a draw is a step, and few are in the support.

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from bayesreg.inference.run import sample
+from bayesreg.inference.chains.run import sample
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import build_posterior
 from tests.phantoms import ball_mesh, smooth_image

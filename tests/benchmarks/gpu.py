@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of
-from bayesreg.inference.diagnostics import convergence
-from bayesreg.inference.run import first_checkpoint, sample
-from bayesreg.inference.stopping import StopRule
+from bayesreg.inference.chains.run import first_checkpoint, sample
+from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.io import store
+from bayesreg.workflow.assembly import posterior_of
 
 REPEATS = 5
 CHAINS = (1, 4, 16, 64, 256, 1024, 4096)

@@ -13,7 +13,7 @@ from unittest import mock
 
 import numpy as np
 
-from bayesreg.inference import devices
+from bayesreg.inference.chains import devices
 from tests.benchmarks.bench_evaluation import CHAINS, _places, _problem, program
 from tests.benchmarks.bench_sampling import _median
 

@@ -19,7 +19,7 @@ import numpy as np
 
 import bayesreg as br
 from bayesreg.fem.elasticity import stiffness
-from bayesreg.inference.diagnostics import convergence
+from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.model.options import FieldConfig
 from tests.oracles.paper import solve_unknown
 from tests.phantoms import ball_mesh, pair_from_model

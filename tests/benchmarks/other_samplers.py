@@ -43,15 +43,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of, start_of
-from bayesreg.inference.checkpoint import Block, Checkpoint
-from bayesreg.inference.diagnostics import worst
-from bayesreg.inference.initialise import Start
-from bayesreg.inference.laplace import Reference
+from bayesreg.inference.chains.checkpoint import Checkpoint
+from bayesreg.inference.chains.initialise import Start
+from bayesreg.inference.chains.run import first_checkpoint, sample
+from bayesreg.inference.draws.blocks import Block
+from bayesreg.inference.draws.diagnostics import worst
+from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.whitened import whitened
 from bayesreg.inference.layout import unravel
-from bayesreg.inference.run import first_checkpoint, sample
-from bayesreg.inference.whitened import whitened
 from bayesreg.io import store
+from bayesreg.workflow.assembly import posterior_of, start_of
 from tests.phantoms import ball_mesh, flat_skull, smooth_image
 
 BLOCK, TREE_DEPTH, WARM_UP, TUNED_EVERY, ENDLESS = 20, 10, 1_000, 25, 10**9

@@ -21,17 +21,17 @@ import jax
 import jax.numpy as jnp
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.equilibrium import equilibrium
-from bayesreg.inference.hamiltonian import _quarter_turn
-from bayesreg.inference.loose import moved_alone
-from bayesreg.inference.reflection import rotated
-from bayesreg.inference.run import checkpoint_from_arrays
-from bayesreg.inference.samplers import chosen_sampler
-from bayesreg.inference.whitened import clearance_of, whitened_density, whitened_position
+from bayesreg.inference.chains.run import checkpoint_from_arrays
+from bayesreg.inference.gaussian.loose import moved_alone
+from bayesreg.inference.gaussian.reflection import rotated
+from bayesreg.inference.gaussian.whitened import clearance_of, whitened_density, whitened_position
+from bayesreg.inference.samplers.hamiltonian import _quarter_turn
+from bayesreg.inference.samplers.registry import chosen_sampler
 from bayesreg.io import store
 from bayesreg.model.blocks import completed
+from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_sampling import _median
 
 APART = 0.01  # In whitened coordinates.

@@ -16,9 +16,9 @@ import numpy as np
 import scipy.linalg
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of
 from bayesreg.io import store
 from bayesreg.model.blocks import Scale
+from bayesreg.workflow.assembly import posterior_of
 
 
 def eigenvalues(folder: Path) -> np.ndarray:

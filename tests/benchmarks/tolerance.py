@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import bayesreg as br
-from bayesreg.assembly import posterior_of
 from bayesreg.io import store
 from bayesreg.model import posterior as posterior_module
-from bayesreg.pipeline import Result
+from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.run import Result
 
 DRAWS, TOLERANCES = 40, (1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 

@@ -14,11 +14,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.laplace import Reference, laplace
+from bayesreg.inference.gaussian.laplace import Reference, laplace
+from bayesreg.inference.gaussian.loose import loose
+from bayesreg.inference.gaussian.normaliser import stand_in
+from bayesreg.inference.gaussian.whitened import Setup, setup_about
 from bayesreg.inference.layout import displacements
-from bayesreg.inference.loose import loose
-from bayesreg.inference.normaliser import stand_in
-from bayesreg.inference.whitened import Setup, setup_about
 from tests.calibration.simulator import MESH, Simulator, draw_data, observing
 
 # Every third node's displacement is looked at: neighbours say much the same.

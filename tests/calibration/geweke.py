@@ -19,7 +19,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.samplers.registry import SAMPLERS
 from tests.calibration.chains import (
     ALONE,
     BATCH,

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import spsolve
 import bayesreg as br
 from bayesreg.fem.elasticity import stiffness
 from bayesreg.fem.location import transfer
-from bayesreg.model.deformation import push_patch
+from bayesreg.synthetic.deformation import push_patch
 from tests.calibration import pairs
 
 EDGES = (13.0, 15.5, 18.0, 22.0)

@@ -4,7 +4,8 @@ Each pair has its own patch and noise (sd 0.01 on each image), of the MNI152 bra
 them is finer than the one that registers them, or, to tell what of an error is the mesh's, the same. A node of the
 coarser mesh may lie a millimetre or two outside the body that was pushed, and where that slides along the skull, the
 truth takes the node into it: between different meshes the registration is therefore without a skull. Intervals of pairs
-between different meshes allow for the registering one, by bodies that are made on a third (`bayesreg.discretisation`).
+between different meshes allow for the registering one, by bodies that are made on a third
+(`bayesreg.workflow.mesh_error`).
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ import jax
 import numpy as np
 
 import bayesreg as br
-from bayesreg.discretisation import PATCH_SHARE, Subject, register_body
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
-from bayesreg.inference.diagnostics import convergence
-from bayesreg.inference.draws import dataset
-from bayesreg.inference.recalibration import Response, recalibrated, response
-from bayesreg.inference.stopping import StopRule
+from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.draws.diagnostics import convergence
+from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.atomic import write_text
 from bayesreg.io.datasets import Anatomy as AnatomyOfData
 from bayesreg.io.datasets import mni152
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain, save_mesh
-from bayesreg.model.deformation import Direction
-from bayesreg.model.simulation import SyntheticPair, make_pair
 from bayesreg.report.bodies import sound
+from bayesreg.synthetic.deformation import Direction
+from bayesreg.synthetic.pair import SyntheticPair, make_pair
+from bayesreg.synthetic.recalibration import Response, recalibrated, response
 from bayesreg.types import InputError
+from bayesreg.workflow.mesh_error import PATCH_SHARE, Subject, register_body
 from tests.calibration import figures
 
 COUNT, ENOUGH = 20, 17

@@ -22,12 +22,12 @@ from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference.gaussian.laplace import averaged
+from bayesreg.inference.gaussian.mode_search import settled
+from bayesreg.inference.gaussian.reflection import rotated
+from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whitened, whitened_position
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.laplace import averaged
-from bayesreg.inference.mode_search import settled
-from bayesreg.inference.reflection import rotated
-from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.inference.whitened import Setup, clearance_of, whitened, whitened_position
+from bayesreg.inference.samplers.registry import SAMPLERS
 from tests.calibration.chains import (
     ALONE,
     BATCH,

@@ -16,9 +16,9 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.laplace import Reference
-from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.inference.whitened import setup_about
+from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.whitened import setup_about
+from bayesreg.inference.samplers.registry import SAMPLERS
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, linear_image, rotated_affine, smooth_image
 

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayesreg.inference.block import run_block
-from bayesreg.inference.devices import devices_for, require_joined, side_by_side
-from bayesreg.inference.run import first_checkpoint, sample
-from bayesreg.inference.samplers import chosen_sampler
+from bayesreg.inference.chains.block import run_block
+from bayesreg.inference.chains.devices import devices_for, require_joined, side_by_side
+from bayesreg.inference.chains.run import first_checkpoint, sample
+from bayesreg.inference.samplers.registry import chosen_sampler
 from tests.inference.gaussians import GaussianTarget
 from tests.model.test_equality import posterior
 

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference import diagnostics
-from bayesreg.inference.diagnostics import convergence, worst
-from bayesreg.inference.draws import STATISTICS, open_posterior, save_posterior, to_blocks, to_inference_data
+from bayesreg.inference.draws import diagnostics
+from bayesreg.inference.draws.diagnostics import convergence, worst
+from bayesreg.inference.draws.inference_data import (
+    STATISTICS,
+    open_posterior,
+    save_posterior,
+    to_blocks,
+    to_inference_data,
+)
 from bayesreg.io.store import StoredBlocks
 from tests.phantoms import ball_mesh, smooth_image
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference import efficiency as module
-from bayesreg.inference.efficiency import Budget, efficiency, sampling_seconds
+from bayesreg.inference.chains import efficiency as module
+from bayesreg.inference.chains.efficiency import Budget, efficiency, sampling_seconds
 from tests.inference.gaussians import GaussianTarget
 
 BUDGET = Budget(chains=3, draws=60, stop=br.StopRule(rhat=1.01, ess=1e6))

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from bayesreg.inference.hierarchy import balanced, is_scale, tempered
+from bayesreg.inference.gaussian.hierarchy import balanced, is_scale, tempered
 
 COUNT, NOISE = 100, 0.5
 

@@ -9,9 +9,9 @@ from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
 import bayesreg as br
-from bayesreg.inference.laplace import _convex, hessian_rows, laplace, precision_at, pulled
+from bayesreg.inference.gaussian.laplace import _convex, hessian_rows, laplace, precision_at, pulled
+from bayesreg.inference.gaussian.mode_search import GAP, find_mode
 from bayesreg.inference.layout import unravel
-from bayesreg.inference.mode_search import GAP, find_mode
 from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem, walled
 from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image

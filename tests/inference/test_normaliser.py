@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference.hamiltonian import hmc
-from bayesreg.inference.initialise import starting_points
+from bayesreg.inference.chains.initialise import starting_points
+from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delayed, stand_in
+from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.kernel import Info
-from bayesreg.inference.laplace import Reference
-from bayesreg.inference.normaliser import Delayed, StandIn, delayed, stand_in
-from bayesreg.inference.whitened import setup_about
+from bayesreg.inference.samplers.hamiltonian import hmc
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(2)

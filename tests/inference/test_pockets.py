@@ -7,10 +7,10 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference import mode_search, pockets
+from bayesreg.inference.gaussian import mode_search, pockets
+from bayesreg.inference.gaussian.mode_search import find_mode
+from bayesreg.inference.gaussian.pockets import out_of_pockets
 from bayesreg.inference.layout import unravel
-from bayesreg.inference.mode_search import find_mode
-from bayesreg.inference.pockets import out_of_pockets
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 from tests.model.test_neighbourhood import MESH, posterior, state
 from tests.phantoms import smooth_image

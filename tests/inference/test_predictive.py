@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayesreg.inference import predictive
-from bayesreg.inference.predictive import predictive_p, push_forward, summarise, thinned
+from bayesreg.inference.draws import predictive
+from bayesreg.inference.draws.predictive import predictive_p, push_forward, summarise, thinned
 
 DRAWS = {"u": np.random.default_rng(0).gamma(2.0, size=(3, 50, 4)), "scale": np.linspace(1, 2, 150).reshape(3, 50)}
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from bayesreg.inference.progress import draws_until, time_left
+from bayesreg.inference.chains.progress import draws_until, time_left
 
 
 def test_draws_until_convergence_follow_the_excess_of_rhat():
@@ -30,7 +30,7 @@ def test_time_left_tells_both():
 def test_arviz_is_imported_without_its_announcement(tmp_path):
     """It makes the announcement once a day: with a new cache it has not been made yet."""
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
-    program = "from bayesreg.inference.draws import arviz; arviz()"
+    program = "from bayesreg.inference.draws.inference_data import arviz; arviz()"
     done = subprocess.run(
         [sys.executable, "-W", "always::FutureWarning", "-c", program],
         capture_output=True, text=True, check=True, env=environment,

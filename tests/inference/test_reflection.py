@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayesreg.inference import reflection
-from bayesreg.inference.reflection import rotated, shifted, walls
+from bayesreg.inference.gaussian import reflection
+from bayesreg.inference.gaussian.reflection import rotated, shifted, walls
 
 DIMENSION, NODES = 9, 3
 CENTRE = np.array([[0.3, 0.0, 0.0], [0.0, 0.5, 0.0], [0.1, 0.1, 0.1]])

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference.block import run_block
-from bayesreg.inference.checkpoint import checkpoint_to_arrays
-from bayesreg.inference.diagnostics import convergence
-from bayesreg.inference.draws import open_posterior, save_posterior
-from bayesreg.inference.initialise import starting_points
-from bayesreg.inference.random_walk import rwmh
-from bayesreg.inference.run import checkpoint_from_arrays
-from bayesreg.inference.samplers import SAMPLERS
+from bayesreg.inference.chains.block import run_block
+from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
+from bayesreg.inference.chains.initialise import starting_points
+from bayesreg.inference.chains.run import checkpoint_from_arrays
+from bayesreg.inference.draws.diagnostics import convergence
+from bayesreg.inference.draws.inference_data import open_posterior, save_posterior
+from bayesreg.inference.samplers.random_walk import rwmh
+from bayesreg.inference.samplers.registry import SAMPLERS
 from tests.inference.gaussians import GaussianTarget
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 

@@ -13,14 +13,14 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.config.sections import sampler_section
-from bayesreg.inference import loose, whitened
-from bayesreg.inference.checkpoint import checkpoint_to_arrays
+from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
+from bayesreg.inference.chains.run import checkpoint_from_arrays
+from bayesreg.inference.gaussian import loose, whitened
+from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.modes import distance, search_modes
+from bayesreg.inference.gaussian.whitened import Moved, about_reference, setup_about
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.laplace import Reference
-from bayesreg.inference.modes import distance, search_modes
-from bayesreg.inference.run import checkpoint_from_arrays
-from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.inference.whitened import Moved, about_reference, setup_about
+from bayesreg.inference.samplers.registry import SAMPLERS
 from tests.inference.gaussians import DIMENSION, GaussianTarget
 
 # Steps at which a good part of the proposals is refused: only then does the test of acceptance matter.

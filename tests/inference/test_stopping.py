@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from bayesreg.inference import stopping
-from bayesreg.inference.checkpoint import Checkpoint, no_steps
-from bayesreg.inference.diagnostics import worst
-from bayesreg.inference.moments import Moments, greatest_rhat
-from bayesreg.inference.stopping import StopRule, judged, reason
+from bayesreg.inference.chains import stopping
+from bayesreg.inference.chains.checkpoint import Checkpoint, no_steps
+from bayesreg.inference.chains.stopping import StopRule, judged, reason
+from bayesreg.inference.draws.diagnostics import worst
+from bayesreg.inference.draws.moments import Moments, greatest_rhat
 
 RULE = StopRule(rhat=1.01, ess=400)
 DRAWS = 600

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayesreg.inference import whitened
-from bayesreg.inference.warm_up import FIRST_STEP, Tuning, _sized, tuned
-from bayesreg.inference.whitened import Moved
+from bayesreg.inference.gaussian import whitened
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _sized, tuned
+from bayesreg.inference.gaussian.whitened import Moved
 from tests.inference.gaussians import DIMENSION, GaussianTarget
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.laplace import laplace
-from bayesreg.inference.samplers import SAMPLERS
-from bayesreg.inference.whitened import setup_about
+from bayesreg.inference.gaussian.laplace import laplace
+from bayesreg.inference.gaussian.whitened import setup_about
+from bayesreg.inference.samplers.registry import SAMPLERS
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)

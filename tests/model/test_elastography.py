@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.inference.diagnostics import convergence
+from bayesreg.inference.draws.diagnostics import convergence
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, pair_from_model
 

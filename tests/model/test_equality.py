@@ -5,9 +5,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.laplace import _height_and_slope
+from bayesreg.inference.gaussian.laplace import _height_and_slope
+from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
-from bayesreg.inference.mode_search import find_mode
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)

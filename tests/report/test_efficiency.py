@@ -8,7 +8,7 @@ import json
 from rich.cells import cell_len
 from rich.console import Console
 
-from bayesreg.inference.efficiency import Efficiency
+from bayesreg.inference.chains.efficiency import Efficiency
 from bayesreg.report.efficiency import HEADER, Setting, efficiency_table, terminal_table, write_efficiencies
 
 SETTING = Setting("a phantom", 4, 5.0, "R̂ below 1.01 and ESS above 400")

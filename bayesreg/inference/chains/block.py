@@ -1,0 +1,204 @@
+"""A block of draws of every chain, side by side: vmap over chains, a loop over steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from bayesreg.inference.chains.checkpoint import Tally, counted, no_steps, with_passed_over, with_solve
+from bayesreg.inference.chains.devices import side_by_side
+from bayesreg.inference.draws.moments import Moments, updated
+from bayesreg.inference.kernel import Draw, Info
+from bayesreg.inference.samplers.registry import Chosen
+from bayesreg.types import AnyArray
+
+# (number of a step in the block, state) → (state, Info)
+Step = Callable[[AnyArray, Any], tuple[Any, Info]]
+
+# (number of a step in the block, state) → whether that step proposes what lies outside the support
+Outside = Callable[[AnyArray, Any], AnyArray]
+
+
+class _Drawn(NamedTuple):
+    """What a block leaves of one chain.
+
+    Attributes
+    ----------
+    state : pytree
+        After the last step.
+    moments : Moments
+    places : dict of (draw, ...) arrays
+        Where the chain stood, as `_place` has it.
+    windows : Tally of (draw,) arrays
+        Of the steps since the draw before each.
+    """
+
+    state: Any
+    moments: Moments
+    places: dict[str, AnyArray]
+    windows: Tally
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def run_block(
+    chosen: Chosen,
+    length: int,
+    thin: int,
+    devices: Mesh | None,
+    data: Any,
+    seed: AnyArray | int,
+    numbers: AnyArray,
+    first: AnyArray | int,
+    setup: Any,
+    state: Any,
+    moments: Moments,
+    tally: Tally,
+) -> tuple[Any, Moments, Tally, dict[str, AnyArray]]:
+    """So many draws of every chain, `thin` steps each.
+
+    Parameters
+    ----------
+    chosen : Chosen
+    length, thin : int
+    devices : Mesh or None
+        Among which the chains are shared.
+    data : pytree
+        As the sampler takes them.
+    seed, numbers, first : int, (c,) int array, int
+        What a chain draws follows from the seed, its number and how many draws it made before this block.
+    setup, state, moments, tally : pytrees
+        As in a `Checkpoint`, after those draws.
+
+    Returns
+    -------
+    state, moments, tally
+        After the block.
+    kept : dict of (c, length, ...) arrays
+        The draws; rates and counts are over the steps since the draw before each.
+    """
+    kernel = chosen.sampler
+    _, key_chains = jax.random.split(jax.random.key(seed))
+
+    def chain(
+        number: AnyArray, state: Any, moments: Moments, tally: Tally
+    ) -> tuple[Any, Moments, Tally, dict[str, AnyArray]]:
+        key_chain = jax.random.fold_in(key_chains, number)
+
+        def key(i: AnyArray) -> AnyArray:
+            return jax.random.fold_in(key_chain, first * thin + i)
+
+        def step(i: AnyArray, state: Any) -> tuple[Any, Info]:
+            return kernel.step(data, setup, key(i), state)
+
+        def outside(i: AnyArray, state: Any) -> AnyArray:
+            assert kernel.outside is not None
+            return kernel.outside(data, setup, key(i), state)
+
+        observe = partial(kernel.observe, data, setup)
+        if kernel.outside is None:
+            drawn = _in_step(step, observe, kernel.many_solves, length, thin, state, moments)
+        else:
+            drawn = _at_own_pace(step, outside, observe, length, thin, state, moments)
+        tally = jax.tree.map(lambda before, window: before + window.sum(), tally, drawn.windows)
+        return drawn.state, drawn.moments, tally, drawn.places | _statistics(drawn.windows)
+
+    return side_by_side(chain, devices)(numbers, state, moments, tally)
+
+
+def watched(draw: Draw) -> dict[str, Any]:
+    """That of which moments are kept."""
+    return {"estimands": draw.estimands, "u": draw.evaluation.u}
+
+
+def _in_step(
+    step: Step,
+    observe: Callable[[Any], Draw],
+    many_solves: bool,
+    length: int,
+    thin: int,
+    state: Any,
+    moments: Moments,
+) -> _Drawn:
+    """All chains take each step together."""
+
+    def one_draw(carry: tuple[Any, Moments], draw: AnyArray) -> tuple[tuple[Any, Moments], tuple[Any, Tally]]:
+        def one_step(i: AnyArray | int, found: tuple[Any, Tally]) -> tuple[Any, Tally]:
+            state, info = step(draw * thin + i, found[0])
+            return state, counted(found[1], info)
+
+        state, moments = carry
+        state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
+        drawn = observe(state)
+        if many_solves:
+            window = with_solve(window, drawn.evaluation, thin)
+        return (state, updated(moments, watched(drawn))), (_place(drawn), window)
+
+    (state, moments), (places, windows) = jax.lax.scan(one_draw, (state, moments), jnp.arange(length))
+    return _Drawn(state, moments, places, windows)
+
+
+def _at_own_pace(
+    step: Step,
+    outside: Outside,
+    observe: Callable[[Any], Draw],
+    length: int,
+    thin: int,
+    state: Any,
+    moments: Moments,
+) -> _Drawn:
+    """A chain passes over the steps that propose what lies outside the support, and waits for none but at the end.
+
+    Side by side all chains evaluate at once, each a step of its own, often of a draw of its own. A chain stands where a
+    step has led it until the next step that it takes, and all draws that end in between are the same.
+    """
+
+    def next_taken(i: AnyArray, state: Any) -> AnyArray:
+        return jax.lax.while_loop(lambda i: (i < length * thin) & outside(i, state), lambda i: i + 1, i)
+
+    def one_step(carry: tuple[AnyArray, _Drawn]) -> tuple[AnyArray, _Drawn]:
+        i, (state, moments, places, windows) = carry
+        state, info = step(i, state)
+        following = next_taken(i + 1, state)
+        drawn, draw = observe(state), i // thin
+        moments = updated(moments, watched(drawn), following // thin - draw)
+        places = jax.tree.map(lambda rows, x: rows.at[draw + 1].set(x), places, _place(drawn))
+        windows = jax.tree.map(lambda rows, x: rows.at[draw].add(x), windows, counted(no_steps(), info))
+        return following, _Drawn(state, moments, places, windows)
+
+    begun = observe(state)
+    # Row 0 is where the block begins, row d + 1 where the last step taken for draw d has led.
+    places = jax.tree.map(lambda x: jnp.zeros((length + 1, *jnp.shape(x)), x.dtype).at[0].set(x), _place(begun))
+    first = next_taken(jnp.zeros((), int), state)
+    moments = updated(moments, watched(begun), first // thin)
+    carry = first, _Drawn(state, moments, places, no_steps((length,)))
+    _, (state, moments, places, windows) = jax.lax.while_loop(lambda carry: carry[0] < length * thin, one_step, carry)
+    latest = jax.lax.cummax(jnp.where(windows.steps > 0, jnp.arange(1, length + 1), 0))
+    places = jax.tree.map(lambda rows: rows[latest], places)
+    return _Drawn(state, moments, places, with_passed_over(windows, thin - windows.steps))
+
+
+def _place(drawn: Draw) -> dict[str, AnyArray]:
+    evaluation = drawn.evaluation
+    return {
+        **drawn.estimands,
+        "lp": evaluation.logdensity,
+        "similarity_energy": evaluation.similarity_energy,
+        "strain_energy": evaluation.strain_energy,
+    }
+
+
+def _statistics(windows: Tally) -> dict[str, AnyArray]:
+    """Rates and counts over the steps since the draw before."""
+    return {
+        "acceptance_rate": windows.acceptance / windows.steps,
+        "solver_iterations": windows.solver_iterations / windows.steps,
+        "solver_failed": windows.solver_failed.astype(int),
+        "outside_support": windows.outside_support.astype(int),
+        "diverging": windows.diverging.astype(int),
+        "gradients": windows.gradients.astype(int),
+    }

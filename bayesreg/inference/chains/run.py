@@ -1,0 +1,301 @@
+"""Running chains: vmap over chains, scan over draws, in blocks whose draws go to the host."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayesreg.inference.chains.block import run_block, watched
+from bayesreg.inference.chains.checkpoint import Checkpoint, Tally, no_steps
+from bayesreg.inference.chains.devices import devices_for, from_first, gathered, is_first, on_host, shared
+from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
+from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress
+from bayesreg.inference.chains.stopping import StopRule, Verdict, judged, out_of_time, reason
+from bayesreg.inference.draws.blocks import Block, Blocks
+from bayesreg.inference.draws.inference_data import to_inference_data
+from bayesreg.inference.draws.moments import pooled, scale_reduction, zero_moments
+from bayesreg.inference.kernel import Draw
+from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, chosen_sampler
+from bayesreg.inference.target import Target
+from bayesreg.types import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What sampling found.
+
+    Attributes
+    ----------
+    posterior : Posterior
+    blocks : Blocks
+        The draws, as arrays (chain, draw, …) of the estimands and of their statistics.
+    u_mean, u_sd : (n, 3) arrays
+        Posterior mean and standard deviation of the displacement of every node, mm, over all kept draws.
+    rhat : mapping
+        R̂ = √(var⁺/W), unsplit, of every estimand (NaN with one chain).
+    tally : Tally
+    converged : bool or None
+        Whether the stop rule's R̂ was met; None where none was asked for.
+    reason : str
+        Why sampling stopped, in words.
+    seconds : float
+        Spent sampling, compilation included.
+    exact : bool
+        Whether the sampler leaves the posterior unchanged.
+    """
+
+    posterior: Target
+    blocks: Blocks
+    u_mean: np.ndarray
+    u_sd: np.ndarray
+    rhat: dict[str, np.ndarray]
+    tally: Tally
+    converged: bool | None
+    reason: str
+    seconds: float
+    exact: bool
+
+    @cached_property
+    def idata(self) -> Any:
+        """All draws in memory, as ArviZ opens them (InferenceData or DataTree): posterior and sample_stats."""
+        return to_inference_data(self.posterior, self.blocks)
+
+
+def sample(
+    posterior: Target,
+    sampler: str = "hmc",
+    chains: int = 4,
+    draws: int = 1000,
+    seed: int = 0,
+    *,
+    thin: int = 1,
+    block: int = 50,
+    start: Start | None = None,
+    stop: StopRule | None = None,
+    progress: bool = True,
+    resume: tuple[Checkpoint, Blocks] | None = None,
+    on_block: Callable[[int, Block, Checkpoint], None] | None = None,
+    **settings: Any,
+) -> Samples:
+    """Draw from a posterior with parallel chains.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    sampler : str
+        A name in `bayesreg.inference.samplers.registry.SAMPLERS`.
+    chains : int
+        Run side by side under `vmap`, in equal shares on as many devices as divide their number.
+    draws : int
+        Most draws to keep for each chain.
+    seed : int
+        Same seed, posterior and options: same draws, however they are cut into blocks.
+    thin : int
+        Steps per kept draw.
+    block : int
+        Kept draws between two looks at the stop rule; only one block's draws are ever on the device.
+    start : Start, optional
+        The default starts all chains at rest, the parameters spread by 10 %.
+    stop : StopRule, optional
+    progress : bool
+        Show a progress bar.
+    resume : (Checkpoint, Blocks), optional
+        Continue from there instead of from `start`; every new block is appended.
+    on_block : callable, optional
+        Called with the block's number, its draws and the checkpoint after it, when the block is kept.
+    **settings
+        Of the sampler, see `bayesreg.inference.samplers.registry`.
+
+    Returns
+    -------
+    Samples
+
+    Raises
+    ------
+    InputError
+        If an option is out of range, a chain cannot start, or those to resume are not where their draws end.
+    """
+    if sampler not in SAMPLERS:
+        raise InputError(f"unknown sampler {sampler!r}; there are {', '.join(SAMPLERS)}")
+    for name, value in {"chains": chains, "draws": draws, "thin": thin, "block": block}.items():
+        if value < 1:
+            raise InputError(f"{name} must be at least 1, got {value}")
+    stop = stop or StopRule()
+    chosen = chosen_sampler(sampler, posterior, settings)
+    began = time.perf_counter()
+    if resume is None:
+        checkpoint = from_first(first_checkpoint(posterior, sampler, chains, seed, start, **settings))
+        blocks: Blocks = []
+        began = time.perf_counter()
+    else:
+        checkpoint, blocks = resume
+        _require_continuation(chosen, checkpoint, blocks)
+    with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
+        advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
+        verdict, ended = _judged(stop, checkpoint, blocks, bar)
+        while not ended and (found := next(advance, None)) is not None:
+            drawn, checkpoint = found
+            blocks.append(drawn)
+            if on_block is not None:
+                on_block(len(blocks) - 1, drawn, checkpoint)
+            verdict, ended = _judged(stop, checkpoint, blocks, bar)
+    return _samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
+
+
+def first_checkpoint(
+    posterior: Target,
+    sampler: str,
+    chains: int,
+    seed: int,
+    start: Start | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    **settings: Any,
+) -> Checkpoint:
+    """The checkpoint before any draw: where `sample` starts its chains, unless it resumes.
+
+    `say` is told of the search for the mode and of the warm-up, where the sampler has them.
+
+    Raises
+    ------
+    InputError
+        If a chain cannot start there.
+    """
+    began = time.perf_counter()
+    key_start, _ = jax.random.split(jax.random.key(seed))
+    points = starting_points(posterior, start or Start(), chains, key_start)
+    require_numbers(points)
+    chosen = chosen_sampler(sampler, posterior, settings)
+    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), say)
+    data = chosen.sampler.data(setup)
+    checkpoint = _first(chosen, data, setup, points)
+    require_density(_observed(chosen, data, setup, checkpoint.state).evaluation)
+    return checkpoint._replace(seconds=np.array(time.perf_counter() - began))
+
+
+def checkpoint_from_arrays(
+    arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: Any
+) -> Checkpoint:
+    """The inverse of `checkpoint_to_arrays`, for the same posterior, sampler and number of chains.
+
+    Raises
+    ------
+    InputError
+        If the arrays belong to another problem.
+    """
+    chosen = chosen_sampler(sampler, posterior, settings)
+    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.estimands(posterior.reference()))
+    expected = jax.eval_shape(partial(_first, chosen, posterior.data), chosen.sampler.blank(), points)
+    leaves = [arrays[name] for name in sorted(arrays)]
+    wanted, structure = jax.tree.flatten(expected)
+    if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
+        raise InputError(
+            "the stored state belongs to another problem: other nodes, parameters or number of chains, or a run that "
+            "another version of bayesreg began"
+        )
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks) -> None:
+    """Raise InputError where a state is read otherwise than it was written: coordinates differ between versions."""
+    if len(blocks) == 0:
+        return
+    last = blocks[len(blocks) - 1]
+    here = _observed(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
+    if not all(np.allclose(here[name], last[name][:, -1], rtol=1e-3, atol=1e-4) for name in here):
+        raise InputError(
+            "the chains do not stand where their last draws were: another version of bayesreg began this run; begin it "
+            "anew in another folder"
+        )
+
+
+def _first(chosen: Chosen, data: Any, setup: Any, points: Any) -> Checkpoint:
+    state = jax.vmap(partial(chosen.sampler.init, data, setup))(points)
+    chains = len(next(iter(points.values())))
+    shapes = jax.eval_shape(partial(_observed, chosen), data, setup, state)
+    moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), watched(shapes)))
+    return Checkpoint(np.array(0), setup, state, moments, no_steps((chains,)), np.array(0.0))
+
+
+@partial(jax.jit, static_argnums=0)
+def _observed(chosen: Chosen, data: Any, setup: Any, state: Any) -> Draw:
+    return jax.vmap(partial(chosen.sampler.observe, data, setup))(state)
+
+
+def _advance(
+    chosen: Chosen,
+    chains: int,
+    seed: int,
+    thin: int,
+    block: int,
+    draws: int,
+    checkpoint: Checkpoint,
+    began: float,
+) -> Iterator[tuple[Block, Checkpoint]]:
+    """Blocks of draws, until there are `draws` of them."""
+    spent = float(checkpoint.seconds)
+    devices = devices_for(chains)
+    data = on_host(chosen.sampler.data(checkpoint.setup))
+    while int(checkpoint.draws) < draws:
+        length = min(block, draws - int(checkpoint.draws))
+        state, moments, tally, found = gathered(
+            run_block(
+                chosen,
+                length,
+                thin,
+                devices,
+                data,
+                seed,
+                np.arange(chains),
+                int(checkpoint.draws),
+                on_host(checkpoint.setup),
+                *shared(on_host(checkpoint[2:5]), devices),
+            )
+        )
+        found = {name: np.asarray(value) for name, value in found.items()}
+        seconds = from_first(np.array(spent + time.perf_counter() - began))
+        drawn = np.array(int(checkpoint.draws) + length)
+        checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
+        yield found, checkpoint
+
+
+def _judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
+    """The verdict on the draws so far, and whether they are enough or time is up; of several processes the first says.
+
+    What is known without judging them is shown.
+    """
+    bar.show(checkpoint, scale_reduction(checkpoint.moments))
+    verdict = judged(stop, checkpoint, blocks) if is_first() else Verdict(holds=False)
+    holds, late = from_first(np.array([verdict.holds, out_of_time(stop, checkpoint)]))
+    return verdict._replace(holds=bool(holds)), bool(holds or late)
+
+
+def _samples(
+    posterior: Target,
+    exact: bool,
+    blocks: Blocks,
+    checkpoint: Checkpoint,
+    stop: StopRule,
+    verdict: Verdict,
+    draws: int,
+) -> Samples:
+    mean, sd = pooled(checkpoint.moments)
+    rhat = scale_reduction(checkpoint.moments)["estimands"]
+    return Samples(
+        posterior=posterior,
+        blocks=blocks,
+        u_mean=mean["u"],
+        u_sd=sd["u"],
+        rhat=rhat,
+        tally=jax.tree.map(np.asarray, checkpoint.tally),
+        converged=None if stop.rhat is None else verdict.holds,
+        reason=reason(stop, checkpoint, blocks, verdict, draws),
+        seconds=float(checkpoint.seconds),
+        exact=exact,
+    )

@@ -1,0 +1,1 @@
+"""Draws: ArviZ, what they say of convergence, and what follows from them."""

@@ -1,0 +1,183 @@
+"""Draws to ArviZ and back, in memory and in files.
+
+The one module that knows which ArviZ it has: 0.23 (InferenceData) and 1.x (xarray.DataTree) differ in
+how draws are handed over, and read each other's NetCDF files. It takes a second to import, which sampling need not
+wait for: hence inside the functions.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import xarray as xr
+
+from bayesreg.inference.draws.blocks import Block, Blocks
+from bayesreg.inference.target import Target
+from bayesreg.types import InputError
+
+_OLD = int(version("arviz").split(".")[0]) < 1
+
+STATISTICS = (
+    "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
+    "outside_support", "diverging", "gradients",
+)  # fmt: skip
+# Estimands besides u_boundary, λ and μ, which only some posteriors have.
+OTHERS = ("t_similarity", "t_elastic", "field_sd", "field")
+# The file's pieces hold so many nodes (or modes, elements) of a block of draws: both few nodes of all draws and all
+# nodes of few draws are to be read at little cost.
+PIECE = 64
+_DIMS = {
+    "u_boundary": ["node", "axis"],
+    "lam": ["tissue"],
+    "mu": ["tissue"],
+    "ratio": ["tissue"],
+    "field": ["mode"],
+    "points": ["point", "axis"],
+    "cells": ["cell", "corner"],
+    "tissue": ["cell"],
+    "boundary": ["node"],
+}
+
+
+def to_inference_data(target: Target, blocks: Blocks) -> Any:
+    """Blocks of draws as ArviZ data.
+
+    Parameters
+    ----------
+    target : Target
+        For the known entries of λ and μ and the names of all of them.
+    blocks : Blocks
+        Arrays (chain, draw, …) of the estimands and of `STATISTICS`.
+
+    Returns
+    -------
+    arviz.InferenceData or xarray.DataTree
+        posterior: u_boundary (chain, draw, node, axis) in mm, lam, mu and ratio = λ/μ (chain, draw, tissue),
+        known entries included, where they were sampled t_similarity, t_elastic, field_sd (chain, draw) and
+        field (chain, draw, mode), the components of the log-stiffness; sample_stats;
+        constant_data.
+    """
+    az = arviz()
+    every = list(blocks)
+    draws = {name: np.concatenate([block[name] for block in every], axis=1) for name in every[0]}
+    estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
+    values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values["ratio"] = values["lam"] / values["mu"]
+    values |= {name: estimands[name] for name in OTHERS if name in estimands}
+    groups: dict[str, Any] = {
+        "posterior": values,
+        "sample_stats": {name: draws[name] for name in STATISTICS},
+        "constant_data": {name: np.asarray(value) for name, value in target.constant_data().items()},
+    }
+    coords = {"node": np.asarray(target.sampled), "axis": list("xyz"), "tissue": list(target.entry_names)}
+    return (
+        az.from_dict(**groups, coords=coords, dims=_DIMS) if _OLD else az.from_dict(groups, coords=coords, dims=_DIMS)
+    )
+
+
+def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
+    """The inverse of `to_inference_data`: blocks of so many draws of each chain, the last with what is left."""
+    posterior, statistics = dataset(idata, "posterior"), dataset(idata, "sample_stats")
+    for first in range(0, posterior.sizes["draw"], length):
+        some = slice(first, first + length)
+        block = {}
+        for name in target.estimands(target.reference()):
+            values = np.asarray(posterior[name].isel(draw=some).to_numpy(), float)
+            block[name] = values[..., np.asarray(target.free[name])] if name in target.free else values
+        yield block | {name: statistics[name].isel(draw=some).to_numpy() for name in STATISTICS}
+
+
+def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """λ and μ with their known entries, on the host: there may be many draws."""
+    reference = target.reference()
+    found = {}
+    for name in ("lam", "mu"):
+        known = np.asarray(reference[name])
+        full = np.tile(known, (*estimands["u_boundary"].shape[:2], 1))
+        if name in estimands:
+            full[..., np.asarray(target.free[name])] = estimands[name]
+        found[name] = full
+    return found
+
+
+def arviz() -> Any:
+    """ArviZ, without its announcement of version 1, which is written for those who call it themselves."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
+        import arviz
+
+    return arviz
+
+
+def dataset(idata: Any, group: str) -> xr.Dataset:
+    """One group of the draws as an xarray Dataset, whichever ArviZ made them."""
+    found = getattr(idata, group)
+    return found if isinstance(found, xr.Dataset) else found.to_dataset()
+
+
+def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
+    """Write draws as NetCDF, displacements in single precision and compressed; one block is in memory at a time.
+
+    The file opens as what `to_inference_data` makes of all of them.
+    """
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        _begin(to_inference_data(target, [blocks[0]]), partial)
+        with netCDF4.Dataset(partial, "a") as file:
+            for index in range(1, len(blocks)):
+                _extend(file, to_inference_data(target, [blocks[index]]))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _begin(idata: Any, path: Path) -> None:
+    """A file with the first draws, to which more can be appended."""
+    for index, group in enumerate(_groups(idata)):
+        data = dataset(idata, group)
+        encoding: dict[Any, dict[str, Any]] = {
+            name: {"chunksizes": tuple(_piece(str(dim), size) for dim, size in values.sizes.items())}
+            for name, values in data.variables.items()
+            if "draw" in values.dims and values.size
+        }
+        if "u_boundary" in encoding:
+            encoding["u_boundary"] |= {"dtype": "float32", "zlib": True, "complevel": 1}
+        more = {"draw"} & set(data.dims)
+        data.to_netcdf(path, mode="a" if index else "w", group=group, engine="netcdf4",
+                       encoding=encoding, unlimited_dims=more)  # fmt: skip
+
+
+def _piece(dim: str, size: int) -> int:
+    return size if dim in ("chain", "draw") else min(size, PIECE)
+
+
+def _extend(file: netCDF4.Dataset, idata: Any) -> None:
+    for group in _groups(idata):
+        data, place = dataset(idata, group), file[group]
+        if "draw" not in data.dims:
+            continue
+        first = len(place.dimensions["draw"])
+        rows = slice(first, first + data.sizes["draw"])
+        for name, values in data.variables.items():
+            if "draw" in values.dims:
+                where = tuple(rows if dim == "draw" else slice(None) for dim in values.dims)
+                place[str(name)][where] = values.to_numpy() + (first if name == "draw" else 0)
+
+
+def _groups(idata: Any) -> list[str]:
+    return list(idata.groups()) if _OLD else [name.strip("/") for name in idata.groups if name != "/"]
+
+
+def open_posterior(path: str | Path) -> Any:
+    """Read draws written by `save_posterior`; InputError where there are none."""
+    if not Path(path).is_file():
+        raise InputError(f"{path} is missing: the folder holds no draws")
+    return arviz().from_netcdf(str(path))

@@ -1,0 +1,131 @@
+"""Push posterior draws forward: any function of them, in blocks, with mean, sd and quantiles in bounded memory.
+
+Functions are handed in and take one draw, a mapping of arrays, and what else they are given. They are compiled: what is
+large (a mesh, an image) is to be given, or it becomes a constant of the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from bayesreg.inference.draws.moments import Moments, extended, pooled, zero_moments
+from bayesreg.types import AnyArray
+
+Draws = Mapping[str, AnyArray]
+
+BLOCK = 16
+MOST_KEPT = 1024
+
+
+class Summary(NamedTuple):
+    """What is known of a function of the draws; pytrees of the function's own structure.
+
+    Attributes
+    ----------
+    mean, sd : pytree
+        Over all draws of all chains.
+    chain_mean : pytree
+        Over the draws of each chain, chains leading.
+    quantiles : pytree
+        Over all chains, probabilities leading; of at most about `MOST_KEPT` evenly spaced draws of each chain.
+    """
+
+    mean: Any
+    sd: Any
+    chain_mean: Any
+    quantiles: Any
+
+
+def thinned(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np.ndarray]:
+    """Evenly spaced draws of the named variables.
+
+    Parameters
+    ----------
+    posterior : xarray.Dataset
+    names : iterable of str
+    most : int
+        Most draws over all chains together, but at least one of each.
+
+    Returns
+    -------
+    dict
+        Arrays (chain, draw, …).
+    """
+    chains, total = posterior.sizes["chain"], posterior.sizes["draw"]
+    # The middles of equal stretches.
+    count = min(total, max(1, most // chains))
+    chosen = ((np.arange(count) + 0.5) * total / count).astype(int)
+    some = posterior[list(names)].isel(draw=chosen).transpose("chain", "draw", ...)
+    return {str(name): np.asarray(some[name].to_numpy(), float) for name in some.data_vars}
+
+
+def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, block: int = BLOCK) -> Iterator[Any]:
+    """A function of every draw, block by block.
+
+    Parameters
+    ----------
+    function : callable
+        (one draw, given) → a pytree of arrays; traceable by JAX.
+    draws : mapping
+        Arrays (chain, draw, …).
+    given : pytree
+        The same for all draws.
+    block : int
+        Draws evaluated side by side.
+
+    Yields
+    ------
+    pytree
+        NumPy arrays (chain, stretch, …), the stretches following one another along the draws.
+    """
+    chains, total = next(iter(draws.values())).shape[:2]
+    stretch = max(1, min(total, block // chains))
+    batched = jax.jit(jax.vmap(jax.vmap(function, (0, None)), (0, None)))
+    for first in range(0, total, stretch):
+        # The last stretch is filled up with its last draw: another shape would be compiled anew.
+        chosen = np.minimum(np.arange(first, first + stretch), total - 1)
+        found = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, given)
+        wanted = slice(total - first)
+        yield jax.tree.map(lambda leaf, wanted=wanted: np.asarray(leaf)[:, wanted], found)
+
+
+def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.5, 0.975)) -> Summary:
+    """Mean, sd and quantiles of what `push_forward` yields; one block and `MOST_KEPT` draws in memory at a time."""
+    moments, kept, stride, seen = None, None, 1, 0
+    for block in blocks:
+        moments = extended(_nothing(block) if moments is None else moments, block)
+        every = slice(-seen % stride, None, stride)
+        some = jax.tree.map(lambda leaf, every=every: leaf[:, every], block)
+        kept = some if kept is None else jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), kept, some)
+        seen += jax.tree.leaves(block)[0].shape[1]
+        while jax.tree.leaves(kept)[0].shape[1] > MOST_KEPT:
+            kept, stride = jax.tree.map(lambda leaf: leaf[:, ::2], kept), 2 * stride
+    if moments is None:
+        raise ValueError("there is no draw to summarise")
+    mean, sd = pooled(moments)
+    return Summary(mean, sd, moments.mean, jax.tree.map(lambda leaf: np.quantile(leaf, probabilities, (0, 1)), kept))
+
+
+def _nothing(block: Any) -> Moments:
+    chains = jax.tree.leaves(block)[0].shape[0]
+    moments = zero_moments(jax.tree.map(lambda leaf: leaf[:, 0], block))
+    return jax.tree.map(np.asarray, moments._replace(count=np.zeros(chains)))
+
+
+def predictive_p(observed: AnyArray, replicated: AnyArray) -> float:
+    """Posterior predictive p-value: how often a replicated discrepancy is at least the realised one.
+
+    Near 0 the data show more of it than the model would, near 1 less.
+
+    Parameters
+    ----------
+    observed, replicated : arrays of one shape
+        The discrepancy of the data and of a replication, for every draw.
+    """
+    return float(np.mean(np.asarray(replicated) >= np.asarray(observed)))

@@ -1,0 +1,262 @@
+"""The Gaussian reference that the curvature of a posterior defines at its mode (Laplace's approximation)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, Float, Int
+
+from bayesreg.inference.gaussian.hierarchy import gained, is_scale, is_temperature
+from bayesreg.inference.layout import others, slices, unravel
+from bayesreg.inference.target import Curvature, SmoothTarget
+from bayesreg.types import AnyArray, InputError
+
+# So many times what is expected of any of its kind, a parameter has no end.
+FAR = 1e6
+# Of coordinates other than the displacements, where these alone are moved.
+ALONE = 10.0
+# Of differences between gradients, in Normal scores and logarithms.
+STEP = 1e-4
+# Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
+LEAST_RATIO = 0.25
+
+
+class Reference(NamedTuple):
+    """The Gaussian N(centre, factor · factorᵀ) of a flat position (a pytree).
+
+    Attributes
+    ----------
+    centre : (d,) array
+    factor : (d, d) array
+        Upper triangular; the whitened coordinates are ξ = factor⁻¹ (x − centre).
+    """
+
+    centre: Float[AnyArray, "dimension"]
+    factor: Float[AnyArray, "dimension dimension"]
+
+    def place(self, xi: AnyArray) -> AnyArray:
+        """The flat position at whitened coordinates ξ."""
+        return self.centre + self.factor @ xi
+
+
+def prior_shares(
+    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
+) -> Float[np.ndarray, "rows rows"]:
+    """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
+    colder = flat - np.log(2) * is_temperature(target)
+    here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
+    return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
+
+
+def laplace(
+    target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
+) -> Reference:
+    """The Gaussian reference about a flat position, with the curvature there (see `precision_at`)."""
+    return gaussian(flat, precision_at(target, flat, data, joint))
+
+
+def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+    """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `pulled` by all.
+
+    Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
+    wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
+    large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with its argument,
+    and its mean over places would be that of the largest. In log T_r it is that at draws about the mode, which
+    trajectories meet, though the posterior of T_r is wider.
+    """
+    # One after the other: each holds more than these two arrays.
+    curvatures = (_curvature(target, target.data, flat) for flat in flats)
+    pairs = [(found.gauss_newton, found.remainder) for found in curvatures]
+    approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
+    curvature = _convex(_regular(approximate), remainder)
+    precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
+    return pulled(target, gaussian(flats[0], precision), flats)
+
+
+def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+    """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
+
+    Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
+    Gaussian's own, whose motion is reflected exactly; kicks are left with what is beyond second order. A scale stays
+    where it is: its force at the mode of what it scales is no hint (see `hierarchy`).
+    """
+    slopes = np.mean([slope_at(target, flat) for flat in flats], axis=0)
+    factor, moving = np.asarray(reference.factor), 1 - is_scale(target)
+    shift = moving * (factor @ (factor.T @ (moving * slopes)))
+    return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
+
+
+def slope_at(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """∇log π of the density without walls."""
+    return height_and_slope(target, target.data, flat)[1]
+
+
+def height_and_slope(
+    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
+) -> tuple[float, Float[np.ndarray, "dimension"]]:
+    """log π and ∇log π of the density without walls.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    data : pytree
+        The target's, or that of a similar problem.
+    flat : (d,) array
+        Flat position.
+    """
+    height, slope = _height_and_slope(target, target.without_walls(data), jnp.asarray(flat))
+    return float(height), np.asarray(slope)
+
+
+@partial(jax.jit, static_argnums=0)
+def _height_and_slope(target: SmoothTarget, data: Any, flat: AnyArray) -> tuple[AnyArray, AnyArray]:
+    return jax.value_and_grad(lambda x: target.logdensity_of(data, unravel(target)(x)))(flat)
+
+
+def _convex(
+    approximate: Float[np.ndarray, "rows rows"], remainder: Float[np.ndarray, "rows rows"]
+) -> Float[np.ndarray, "rows rows"]:
+    """The sum of a positive definite curvature and another, made positive definite.
+
+    In coordinates that whiten the first, eigenvalues of the sum count by their size, and as no less than `LEAST_RATIO`.
+    """
+    lower = np.linalg.cholesky(approximate)
+    half = scipy.linalg.solve_triangular(lower, remainder, lower=True)
+    values, vectors = np.linalg.eigh(scipy.linalg.solve_triangular(lower, half.T, lower=True))
+    vectors = lower @ vectors
+    return (vectors * np.maximum(np.abs(1 + values), LEAST_RATIO)) @ vectors.T
+
+
+def gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]) -> Reference:
+    """The reference of that centre and precision."""
+    lower = np.linalg.cholesky(precision)
+    factor = scipy.linalg.solve_triangular(lower, np.eye(len(centre)), lower=True).T
+    return Reference(jnp.asarray(centre), jnp.asarray(factor))
+
+
+def precision_at(
+    target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
+) -> Float[np.ndarray, "dimension dimension"]:
+    """A positive definite curvature of minus the log density.
+
+    The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are differences of the
+    gradient; directions in which these are not convex count by their size, and as no less than the target says.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    flat : (d,) array
+    data : pytree, optional
+        Of a problem other than the target's own.
+    joint : bool
+        Whether the other coordinates are given curvature; else they are left uncorrelated.
+
+    Raises
+    ------
+    InputError
+        If a parameter runs away, or its curvature is not finite.
+    """
+    data = target.data if data is None else data
+    return _jointly(target, data, flat, _regular(_curvature(target, data, flat).gauss_newton), joint)
+
+
+def _curvature(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
+    estimands = _estimands_at(target, data, jnp.asarray(flat))
+    expected = target.reference()
+    for name in (name for name in estimands if name not in ("field", "u_boundary")):
+        _require_an_end((np.asarray(estimands[name]) < FAR * np.asarray(expected[name]).max()).all())
+    return target.displacement_curvature(data, estimands)
+
+
+@partial(jax.jit, static_argnums=0)
+def _estimands_at(target: SmoothTarget, data: Any, flat: AnyArray) -> Any:
+    return target.constrain_of(data, unravel(target)(flat))
+
+
+def _require_an_end(found: bool | np.bool_) -> None:
+    if not found:
+        raise InputError(
+            "the search for the mode has no end: λ, μ or a temperature runs away; fix one more of them, or give it a "
+            "narrower prior"
+        )
+
+
+def _regular(curvature: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
+    """A trace of the identity keeps directions finite that neither images nor elasticity see."""
+    return curvature + 1e-9 * np.trace(curvature) * np.eye(len(curvature))
+
+
+def _jointly(
+    target: SmoothTarget,
+    data: Any,
+    flat: Float[np.ndarray, "dimension"],
+    curvature: Float[np.ndarray, "rows rows"],
+    joint: bool,
+    at_draws: bool = False,
+) -> Float[np.ndarray, "dimension dimension"]:
+    """The curvature in all coordinates, given that in the displacements and, jointly, the field.
+
+    In log T_r it is that of its evidence, or that at draws of the displacements (see `hierarchy`).
+    """
+    curved = _curved(target, joint)
+    count = int((~curved).sum())
+    # The coordinates whose curvature counts come last. Where not jointly, the field's share of the given is left out.
+    order = np.argsort(curved, kind="stable")
+    precision = np.zeros((len(flat), len(flat)))
+    first = len(curvature) - int(curved.sum())
+    precision[count:, count:] = curvature[first:, first:]
+    if joint and count:
+        rows = -hessian_rows(target, data, flat, order[:count])[:, order]
+        _require_an_end(np.isfinite(rows).all())
+        temperature = np.flatnonzero(is_temperature(target)[order[:count]])
+        if len(temperature):
+            shares = prior_shares(target, data, flat)
+            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else gained(shares)
+        precision[:count] = rows
+        precision[count:, :count] = rows[:, count:].T
+        cross = rows[:, count:]
+        inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[count:, count:]), cross.T)
+        schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
+        least = ravel_pytree(target.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
+        unit = np.sqrt(np.asarray(least)[order[:count]])
+        values, vectors = np.linalg.eigh(schur / np.outer(unit, unit))
+        vectors *= unit[:, None]
+        convex = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
+        precision[:count, :count] = convex + cross @ inner
+    else:
+        precision[:count, :count] = ALONE * np.eye(count)
+    precision[np.ix_(order, order)] = (precision + precision.T) / 2
+    return precision
+
+
+def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
+    """Entries of a flat position whose curvature the target knows: "u_boundary" and, jointly, "field"."""
+    marked = np.ones(len(others(target)) + 3 * len(target.sampled), bool)
+    marked[others(target)] = False
+    if joint and "field" in slices(target):
+        marked[slices(target)["field"]] = True
+    return marked
+
+
+def hessian_rows(
+    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
+) -> Float[np.ndarray, "rows dimension"]:
+    """Rows of the Hessian of the log density without walls, by differences of its gradient.
+
+    The coordinates are Normal scores and logarithms, so that one step suits all. Exact rows would cost more to compile
+    than the search.
+    """
+    rows = []
+    for entry in entries:
+        step = np.zeros(len(flat))
+        step[entry] = STEP
+        ahead, behind = (height_and_slope(target, data, flat + way * step)[1] for way in (1, -1))
+        rows.append((ahead - behind) / (2 * STEP))
+    return np.array(rows)

@@ -1,0 +1,219 @@
+"""The search for a mode of a posterior, in its support."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+
+from bayesreg.inference.gaussian.hierarchy import balanced, is_scale, is_temperature, tempered
+from bayesreg.inference.gaussian.laplace import (
+    Reference,
+    gaussian,
+    height_and_slope,
+    hessian_rows,
+    laplace,
+    precision_at,
+    prior_shares,
+    slope_at,
+)
+from bayesreg.inference.gaussian.pockets import out_of_pockets
+from bayesreg.inference.layout import displacements, others, unravel
+from bayesreg.inference.target import SmoothTarget
+from bayesreg.types import AnyArray, InputError, Scalar
+
+# The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
+SOFTNESS, GAP = 0.05, 0.02
+# The last stage is repeated so often, at most, or until no coordinate moves by more.
+REPEATS, SETTLED = 20, 1e-3
+# A stage ends where an iteration gains less than this share of the height. On the way nothing is owed to a place that
+# the next stage leaves: with that of the last, twice as many gradients led to the same modes.
+ROUGH, FINE = 1e-4, 1e-10
+# So often, at most, single nodes are moved elsewhere.
+RESCUES = 3
+
+
+def find_mode(
+    target: SmoothTarget,
+    start: Float[np.ndarray, "dimension"],
+    say: Callable[[str], None] = lambda text: None,
+    iterations: int = 40,
+) -> Float[np.ndarray, "dimension"]:
+    """A mode of the log density of the position, in its support, by L-BFGS along the target's continuation.
+
+    Single nodes that are then far more probable elsewhere are moved there, and the search goes on (`out_of_pockets`).
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    start : (d,) array
+        Flat position to start from; it need not lie in the support.
+    say : callable
+        Told of each stage.
+    iterations : int
+        Most iterations of a stage; the last is repeated, whitened anew, until it moves nothing.
+
+    Returns
+    -------
+    (d,) array
+        Flat position. Nodes that the soft skull let in are moved to its surface.
+
+    Raises
+    ------
+    InputError
+        If the density is not finite at the start.
+    """
+    flat = np.asarray(start)
+    for data in target.continuation():
+        flat = _improved(target, data, flat, False, iterations, say, gain=ROUGH)
+    flat = settled(target, flat, say, iterations)
+    for _ in range(RESCUES):
+        elsewhere, nodes = out_of_pockets(target, flat)
+        if not len(nodes):
+            break
+        named = ", ".join(map(str, np.asarray(target.sampled)[nodes]))
+        say(f"mode: moved to where they are more probable: nodes {named}")
+        flat = settled(target, elsewhere, say, iterations)
+    else:
+        say("mode: single nodes may be more probable elsewhere")
+    return flat
+
+
+def settled(
+    target: SmoothTarget,
+    flat: Float[np.ndarray, "dimension"],
+    say: Callable[[str], None] = lambda text: None,
+    iterations: int = 40,
+) -> Float[np.ndarray, "dimension"]:
+    """The mode next to a flat position: L-BFGS on the problem itself, whitened anew until it moves nothing."""
+    # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
+    # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
+    # skull and not in it, however great the force that presses.
+    shift = np.zeros(len(target.sampled))
+    for _ in range(REPEATS):
+        before, pressed = flat, shift
+        flat = _improved(target, target.data, flat, True, iterations, say, shift)
+        flat = _tempered(target, balanced(target, flat, partial(_factor, target, flat)))
+        shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
+        if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
+            break
+    else:
+        say("mode: not settled")
+    return _admissible(target, flat)
+
+
+def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """The flat position with T_r, if it is inferred, nearer to the maximum of its evidence."""
+    entry = np.flatnonzero(is_temperature(target))
+    if not len(entry):
+        return flat
+    slope = slope_at(target, flat)[entry]
+    curvature = -hessian_rows(target, target.data, flat, entry)[0, entry]
+    return tempered(target, flat, float(slope[0]), float(curvature[0]), prior_shares(target, target.data, flat))
+
+
+def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
+    """Signed distance of every sampled node to the forbidden region, mm; infinite where there is none."""
+    u = unravel(target)(jnp.asarray(flat))["u_boundary"]
+    return np.asarray(target.clearance(target.data, u, jnp.arange(len(target.sampled))))
+
+
+def _factor(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
+    return np.asarray(laplace(target, flat).factor)
+
+
+def _improved(
+    target: SmoothTarget,
+    data: Any,
+    flat: Float[np.ndarray, "dimension"],
+    moves: bool,
+    iterations: int,
+    say: Callable[[str], None],
+    shift: Float[np.ndarray, "sampled"] | None = None,
+    gain: float = FINE,
+) -> Float[np.ndarray, "dimension"]:
+    """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
+    shift = np.zeros(len(target.sampled)) if shift is None else shift
+    reference = gaussian(flat, _apart(precision_at(target, flat, data, moves), is_scale(target) > 0))
+    if not moves:
+        # The same for all displacements.
+        data = target.without_normaliser(data)
+    moving, own = 1 - is_scale(target), displacements(target)
+    if not moves:
+        moving[others(target)] = 0.0
+    best: list[tuple[Any, float, Any, float]] = []
+
+    def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
+        there = np.asarray(_place(reference, moving * xi))
+        height, slope = height_and_slope(target, data, there)
+        pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[own].reshape(-1, 3)), shift)
+        value, slope = float(pressed) - height, -slope
+        slope[own] += np.asarray(push).ravel()
+        gradient = moving * np.asarray(_pulled_back(reference, slope))
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            if not best:
+                raise InputError("the mode cannot be looked for: the density is not finite at the start field")
+            # A wall for the line search: uphill from the best place so far, sloping back to it.
+            place, least, slope, _ = best[-1]
+            return least + 2 * abs(slope @ (xi - place)), -slope
+        if not best or value < best[-1][1]:
+            best[:] = [(xi.copy(), value, gradient, float(pressed))]
+        return value, gradient
+
+    options = {"maxiter": iterations, "maxcor": 20, "ftol": gain, "gtol": 1e-2}
+    minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
+    place, least, _, pressed = best[-1]
+    say(f"mode: log density {pressed - least:.1f}")
+    return np.asarray(_place(reference, moving * place))
+
+
+# On the device: the threads of NumPy's products stay awake for a while and are in the way of what comes next.
+_place = jax.jit(Reference.place)
+_pulled_back = jax.jit(lambda reference, slope: reference.factor.T @ slope)
+
+
+def _apart(
+    precision: Float[np.ndarray, "dimension dimension"], held: Bool[np.ndarray, "dimension"]
+) -> Float[np.ndarray, "dimension dimension"]:
+    """Without what couples the held entries to the others: no move of the whitened others moves the held then."""
+    precision = np.array(precision)
+    precision[held] = precision[:, held] = 0.0
+    precision[held, held] = 1.0
+    return precision
+
+
+def penalty(target: SmoothTarget, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
+    """What minus the log density gains in place of the hard skull, moved inwards by `shift`, mm."""
+    gap = target.clearance(data, u, jnp.arange(len(target.sampled)))
+    return 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
+
+
+_penalty_with_slope = jax.jit(jax.value_and_grad(penalty, argnums=2), static_argnums=0)
+
+
+def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
+    own = displacements(target)
+    u = np.array(flat[own].reshape(-1, 3))
+    for _ in range(100):
+        gap, slope = (np.asarray(found) for found in _clearance_with_slope(target, target.data, jnp.asarray(u)))
+        inside = gap < GAP / 2
+        if not inside.any():
+            moved = np.array(flat)
+            moved[own] = u.ravel()
+            return moved
+        steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
+        u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
+    raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")
+
+
+@partial(jax.jit, static_argnums=0)
+def _clearance_with_slope(target: SmoothTarget, data: Any, u: AnyArray) -> tuple[AnyArray, AnyArray]:
+    gap, pullback = jax.vjp(lambda u: target.clearance(data, u, jnp.arange(len(u))), u)
+    return gap, pullback(jnp.ones_like(gap))[0]

@@ -1,0 +1,93 @@
+"""Where the chains start: about one mode of the posterior, or each about the one that its own start leads to."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from bayesreg.inference.gaussian.laplace import Reference, laplace
+from bayesreg.inference.gaussian.mode_search import find_mode
+from bayesreg.inference.kernel import Say
+from bayesreg.inference.layout import unravel
+from bayesreg.inference.target import SmoothTarget
+
+# Modes count as one where no coordinate lies further apart than this, in its standard deviations.
+SAME = 1.0
+
+
+class Modes(NamedTuple):
+    """The modes that were found.
+
+    Attributes
+    ----------
+    references : list of Reference
+        Laplace's approximation about each, the mode of the highest density first.
+    chains : (chains,) list of int
+        Whose mode each chain's is.
+    """
+
+    references: list[Reference]
+    chains: list[int]
+
+
+def search_modes(target: SmoothTarget, points: Any, each: bool, say: Say) -> Modes:
+    """Modes from the start points (chains as the leading axis): one from their mean, or one from each.
+
+    One search costs as much as all of a short run; that it leads elsewhere from other starts is the exception.
+    """
+    chains = len(next(iter(points.values())))
+    if not each:
+        middle = jax.tree.map(lambda x: jnp.asarray(x).mean(axis=0), points)
+        return Modes([laplace(target, find_mode(target, _flat(target, middle), say))], [0] * chains)
+    found = []
+    for chain in range(chains):
+        say(f"chain {chain}:")
+        found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points)), say))
+    return told(target, distinct(target, np.stack(found)), say)
+
+
+def distinct(target: SmoothTarget, found: Float[np.ndarray, "chains dimension"]) -> Modes:
+    """The modes among those of every chain that differ, by their distance in standard deviations (see `SAME`)."""
+    heights = [_height(target, mode) for mode in found]
+    references: list[Reference] = []
+    chains = [0] * len(found)
+    for chain in np.argsort(heights)[::-1]:
+        apart = [distance(reference, found[chain]) for reference in references]
+        if not apart or min(apart) > SAME:
+            apart = [*apart, 0.0]
+            references.append(laplace(target, found[chain]))
+        chains[chain] = int(np.argmin(apart))
+    return Modes(references, chains)
+
+
+def distance(reference: Reference, flat: Float[np.ndarray, "dimension"]) -> float:
+    """How far a flat position is from the centre, in standard deviations of the coordinate in which it is furthest."""
+    sd = np.linalg.norm(np.asarray(reference.factor), axis=1)
+    return float(np.abs((flat - np.asarray(reference.centre)) / sd).max())
+
+
+def told(target: SmoothTarget, modes: Modes, say: Say) -> Modes:
+    """The same modes, said."""
+    if len(modes.references) == 1:
+        say("modes: every chain's search ended at one and the same")
+        return modes
+    say(f"modes: {len(modes.references)}, about which the chains start; all are whitened at the first")
+    for number, reference in enumerate(modes.references):
+        centre = np.asarray(reference.centre)
+        chains = ", ".join(str(chain) for chain, mode in enumerate(modes.chains) if mode == number)
+        apart = distance(modes.references[0], centre)
+        say(f"  log density {_height(target, centre):.1f}, {apart:.1f} sd from the first: chains {chains}")
+    return modes
+
+
+def _height(target: SmoothTarget, flat: np.ndarray) -> float:
+    return float(target.logdensity_of(target.data, unravel(target)(jnp.asarray(flat))))
+
+
+def _flat(target: SmoothTarget, estimands: Any) -> np.ndarray:
+    return np.asarray(ravel_pytree(target.unconstrain_of(target.data, estimands))[0])

@@ -1,0 +1,125 @@
+"""Samplers of one evaluation per transition: random walks and Langevin steps in the whitened coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+from blackjax.mcmc import random_walk
+
+from bayesreg.inference.gaussian.reflection import reflective_leapfrog, rotated, shifted
+from bayesreg.inference.gaussian.warm_up import Tuning
+from bayesreg.inference.gaussian.whitened import (
+    Density,
+    Moved,
+    Setup,
+    Transition,
+    about_reference,
+    clearance_of,
+    whitened_density,
+)
+from bayesreg.inference.kernel import Sampler
+from bayesreg.inference.target import SmoothTarget
+from bayesreg.types import AnyArray
+
+# Steps of a random walk shrink with the square root of the dimension, and with what refuses them.
+LEAST = 1e-4
+
+
+def mala(
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.574, mode_search: str = "once"
+) -> Sampler:
+    """The Metropolis-adjusted Langevin algorithm: Hamiltonian Monte Carlo of a single leapfrog step (Neal 2011).
+
+    Written so, it has a momentum that the skull can reflect.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    warm_up : int
+        Transitions in which the step size is tuned and that are not kept.
+    target_acceptance : float
+        Between 0 and 1; the default is the best in many dimensions (Roberts and Rosenthal 1998).
+    mode_search : str
+        "once" or "per_chain".
+    """
+
+    return about_reference(target, _leapfrog, Tuning(warm_up, target_acceptance, LEAST), mode_search=mode_search)
+
+
+def _leapfrog(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    kernel = blackjax.mcmc.hmc.build_kernel(reflective_leapfrog(setup.walls, clearance_of(target, data, setup)))
+    density = whitened_density(target, data, setup)
+    state, info = kernel(key, state, density, setup.step_size, jnp.ones_like(state.position), 1)
+    return state, Moved(info.acceptance_rate, info.is_divergent, gradients=1)
+
+
+def barker(
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.4, mode_search: str = "once"
+) -> Sampler:
+    """Barker's proposal, whose gradient decides on signs alone (Livingstone and Zanella 2022); settings of `mala`.
+
+    It has no momentum: a proposal in the skull is refused.
+    """
+
+    tuning = Tuning(warm_up, target_acceptance, LEAST)
+    return about_reference(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=mode_search)
+
+
+def _barker(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    density = whitened_density(target, data, setup)
+    state, info = blackjax.mcmc.barker.build_kernel()(key, state, density, setup.step_size)
+    # Outside the support the gradient, and with it the acceptance, may be NaN, which the kernel refuses.
+    outside = ~jnp.isfinite(info.proposal.logdensity)
+    return state, Moved(jnp.nan_to_num(info.acceptance_rate), outside_support=outside, gradients=1)
+
+
+def rwmh_adaptive(
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
+) -> Sampler:
+    """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned; settings of `mala`.
+
+    A step is a straight flight with a Normal momentum, reflected by the skull: back with the momentum reversed it
+    takes the same way, so that the proposal is symmetric.
+    """
+
+    tuning, transition = Tuning(warm_up, target_acceptance, LEAST), _symmetric(shifted, whitened_density)
+    return about_reference(target, transition, tuning, random_walk.init, whitened_density, mode_search)
+
+
+def pcn(
+    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
+) -> Sampler:
+    """Preconditioned Crank–Nicolson on the Gaussian reference (Cotter et al. 2013); its settings are those of `mala`.
+
+    ξ′ = cos β ξ + sin β p with p Normal is a rotation, reflected by the skull. It leaves the reference, cut off there,
+    unchanged and is reversible, so that the test sees only the ratio of the posterior to the reference.
+    """
+
+    tuning, transition = Tuning(warm_up, target_acceptance, LEAST), _symmetric(rotated, against_reference)
+    return about_reference(target, transition, tuning, random_walk.init, against_reference, mode_search)
+
+
+@cache
+def _symmetric(motion: Callable, density: Density) -> Transition:
+    """A motion with a Normal momentum for the time of a step, accepted with the ratio of a density."""
+
+    def transition(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+        def proposal(key: AnyArray, position: AnyArray) -> AnyArray:
+            momentum = jax.random.normal(key, position.shape)
+            return motion(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
+
+        state, info = random_walk.build_rmh()(key, state, density(target, data, setup), proposal)
+        return state, Moved(info.acceptance_rate, densities=1)
+
+    return transition
+
+
+def against_reference(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
+    """log π(ξ) − log N(ξ; 0, I), up to a constant."""
+    density = whitened_density(target, data, setup)
+    return lambda xi: density(xi) + 0.5 * (xi @ xi)

@@ -1,0 +1,158 @@
+"""Sequential Monte Carlo: particles tempered from a broad Gaussian into the posterior, where chains go on."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from blackjax.smc import adaptive_tempered, resampling
+from jax.flatten_util import ravel_pytree
+
+from bayesreg.inference.gaussian.reflection import reflective_rotation, rotated
+from bayesreg.inference.gaussian.whitened import (
+    Setup,
+    clearance_of,
+    whitened,
+    whitened_density,
+    whitened_position,
+)
+from bayesreg.inference.kernel import Sampler, Say
+from bayesreg.inference.samplers.hamiltonian import hmc
+from bayesreg.inference.target import SmoothTarget
+from bayesreg.types import AnyArray, InputError
+
+# Quarter turns that spread the first particles; trajectories of each particle at each temperature; the share of the
+# particles that a rise of the inverse temperature leaves effective; how many are moved at once; the most temperatures.
+_TURNS, _MOVES, _SHARE, _BATCH, _MOST = 20, 2, 0.7, 32, 500
+
+
+def smc(
+    target: SmoothTarget,
+    particles: int = 128,
+    spread: float = 2.0,
+    warm_up: int = 80,
+    target_acceptance: float = 0.75,
+    mode_search: str = "once",
+) -> Sampler:
+    """Adaptive tempered sequential Monte Carlo, whose particles are where chains of `hmc` start.
+
+    Particles drawn from Laplace's approximation π₀, widened and cut off by the skull, are reweighted, resampled and
+    moved by `hmc`'s kernel along π₀^(1−β) π^β, β rising from 0 to 1. Modes that the broad Gaussian reaches then hold
+    particles in proportion to their mass, up to the noise of so many. Chains start at a resampled few and go on with
+    `hmc`, which leaves the posterior unchanged: it, not the tempering, is what makes the draws exact.
+
+    Parameters
+    ----------
+    target : SmoothTarget
+    particles : int
+        At least as many as chains.
+    spread : float
+        By how much the first distribution is wider than Laplace's approximation, at least 1.
+    warm_up, target_acceptance, mode_search
+        Of `hmc`, before the tempering.
+    """
+    if not spread >= 1:
+        raise InputError(f"spread must be at least 1, got {spread}")
+    chains_of = hmc(target, warm_up, target_acceptance, mode_search)
+
+    def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
+        chains = len(next(iter(points.values())))
+        if particles < chains:
+            raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
+        setup, starts = chains_of.prepare(points, key, say)
+        data = chains_of.data(setup)
+        key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
+        one = target.unconstrain_of(data, jax.tree.map(lambda x: x[0], starts))
+        begin = whitened(setup.reference, ravel_pytree(one)[0])
+        first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
+        found, weights = _tempered(target, data, setup, spread, first, target_acceptance, key_temper, say)
+        chosen = resampling.systematic(key_choose, weights, chains)
+        positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
+        return setup, jax.vmap(partial(target.constrain_of, target.data))(positions)
+
+    return chains_of._replace(prepare=prepare)
+
+
+@partial(jax.jit, static_argnums=0)
+def _broad(
+    target: SmoothTarget, data: Any, setup: Setup, begin: AnyArray, spread: AnyArray | float, keys: AnyArray
+) -> AnyArray:
+    """Draws of N(0, spread² I) cut off by the skull: from a place in the support, by quarter turns."""
+    clearance = clearance_of(target, data, setup)
+
+    def draw(key: AnyArray) -> AnyArray:
+        def turn(position: AnyArray, key: AnyArray) -> tuple[AnyArray, None]:
+            momentum = spread * jax.random.normal(key, position.shape)
+            turned, _ = rotated(setup.walls, clearance, position, momentum, jnp.pi / 2)
+            return jnp.where(jnp.isfinite(turned).all(), turned, position), None
+
+        return jax.lax.scan(turn, begin, jax.random.split(key, _TURNS))[0]
+
+    return jax.lax.map(draw, keys, batch_size=_BATCH)
+
+
+def _tempered(
+    target: SmoothTarget,
+    data: Any,
+    setup: Setup,
+    spread: float,
+    particles: AnyArray,
+    acceptance: float,
+    key: AnyArray,
+    say: Say,
+) -> tuple[AnyArray, AnyArray]:
+    """Particles and weights at β = 1; from one temperature to the next the step size follows the acceptance."""
+    state, size = adaptive_tempered.init(particles), setup.step_size
+    for number in range(_MOST):
+        state, rate = _rise(target, data, setup, spread, state, size, jax.random.fold_in(key, number))
+        power = float(state.tempering_param)
+        if not np.isfinite(power):
+            break
+        if power >= 1:
+            effective = 1 / float((state.weights**2).sum())
+            say(f"tempering: {number + 1} temperatures, acceptance {float(rate):.0%}, {effective:.0f} particles")
+            return state.particles, state.weights
+        size = jnp.clip(size * jnp.exp(rate - acceptance), 0.01, jnp.pi / 2)
+    raise InputError("the tempering came to a halt before the posterior; give smc more particles or less spread")
+
+
+@partial(jax.jit, static_argnums=0)
+def _rise(
+    target: SmoothTarget,
+    data: Any,
+    setup: Setup,
+    spread: AnyArray | float,
+    state: Any,
+    size: AnyArray,
+    key: AnyArray,
+) -> tuple[Any, AnyArray]:
+    """Resample, move, and reweight for the next β; and the acceptance of the moves."""
+    density = whitened_density(target, data, setup)
+    clearance = clearance_of(target, data, setup)
+
+    def broad(xi: AnyArray) -> AnyArray:
+        return -0.5 * (xi @ xi) / spread**2
+
+    # That of the tempered reference, about which trajectories rotate.
+    precision = (1 - state.tempering_param) / spread**2 + state.tempering_param
+    kernel = adaptive_tempered.build_kernel(
+        broad,
+        lambda xi: density(xi) - broad(xi),
+        blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance, precision)),
+        blackjax.mcmc.hmc.init,
+        resampling.systematic,
+        _SHARE,
+        batch_size=_BATCH,
+    )
+    steps = jnp.maximum(jnp.ceil(jnp.pi / 2 / size), 1).astype(int)
+    settings = {
+        "step_size": jnp.pi / 2 / steps,
+        "inverse_mass_matrix": jnp.ones_like(setup.reference.centre) / precision,
+        "num_integration_steps": steps,
+    }
+    state, info = kernel(key, state, _MOVES, jax.tree.map(lambda x: x[None], settings))
+    return state, info.update_info.acceptance_rate.mean()

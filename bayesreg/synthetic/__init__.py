@@ -1,0 +1,1 @@
+"""Pairs of images with a known truth, and what a mesh does to stiffness."""

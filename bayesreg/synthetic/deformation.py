@@ -1,0 +1,229 @@
+"""A patch of the boundary pushed in, after section 4.1 of the paper: the true deformation of a synthetic pair."""
+
+from __future__ import annotations
+
+import logging
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.sparse.csgraph import dijkstra
+
+from bayesreg.fem.elasticity import stiffness
+from bayesreg.image import Image
+from bayesreg.mesh import TetMesh, signed_volumes
+from bayesreg.synthetic.contact import ContactProblem, EnergyMinimum
+from bayesreg.synthetic.obstacle import SmoothObstacle
+from bayesreg.types import InputError
+
+Direction = tuple[float, float, float]
+
+# Frontal (right, left, right and lower), lateral (right, left) and parietal: all where the hull of the brain is free.
+DIRECTIONS: tuple[Direction, ...] = (
+    (0.6, 0.3, 0.75),
+    (-0.6, 0.3, 0.75),
+    (0.5, 0.7, 0.4),
+    (0.8, 0.1, 0.5),
+    (-0.8, 0.3, 0.4),
+    (0.0, -0.6, 0.8),
+    (-0.5, 0.7, 0.4),
+    (-0.8, 0.1, 0.5),
+    (0.8, 0.3, 0.4),
+)
+
+_log = logging.getLogger(__name__)
+
+# How often to raise the floors of nodes that ended nearer to the skull than the margin, and by what share of
+# the margin they may.
+_ROUNDS_OF_FLOORS = 20
+_SLIP = 0.01
+
+
+class Deformation(NamedTuple):
+    """A patch of the boundary pushed in, and the least elastic energy of the rest.
+
+    Attributes
+    ----------
+    u : (n, 3) array
+        Displacement of every node, mm.
+    patch : (k,) int array
+        The nodes that were pushed.
+    contact : (c,) int array
+        Nodes that press against the skull.
+    minimum : EnergyMinimum
+        Contact forces and how well the minimum converged.
+    volume_ratio : (m,) array
+        det F of every tetrahedron, all positive.
+    """
+
+    u: Float[np.ndarray, "nodes 3"]
+    patch: Int[np.ndarray, "patch"]
+    contact: Int[np.ndarray, "contact"]
+    minimum: EnergyMinimum
+    volume_ratio: Float[np.ndarray, "cells"]
+
+
+def push_patch(
+    mesh: TetMesh,
+    skull: Image,
+    *,
+    lam: Float[np.ndarray, "entries"],
+    mu: Float[np.ndarray, "entries"],
+    displacement: float = 15.0,
+    patch_nodes: int = 20,
+    direction: Direction | None = None,
+    margin: float = 0.1,
+    skull_smoothing_mm: float = 2.0,
+) -> Deformation:
+    """Push a patch of the boundary towards the centre of gravity, and let the rest find its least energy.
+
+    Every other node on the boundary keeps at least `margin` from the skull, which it may slide along: along
+    a smoothed skull, that is, drawn in at each node as far as the margin from the exact one asks for.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    skull : Image
+        Nonzero = forbidden.
+    lam, mu : (T,), (m,) or (1,) array
+        Lamé parameters, mu positive.
+    displacement : float, default 15.0
+        Of each node of the patch, mm.
+    patch_nodes : int, default 20
+        The boundary node farthest out along `direction`, and those nearest to it over the surface.
+    direction : (x, y, z), optional
+        From the centre of gravity towards the patch, RAS; any length. The default is the first of `DIRECTIONS`
+        along which no tetrahedron inverts.
+    margin : float, default 0.1
+        Least distance of a boundary node from the skull after the deformation, mm.
+    skull_smoothing_mm : float, default 2.0
+        See `SmoothObstacle`.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of range, nodes lie in the skull before or patch nodes after the push, a
+        tetrahedron inverts, or the minimum is not found.
+    """
+    if not (np.asarray(mu) > 0).all() or not (np.asarray(lam) >= 0).all():
+        raise InputError(f"the truth needs mu > 0 and lam >= 0 everywhere, got mu = {mu}, lam = {lam}")
+    if not margin > 0:
+        raise InputError(f"the margin must be positive, mm, or nodes end on the skull itself; got {margin}")
+    obstacle = SmoothObstacle(skull, skull_smoothing_mm)
+    stiff = stiffness(mesh, lam, mu)
+    for chosen in DIRECTIONS if direction is None else (direction,):
+        patch = surface_patch(mesh, patch_nodes, np.asarray(chosen, float))
+        found = _pushed(mesh, stiff, obstacle, patch, displacement, margin)
+        if found.volume_ratio.min() > 0:
+            return found
+        _log.info("a push along %s inverts %d tetrahedra", chosen, (found.volume_ratio <= 0).sum())
+    raise InputError(_inversion(mesh, found.volume_ratio, displacement))
+
+
+def _pushed(
+    mesh: TetMesh,
+    stiff: scipy.sparse.csr_matrix,
+    obstacle: SmoothObstacle,
+    patch: np.ndarray,
+    displacement: float,
+    margin: float,
+) -> Deformation:
+    towards = centre_of_gravity(mesh) - mesh.points[patch]
+    pushed = displacement * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    _require_outside_skull(obstacle, mesh, patch, pushed, margin)
+    minimum = _settle(ContactProblem(mesh, stiff, patch, pushed, obstacle), obstacle, margin)
+    ratio = signed_volumes(mesh.points + minimum.u, mesh.cells) / mesh.volumes
+    return Deformation(minimum.u, patch, np.flatnonzero(minimum.force), minimum, ratio)
+
+
+def centre_of_gravity(mesh: TetMesh) -> Float[np.ndarray, "3"]:
+    """Centre of the meshed volume, mm."""
+    return mesh.volumes @ mesh.points[mesh.cells].mean(axis=1) / mesh.volumes.sum()
+
+
+def surface_patch(mesh: TetMesh, count: int, direction: Float[np.ndarray, "3"]) -> Int[np.ndarray, "patch"]:
+    """A connected patch of the boundary: a node, and those nearest to it along the edges of the surface.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    count : int
+        Number of nodes, at least three.
+    direction : (3,) array
+        The first node is the one whose bearing from the centre of gravity is closest to it.
+
+    Returns
+    -------
+    (count,) int array
+        Nearest first.
+
+    Raises
+    ------
+    InputError
+        If the direction is zero, or the surface has too few connected nodes.
+    """
+    if not np.linalg.norm(direction) > 0:
+        raise InputError(f"the direction of the patch must not be zero, got {direction.tolist()}")
+    bearing = mesh.points[mesh.boundary] - centre_of_gravity(mesh)
+    cosine = bearing @ direction / np.linalg.norm(bearing, axis=1)
+    distance = dijkstra(_surface_edges(mesh), directed=False, indices=mesh.boundary[cosine.argmax()])
+    reachable = int(np.isfinite(distance).sum())
+    if not 3 <= count < reachable:
+        raise InputError(f"a patch has at least 3 nodes and fewer than the surface ({reachable}), got {count}")
+    return np.argsort(distance, kind="stable")[:count]
+
+
+def _surface_edges(mesh: TetMesh) -> scipy.sparse.csr_matrix:
+    """Lengths of the edges of the boundary."""
+    faces = mesh.boundary_faces
+    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
+    length = np.linalg.norm(mesh.points[edges[:, 0]] - mesh.points[edges[:, 1]], axis=1)
+    return scipy.sparse.csr_matrix((length, tuple(edges.T)), shape=(len(mesh.points),) * 2)
+
+
+def _settle(problem: ContactProblem, obstacle: SmoothObstacle, margin: float) -> EnergyMinimum:
+    """The minimum with floors on the smoothed distance that keep the exact distance above the margin."""
+    floor = np.full(len(problem.points), margin)
+    minimum = problem.solve(floor, tolerance=1e-3)
+    for _ in range(_ROUNDS_OF_FLOORS):
+        place = (problem.points + minimum.u)[problem.nodes]
+        missing = margin - obstacle.distance(place)
+        if missing.max() <= _SLIP * margin or not minimum.converged:
+            break
+        raised = np.where(missing > _SLIP * margin, obstacle(place)[0] + missing, -np.inf)
+        floor[problem.nodes] = np.maximum(floor[problem.nodes], raised)
+        minimum = problem.solve(floor, start=minimum, tolerance=1e-3)
+    if minimum.converged:
+        minimum = problem.solve(floor, start=minimum)
+    deepest = obstacle.distance((problem.points + minimum.u)[problem.nodes]).min()
+    if not minimum.converged or not deepest > 0:
+        raise InputError(
+            f"no least energy found under the skull constraint: after {minimum.iterations} steps the nodes are "
+            f"{minimum.stationarity:.1e} mm out of balance and {deepest:.2g} mm from the skull at the least; try "
+            "another direction, a smaller displacement or a wider skull"
+        )
+    return minimum
+
+
+def _require_outside_skull(
+    obstacle: SmoothObstacle, mesh: TetMesh, patch: np.ndarray, pushed: np.ndarray, margin: float
+) -> None:
+    inside = int((obstacle.distance(mesh.points[mesh.boundary]) < 0).sum())
+    if inside:
+        raise InputError(f"{inside} boundary nodes lie in the skull before any deformation; repair the mesh first")
+    inside = int((obstacle.distance(mesh.points[patch] + pushed) < margin).sum())
+    if inside:
+        raise InputError(
+            f"{inside} of the {len(patch)} patch nodes would be pushed to within {margin} mm of the skull; choose "
+            "another direction or a smaller displacement"
+        )
+
+
+def _inversion(mesh: TetMesh, ratio: np.ndarray, displacement: float) -> str:
+    inverted = mesh.tissue[ratio <= 0]
+    counts = ", ".join(f"{(inverted == t).sum()} {name}" for t, name in enumerate(mesh.names))
+    return (
+        f"the push of {displacement} mm inverts {len(inverted)} of {len(ratio)} tetrahedra ({counts}), so that the "
+        "deformation has no inverse; choose another direction, a smaller displacement or fewer patch nodes"
+    )

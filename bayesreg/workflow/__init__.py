@@ -1,0 +1,1 @@
+"""The verbs of the command line, from a configuration to a folder of results."""

@@ -1,0 +1,79 @@
+"""From a configuration and its inputs to the posterior and to where its chains begin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.config import Config
+from bayesreg.inference.chains.initialise import Start
+from bayesreg.io.displacements import read_displacement
+from bayesreg.io.store import Inputs
+from bayesreg.mesh import TetMesh
+from bayesreg.model.options import Lame, ModelConfig
+from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.problem import cell_entries, lame_parameter
+from bayesreg.model.terms.images import ImagePair
+
+
+def posterior_of(config: Config, inputs: Inputs, observations: Sequence[Any] = ()) -> Posterior:
+    """The posterior of a run, with observations besides its images; solves preconditioned at the start parameters."""
+    reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
+    model = _model(config.model, inputs)
+    observed = [ImagePair(inputs.fixed, inputs.moving), *observations]
+    return build_posterior(
+        mesh=inputs.mesh, observations=observed, model=model, skull=inputs.skull, reference=reference
+    )
+
+
+def _model(model: ModelConfig, inputs: Inputs) -> ModelConfig:
+    """The model of a configuration, its boundary held where that is known."""
+    if inputs.boundary is None:
+        return model
+    held = dict(zip(inputs.mesh.boundary.tolist(), map(tuple, np.asarray(inputs.boundary).tolist()), strict=True))
+    return ModelConfig(**{**dict(model), "sampled": [], "held": held})
+
+
+def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
+    """All entries of λ or μ at the start: as the configuration gives them, else as the model chooses."""
+    values = np.array(lame_parameter(name, mesh, config.model, None).reference())
+    given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
+    for index, tissue in enumerate(mesh.names):
+        if tissue in given:
+            values[entry[mesh.tissue == index]] = given[tissue]
+    return values
+
+
+def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
+    """Where a configuration's chains begin."""
+    field = _start_field(config, inputs)
+    return Start(
+        field=None if field is None else field[posterior.sampled],
+        fraction=config.start.fraction,
+        lam=config.start.entries("lam", posterior.entry_names),
+        mu=config.start.entries("mu", posterior.entry_names),
+        spread=config.start.spread,
+    )
+
+
+def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
+    """Displacement of every node at fraction one, mm."""
+    wanted = config.start.field
+    if wanted == "identity":
+        return None
+    if wanted == "truth":
+        assert inputs.truth is not None
+        return np.asarray(inputs.truth.u)
+    return read_displacement(Path(wanted), inputs.mesh)
+
+
+def with_initial(inputs: Inputs, config: Config) -> Inputs:
+    """The truth with the centre of the chains' starts, for the paper's Table 1."""
+    field = _start_field(config, inputs)
+    if inputs.truth is None or field is None:
+        return inputs
+    return inputs._replace(truth=inputs.truth._replace(initial=np.mean(config.start.fraction) * field))

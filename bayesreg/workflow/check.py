@@ -1,0 +1,74 @@
+"""Everything but sampling, and what sampling would cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from bayesreg.config import Config, load_config
+from bayesreg.inference.chains.checkpoint import Checkpoint
+from bayesreg.inference.chains.run import sample
+from bayesreg.inference.draws.blocks import Block
+from bayesreg.workflow.assembly import posterior_of, start_of
+from bayesreg.workflow.preparation import prepared_inputs
+
+
+def check(config: str | Path | Config) -> Check:
+    """Everything but sampling, with an estimate of time and memory."""
+    config = config if isinstance(config, Config) else load_config(config)
+    inputs, provenance = prepared_inputs(config)
+    posterior = posterior_of(config, inputs)
+    start = start_of(config, inputs, posterior)
+    options, trial, reached = config.sampler, 10, []
+
+    def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
+        reached.append(float(checkpoint.seconds))
+
+    # Two blocks: the first holds the compilation.
+    sample(posterior, options.name, options.chains, 2 * trial, config.seed, block=trial, start=start,
+           progress=False, on_block=keep, **options.settings)  # fmt: skip
+    seconds_per_step = (reached[1] - reached[0]) / trial
+    device = sum(leaf.nbytes for leaf in jax.tree.leaves(posterior.data))
+    draws = config.stop.max_steps // options.thin
+    numbers = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values()) + 8
+    return Check(
+        nodes=len(inputs.mesh.points),
+        cells=len(inputs.mesh.cells),
+        sampled=len(posterior.sampled),
+        steps_per_second=1 / seconds_per_step,
+        hours=config.stop.max_steps * seconds_per_step / 3600,
+        device_bytes=device,
+        draws_bytes=draws * options.chains * numbers * 8,
+        preparation=provenance["timings"],
+    )
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a configuration would cost; `text` says it."""
+
+    nodes: int
+    cells: int
+    sampled: int
+    steps_per_second: float
+    hours: float
+    device_bytes: int
+    draws_bytes: int
+    preparation: dict[str, float]
+
+    @property
+    def text(self) -> str:
+        """The estimate in words."""
+        preparation = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.preparation.items())
+        return (
+            "The configuration is sound.\n"
+            f"  mesh      {self.nodes} nodes, {self.cells} elements, {self.sampled} nodes sampled\n"
+            f"  prepared  {preparation}\n"
+            f"  speed     about {self.steps_per_second:.0f} steps per second and chain\n"
+            f"  time      {self.hours:.1f} h for all the steps that stop.max_steps allows\n"
+            f"  memory    {self.device_bytes / 1e6:.0f} MB on the device, whatever the number of draws; "
+            f"{self.draws_bytes / 1e6:.0f} MB of draws on the host at most"
+        )

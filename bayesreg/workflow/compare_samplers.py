@@ -1,0 +1,109 @@
+"""Several samplers on the posterior of one configuration, with one budget each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.config.sections import StopConfig, sampler_section
+from bayesreg.inference.chains.efficiency import Budget, Efficiency, efficiency
+from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.io import store
+from bayesreg.io.atomic import write_text
+from bayesreg.report.efficiency import Setting, efficiency_table, terminal_table, write_efficiencies
+from bayesreg.types import InputError
+from bayesreg.workflow.assembly import posterior_of, start_of
+from bayesreg.workflow.preparation import prepared_inputs
+
+BLOCK = 50
+
+
+def compare_samplers(
+    config: str | Path | Config,
+    out: str | Path,
+    samplers: Sequence[str] = tuple(SAMPLERS),
+    minutes: float = 5.0,
+    progress: bool = True,
+) -> list[Efficiency]:
+    """Draw from one posterior with each of several samplers, and write a table and a figure of what it cost.
+
+    Parameters
+    ----------
+    config : path or Config
+        Its sampler's settings are that sampler's; the others have their defaults, and the same number of chains.
+    out : path
+        A folder, new or empty: samplers.csv, samplers.json, samplers.html, config.yaml.
+    samplers : sequence of str
+        Names in `bayesreg.inference.samplers.registry.SAMPLERS`; each searches for the mode and warms up by itself.
+    minutes : float
+        Budget of each, positive; one that meets the rule of `config.stop` ends earlier.
+    progress : bool
+        Say what is being done.
+
+    Returns
+    -------
+    list of Efficiency
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, the budget is not positive, or the configuration, a file or the folder is wrong.
+    """
+    _require_sound(samplers, minutes)
+    config = config if isinstance(config, Config) else load_config(config)
+    store.require_fresh(out)
+    console = Console(quiet=not progress, highlight=False)
+    console.print("reading the images, meshing")
+    inputs = prepared_inputs(config)[0]
+    posterior, setting = posterior_of(config, inputs), _setting(config, minutes)
+    start = start_of(config, inputs, posterior)
+    rule = StopRule(config.stop.rhat, config.stop.ess, 60 * minutes)
+    found = []
+    for name in samplers:
+        console.print(f"{name}:")
+        own = config.sampler if config.sampler.name == name else sampler_section(name)
+        budget = Budget(config.sampler.chains, max(config.stop.max_steps // own.thin, 4), rule)
+        found.append(
+            efficiency(
+                posterior,
+                name,
+                budget,
+                config.seed,
+                thin=own.thin,
+                block=own.block or BLOCK,
+                start=start,
+                say=lambda text: console.print(f"  {text}"),
+                **own.settings,
+            )
+        )
+        console.print(f"  {found[-1].note or f'{found[-1].seconds:.0f} s'}")
+        # After each: a comparison that is cut off has shown the samplers up to there.
+        page = write_efficiencies(found, setting, out)
+    write_text(Path(out) / "config.yaml", resolved_yaml(config))
+    console.print(terminal_table(efficiency_table(found, setting)))
+    console.print(f"{page}")
+    return found
+
+
+def _require_sound(samplers: Sequence[str], minutes: float) -> None:
+    for name in samplers:
+        if name not in SAMPLERS:
+            raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
+    if not samplers or len({*samplers}) < len(samplers):
+        raise InputError(f"expected one or more samplers, none of them twice; got {', '.join(samplers) or 'none'}")
+    if not minutes > 0:
+        raise InputError(f"minutes must be positive, got {minutes:g}")
+
+
+def _setting(config: Config, minutes: float) -> Setting:
+    return Setting(config.description, config.sampler.chains, minutes, _rule(config.stop))
+
+
+def _rule(stop: StopConfig) -> str:
+    if stop.rhat is None:
+        return "there is none"
+    return f"R̂ below {stop.rhat:g}" + (f" and ESS above {stop.ess:g}" if stop.ess is not None else ", unsplit")

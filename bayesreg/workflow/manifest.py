@@ -1,0 +1,143 @@
+"""What run.json says of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from bayesreg import __version__
+from bayesreg.config import Config
+from bayesreg.config.sections import StopConfig
+from bayesreg.inference.chains.run import Samples
+from bayesreg.inference.draws.diagnostics import Convergence
+from bayesreg.inference.draws.moments import greatest_rhat
+from bayesreg.io.store import Inputs
+from bayesreg.mesh import signed_volumes
+from bayesreg.model.posterior import Posterior
+
+# A sampled node counts as in contact where its mean position lies this near to the skull, mm.
+CONTACT = 0.5
+
+
+def manifest(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    samples: Samples,
+    draws: xr.Dataset,
+    judged: Convergence,
+    provenance: dict[str, Any],
+    began: float,
+) -> dict[str, Any]:
+    """The content of run.json: versions, digests, timings, and how well the sampling went.
+
+    Parameters
+    ----------
+    config : Config
+    inputs : Inputs
+    posterior : Posterior
+    samples : Samples
+    draws : xarray.Dataset
+        The group `posterior`.
+    judged : Convergence
+    provenance : dict
+        "timings" (s) of the preparation, and what is known of a synthetic "pair".
+    began : float
+        `time.perf_counter()` when the run began, put back by what processes that were cut off have spent.
+    """
+    tally = samples.tally
+    steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
+    accepted = float(tally.acceptance.sum())
+    greatest = _extreme(judged.rhat, np.nanmax)
+    return {
+        "name": config.description,
+        "versions": _versions(),
+        "seed": config.seed,
+        "mesh_digest": inputs.mesh.digest,
+        "image_digests": {name: getattr(inputs, name).digest for name in ("fixed", "moving")},
+        "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
+        "devices": [str(device) for device in jax.devices()],
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        "timings": {
+            **provenance["timings"],
+            "sampling": samples.seconds,
+            "total": time.perf_counter() - began,
+        },
+        "pair": provenance["pair"],
+        "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
+        "model": config.model.model_dump(mode="json"),
+        "observations": list(posterior.observations),
+        "exact": samples.exact,
+        "stopped": {
+            "reason": samples.reason,
+            "converged": _converged(samples, config.stop, judged),
+            "rhat_threshold": config.stop.rhat,
+            "ess_threshold": config.stop.ess,
+        },
+        "convergence": {
+            "rhat_max": greatest,
+            "ess_bulk_min": _extreme(judged.ess_bulk, np.nanmin),
+            "ess_tail_min": _extreme(judged.ess_tail, np.nanmin),
+            "rhat_paper_max": greatest_rhat(samples.rhat),
+        },
+        "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
+        "contact_nodes": _contact_nodes(inputs, posterior, samples),
+        "inverted_elements": _inverted_elements(posterior, samples),
+        "solver": {
+            "failed": int(tally.solver_failed.sum()),
+            "iterations_mean": float(tally.solver_iterations.sum()) / steps,
+        },
+        "steps_per_chain": int(tally.steps[0]),
+        "gradients_per_chain": float(np.mean(tally.gradients)),
+        "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
+        "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
+        "implied_noise_sd": implied_noise_sd(posterior, draws),
+    }
+
+
+def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float:
+    """The noise that T_s stands for (see `Posterior.noise_sd`): the known one, or its posterior mean."""
+    if "t_similarity" in draws:
+        return posterior.noise_sd(float(draws["t_similarity"].mean()))
+    return posterior.implied_noise_sd
+
+
+def _converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:
+    """The stop rule and the figures of the report, rank-normalised and split, must both agree."""
+    if stop.rhat is None:
+        return None
+    greatest = _extreme(judged.rhat, np.nanmax)
+    least = [_extreme(ess, np.nanmin) for ess in (judged.ess_bulk, judged.ess_tail)]
+    enough = stop.ess is None or all(ess is not None and ess > stop.ess for ess in least)
+    return bool(samples.converged) and greatest is not None and greatest < stop.rhat and enough
+
+
+def _versions() -> dict[str, str]:
+    packages = ("jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "pytetwild")
+    return {"bayesreg": __version__, "python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+def _extreme(figures: Any, choose: Callable[[np.ndarray], float]) -> float | None:
+    values = np.concatenate([np.ravel(figures[name]) for name in figures])
+    return float(choose(values)) if np.isfinite(values).any() else None
+
+
+def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
+    mesh = posterior.mesh
+    return int((signed_volumes(mesh.points + samples.u_mean, mesh.cells) <= 0).sum())
+
+
+def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
+    if inputs.skull is None:
+        return None
+    u, rows = samples.u_mean[posterior.sampled], np.arange(len(posterior.sampled))
+    return int((np.asarray(posterior.clearance(posterior.data, u, rows)) < CONTACT).sum())

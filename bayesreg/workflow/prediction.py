@@ -1,0 +1,167 @@
+"""What only the posterior can tell after sampling, computed once and stored with the run: the report reads it back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from bayesreg.fem.location import locate
+from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thinned
+from bayesreg.io.store import Predicted
+from bayesreg.mesh import TetMesh
+from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual, t_similarity_of
+from bayesreg.model.posterior import Posterior
+from bayesreg.types import AnyArray, InputError
+
+Landmarks = Mapping[str, tuple[float, float, float]]
+
+MOST_DRAWS = 400
+FAR = 2.0
+REACH = 0.95
+STIFFER = 1.5
+
+
+def predict(
+    posterior: Posterior,
+    draws: xr.Dataset,
+    u_mean: Float[np.ndarray, "nodes 3"],
+    u_sd: Float[np.ndarray, "nodes 3"],
+    landmarks: Landmarks,
+    seed: int,
+) -> Predicted:
+    """Push at most 400 evenly spaced draws forward: u at nodes and landmarks, stiffness, residuals and replications.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    draws : xarray.Dataset
+        The group `posterior` of the run.
+    u_mean, u_sd : (n, 3) arrays
+        Posterior mean and standard deviation at every node over all draws, mm.
+    landmarks : mapping
+        Name to place (world mm, in the fixed image); where it is empty some are chosen.
+    seed : int
+        Of the replicated noise.
+
+    Raises
+    ------
+    InputError
+        If a landmark lies outside the mesh.
+    """
+    mesh = posterior.mesh
+    landmarks = landmarks or default_landmarks(mesh, u_mean, u_sd)
+    nodes, weights = _interpolation(mesh, landmarks)
+    given = posterior.data, jnp.asarray(mesh.neighbours), jnp.asarray(u_mean), jnp.asarray(nodes), jnp.asarray(weights)
+    key = jax.random.key(seed)
+
+    def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
+        data, neighbours, u_mean, nodes, weights = given
+        number, here = draw.pop("number"), replace(posterior, data=data)
+        cells = here.images.quadrature.cells
+        u = here.evaluate(draw).u
+        z = standardised_residual(here, u, t_similarity_of(here, draw))
+        values = {"t_similarity": t_similarity_of(here, draw)}
+        noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
+        observed, replicated = (discrepancies(x, cells, neighbours, len(mesh.cells)) for x in (z, noise))
+        distance = jnp.linalg.norm(u - u_mean, axis=1)
+        marks = jnp.einsum("la,lai->li", weights, u[nodes])
+        stiffness = here.stiffness(draw)
+        return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "landmarks": marks,
+                "observed": observed, "replicated": replicated,
+                "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
+
+    some = thinned(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
+    chains, count = some["u_boundary"].shape[:2]
+    some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
+    aside: dict[str, list[np.ndarray]] = {"landmarks": [], "observed": [], "replicated": []}
+    found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
+    whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
+    at_mean = standardised_residual(posterior, jnp.asarray(u_mean), _median_t_similarity(posterior, some))
+    return Predicted(
+        chain_mean=found.chain_mean["u"],
+        far_mm=np.array(FAR),
+        far=found.mean["far"],
+        reach=found.quantiles["distance"][0],
+        landmark_names=np.array(list(landmarks)),
+        landmark_points=np.array(list(landmarks.values()), float),
+        landmark_draws=whole["landmarks"],
+        residual=np.asarray(at_mean, np.float32),
+        residual_tissue=mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
+        discrepancies=np.array(DISCREPANCIES),
+        observed=whole["observed"],
+        replicated=whole["replicated"],
+        **(_stiffness(found) if posterior.data.body.field is not None else {}),
+    )
+
+
+def _stiffness(found: Summary) -> dict[str, np.ndarray]:
+    return {
+        "stiffness_mean": found.mean["stiffness"],
+        "stiffness_sd": found.sd["stiffness"],
+        "stiffer": np.array(STIFFER),
+        "stiffer_probability": found.mean["stiffer"],
+    }
+
+
+def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]]) -> Iterator[dict[str, Any]]:
+    """The blocks less some entries, which are small and kept whole."""
+    for block in blocks:
+        for name, parts in aside.items():
+            parts.append(block.pop(name))
+        yield block
+
+
+def _median_t_similarity(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> float:
+    middle = {name: np.asarray(np.median(draws[name])) for name in ("t_similarity",) if name in draws}
+    return float(t_similarity_of(posterior, middle))
+
+
+def require_inside(mesh: TetMesh, landmarks: Landmarks) -> None:
+    """Raise InputError if a landmark lies outside the mesh, where no displacement is estimated."""
+    _interpolation(mesh, landmarks)
+
+
+def _interpolation(mesh: TetMesh, landmarks: Landmarks) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (landmark, 4) and barycentric weights (landmark, 4) of places in the mesh."""
+    places = np.array(list(landmarks.values()), float).reshape(-1, 3)
+    # Nodes on a curved boundary may lie outside every cell by rounding.
+    cell, barycentric = locate(mesh.points, mesh.cells, places, tolerance=1e-6)
+    for name, place, where in zip(landmarks, places, cell, strict=True):
+        if where < 0:
+            raise InputError(
+                f"landmark {name!r} at {place.tolist()} mm lies outside the mesh, which runs from "
+                f"{mesh.points.min(axis=0).round(1).tolist()} to {mesh.points.max(axis=0).round(1).tolist()} mm "
+                "(world RAS, in the fixed image); give a place inside the brain"
+            )
+    return mesh.cells[cell], barycentric
+
+
+def default_landmarks(
+    mesh: TetMesh, u_mean: Float[np.ndarray, "nodes 3"], u_sd: Float[np.ndarray, "nodes 3"]
+) -> dict[str, tuple[float, float, float]]:
+    """The nodes of the largest shift, the least certainty and the greatest depth, and the middle of each tissue.
+
+    A tissue's middle is the centre of the one of its tetrahedra that lies nearest to its centroid.
+    """
+    depth, _ = cKDTree(mesh.points[mesh.boundary]).query(mesh.points)
+    centres = mesh.points[mesh.cells].mean(axis=1)
+    found = {
+        "largest shift": mesh.points[np.linalg.norm(u_mean, axis=1).argmax()],
+        "largest sd": mesh.points[np.linalg.norm(u_sd, axis=1).argmax()],
+        "deepest point": mesh.points[depth.argmax()],
+    }
+    for index, name in enumerate(mesh.names):
+        inside = mesh.tissue == index
+        if inside.any():
+            centroid = np.average(centres[inside], axis=0, weights=mesh.volumes[inside])
+            nearest = np.linalg.norm(centres[inside] - centroid, axis=1).argmin()
+            found[f"middle of {name.upper() if len(name) <= 3 else name}"] = centres[inside][nearest]
+    return {name: (float(x), float(y), float(z)) for name, (x, y, z) in found.items()}

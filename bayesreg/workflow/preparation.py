@@ -1,0 +1,209 @@
+"""From a configuration to the inputs of a run: anatomy, mesh, image pair, and the truth where it is made."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.config import Config, resolved_yaml
+from bayesreg.config.sections import BrainWebData, CalibratedPair, FilesData, MeshConfig
+from bayesreg.distance import forbidden
+from bayesreg.fem.location import transfer
+from bayesreg.image import Image, robust_scale
+from bayesreg.io import store
+from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
+from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
+from bayesreg.io.domain import without_ridges
+from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
+from bayesreg.io.store import Inputs, Truth
+from bayesreg.io.volumes import load_image
+from bayesreg.mesh import TetMesh
+from bayesreg.synthetic.pair import SyntheticPair, make_pair
+from bayesreg.workflow.prediction import require_inside
+
+PROVENANCE = Path("inputs") / "provenance.json"
+
+
+class Prepared(NamedTuple):
+    """The inputs of a run, and how they came about.
+
+    Attributes
+    ----------
+    inputs : Inputs
+    timings : dict
+        Seconds for "anatomy", "mesh" and "pair".
+    pair : dict
+        What is known of a synthetic pair besides its truth; empty for files.
+    """
+
+    inputs: Inputs
+    timings: dict[str, float]
+    pair: dict[str, object]
+
+
+def prepare(config: Config) -> Prepared:
+    """Read or make everything that the posterior needs.
+
+    Raises
+    ------
+    InputError
+        If a file, a label, the mesh or the pair is not what the configuration promises.
+    """
+    clock = _Clock()
+    _require_start(config)
+    anatomy, moving = _anatomy(config)
+    if anatomy.intracranial is not None:
+        anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
+    clock.lap("anatomy")
+    domain = mesh_domain(anatomy.tissue, anatomy.intracranial)
+    tissue = _as_stored(domain_labels(anatomy.tissue, domain))
+    mesh = _mesh(anatomy, domain, config.mesh)
+    clock.lap("mesh")
+    _require_start(config, mesh)
+    skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
+    scale = robust_scale(anatomy.image, domain.voxels != 0)
+    fixed = scale(anatomy.image)
+    if isinstance(config.data, FilesData):
+        assert moving is not None
+        own_scale = scale if config.data.same_contrast else robust_scale(moving, _within(domain, moving))
+        images = _as_stored(fixed), _as_stored(own_scale(moving))
+        boundary = _known_boundary(config, mesh, None)
+        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary)
+        return Prepared(inputs, clock.laps, {})
+    pair = _pair(config, fixed, anatomy, domain, skull, mesh)
+    clock.lap("pair")
+    u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
+    truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
+    images = _as_stored(pair.fixed), _as_stored(pair.moving)
+    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, _known_boundary(config, mesh, truth))
+    return Prepared(inputs, clock.laps, _described(config, pair))
+
+
+def prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
+    """The images, mesh and truth of a configuration, and where they come from."""
+    prepared = prepare(config)
+    require_inside(prepared.inputs.mesh, config.report.landmarks)
+    return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
+
+
+def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:
+    """With the seconds spent on all but sampling, which a resumed run adds to its own."""
+    return provenance | {"unsampled": time.perf_counter() - began}
+
+
+def store_inputs(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
+    """Write the inputs of a run, and where they come from."""
+    (out / PROVENANCE).parent.mkdir(parents=True, exist_ok=True)
+    store.write_json(out / PROVENANCE, provenance)
+    store.write_inputs(out, inputs)
+
+
+def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
+    """Raise InputError where a file with displacements cannot serve, as far as can be told by now."""
+    if isinstance(config.start.field, Path):
+        read_displacement(config.start.field, mesh)
+    if isinstance(config.known_boundary, Path) and mesh is None:
+        require_displacement(config.known_boundary)
+
+
+def _known_boundary(config: Config, mesh: TetMesh, truth: Truth | None) -> Float[np.ndarray, "boundary 3"] | None:
+    """u_B where the configuration gives it, mm."""
+    if config.known_boundary is None:
+        return None
+    if config.known_boundary == "truth":
+        assert truth is not None
+        return np.asarray(truth.u)[mesh.boundary]
+    return read_boundary(Path(config.known_boundary), mesh)
+
+
+class _Clock:
+    """Seconds since the lap before."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name], self._last = now - self._last, now
+
+
+def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
+    """The fixed side, and the moving image of a pair from files."""
+    data = config.data
+    if isinstance(data, FilesData):
+        anatomy = from_files(data.fixed, data.labels, data.label_table.as_dict(), data.intracranial)
+        moving = load_image(data.moving)
+        check_same_space(anatomy.image, moving, ("fixed", "moving"))
+        return anatomy, moving
+    if isinstance(data, BrainWebData):
+        return brainweb(data.labels, data.t1, data.intracranial_labels), None
+    return mni152(), None
+
+
+def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
+    if settings.file is not None and edge_length is None:
+        return load_mesh(settings.file)
+    options = MeshOptions(
+        edge_length=edge_length or settings.edge_length,
+        envelope=None if edge_length else settings.envelope,
+        skull_gap=settings.skull_gap,
+    )
+    return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain)
+
+
+def _as_stored(image: Image) -> Image:
+    """In the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
+    voxels = np.asarray(image.voxels)
+    return Image(voxels.astype(np.float32) if voxels.dtype.kind == "f" else voxels, image.affine.astype(np.float32))
+
+
+def _within(domain: Image, image: Image) -> np.ndarray:
+    """Which voxels of an image on another grid lie in the domain."""
+    return np.asarray(domain.interpolate(image.grid_points())) > 0.5
+
+
+def _pair(
+    config: Config, fixed: Image, anatomy: Anatomy, domain: Image, skull: Image | None, mesh: TetMesh
+) -> SyntheticPair:
+    settings = config.simulate
+    assert settings is not None
+    assert skull is not None
+    making = mesh
+    if isinstance(settings, CalibratedPair):
+        making = _mesh(anatomy, domain, config.mesh, settings.making_edge_length)
+    given = {} if settings.smoothing_mm is None else {"smoothing_mm": settings.smoothing_mm}
+    return make_pair(
+        fixed,
+        anatomy.tissue,
+        skull,
+        making,
+        lam=np.asarray(settings.lam.as_tuple()),
+        mu=np.asarray(settings.mu.as_tuple()),
+        displacement=settings.displacement,
+        patch_nodes=settings.patch_nodes,
+        direction=settings.direction,
+        noise_sd=settings.noise_sd,
+        seed=config.seed,
+        **given,
+    )
+
+
+def _described(config: Config, pair: SyntheticPair) -> dict[str, object]:
+    assert config.simulate is not None
+    same = "the mesh of the registration (the inverse crime)"
+    return {
+        "kind": config.simulate.kind,
+        "made_on": same if config.simulate.kind == "paper" else f"a finer mesh of {len(pair.mesh.points)} nodes",
+        "noise_sd": pair.noise_sd,
+        "smoothing_mm": pair.smoothing_mm,
+        "residual_sd_at_truth": pair.residual_sd,
+        "interpolation_sd_at_truth": pair.interpolation_sd,
+        "patch": pair.deformation.patch.tolist(),
+        "contact": pair.deformation.contact.tolist(),
+        "least_volume_ratio": float(pair.deformation.volume_ratio.min()),
+    }

@@ -1,0 +1,98 @@
+"""A finished run: to open it, to write its report anew, and to put several side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesreg.inference.draws.diagnostics import Convergence, convergence
+from bayesreg.inference.draws.inference_data import open_posterior
+from bayesreg.io import store
+from bayesreg.io.store import Run
+from bayesreg.mesh import TetMesh
+from bayesreg.types import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder : Path
+    run : bayesreg.io.store.Run
+        Mesh, images, posterior mean and sd of u at every node, manifest, metrics.
+    """
+
+    folder: Path
+    run: Run
+
+    @cached_property
+    def idata(self) -> Any:
+        """The draws, as ArviZ opens them."""
+        return open_posterior(self.folder / "posterior.nc")
+
+    @cached_property
+    def convergence(self) -> Convergence:
+        """R̂ and effective sample sizes of every estimand."""
+        return convergence(self.idata)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh of the registration."""
+        return self.run.mesh
+
+    @property
+    def u_mean(self) -> np.ndarray:
+        """Posterior mean displacement of every node, (n, 3), mm."""
+        return np.asarray(self.run.u_mean)
+
+    @property
+    def u_sd(self) -> np.ndarray:
+        """Posterior standard deviation of the displacement of every node, (n, 3), mm."""
+        return np.asarray(self.run.u_sd)
+
+    @property
+    def metrics(self) -> dict[str, Any] | None:
+        """The paper's Tables 1 and 2 and the coverage of intervals, where the truth is known."""
+        return self.run.metrics
+
+    @property
+    def converged(self) -> bool | None:
+        """Whether the stop rule held and the report's rank-normalised R̂ agrees; None where no rule was set."""
+        return self.run.manifest["stopped"]["converged"]
+
+    @property
+    def report(self) -> Path:
+        """The HTML report."""
+        return self.folder / "report.html"
+
+
+def load_result(folder: str | Path) -> Result:
+    """Open a finished run; InputError where the folder holds none."""
+    return Result(Path(folder), store.read_run(folder))
+
+
+def report(folder: str | Path) -> Path:
+    """Write the report of a finished run anew, and return its path."""
+    from bayesreg.report.html import write_report
+
+    result = load_result(folder)
+    write_report(result.run, result.idata, *result.convergence, result.report)
+    return result.report
+
+
+def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
+    """Put runs side by side on one page, and return its path."""
+    from bayesreg.report.compare import write_comparison
+
+    if not Path(out).absolute().parent.is_dir():
+        raise InputError(f"{out} cannot be written: there is no folder {Path(out).parent}")
+    results = [load_result(folder) for folder in folders]
+    write_comparison([(r.run, r.idata, *r.convergence) for r in results], out)
+    return Path(out)

@@ -1,0 +1,287 @@
+"""From a configuration to a run folder: the only place that wires everything together.
+
+Reports are imported where they are written: no run waits at its start for what draws them at its end.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
+from bayesreg.inference.chains.devices import is_first, require_joined, wait
+from bayesreg.inference.chains.run import (
+    Samples,
+    checkpoint_from_arrays,
+    first_checkpoint,
+    sample,
+)
+from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.draws.blocks import Block, Blocks
+from bayesreg.inference.draws.diagnostics import convergence
+from bayesreg.inference.draws.inference_data import dataset, open_posterior, save_posterior, to_blocks
+from bayesreg.io import store
+from bayesreg.io.atomic import write_text
+from bayesreg.io.store import Inputs, Run
+from bayesreg.model.posterior import Posterior
+from bayesreg.model.warp import nodal_field_on_grid, warp_image
+from bayesreg.report.metrics import compute_metrics
+from bayesreg.types import InputError
+from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
+from bayesreg.workflow.manifest import manifest
+from bayesreg.workflow.prediction import predict
+from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
+from bayesreg.workflow.result import Result, load_result, report
+
+# Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
+# whole state is written.
+BLOCK, POINTS, FEWEST = 100, 20_000, 10
+# Where several processes wait for one another.
+BEGUN, KEPT, SAMPLED, ENDED = (
+    "the run has begun",
+    "a block of draws is kept",
+    "all draws are judged",
+    "the run has ended",
+)
+
+
+def run(
+    config: str | Path | Config,
+    out: str | Path,
+    resume: bool = False,
+    progress: bool = True,
+    observations: Sequence[Any] = (),
+) -> Result:
+    """Run a configuration from end to end.
+
+    Parameters
+    ----------
+    config : path or Config
+    out : path
+        The run folder, new or empty; with `resume`, that of a run that was cut off, or of a finished one.
+    resume : bool
+        Continue after the last draws that were stored. Where the section `stop` differs from the one that the run was
+        begun with, the new one holds: a finished run is given more draws so.
+    progress : bool
+        Say what is being done, and show a progress bar.
+    observations : sequence
+        What was observed besides the two images, such as `bayesreg.Landmarks`; see `bayesreg.build_posterior`. A run
+        that began with some is resumed with the same.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    InputError
+        If the configuration, a file or an observation is wrong, or the folder holds another run; if the section
+        `distributed` is given and `bayesreg.inference.chains.devices.join` was not called.
+    """
+    config = config if isinstance(config, Config) else load_config(config)
+    if config.distributed is not None:
+        return _run_together(config, Path(out), resume, progress, observations)
+    return _run(config, Path(out), resume, progress, observations)
+
+
+def _run_together(config: Config, out: Path, resume: bool, progress: bool, observations: Sequence[Any]) -> Result:
+    """The first of several processes runs, and the others join it as if they resumed what it began.
+
+    A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
+    """
+    require_joined(config.sampler.chains)
+    # Where a run is made is no part of it.
+    config = config.model_copy(update={"distributed": None})
+    if is_first():
+        result = _run(config, out, resume, progress, observations)
+        wait(ENDED)
+        return result
+    wait(BEGUN)
+    if not (out / "run.json").exists():
+        begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
+        posterior = posterior_of(begun, inputs, observations)
+        _sample(begun, posterior, _reached(begun, inputs, posterior, out, progress=False), out, progress=False)
+        wait(SAMPLED)
+    wait(ENDED)
+    return load_result(out)
+
+
+def _run(config: Config, out: Path, resume: bool, progress: bool, observations: Sequence[Any]) -> Result:
+    began = time.perf_counter()
+    say = _narrator(progress)
+    if resume and (out / "config.yaml").exists():
+        known = _resumed_config(out, config)
+        if (out / "run.json").exists() and known.stop == config.stop:
+            say(f"{out} holds a finished run already; another budget (stop) would continue it")
+            if not (out / "report.html").exists():
+                report(out)
+            wait(BEGUN)
+            return load_result(out)
+        inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
+        _require_same_observations(out, provenance, observations)
+        posterior = posterior_of(config, inputs, observations)
+        if (out / "run.json").exists():
+            store.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
+        inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
+        write_text(out / "config.yaml", inputs.config)
+        reached = _reached(config, inputs, posterior, out, progress)
+        sampled = float(reached[0].seconds)
+        began -= provenance["unsampled"] + sampled
+        store.write_json(out / PROVENANCE, with_unsampled(provenance, began + sampled))
+    else:
+        # A run that was cut off before its configuration was written has nothing yet that is worth keeping.
+        if not (resume and (out / PROVENANCE).exists()):
+            store.require_fresh(out)
+        say("reading the images, meshing")
+        inputs, provenance = prepared_inputs(config)
+        # Nothing is written before all input has proved sound, and all of it before the first step is taken.
+        posterior = posterior_of(config, inputs, observations)
+        provenance["observations"] = _names(observations)
+        reached = _first(config, inputs, posterior, out, progress)
+        inputs = with_initial(inputs, config)
+        store_inputs(out, inputs, with_unsampled(provenance, began))
+    _save_state(out, *reached)
+    say(_described(inputs))
+    wait(BEGUN)
+    samples = _sample(config, posterior, reached, out, progress)
+    wait(SAMPLED)
+    say("writing the results")
+    result = _finish(config, inputs, posterior, samples, provenance, out, began)
+    say(f"{samples.reason}")
+    return result
+
+
+def _resumed_config(out: Path, config: Config) -> Config:
+    """The configuration that a run was begun with; InputError if it differs in more than its budget."""
+    known = load_config(out / "config.yaml")
+    if resolved_yaml(known.model_copy(update={"stop": config.stop})) != resolved_yaml(config):
+        raise InputError(
+            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which "
+            "only the section stop may change, or name another folder"
+        )
+    return known
+
+
+def _names(observations: Sequence[Any]) -> list[str]:
+    return [observation.name for observation in observations]
+
+
+def _require_same_observations(out: Path, provenance: dict[str, Any], observations: Sequence[Any]) -> None:
+    """Raise InputError where a run would go on with other observations than it began with."""
+    begun, given = provenance.get("observations", []), _names(observations)
+    if begun != given:
+        raise InputError(
+            f"the run in {out} began with the observations {begun or 'none'} besides its images, and is resumed with "
+            f"{given or 'none'}: give the same to bayesreg.run(..., observations=[...])"
+        )
+
+
+def _narrator(progress: bool) -> Callable[[str], None]:
+    console = Console(quiet=not progress, highlight=False)
+    return lambda text: console.print(text)
+
+
+def _described(inputs: Inputs) -> str:
+    mesh = inputs.mesh
+    return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
+
+
+Reached = tuple[Checkpoint, Blocks]
+
+
+def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
+    """The chains before their first step; InputError where one cannot start."""
+    options, start = config.sampler, start_of(config, inputs, posterior)
+    found = first_checkpoint(
+        posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
+    )
+    return found, store.StoredBlocks(out, 0, writes=is_first())
+
+
+def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
+    """The chains as the run that was cut off stored them last."""
+    state = store.load_state(out)
+    if state is None:
+        return _first(config, inputs, posterior, out, progress)
+    blocks = store.StoredBlocks(out, int(state.pop("blocks")), writes=is_first())
+    options = config.sampler
+    return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
+
+
+def _save_state(out: Path, checkpoint: Checkpoint, blocks: Blocks) -> None:
+    store.save_state(out, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
+
+
+def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
+    def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
+        if is_first():
+            _save_state(out, checkpoint, reached[1])
+        wait(KEPT)
+
+    options = config.sampler
+    return sample(
+        posterior,
+        options.name,
+        options.chains,
+        config.stop.max_steps // options.thin,
+        config.seed,
+        thin=options.thin,
+        block=options.block or _block(len(posterior.images.quadrature.weights)),
+        stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
+        progress=progress,
+        resume=reached,
+        on_block=keep,
+        **options.settings,
+    )
+
+
+def _block(points: int) -> int:
+    """Fewer draws where a step costs more, or no look would come before a time limit is long over.
+
+    By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
+    """
+    return max(BLOCK * POINTS // max(points, POINTS), FEWEST)
+
+
+def _finish(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    samples: Samples,
+    provenance: dict[str, Any],
+    out: Path,
+    began: float,
+) -> Result:
+    """Everything after the last draw: the files of the run folder, run.json last but for the report."""
+    from bayesreg.report.html import write_report
+
+    save_posterior(posterior, samples.blocks, out / "posterior.nc")
+    idata = open_posterior(out / "posterior.nc")
+    draws, judged = dataset(idata, "posterior"), convergence(idata)
+    moments = np.concatenate([samples.u_mean, samples.u_sd], axis=1)
+    mean_field, sd_field = np.split(nodal_field_on_grid(inputs.mesh, moments, inputs.fixed), 2, axis=-1)
+    metrics = None
+    if inputs.truth is not None:
+        metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
+    predicted = predict(posterior, draws, samples.u_mean, samples.u_sd, config.report.landmarks, config.seed)
+    finished = Run(
+        manifest=manifest(config, inputs, posterior, samples, draws, judged, provenance, began),
+        u_mean=samples.u_mean,
+        u_sd=samples.u_sd,
+        warped=warp_image(inputs.moving, mean_field, inputs.fixed),
+        metrics=metrics,
+        predicted=predicted,
+        bodies=store.read_bodies(out),
+        **inputs._asdict(),
+    )
+    store.write_results(out, finished, mean_field, sd_field)
+    store.remove_blocks(out)
+    result = Result(out, finished)
+    write_report(finished, idata, *judged, result.report)
+    return result
