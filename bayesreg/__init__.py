@@ -23,7 +23,7 @@ _HOME = {
     "PriorConfig": "model.options",
     "TemperaturePrior": "model.options",
     "Posterior": "model.posterior",
-    "build_posterior": "model.posterior",
+    "build_posterior": "model.build",
     "ImagePair": "model.terms.images",
     "Landmarks": "model.terms.landmarks",
     "independent_points": "model.independence",

@@ -1,4 +1,4 @@
-"""What run.json says beyond what the pipeline's tests look at."""
+"""What run.json says beyond what the tests of whole runs look at."""
 
 import numpy as np
 import pytest
@@ -17,5 +17,6 @@ def test_noise_of_an_inferred_temperature_is_that_of_its_mean():
     )
     u = xr.Dataset({"lam": (("chain", "draw", "tissue"), np.ones((2, 3, 3)))})
     drawn = u.assign(t_similarity=(("chain", "draw"), [[3.0, 3.2, 3.4], [2.8, 3.2, 3.6]]))
-    assert implied_noise_sd(known, u) == known.implied_noise_sd
-    assert implied_noise_sd(inferred, drawn) == pytest.approx(2 * known.implied_noise_sd)
+    assert implied_noise_sd(known, u) == known.images.noise_sd(0.8)
+    assert implied_noise_sd(inferred, drawn) == pytest.approx(2 * known.images.noise_sd(0.8))
+    assert implied_noise_sd(inferred, u) == known.images.noise_sd(0.8)

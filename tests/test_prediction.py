@@ -33,7 +33,7 @@ def problem() -> tuple[br.Posterior, xr.Dataset, np.ndarray]:
     u = np.asarray(posterior.evaluate(truth).u)
     weights = np.asarray(images.quadrature.weights)
     noise = np.sqrt(0.05 / (2 * weights)) * rng.normal(size=len(weights))
-    shown = images.fixed_values - posterior.residuals(u) + noise
+    shown = images.fixed_values - posterior.images.residuals(u) + noise
     posterior = replace(posterior, data=posterior.data.with_term("images", images._replace(fixed_values=shown)))
     draws = {name: np.broadcast_to(value, (3, 12, *value.shape)) for name, value in truth.items()}
     draws["u_boundary"] = draws["u_boundary"] + 0.02 * rng.normal(size=draws["u_boundary"].shape)

@@ -3,29 +3,48 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
+from bayesreg.inference.target import Coordinates, Estimands
 from bayesreg.types import AnyArray
 
 
+@runtime_checkable
+class Placed(Hashable, Protocol):
+    """The part of a target that the order of the coordinates follows from."""
+
+    @property
+    def data(self) -> Any:
+        """See `Target`."""
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """See `Target`."""
+
+
+def flat_position(target: Placed, data: Any, estimands: Estimands) -> AnyArray:
+    """The flat position of estimands."""
+    return ravel_pytree(target.coordinates.unconstrain(data, estimands))[0]
+
+
 @lru_cache(maxsize=8)
-def unravel(target: Any) -> Callable[[AnyArray], dict[str, AnyArray]]:
+def unravel(target: Placed) -> Callable[[AnyArray], dict[str, AnyArray]]:
     """The map from flat positions to positions."""
-    return ravel_pytree(target.unconstrain(target.reference()))[1]
+    return ravel_pytree(_at_rest(target))[1]
 
 
 @lru_cache(maxsize=8)
-def slices(target: Any) -> dict[str, slice]:
+def slices(target: Placed) -> dict[str, slice]:
     """The entries of a flat position that hold each part of a position, by name."""
     # Shapes alone: this may be asked for while something is traced.
-    shapes = jax.eval_shape(lambda: target.unconstrain(target.reference()))
+    shapes = jax.eval_shape(lambda: _at_rest(target))
     found, first = {}, 0
     # In the order of the leaves, which is that of `ravel_pytree`.
     for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
@@ -34,12 +53,35 @@ def slices(target: Any) -> dict[str, slice]:
     return found
 
 
-def displacements(target: Any) -> slice:
+def dimension(target: Placed) -> int:
+    """The number of coordinates."""
+    return sum(part.stop - part.start for part in slices(target).values())
+
+
+def marked(target: Placed, *names: str) -> Bool[np.ndarray, "dimension"]:
+    """Which entries of a flat position belong to the parts of these names, of which some may not exist."""
+    marks = np.zeros(dimension(target), bool)
+    for name in names:
+        if name in slices(target):
+            marks[slices(target)[name]] = True
+    return marks
+
+
+def displacements(target: Placed) -> slice:
     """The entries of "u_boundary": three for each node."""
     return slices(target)["u_boundary"]
 
 
-def others(target: Any) -> Int[np.ndarray, "parameters"]:
+def node_count(target: Placed) -> int:
+    """The number of sampled nodes."""
+    own = displacements(target)
+    return (own.stop - own.start) // 3
+
+
+def others(target: Placed) -> Int[np.ndarray, "parameters"]:
     """The entries that are no displacements."""
-    size = sum(part.stop - part.start for part in slices(target).values())
-    return np.delete(np.arange(size), displacements(target))
+    return np.flatnonzero(~marked(target, "u_boundary"))
+
+
+def _at_rest(target: Placed) -> dict[str, AnyArray]:
+    return target.coordinates.unconstrain(target.data, target.coordinates.reference())

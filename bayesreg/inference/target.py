@@ -1,11 +1,18 @@
-"""What the samplers know of a posterior."""
+"""What the samplers know of a posterior: a small target, and objects that it may carry.
+
+Functions of a target take its `data`, a pytree with all its arrays, as an argument: no array is baked into compiled
+code, and the data of an easier or a prepared problem serve as well. A *target* is hashable, by all but the values in
+its data; what is compiled for one serves its equals.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from bayesreg.types import AnyArray
+import jax.numpy as jnp
+
+from bayesreg.types import AnyArray, Scalar
 
 Estimands = Mapping[str, AnyArray]
 
@@ -24,8 +31,89 @@ class Evaluation(Protocol):
 
 
 @runtime_checkable
+class Coordinates(Protocol):
+    """The map between estimands and positions: a *position* holds the estimands mapped to the real line."""
+
+    def reference(self) -> dict[str, AnyArray]:
+        """Estimands at rest."""
+
+    def constrain(self, data: Any, position: Estimands) -> tuple[dict[str, AnyArray], Scalar]:
+        """Estimands of a position, and the logarithm of the Jacobian."""
+
+    def unconstrain(self, data: Any, estimands: Estimands) -> dict[str, AnyArray]:
+        """Position of estimands."""
+
+    def least_curvature(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
+        """Curvature of −log density in every coordinate where next to nothing is known of it, positive."""
+
+
+@runtime_checkable
+class Variables(Protocol):
+    """How draws are shown to a reader: named as in xarray, known entries included."""
+
+    @property
+    def dims(self) -> Mapping[str, Sequence[str]]:
+        """The dimensions of each variable and constant, without chain and draw."""
+
+    @property
+    def coords(self) -> Mapping[str, Any]:
+        """The labels along these dimensions; "node" are the node numbers of the rows of "u_boundary"."""
+
+    @property
+    def constants(self) -> Mapping[str, AnyArray]:
+        """Arrays that a reader of the draws needs, such as the mesh."""
+
+    def values(self, estimands: Estimands) -> dict[str, Any]:
+        """Variables of estimands whose arrays may have leading axes; on the host."""
+
+    def estimands(self, values: Estimands) -> dict[str, Any]:
+        """The sampled entries of variables; the inverse of `values`."""
+
+
+@runtime_checkable
+class Walls(Protocol):
+    """A region in which no sampled node may lie."""
+
+    def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
+        """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to that region."""
+
+    def without(self, data: Any) -> Any:
+        """The data of the same problem in which a node may be anywhere."""
+
+
+@runtime_checkable
+class Normaliser(Protocol):
+    """A factor of the density that depends on estimands other than "u_boundary" alone."""
+
+    @property
+    def is_costly(self) -> bool:
+        """Whether it costs much more than the rest of the density."""
+
+    def log(self, data: Any, estimands: Estimands) -> Scalar:
+        """Its logarithm, as part of the log density."""
+
+    def without(self, data: Any) -> Any:
+        """The data of the same problem without this factor."""
+
+
+@runtime_checkable
+class SingleNodes(Protocol):
+    """Cheap and approximate densities of single nodes, for nodes that the data are conditioned for."""
+
+    def log_density(self, data: Any, estimands: Estimands, which: AnyArray) -> Callable[[AnyArray], AnyArray]:
+        """Approximate log density, up to a constant, as a function of the displacement (3,) of one node, mm.
+
+        The sum over all these nodes is one function of where they are: it must not matter to any of them where another
+        one is.
+        """
+
+    def equilibrium(self, data: Any, estimands: Estimands, which: AnyArray) -> AnyArray:
+        """Displacement (3,), mm, at which one of these nodes feels no elastic force while all others stay."""
+
+
+@runtime_checkable
 class Curvature(Protocol):
-    """Of minus a log density: a positive semidefinite part, and what the exact one has besides."""
+    """The curvature of minus a log density: a positive semidefinite part, and what the exact one has besides."""
 
     @property
     def gauss_newton(self) -> AnyArray:
@@ -37,111 +125,88 @@ class Curvature(Protocol):
 
 
 @runtime_checkable
-class Target(Protocol):
-    """A posterior as the samplers see it; `bayesreg.Posterior` is one.
+class ModeSearch(Protocol):
+    """What the search for a mode, and Laplace's approximation there, need."""
 
-    `data` is a pytree and an argument of every density, so that no array is baked into compiled code.
-    """
+    def continuation(self) -> Iterable[Any]:
+        """Data of ever harder problems, in the displacements alone, that lead to the target's own."""
 
-    def __hash__(self) -> int:
-        """Of all but the values in `data`, as for equality: what is compiled for a target serves its equals."""
+    def curvature(self, data: Any, estimands: Estimands) -> Curvature:
+        """Curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""
+
+
+@runtime_checkable
+class Target(Hashable, Protocol):
+    """A posterior as the samplers see it; `bayesreg.Posterior` is one. What is optional may be None."""
 
     @property
     def data(self) -> Any:
         """All arrays of the problem."""
 
     @property
-    def sampled(self) -> AnyArray:
-        """Node numbers of the rows of "u_boundary"."""
+    def coordinates(self) -> Coordinates:
+        """The map between estimands and the real line."""
 
     @property
-    def free(self) -> Mapping[str, AnyArray]:
-        """Indices of the sampled entries of "lam" and "mu"."""
-
-    @property
-    def entry_names(self) -> tuple[str, ...]:
-        """Names of all entries of "lam" and "mu"."""
+    def variables(self) -> Variables:
+        """How draws are shown to a reader."""
 
     def evaluate_estimands(self, data: Any, estimands: Estimands, guess: AnyArray | None = None) -> Any:
         """An `Evaluation` in the constrained space; a guess of its u makes it faster and costs the gradient."""
 
-    def conditioned(self, estimands: Estimands, alone: AnyArray, quick: bool = False) -> Any:
+    def supports(self, data: Any, estimands: Estimands) -> AnyArray:
+        """Whether the density may be positive there; much cheaper than an evaluation."""
+
+    def conditioned(self, estimands: Estimands, alone: Any = (), quick: bool = False) -> Any:
         """The data of the same problem, prepared for fast densities near these estimands.
 
-        And for `local_logdensity` of the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
+        They serve `single_nodes` for the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
         about as good and cheap.
         """
 
-    def supports(self, data: Any, estimands: Estimands) -> AnyArray:
-        """Whether the density may be positive there."""
-
-    def estimands(self, values: Estimands) -> dict[str, AnyArray]:
-        """The sampled entries of values."""
-
-    def reference(self) -> dict[str, AnyArray]:
-        """Values at rest."""
-
-    def allowed(self, u_boundary: AnyArray) -> AnyArray:
-        """Which sampled nodes, so displaced, satisfy the hard constraint."""
-
-    def constant_data(self) -> dict[str, AnyArray]:
-        """What a reader of the draws needs to know of the mesh."""
-
-
-@runtime_checkable
-class SmoothTarget(Target, Protocol):
-    """What samplers that follow gradients know besides.
-
-    A *position* holds the estimands mapped to the real line; "u_boundary" stays as it is.
-    """
-
-    def logdensity_of(self, data: Any, position: Estimands) -> AnyArray:
-        """Log density of a position, the Jacobian included."""
-
-    def constrain_of(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
-        """Estimands of a position."""
-
-    def unconstrain_of(self, data: Any, estimands: Estimands) -> dict[str, AnyArray]:
-        """Position of estimands."""
-
-    def unconstrain(self, values: Estimands) -> dict[str, AnyArray]:
-        """Position of values."""
+    @property
+    def walls(self) -> Walls | None:
+        """Where no sampled node may lie; None where it may lie anywhere."""
 
     @property
-    def costly_normaliser(self) -> bool:
-        """Whether the density has a normaliser that depends on estimands other than "u_boundary", and is costly."""
-
-    def log_normaliser(self, data: Any, estimands: Estimands) -> AnyArray:
-        """It, as part of the log density; it is the same for all displacements."""
-
-    def without_normaliser(self, data: Any) -> Any:
-        """The data of the same problem without it."""
-
-    def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
-        """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to where none may be."""
+    def normaliser(self) -> Normaliser | None:
+        """The normaliser of the prior of "u_boundary"; None where the density leaves it out."""
 
     @property
-    def knows_neighbourhoods(self) -> bool:
-        """Whether there is a `local_logdensity`."""
+    def single_nodes(self) -> SingleNodes | None:
+        """Densities of single nodes; None where none are known."""
 
-    def local_logdensity(self, data: Any, estimands: Estimands, which: AnyArray) -> Callable[[AnyArray], AnyArray]:
-        """Approximate log density, up to a constant, as a function of the displacement (3,) of one node, mm.
+    @property
+    def mode_search(self) -> ModeSearch | None:
+        """What samplers about a mode need; None where it is not known."""
 
-        The node is that one of those that `data` was conditioned for. The sum over all of these is one function of
-        where they are: it must not matter to any of them where another one is.
-        """
 
-    def local_equilibrium(self, data: Any, estimands: Estimands, which: AnyArray) -> AnyArray:
-        """Displacement (3,), mm, at which one of these nodes feels no elastic force while all others stay."""
+def logdensity(target: Target, data: Any, position: Estimands) -> Scalar:
+    """The log density of a position, the Jacobian included."""
+    estimands, log_jacobian = target.coordinates.constrain(data, position)
+    return target.evaluate_estimands(data, estimands).logdensity + log_jacobian
 
-    def without_walls(self, data: Any) -> Any:
-        """The data of the same problem in which a node may be anywhere."""
 
-    def continuation(self) -> Iterable[Any]:
-        """Data of ever harder problems, in the displacements alone, that lead to this one."""
+def estimands_of(target: Target, data: Any, position: Estimands) -> dict[str, AnyArray]:
+    """The estimands of a position."""
+    return target.coordinates.constrain(data, position)[0]
 
-    def least_curvature(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
-        """Of minus the log density in every coordinate where next to nothing is known of it, positive."""
 
-    def displacement_curvature(self, data: Any, estimands: Estimands) -> Curvature:
-        """Curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""
+def clearance(target: Target, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
+    """Signed distances of nodes to the walls, mm (see `Walls`); infinite where there are none."""
+    return jnp.full(u.shape[:-1], jnp.inf) if target.walls is None else target.walls.clearance(data, u, nodes)
+
+
+def without_walls(target: Target, data: Any) -> Any:
+    """The data of the same problem without walls."""
+    return data if target.walls is None else target.walls.without(data)
+
+
+def without_normaliser(target: Target, data: Any) -> Any:
+    """The data of the same problem without the normaliser."""
+    return data if target.normaliser is None else target.normaliser.without(data)
+
+
+def has_costly_normaliser(target: Target) -> bool:
+    """Whether the density has a normaliser that should not stand in every step of a trajectory."""
+    return target.normaliser is not None and target.normaliser.is_costly

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from bayesreg.model.posterior import Posterior
+from bayesreg.model.terms.images import ComparedImages
 from bayesreg.types import AnyArray, Scalar
 
 DISCREPANCIES = ("sd", "greatest", "neighbours")
 
 
 def standardised_residual(
-    posterior: Posterior, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float
+    images: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float
 ) -> Float[AnyArray, "points"]:
-    """(f(x_q) − m(x_q + u(x_q))) / √(T_s / 2w_q): where the model holds independent numbers, standard
-    Normal or of Student's t."""
-    return posterior.residuals(u) * jnp.sqrt(2 * posterior.images.quadrature.weights / t_similarity)
+    """(f(x_q) − m(x_q + u(x_q))) / √(T_s / 2w_q) at every quadrature point.
 
-
-def t_similarity_of(posterior: Posterior, draw: Mapping[str, AnyArray]) -> Scalar | float:
-    """T_s of a draw: its own where it is sampled, else that of the model."""
-    return draw.get("t_similarity", posterior.data.blocks["t_similarity"].reference())
+    Where the model holds, these are independent numbers, standard Normal or of Student's t.
+    """
+    return images.residuals(jnp.asarray(u)) * jnp.sqrt(2 * images.quadrature.weights / t_similarity)
 
 
 def discrepancies(

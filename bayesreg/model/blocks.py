@@ -199,7 +199,7 @@ class LameParameter(NamedTuple):
 
     def estimand(self, value: AnyArray) -> AnyArray:
         """The sampled entries."""
-        return jnp.asarray(value, float)[self.free.index]
+        return jnp.asarray(value, float)[..., self.free.index]
 
     @property
     def transform(self) -> RangeTransform:
@@ -336,55 +336,3 @@ class FieldComponents(_Arrays):
 
 # Blocks by name; what is particular to one kind is asked of it by those who know that it is there.
 Blocks = dict[str, Any]
-
-
-def sampled_blocks(blocks: Blocks) -> Blocks:
-    """The blocks that have unknown entries."""
-    return {name: block for name, block in blocks.items() if block.is_sampled}
-
-
-def reference_values(blocks: Blocks) -> dict[str, AnyArray]:
-    """The value of every block at rest."""
-    return {name: block.reference() for name, block in blocks.items()}
-
-
-def filled(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
-    """Values in which blocks without unknowns that were left out are filled in."""
-    return {name: values[name] if name in values else block.reference() for name, block in blocks.items()}
-
-
-def completed(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
-    """The values of estimands: known entries and known blocks are filled in."""
-    return {
-        name: block.complete(estimands[name]) if block.is_sampled else block.reference()
-        for name, block in blocks.items()
-    }
-
-
-def estimands_of(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
-    """The sampled entries of values."""
-    return {name: block.estimand(values[name]) for name, block in sampled_blocks(blocks).items()}
-
-
-def constrained(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
-    """The estimands of a position, and the logarithm of the Jacobian."""
-    found = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
-    return {name: estimand for name, (estimand, _) in found.items()}, sum(log for _, log in found.values())
-
-
-def unconstrained(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
-    """The position of estimands."""
-    return {name: block.unconstrain(estimands[name]) for name, block in sampled_blocks(blocks).items()}
-
-
-def least_curvatures(blocks: Blocks, position: Values) -> dict[str, AnyArray]:
-    """Of −log density, in every coordinate, where the data say next to nothing; shaped as the position."""
-    return {name: block.least_curvature(position[name]) for name, block in sampled_blocks(blocks).items()}
-
-
-def allowed(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
-    """Whether every value lies in the range of its prior."""
-    found = jnp.array(True)
-    for name, block in blocks.items():
-        found &= block.allows(values[name])
-    return found

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from numpyro.infer.util import log_density
 
 from bayesreg.model.program import Problem, registration
-from bayesreg.model.state import physical_values
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -71,13 +70,3 @@ def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
 def _similarity_energy(trace: dict[str, Any]) -> Scalar:
     sites = (site for site in trace.values() if hasattr(site.get("fn"), "energy"))
     return sum((site["fn"].energy(site["value"]) for site in sites), jnp.zeros(()))
-
-
-@jax.jit
-def log_normaliser(problem: Problem, values: dict[str, AnyArray]) -> Scalar:
-    """½ log pdet S(λ, μ) − r/2 log(2π T_r); zero where the density is not normalised."""
-    elastic = problem.terms.get("elastic")
-    if elastic is None or elastic.determinant is None:
-        return jnp.zeros(())
-    lam, mu = problem.body.lame_by_cell(physical_values(problem.body, problem.blocks, values))
-    return elastic.log_normaliser(problem.body.system.elements, lam, mu, values["t_elastic"])

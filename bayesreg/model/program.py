@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpyro
 from jaxtyping import Bool, Float
 
-from bayesreg.model import blocks
+from bayesreg.model import coordinates
 from bayesreg.model.blocks import Blocks, Values
 from bayesreg.model.neighbourhood import Neighbourhoods
 from bayesreg.model.state import Body, state_of
@@ -76,7 +76,7 @@ def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = No
 
 def allowed(problem: Problem, values: Values) -> Bool[AnyArray, ""]:
     """Whether the density may be positive: parameters physical and in range, every term that knows it; no solve."""
-    found = problem.body.is_physical(values) & blocks.allowed(problem.blocks, values)
+    found = problem.body.is_physical(values) & coordinates.allowed(problem.blocks, values)
     for term in problem.terms.values():
         if isinstance(term, Support):
             found &= term.allows(values)

@@ -12,10 +12,25 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from bayesreg.model.blocks import Values
+from bayesreg.model.coordinates import completed
 from bayesreg.model.program import Problem
 from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.terms.skull import is_allowed
 from bayesreg.types import AnyArray, Scalar
+
+
+class SingleNodes:
+    """The densities of single nodes, as the samplers see them (`bayesreg.inference.target.SingleNodes`)."""
+
+    def log_density(
+        self, data: Problem, estimands: Values, which: Int[AnyArray, ""]
+    ) -> Callable[[Float[AnyArray, "3"]], Scalar]:
+        """See `local_logdensity`."""
+        return local_logdensity(data, completed(data.blocks, estimands), which)
+
+    def equilibrium(self, data: Problem, estimands: Values, which: Int[AnyArray, ""]) -> Float[AnyArray, "3"]:
+        """See `local_equilibrium`."""
+        return local_equilibrium(data, estimands["u_boundary"], which)
 
 
 def local_logdensity(

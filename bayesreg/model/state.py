@@ -150,16 +150,21 @@ def state_of(body: Body, blocks: Blocks, values: Values, guess: Float[AnyArray, 
     A `guess` of the displacement of every node speeds up the solve (see `bayesreg.fem.equilibrium.equilibrium`) and has
     no derivative.
     """
-    lam, mu = body.lame_by_cell(physical_values(body, blocks, values))
+    lam, mu = physical_lame_by_cell(body, blocks, values)
     found = equilibrium(body.system, lam, mu, body.prescribed(values["u_boundary"]), guess)
     return State(values, lam, mu, found, body.system.elements, body.mesh.mesh)
 
 
-def physical_values(body: Body, blocks: Blocks, values: Values) -> Values:
-    """The values, with λ, μ and field at their references where K may be indefinite: the density is −∞ there."""
+def physical_lame_by_cell(
+    body: Body, blocks: Blocks, values: Values
+) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
+    """λ and μ of every cell; at their references where K may be indefinite: the density is −∞ there."""
     physical = body.is_physical(values)
-    names = LAME if body.field is None else (*LAME, "field")
-    return {**values, **{name: jnp.where(physical, values[name], blocks[name].reference()) for name in names}}
+    lam, mu = (jnp.where(physical, values[name], blocks[name].reference())[body.cell_entry] for name in LAME)
+    if body.field is None:
+        return lam, mu
+    factor = jnp.where(physical, body.stiffness_factor(values), 1.0)
+    return lam * factor, mu * factor
 
 
 @lru_cache(maxsize=64)

@@ -14,8 +14,9 @@ from bayesreg.image import Image
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
 from bayesreg.mesh import TetMesh, signed_volumes
+from bayesreg.model.build import build_posterior
 from bayesreg.model.options import ModelConfig, of_tissue
-from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.posterior import Posterior
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.synthetic.recalibration import RANGE
 from bayesreg.types import InputError

@@ -14,8 +14,9 @@ from bayesreg.inference.chains.initialise import Start
 from bayesreg.io.displacements import read_displacement
 from bayesreg.io.store import Inputs
 from bayesreg.mesh import TetMesh
+from bayesreg.model.build import build_posterior
 from bayesreg.model.options import Lame, ModelConfig
-from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import cell_entries, lame_parameter
 from bayesreg.model.terms.images import ImagePair
 
@@ -54,8 +55,8 @@ def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
     return Start(
         field=None if field is None else field[posterior.sampled],
         fraction=config.start.fraction,
-        lam=config.start.entries("lam", posterior.entry_names),
-        mu=config.start.entries("mu", posterior.entry_names),
+        lam=config.start.entries("lam", posterior.variables.entry_names),
+        mu=config.start.entries("mu", posterior.variables.entry_names),
         spread=config.start.spread,
     )
 

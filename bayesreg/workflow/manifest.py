@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -20,8 +21,10 @@ from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.diagnostics import Convergence
 from bayesreg.inference.draws.moments import greatest_rhat
+from bayesreg.inference.target import clearance
 from bayesreg.io.store import Inputs
 from bayesreg.mesh import signed_volumes
+from bayesreg.model.coordinates import filled
 from bayesreg.model.posterior import Posterior
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
@@ -99,16 +102,15 @@ def manifest(
         "steps_per_chain": int(tally.steps[0]),
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
-        "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
+        "residual_sd": float(np.std(posterior.images.residuals(jnp.asarray(samples.u_mean)))),
         "implied_noise_sd": implied_noise_sd(posterior, draws),
     }
 
 
 def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float:
-    """The noise that T_s stands for (see `Posterior.noise_sd`): the known one, or its posterior mean."""
-    if "t_similarity" in draws:
-        return posterior.noise_sd(float(draws["t_similarity"].mean()))
-    return posterior.implied_noise_sd
+    """The noise that T_s stands for (see `ComparedImages.noise_sd`): the known one, or its posterior mean."""
+    mean = {name: draws[name].mean().to_numpy() for name in ("t_similarity",) if name in draws}
+    return posterior.images.noise_sd(float(filled(posterior.data.blocks, mean)["t_similarity"]))
 
 
 def _converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:
@@ -139,5 +141,5 @@ def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
 def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
     if inputs.skull is None:
         return None
-    u, rows = samples.u_mean[posterior.sampled], np.arange(len(posterior.sampled))
-    return int((np.asarray(posterior.clearance(posterior.data, u, rows)) < CONTACT).sum())
+    u, rows = jnp.asarray(samples.u_mean[posterior.sampled]), jnp.arange(len(posterior.sampled))
+    return int((np.asarray(clearance(posterior, posterior.data, u, rows)) < CONTACT).sum())

@@ -17,7 +17,8 @@ from bayesreg.fem.location import locate
 from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thinned
 from bayesreg.io.store import Predicted
 from bayesreg.mesh import TetMesh
-from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual, t_similarity_of
+from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
+from bayesreg.model.coordinates import filled
 from bayesreg.model.posterior import Posterior
 from bayesreg.types import AnyArray, InputError
 
@@ -67,13 +68,13 @@ def predict(
         number, here = draw.pop("number"), replace(posterior, data=data)
         cells = here.images.quadrature.cells
         u = here.evaluate(draw).u
-        z = standardised_residual(here, u, t_similarity_of(here, draw))
-        values = {"t_similarity": t_similarity_of(here, draw)}
+        values = here.filled(draw)
+        z = standardised_residual(here.images, u, values["t_similarity"])
         noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
         observed, replicated = (discrepancies(x, cells, neighbours, len(mesh.cells)) for x in (z, noise))
         distance = jnp.linalg.norm(u - u_mean, axis=1)
         marks = jnp.einsum("la,lai->li", weights, u[nodes])
-        stiffness = here.stiffness(draw)
+        stiffness = here.data.body.stiffness_factor(draw)
         return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "landmarks": marks,
                 "observed": observed, "replicated": replicated,
                 "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
@@ -84,7 +85,7 @@ def predict(
     aside: dict[str, list[np.ndarray]] = {"landmarks": [], "observed": [], "replicated": []}
     found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
-    at_mean = standardised_residual(posterior, jnp.asarray(u_mean), _median_t_similarity(posterior, some))
+    at_mean = standardised_residual(posterior.images, u_mean, _median_t_similarity(posterior, some))
     return Predicted(
         chain_mean=found.chain_mean["u"],
         far_mm=np.array(FAR),
@@ -120,8 +121,8 @@ def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]
 
 
 def _median_t_similarity(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> float:
-    middle = {name: np.asarray(np.median(draws[name])) for name in ("t_similarity",) if name in draws}
-    return float(t_similarity_of(posterior, middle))
+    median = {name: np.median(draws[name]) for name in ("t_similarity",) if name in draws}
+    return float(filled(posterior.data.blocks, median)["t_similarity"])
 
 
 def require_inside(mesh: TetMesh, landmarks: Landmarks) -> None:

@@ -38,14 +38,16 @@ from jax.experimental.compilation_cache import compilation_cache
 import bayesreg as br
 from bayesreg.fem.equilibrium import equilibrium
 from bayesreg.inference.chains.devices import side_by_side
+from bayesreg.inference.target import estimands_of, logdensity
 from bayesreg.io.datasets import mni152
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh
 from bayesreg.io.store import Inputs
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import completed
+from bayesreg.model.build import build_posterior
+from bayesreg.model.coordinates import completed
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem as Data
 from bayesreg.workflow.preparation import prepare
 from tests.benchmarks import floor
@@ -185,7 +187,7 @@ def _places(mesh: str, interpolation: str, chains: int) -> Places:
     positions = scattered(posterior, chains)
 
     def settled(data: Data, position: dict[str, jax.Array]) -> Any:
-        values = completed(data.blocks, posterior.constrain_of(data, position))
+        values = completed(data.blocks, estimands_of(posterior, data, position))
         lam, mu = data.body.lame_by_cell(values)
         given = data.body.prescribed(values["u_boundary"])
         found = equilibrium(data.body.system, lam, mu, given)
@@ -228,7 +230,7 @@ def program(problem: Problem, places: Places, part: str) -> tuple[Any, tuple[Any
         images = data.terms["images"]
         return images.quadrature.weights @ images.residuals(u) ** 2
 
-    density = problem.posterior.logdensity_of
+    density = partial(logdensity, problem.posterior)
     one, each = {
         "density": (density, (places.positions,)),
         "gradient": (jax.value_and_grad(density, argnums=1), (places.positions,)),

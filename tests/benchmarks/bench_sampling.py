@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bayesreg.inference.chains.run import sample
+from bayesreg.model.build import build_posterior
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.posterior import build_posterior
 from tests.phantoms import ball_mesh, smooth_image
 
 REPETITIONS = 9

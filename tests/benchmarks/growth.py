@@ -17,13 +17,16 @@ import resource
 import subprocess
 import sys
 import time
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
+from bayesreg.inference.target import estimands_of, logdensity
+from bayesreg.model.build import build_posterior
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.posterior import Posterior, build_posterior
+from bayesreg.model.posterior import Posterior
 from tests.benchmarks.bench_sampling import _median
 from tests.benchmarks.places import scattered
 from tests.benchmarks.solves import mesh_of
@@ -79,8 +82,8 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     data = posterior.conditioned(posterior.estimands(values))
     positions = scattered(posterior, chains)
     setup = time.perf_counter() - begun
-    many = jax.jit(jax.vmap(posterior.logdensity_of, in_axes=(None, 0)))
-    slopes = jax.jit(jax.vmap(jax.value_and_grad(posterior.logdensity_of, argnums=1), in_axes=(None, 0)))
+    many = jax.jit(jax.vmap(partial(logdensity, posterior), in_axes=(None, 0)))
+    slopes = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior), argnums=1), in_axes=(None, 0)))
     begun = time.perf_counter()
     compiled = [function.lower(data, positions).compile() for function in (many, slopes)]
     compiling = time.perf_counter() - begun
@@ -88,7 +91,7 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     density, gradient = (_median(function, data, positions) for function in compiled)
 
     def evaluated(data: Any, position: Any) -> Any:
-        return posterior.evaluate_estimands(data, posterior.constrain_of(data, position))
+        return posterior.evaluate_estimands(data, estimands_of(posterior, data, position))
 
     iterations = jax.jit(jax.vmap(evaluated, in_axes=(None, 0)))(data, positions).solver_iterations
     return {

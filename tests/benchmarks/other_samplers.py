@@ -51,6 +51,7 @@ from bayesreg.inference.draws.diagnostics import worst
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.whitened import whitened
 from bayesreg.inference.layout import unravel
+from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
 from bayesreg.workflow.assembly import posterior_of, start_of
 from tests.phantoms import ball_mesh, flat_skull, smooth_image
@@ -166,7 +167,7 @@ def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) 
 def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str, Problem]:
     """The density in unconstrained coordinates, and in those of `hmc` after its warm-up."""
     reference, middle = first.setup.reference, unravel(posterior)(first.setup.middle)
-    data = posterior.conditioned(posterior.constrain_of(posterior.data, middle))
+    data = posterior.conditioned(estimands_of(posterior, posterior.data, middle))
     xi = np.asarray(jax.vmap(partial(whitened, reference))(jnp.asarray(places)))
     return {
         "unconstrained": Problem(posterior, data, None, places, 0.008),
@@ -181,7 +182,7 @@ def position(posterior: Any, reference: Reference | None, x: jax.Array) -> dict[
 
 def logdensity(posterior: Any, data: Any, reference: Reference | None, x: jax.Array) -> jax.Array:
     """Of flat coordinates; whitening is linear, and leaves out a constant."""
-    return posterior.logdensity_of(data, position(posterior, reference, x))
+    return logdensity(posterior, data, position(posterior, reference, x))
 
 
 value = jax.jit(logdensity, static_argnums=0)
@@ -191,7 +192,7 @@ value_and_slope = jax.jit(jax.value_and_grad(logdensity, argnums=3), static_argn
 def estimands(problem: Problem, draws: np.ndarray) -> list[Block]:
     """Flat coordinates (chain, draw, …) as a block of draws, if there are any."""
     posterior, data, reference = problem[:3]
-    every = jax.jit(jax.vmap(jax.vmap(lambda x: posterior.constrain_of(data, position(posterior, reference, x)))))
+    every = jax.jit(jax.vmap(jax.vmap(lambda x: estimands_of(posterior, data, position(posterior, reference, x)))))
     return [jax.tree.map(np.asarray, every(draws))] if draws.size else []
 
 

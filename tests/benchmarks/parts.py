@@ -29,8 +29,9 @@ from bayesreg.inference.gaussian.reflection import rotated
 from bayesreg.inference.gaussian.whitened import clearance_of, whitened_density, whitened_position
 from bayesreg.inference.samplers.hamiltonian import _quarter_turn
 from bayesreg.inference.samplers.registry import chosen_sampler
+from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
-from bayesreg.model.blocks import completed
+from bayesreg.model.coordinates import completed
 from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_sampling import _median
 
@@ -109,7 +110,7 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
         return whitened_density(posterior, data, setup)(xi)
 
     def values_of(xi: jax.Array) -> Any:
-        estimands = posterior.constrain_of(data, whitened_position(posterior, setup.reference, xi))
+        estimands = estimands_of(posterior, data, whitened_position(posterior, setup.reference, xi))
         values = completed(data.blocks, estimands)
         return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 

@@ -116,7 +116,7 @@ def prior_covariances(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     marks = br.Landmarks(points, points, sd=1.0)
     posterior = br.build_posterior(mesh=mesh, observations=[marks], model=model)
     data = posterior.data.without_term("landmarks")
-    precision = posterior.displacement_curvature(data, posterior.estimands(posterior.reference())).gauss_newton
+    precision = posterior.mode_search.curvature(data, posterior.estimands(posterior.reference())).gauss_newton
     modes, term = np.asarray(data.terms["rigid"].modes), posterior.data.terms["landmarks"]
 
     def moved(u_boundary: jax.Array) -> jax.Array:

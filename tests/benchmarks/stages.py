@@ -33,7 +33,7 @@ from bayesreg.fem import equilibrium
 from bayesreg.fem.elasticity import stiffness, unknowns_of
 from bayesreg.inference.samplers.random_walk import _normal_step
 from bayesreg.io import store
-from bayesreg.model.blocks import completed
+from bayesreg.model.coordinates import completed
 from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_effective_draws import STEPS, estimands_of

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import bayesreg as br
+from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
 from bayesreg.model import posterior as posterior_module
 from bayesreg.workflow.assembly import posterior_of
@@ -73,9 +74,9 @@ def at_draws(folder: Path) -> None:
     )
     at = [{n: jnp.asarray(draws[n].values[place], float) for n in known if n in draws} for place in places]
     estimands = [posterior.estimands(known | values) for values in at]
-    positions = [posterior.unconstrain_of(posterior.data, e) for e in estimands]
+    positions = [posterior.coordinates.unconstrain(posterior.data, e) for e in estimands]
     middle = jax.tree.map(lambda *x: jnp.stack(x).mean(axis=0), *positions)
-    data = posterior.conditioned(posterior.constrain_of(posterior.data, middle))
+    data = posterior.conditioned(estimands_of(posterior, posterior.data, middle))
     evaluate = jax.jit(posterior.evaluate_estimands)
 
     def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:

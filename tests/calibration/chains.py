@@ -19,6 +19,7 @@ from bayesreg.inference.gaussian.loose import loose
 from bayesreg.inference.gaussian.normaliser import stand_in
 from bayesreg.inference.gaussian.whitened import Setup, setup_about
 from bayesreg.inference.layout import displacements
+from bayesreg.model.blocks import LAME
 from tests.calibration.simulator import MESH, Simulator, draw_data, observing
 
 # Every third node's displacement is looked at: neighbours say much the same.
@@ -36,8 +37,9 @@ Estimands = dict[str, Any]
 
 def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
     """What is looked at: parameters, some displacements, E_s and the log density."""
-    entries = [f"{name} {posterior.entry_names[i]}" for name, free in posterior.free.items() for i in free]
-    warm = [name for name in PARAMETERS if name not in posterior.free and posterior.data.blocks[name].is_sampled]
+    labels, blocks = posterior.variables.entry_names, posterior.data.blocks
+    entries = [f"{name} {labels[i]}" for name in LAME for i in blocks[name].free.index]
+    warm = [name for name in PARAMETERS if name not in LAME and blocks[name].is_sampled]
     nodes = [f"u{posterior.sampled[node]} {axis}" for node in NODES for axis in "xyz"]
     return (*entries, *warm, *nodes, "E_s", "log p")
 

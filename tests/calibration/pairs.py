@@ -163,10 +163,10 @@ def register(shared: Anatomy, pair: SyntheticPair, seed: int) -> dict[str, Any]:
     return {
         "ratio": {name: np.quantile(values, QUANTILES).tolist() for name, values in ratio.items()},
         "t_similarity": float(draws["t_similarity"].mean()),
-        "noise_sd_of_t_similarity": posterior.noise_sd(float(draws["t_similarity"].mean())),
+        "noise_sd_of_t_similarity": posterior.images.noise_sd(float(draws["t_similarity"].mean())),
         "residual_sd_at_truth": pair.residual_sd,
-        "residual_sd": float(np.std(posterior.residuals(samples.u_mean))),
-        "residual_sd_at_transferred_truth": float(np.std(posterior.residuals(u_true))),
+        "residual_sd": float(np.std(posterior.images.residuals(samples.u_mean))),
+        "residual_sd_at_transferred_truth": float(np.std(posterior.images.residuals(u_true))),
         "boundary_error_mm": float(np.median(np.linalg.norm((samples.u_mean - u_true)[posterior.sampled], axis=1))),
         "rhat_of_ratio": float(judged.rhat["lam"].max()),
         "rhat": float(max(float(judged.rhat[name].max()) for name in judged.rhat)),

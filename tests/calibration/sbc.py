@@ -28,6 +28,7 @@ from bayesreg.inference.gaussian.reflection import rotated
 from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whitened, whitened_position
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.inference.target import estimands_of
 from tests.calibration.chains import (
     ALONE,
     BATCH,
@@ -199,7 +200,7 @@ def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
     """Flat positions (r, d) of the modes of all replications, from draws of the prior."""
     found = []
     for k, problem in enumerate(problems):
-        start = problem.unconstrain_of(problem.data, {name: x[k] for name, x in starts.items()})
+        start = problem.coordinates.unconstrain(problem.data, {name: x[k] for name, x in starts.items()})
         found.append(settled(problem, np.asarray(ravel_pytree(start)[0])))
     return np.stack(found)
 
@@ -219,7 +220,7 @@ def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, mode
             setup.walls, clearance_of(posterior, here, setup), begin, jax.random.normal(key, begin.shape), jnp.pi / 2
         )
         place = whitened_position(posterior, setup.reference, jnp.where(jnp.isfinite(xi).all(), xi, begin))
-        return posterior.constrain_of(here, place)
+        return estimands_of(posterior, here, place)
 
     return jax.lax.map(one, (setup, observed, modes, keys), batch_size=BATCH)
 
@@ -242,7 +243,7 @@ def _advance(  # type: ignore[no-untyped-def]
         here = observing(data, observed)
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
-        place = ravel_pytree(posterior.unconstrain_of(data, drawn.estimands))[0]
+        place = ravel_pytree(posterior.coordinates.unconstrain(data, drawn.estimands))[0]
         return state, drawn.estimands, place, quantities(drawn.estimands, drawn.evaluation), info.acceptance_rate
 
     return jax.lax.map(one, (setup, observed, keys, states), batch_size=BATCH)

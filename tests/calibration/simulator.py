@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 import bayesreg as br
+from bayesreg.inference.target import without_normaliser
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
@@ -119,7 +120,7 @@ class Simulator:
         """λ, μ (all entries) and the temperatures of the prior."""
         values: dict[str, Any] = {}
         for name in LAME:
-            free = self.posterior.free[name]
+            free = self.posterior.data.blocks[name].free.index
             values[name] = np.array(self.posterior.reference()[name])
             values[name][free] = PRIOR["high"] * rng.beta(PRIOR["alpha"], PRIOR["beta"], len(free))
         if self.variant.temperatures:
@@ -134,15 +135,15 @@ class Simulator:
             values = self.draw_parameters(rng)
             u = self.draw_displacement(rng, values["lam"], values["mu"], values.get("t_elastic", T_ELASTIC))
             if not self.variant.skull or (MESH.points[MESH.boundary, 0] + u[:, 0] <= WALL).all():
-                free = self.posterior.free
-                values |= {name: values[name][free[name]] for name in LAME}
+                blocks = self.posterior.data.blocks
+                values |= {name: values[name][blocks[name].free.index] for name in LAME}
                 draws.append({"u_boundary": u, **values})
         return {name: np.stack([draw[name] for draw in draws]) for name in draws[0]}
 
 
 def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
     """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
-    u, images = posterior.evaluate_estimands(posterior.without_normaliser(data), estimands).u, data.terms["images"]
+    u, images = posterior.evaluate_estimands(without_normaliser(posterior, data), estimands).u, data.terms["images"]
     t_similarity = estimands.get("t_similarity", data.blocks["t_similarity"].reference())
     sd = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
     return images.predicted(u) + sd * jax.random.normal(key, sd.shape)

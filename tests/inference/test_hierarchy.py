@@ -22,11 +22,23 @@ class Field:
     def __init__(self, **position):
         self.position = position
 
+    data = None
+
+    @property
+    def coordinates(self):
+        return self
+
     def reference(self):
         return self.position
 
-    def unconstrain(self, values):
-        return values
+    def unconstrain(self, data, estimands):
+        return estimands
+
+    def constrain(self, data, position):
+        return position, 0.0
+
+    def least_curvature(self, data, position):
+        return position
 
 
 TARGET = Field(field=np.zeros(COUNT), field_sd=np.array(0.0), lam=np.zeros(2))

@@ -12,6 +12,7 @@ import bayesreg as br
 from bayesreg.inference.gaussian.laplace import _convex, hessian_rows, laplace, precision_at, pulled
 from bayesreg.inference.gaussian.mode_search import GAP, find_mode
 from bayesreg.inference.layout import unravel
+from bayesreg.inference.target import logdensity
 from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem, walled
 from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image
@@ -53,15 +54,21 @@ def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
     assert curvature > 1.5
 
 
+def allowed(posterior, u):
+    """Whether every sampled node, so displaced, lies outside the skull."""
+    nodes = jnp.arange(len(posterior.sampled))
+    return bool((posterior.walls.clearance(posterior.data, jnp.asarray(u), nodes) >= 0).all())
+
+
 def test_the_mode_is_in_the_support():
     """The Gaussian's mean has nodes beyond the wall."""
     posterior = walled()
     values = {"lam": LAM, "mu": MU}
     exact = problem().exact
-    assert not posterior.allowed(exact.mean.reshape(-1, 3) + np.array([3.0, 0, 0])).all()
+    assert not allowed(posterior, exact.mean.reshape(-1, 3) + np.array([3.0, 0, 0]))
     start = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
     mode = find_mode(posterior, start + np.tile([3.0, 0, 0], len(start) // 3))
-    assert posterior.allowed(mode.reshape(-1, 3)).all()
+    assert allowed(posterior, mode.reshape(-1, 3))
     assert np.isfinite(posterior.logdensity_constrained({"u_boundary": mode.reshape(-1, 3), **values}))
 
 
@@ -101,7 +108,7 @@ def test_curvature_of_parameters_is_the_hessian():
     reference = laplace(posterior, flat)
     precision = np.linalg.inv(np.asarray(reference.factor @ reference.factor.T))
 
-    slope = jax.grad(lambda x: -posterior.logdensity_of(posterior.data, unravel(posterior)(x)))
+    slope = jax.grad(lambda x: -logdensity(posterior, posterior.data, unravel(posterior)(x)))
     hessian_row = jax.jit(lambda direction: jax.jvp(slope, (jnp.asarray(flat),), (direction,))[1])
     count = len(flat) - 3 * len(posterior.sampled)
     for k, direction in enumerate(np.eye(len(flat))[:count]):
@@ -149,7 +156,7 @@ def test_a_parameter_far_above_its_scale_is_as_wide_as_its_logarithm(above):
     z = np.asarray(posterior.data.blocks["lam"].unconstrain(jnp.asarray(x)[:, None] * jnp.array([0.0, 1.0, 0.0])))[:, 1]
     position = posterior.unconstrain(posterior.reference())
     at = {**position, "lam": position["lam"].at[1].set(np.median(z))}
-    least = posterior.least_curvature(posterior.data, at)["lam"][1]
+    least = posterior.coordinates.least_curvature(posterior.data, at)["lam"][1]
     assert 0.5 < z.std() * np.sqrt(least) < 1.5
 
 

@@ -18,6 +18,7 @@ from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delayed, st
 from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.kernel import Info
 from bayesreg.inference.samplers.hamiltonian import hmc
+from bayesreg.inference.target import estimands_of
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(2)
@@ -53,8 +54,8 @@ def test_the_stand_in_is_the_normaliser_to_second_order():
 
     def true(x):
         away = flat.at[:count].add(x)
-        estimands = post.constrain_of(post.data, jax.flatten_util.ravel_pytree(position)[1](away))
-        return float(post.log_normaliser(post.data, estimands))
+        estimands = estimands_of(post, post.data, jax.flatten_util.ravel_pytree(position)[1](away))
+        return float(post.normaliser.log(post.data, estimands))
 
     at_centre = true(jnp.zeros(count))
     for seed in range(3):
@@ -113,7 +114,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     post = posterior()
     sampler = hmc(post)
     estimands = post.estimands(post.reference())
-    flat = jax.flatten_util.ravel_pytree(post.unconstrain_of(post.data, estimands))[0]
+    flat = jax.flatten_util.ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0]
     reference = Reference(flat, 0.05 * jnp.eye(len(flat)))
     setup = setup_about(post, reference, flat, np.array([0, 5]))
     setup = setup._replace(stand_in=stand_in(post, reference, flat), step_size=jnp.asarray(0.3))

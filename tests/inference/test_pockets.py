@@ -28,18 +28,27 @@ class Pocket(GaussianTarget):
         super().__init__(wall)
         self.depth = depth
 
-    def logdensity_of(self, data, position):
-        flat = position["u_boundary"].ravel()
-        away = jnp.stack([flat, flat.at[3].add(AWAY)])
-        inside = (self.clearance(data, position["u_boundary"], self.sampled) >= 0).all()
+    @property
+    def single_nodes(self):
+        return Alone(self)
+
+    def height(self, data, u):
+        away = jnp.stack([u.ravel(), u.ravel().at[3].add(AWAY)])
         heights = -0.5 * jnp.einsum("ci,ij,cj->c", away, data.precision, away) - jnp.array([0.0, self.depth])
-        return jnp.where(inside, jax.nn.logsumexp(heights), -jnp.inf)
+        return jax.nn.logsumexp(heights)
 
-    def local_logdensity(self, data, estimands, which):
+
+class Alone:
+    """The true density of a node."""
+
+    def __init__(self, target):
+        self.target = target
+
+    def log_density(self, data, estimands, which):
         u = estimands["u_boundary"]
-        return lambda place: self.logdensity_of(data, {"u_boundary": u.at[which].set(place)})
+        return lambda place: self.target.evaluate_estimands(data, {"u_boundary": u.at[which].set(place)}).logdensity
 
-    def local_equilibrium(self, data, estimands, which):
+    def equilibrium(self, data, estimands, which):
         u, precision = estimands["u_boundary"], data.precision.reshape(NODES, 3, NODES, 3)
         force = jnp.einsum("ibj,bj->i", precision[which], u)
         return u[which] - jnp.linalg.solve(precision[which, :, which], force)
@@ -68,13 +77,16 @@ def test_the_search_stays(target):
 
 
 def test_a_gain_that_the_density_itself_does_not_confirm_moves_nothing():
-    class Wrong(Pocket):
-        def local_logdensity(self, data, estimands, which):
+    class Misled:
+        def log_density(self, data, estimands, which):
             u = estimands["u_boundary"]
             return lambda place: 100 * jnp.abs(place - u[which]).sum()
 
-        def local_equilibrium(self, data, estimands, which):
+        def equilibrium(self, data, estimands, which):
             return estimands["u_boundary"][which] + 5.0
+
+    class Wrong(Pocket):
+        single_nodes = Misled()
 
     flat, nodes = out_of_pockets(Wrong(depth=8.0), start(0.0))
     assert not len(nodes)
@@ -87,9 +99,11 @@ def test_without_sampled_nodes_or_neighbourhoods_nothing_is_looked_at():
     post = br.build_posterior(smooth_image(MESH.points), smooth_image(MESH.points, seed=2), MESH, model=model)
     flat = np.asarray(ravel_pytree(post.unconstrain(post.reference()))[0])
     assert not len(out_of_pockets(post, flat)[1])
-    target = Pocket(depth=8.0)
-    target.knows_neighbourhoods = False
-    assert not len(out_of_pockets(target, start())[1])
+
+    class Unknown(Pocket):
+        single_nodes = None
+
+    assert not len(out_of_pockets(Unknown(depth=8.0), start())[1])
 
 
 @pytest.mark.parametrize("options", [{}, {"sampled": "all"}, {"quadrature": "voxels"}])
@@ -119,7 +133,7 @@ def test_at_rest_no_elastic_force_acts_on_a_node():
     post = posterior()
     values, row = state(post), 11
     data = post.conditioned(post.estimands(values), np.array([3, row]))
-    rest = np.asarray(post.local_equilibrium(data, post.estimands(values), jnp.asarray(1)))
+    rest = np.asarray(post.single_nodes.equilibrium(data, post.estimands(values), jnp.asarray(1)))
 
     def energy(place):
         u = values["u_boundary"].at[row].set(jnp.asarray(place))

@@ -21,7 +21,7 @@ from bayesreg.inference.gaussian.modes import distance, search_modes
 from bayesreg.inference.gaussian.whitened import Moved, about_reference, setup_about
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import SAMPLERS
-from tests.inference.gaussians import DIMENSION, GaussianTarget
+from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 
 # Steps at which a good part of the proposals is refused: only then does the test of acceptance matter.
 STEPS = {
@@ -55,7 +55,7 @@ def nodes_alone() -> Sampler:
     def stay(target, data, setup, key, state):
         return state, Moved(jnp.ones(()))
 
-    return about_reference(target(), stay, alone=len(target().sampled))
+    return about_reference(target(), stay, alone=NODES)
 
 
 def after_steps(name: str, alone: Any = ()) -> np.ndarray:
@@ -90,7 +90,7 @@ def statistics(u: np.ndarray) -> np.ndarray:
     """(statistic, draw): coordinates, their distance from the mean, that from the wall, and a product."""
     flat = u.reshape(len(u), -1)
     radius = np.einsum("ni,ij,nj->n", flat, np.linalg.inv(target().covariance), flat)
-    gap = np.asarray(target().clearance(target().data, jnp.asarray(u), target().sampled)).min(axis=1)
+    gap = np.asarray(target().walls.clearance(target().data, jnp.asarray(u), np.arange(NODES))).min(axis=1)
     return np.stack([*flat.T, radius, gap, flat[:, 0] * flat[:, 4]])
 
 
@@ -113,7 +113,7 @@ def test_every_exact_sampler_is_looked_at():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STEPS)
 def test_exact_draws_stay_exact(name):
-    moved = after_steps(name, target().sampled)
+    moved = after_steps(name, np.arange(NODES))
     assert target().allowed(moved).all()
     assert np.corrcoef(moved.ravel(), exact()[:CHAINS].ravel())[0, 1] < 0.8
     assert least_p(moved) > 1e-3
@@ -133,7 +133,7 @@ def test_a_wrong_sign_in_the_acceptance_is_found(name, monkeypatch):
 
     alone = name == "nodes alone"
     monkeypatch.setattr(loose if alone else blackjax.mcmc.proposal, "jnp", Wrong())
-    assert least_p(after_steps(name, target().sampled if alone else ())) < 1e-6
+    assert least_p(after_steps(name, np.arange(NODES) if alone else ())) < 1e-6
 
 
 THIN = {"rwmh": 60, "rwmh_adaptive": 30, "pcn": 5, "mala": 8, "barker": 15}

@@ -64,8 +64,8 @@ def test_steps_make_a_quarter_turn_and_none_is_too_long(size):
 
 def test_a_place_without_a_slope_has_no_part_in_the_reference():
     class Broken(GaussianTarget):
-        def logdensity_of(self, data, position):
-            return super().logdensity_of(data, position) + jnp.sqrt(50 - position["u_boundary"].max())
+        def height(self, data, u):
+            return super().height(data, u) + jnp.sqrt(50 - u.max())
 
     target, mode = Broken(), np.zeros(DIMENSION)
     sound = jnp.asarray(target.exact_draws(np.random.default_rng(0), 3))

@@ -43,7 +43,7 @@ def chains():
     """Data conditioned for chains, and (data) → where 60 transitions of 4 chains lead, and how probably they go."""
     post, count = posterior(), 4
     estimands = post.estimands(post.reference())
-    flat = np.asarray(ravel_pytree(post.unconstrain_of(post.data, estimands))[0])
+    flat = np.asarray(ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0])
     setup = setup_about(post, laplace(post, flat), flat)._replace(step_size=jnp.asarray(0.3), steps=jnp.asarray(5))
     kernel = SAMPLERS["hmc"](post)
 

@@ -159,10 +159,10 @@ def test_curvature_is_gauss_newtons(share):
     post, place = example(), values(u_sd=0.3)
     images, estimands = post.images._replace(independent_share=jnp.asarray(share)), post.estimands(place)
     data = post.data.with_term("images", images)
-    H = post.displacement_curvature(data, estimands).gauss_newton
+    H = post.mode_search.curvature(data, estimands).gauss_newton
     assert H.shape == (MODES + 3 * len(MESH.boundary),) * 2
     assert np.linalg.eigvalsh(H).min() > -1e-6 * np.trace(H)
-    residuals = jax.jit(lambda v: post.residuals(post.evaluate(v).u))
+    residuals = jax.jit(lambda v: post.images.residuals(post.evaluate(v).u))
     rng = np.random.default_rng(3)
     for weights in ((1.0, 0.0), (0.0, 1.0), (1.0, 0.2)):
         d = {name: w * jnp.asarray(rng.normal(size=place[name].shape)) for name, w in zip(KEYS, weights, strict=True)}

@@ -52,7 +52,7 @@ def loose(post: br.Posterior) -> np.ndarray:
 @partial(jax.jit, static_argnums=0)
 def local(post: br.Posterior, data: Any, estimands: Any, u: Any) -> Any:
     """Log densities (k, c) of displacements (k, c, 3) of the nodes."""
-    logs = [post.local_logdensity(data, estimands, jnp.asarray(which)) for which in range(len(u))]
+    logs = [post.single_nodes.log_density(data, estimands, jnp.asarray(which)) for which in range(len(u))]
     return jnp.stack([jax.lax.map(log, places) for log, places in zip(logs, u, strict=True)])
 
 

@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference.target import logdensity, without_normaliser
 from tests.model.test_gradients import assert_gradient
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, linear_image, smooth_image
@@ -62,19 +63,20 @@ def test_elastic_prior_is_scipys_gaussian(held):
 @pytest.mark.parametrize("elasticity", ["tissue", "uniform", "element"])
 def test_density_is_the_papers_and_the_normaliser(elasticity):
     proper, improper = (posterior(elasticity=elasticity, fixed={}, normalised=which) for which in (True, False))
-    size = len(proper.entry_names)
+    size = len(proper.variables.entry_names)
     for state in states(count=2):
         values = state | {name: np.resize(state[name], size) for name in ("lam", "mu")}
         estimands = proper.estimands(values)
-        plain = proper.without_normaliser(proper.data)
+        plain = without_normaliser(proper, proper.data)
         without = proper.evaluate_estimands(plain, estimands)
         assert float(without.logdensity) == float(improper.logdensity_constrained(values))
-        both = without.logdensity + proper.log_normaliser(proper.data, estimands)
+        both = without.logdensity + proper.normaliser.log(proper.data, estimands)
         assert float(proper.logdensity_constrained(values)) == pytest.approx(float(both), rel=1e-12)
-        assert float(improper.log_normaliser(improper.data, estimands)) == 0
+        assert improper.normaliser is None
+        assert float(proper.normaliser.log(plain, estimands)) == 0
         position = proper.unconstrain(values)
-        less = proper.logdensity(position) - proper.logdensity_of(plain, position)
-        assert float(less) == pytest.approx(float(proper.log_normaliser(proper.data, estimands)), rel=1e-9)
+        less = proper.logdensity(position) - logdensity(proper, plain, position)
+        assert float(less) == pytest.approx(float(proper.normaliser.log(proper.data, estimands)), rel=1e-9)
 
 
 def test_chains_side_by_side():
@@ -119,12 +121,12 @@ def replicated():
 
     def density(u):
         def at(mu):
-            return post.evaluate_estimands(post.without_normaliser(post.data), {"u_boundary": u, "mu": mu}).logdensity
+            return post.evaluate_estimands(without_normaliser(post, post.data), {"u_boundary": u, "mu": mu}).logdensity
 
         return jax.vmap(at)(grid)
 
     without = np.asarray(jax.lax.map(density, draws))
-    normaliser = np.array([float(post.log_normaliser(post.data, {"u_boundary": draws[0], "mu": mu})) for mu in grid])
+    normaliser = np.array([float(post.normaliser.log(post.data, {"u_boundary": draws[0], "mu": mu})) for mu in grid])
     return tuple(mean_of_level(log_p) - TRUTHS for log_p in (without, without + normaliser))
 
 

@@ -116,7 +116,7 @@ def test_density_is_the_gaussian(with_region):
 @pytest.mark.parametrize("with_region", [False, True])
 def test_curvature_is_the_gaussians(with_region):
     post = posterior(with_region)
-    found = post.displacement_curvature(post.data, post.estimands(post.reference()))
+    found = post.mode_search.curvature(post.data, post.estimands(post.reference()))
     np.testing.assert_allclose(found.gauss_newton, np.linalg.inv(exact(with_region)[1]), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(found.remainder, 0, atol=1e-12)
 
@@ -159,8 +159,8 @@ def test_images_and_landmarks_are_one_density():
     parts = both.energies(values)
     expected = float(short.logdensity_constrained(values)) + float(parts["landmarks"])
     assert float(both.logdensity_constrained(values)) == pytest.approx(expected, rel=1e-12)
-    curvature = both.displacement_curvature(both.data, both.estimands(values))
-    alone = short.displacement_curvature(short.data, short.estimands(values))
+    curvature = both.mode_search.curvature(both.data, both.estimands(values))
+    alone = short.mode_search.curvature(short.data, short.estimands(values))
     assert np.linalg.eigvalsh(curvature.gauss_newton - alone.gauss_newton).min() > -1e-8
 
 

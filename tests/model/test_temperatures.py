@@ -36,7 +36,7 @@ def values(seed=0, **temperatures):
 
 def residuals_and_scales(post, state, t_similarity):
     """Residual and √(T_s / 2w) at every quadrature point."""
-    r = np.asarray(post.residuals(post.evaluate(state).u))
+    r = np.asarray(post.images.residuals(post.evaluate(state).u))
     return r, np.sqrt(t_similarity / (2 * np.asarray(post.images.quadrature.weights)))
 
 
@@ -166,10 +166,10 @@ def test_a_temperature_that_is_not_positive_is_outside_the_support(name, value):
 
 def test_noise_that_a_temperature_stands_for():
     weight = float(np.mean(posterior().images.quadrature.weights))
-    assert posterior(t_similarity=0.8).implied_noise_sd == pytest.approx(np.sqrt(0.8 / (2 * weight)))
-    inferred = posterior(t_similarity={"median": 0.8}, similarity="student_t", degrees_of_freedom=NU)
-    assert inferred.implied_noise_sd == pytest.approx(stats.t.std(NU, scale=np.sqrt(0.8 / (2 * weight))))
-    assert inferred.noise_sd(3.2) == pytest.approx(2 * inferred.implied_noise_sd)
+    assert posterior().images.noise_sd(0.8) == pytest.approx(np.sqrt(0.8 / (2 * weight)))
+    heavy = posterior(similarity="student_t", degrees_of_freedom=NU).images
+    assert heavy.noise_sd(0.8) == pytest.approx(stats.t.std(NU, scale=np.sqrt(0.8 / (2 * weight))))
+    assert heavy.noise_sd(3.2) == pytest.approx(2 * heavy.noise_sd(0.8))
 
 
 def test_values_must_hold_the_inferred_temperatures():

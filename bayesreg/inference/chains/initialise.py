@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.inference.target import Estimands, Evaluation, Target
+from bayesreg.inference.target import Estimands, Evaluation, Target, clearance
 from bayesreg.types import AnyArray, InputError
 
 
@@ -45,14 +45,15 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
     InputError
         If the field has the wrong shape or a parameter's name is unknown.
     """
-    at_rest = target.reference()
+    at_rest = target.coordinates.reference()
     field = np.zeros(at_rest["u_boundary"].shape) if start.field is None else np.asarray(start.field, float)
     if field.shape != at_rest["u_boundary"].shape:
         raise InputError(f"the start field must have shape {at_rest['u_boundary'].shape}, got {field.shape}")
     fractions = np.linspace(*start.fraction, chains) if chains > 1 else np.array([np.mean(start.fraction)])
-    for name in ("lam", "mu"):
-        at_rest[name] = _with_entries(at_rest[name], getattr(start, name), target, name)
-    centre = target.estimands(at_rest)
+    values = target.variables.values(at_rest)
+    for name in {"lam", "mu"} & set(values):
+        values[name] = _with_entries(values[name], getattr(start, name), target, name)
+    centre = target.variables.estimands(values)
     points = {"u_boundary": jnp.stack([_admissible(target, field, fraction) for fraction in fractions])}
     for name, subkey in zip(("lam", "mu"), jax.random.split(key), strict=True):
         if name in centre:
@@ -73,7 +74,8 @@ def _admissible(target: Target, field: np.ndarray, fraction: float) -> AnyArray:
     chosen = np.full(len(field), fraction)
     candidates = np.linspace(0, 1, 201)
     for candidate in candidates[np.argsort(np.abs(candidates - fraction), kind="stable")]:
-        forbidden = ~np.asarray(target.allowed(chosen[:, None] * field))
+        gap = clearance(target, target.data, jnp.asarray(chosen[:, None] * field), jnp.arange(len(field)))
+        forbidden = np.asarray(gap) < 0
         if not forbidden.any():
             break
         chosen[forbidden] = candidate
@@ -81,13 +83,11 @@ def _admissible(target: Target, field: np.ndarray, fraction: float) -> AnyArray:
 
 
 def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: Target, name: str) -> AnyArray:
-    values = jnp.asarray(values)
+    values, names = np.array(values), list(target.variables.coords["tissue"])
     for entry, value in (given or {}).items():
-        if entry not in target.entry_names:
-            raise InputError(f"start.{name} names {entry!r}; the entries are {', '.join(target.entry_names[:8])}")
-        index = target.entry_names.index(entry)
-        if index in target.free[name]:
-            values = values.at[index].set(value)
+        if entry not in names:
+            raise InputError(f"start.{name} names {entry!r}; the entries are {', '.join(names[:8])}")
+        values[names.index(entry)] = value
     return values
 
 

@@ -190,7 +190,7 @@ def checkpoint_from_arrays(
         If the arrays belong to another problem.
     """
     chosen = chosen_sampler(sampler, posterior, settings)
-    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.estimands(posterior.reference()))
+    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.coordinates.reference())
     expected = jax.eval_shape(partial(_first, chosen, posterior.data), chosen.sampler.blank(), points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)

@@ -10,7 +10,7 @@ import xarray as xr
 from jaxtyping import Int
 
 from bayesreg.inference.draws.blocks import Block, Blocks
-from bayesreg.inference.draws.inference_data import OTHERS, STATISTICS, arviz, dataset
+from bayesreg.inference.draws.inference_data import DERIVED, STATISTICS, arviz, dataset
 
 # Numbers (8 MB of them) that are judged at once, so that memory does not grow with the draws: ArviZ takes many times as
 # much.
@@ -39,8 +39,7 @@ def convergence(idata: Any) -> Convergence:
     Draws that lie in a file are read in parts.
     """
     draws = dataset(idata, "posterior")
-    names = ["u_boundary", "lam", "mu", *(name for name in OTHERS if name in draws)]
-    judged = [_judged(draws[name]) for name in names]
+    judged = [_judged(values) for name, values in draws.items() if name not in DERIVED]
     return Convergence(*(xr.merge([found[k] for found in judged]) for k in range(len(Convergence._fields))))
 
 

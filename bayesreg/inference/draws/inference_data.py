@@ -27,22 +27,11 @@ STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
     "outside_support", "diverging", "gradients",
 )  # fmt: skip
-# Estimands besides u_boundary, λ and μ, which only some posteriors have.
-OTHERS = ("t_similarity", "t_elastic", "field_sd", "field")
+# Functions of estimands that stand beside them.
+DERIVED = ("ratio",)
 # The file's pieces hold so many nodes (or modes, elements) of a block of draws: both few nodes of all draws and all
 # nodes of few draws are to be read at little cost.
 PIECE = 64
-_DIMS = {
-    "u_boundary": ["node", "axis"],
-    "lam": ["tissue"],
-    "mu": ["tissue"],
-    "ratio": ["tissue"],
-    "field": ["mode"],
-    "points": ["point", "axis"],
-    "cells": ["cell", "corner"],
-    "tissue": ["cell"],
-    "boundary": ["node"],
-}
 
 
 def to_inference_data(target: Target, blocks: Blocks) -> Any:
@@ -51,7 +40,7 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
     Parameters
     ----------
     target : Target
-        For the known entries of λ and μ and the names of all of them.
+        Its variables say what the draws are called, and which entries are known.
     blocks : Blocks
         Arrays (chain, draw, …) of the estimands and of `STATISTICS`.
 
@@ -63,23 +52,20 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
         field (chain, draw, mode), the components of the log-stiffness; sample_stats;
         constant_data.
     """
-    az = arviz()
+    az, variables = arviz(), target.variables
     every = list(blocks)
     draws = {name: np.concatenate([block[name] for block in every], axis=1) for name in every[0]}
     estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
-    values = {"u_boundary": estimands["u_boundary"], **_completed(target, estimands)}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values["ratio"] = values["lam"] / values["mu"]
-    values |= {name: estimands[name] for name in OTHERS if name in estimands}
     groups: dict[str, Any] = {
-        "posterior": values,
+        "posterior": variables.values(estimands),
         "sample_stats": {name: draws[name] for name in STATISTICS},
-        "constant_data": {name: np.asarray(value) for name, value in target.constant_data().items()},
+        "constant_data": {name: np.asarray(value) for name, value in variables.constants.items()},
     }
-    coords = {"node": np.asarray(target.sampled), "axis": list("xyz"), "tissue": list(target.entry_names)}
-    return (
-        az.from_dict(**groups, coords=coords, dims=_DIMS) if _OLD else az.from_dict(groups, coords=coords, dims=_DIMS)
-    )
+    labels: dict[str, Any] = {
+        "coords": dict(variables.coords),
+        "dims": {name: list(dims) for name, dims in variables.dims.items()},
+    }
+    return az.from_dict(**groups, **labels) if _OLD else az.from_dict(groups, **labels)
 
 
 def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
@@ -87,24 +73,10 @@ def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
     posterior, statistics = dataset(idata, "posterior"), dataset(idata, "sample_stats")
     for first in range(0, posterior.sizes["draw"], length):
         some = slice(first, first + length)
-        block = {}
-        for name in target.estimands(target.reference()):
-            values = np.asarray(posterior[name].isel(draw=some).to_numpy(), float)
-            block[name] = values[..., np.asarray(target.free[name])] if name in target.free else values
-        yield block | {name: statistics[name].isel(draw=some).to_numpy() for name in STATISTICS}
-
-
-def _completed(target: Target, estimands: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """λ and μ with their known entries, on the host: there may be many draws."""
-    reference = target.reference()
-    found = {}
-    for name in ("lam", "mu"):
-        known = np.asarray(reference[name])
-        full = np.tile(known, (*estimands["u_boundary"].shape[:2], 1))
-        if name in estimands:
-            full[..., np.asarray(target.free[name])] = estimands[name]
-        found[name] = full
-    return found
+        values = {str(name): found.isel(draw=some).to_numpy().astype(float) for name, found in posterior.items()}
+        yield target.variables.estimands(values) | {
+            name: statistics[name].isel(draw=some).to_numpy() for name in STATISTICS
+        }
 
 
 def arviz() -> Any:

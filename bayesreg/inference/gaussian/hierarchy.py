@@ -13,41 +13,24 @@ typical draw of u_B, where E_r / T_r is greater by ½ tr(C P) than at the mode, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.inference.layout import slices
-from bayesreg.inference.target import Estimands
-from bayesreg.types import AnyArray
+from bayesreg.inference.layout import Placed, marked
 
 SCALE, COMPONENTS, TEMPERATURE = "field_sd", "field", "t_elastic"
 _MOST = 1.0
 
 
-@runtime_checkable
-class Placed(Protocol):
-    """What is asked of a target here."""
-
-    def __hash__(self) -> int:
-        """See `Target`."""
-
-    def reference(self) -> dict[str, AnyArray]:
-        """Values at rest."""
-
-    def unconstrain(self, values: Estimands) -> dict[str, AnyArray]:
-        """Position of values."""
-
-
 def is_scale(target: Placed) -> Float[np.ndarray, "dimension"]:
     """One at the entries of a flat position that hold log sd or log T_r, zero elsewhere."""
-    return _marked(target, SCALE) + is_temperature(target)
+    return marked(target, SCALE, TEMPERATURE).astype(float)
 
 
 def is_temperature(target: Placed) -> Float[np.ndarray, "dimension"]:
     """One at the entry of a flat position that holds log T_r, zero elsewhere."""
-    return _marked(target, TEMPERATURE)
+    return marked(target, TEMPERATURE).astype(float)
 
 
 def balanced(
@@ -65,10 +48,10 @@ def balanced(
     factor : callable
         () → F, where F Fᵀ is the covariance there; not asked for where there is no field.
     """
-    scale = np.flatnonzero(_marked(target, SCALE))
+    scale = np.flatnonzero(marked(target, SCALE))
     if not len(scale):
         return flat
-    components = np.flatnonzero(_marked(target, COMPONENTS))
+    components = np.flatnonzero(marked(target, COMPONENTS))
     rows = np.asarray(factor())[np.concatenate([components, scale])]
     covariance = rows @ rows.T
     # Given sd.
@@ -110,11 +93,3 @@ def tempered(
 def gained(shares: Float[np.ndarray, "rows rows"]) -> float:
     """By how much the evidence of log T_r is more curved than the log density: ½ tr(C P − (C P)²)."""
     return float(np.trace(shares) - (shares * shares.T).sum()) / 2
-
-
-def _marked(target: Placed, wanted: str) -> Float[np.ndarray, "dimension"]:
-    parts = slices(target)
-    marks = np.zeros(sum(part.stop - part.start for part in parts.values()))
-    if wanted in parts:
-        marks[parts[wanted]] = 1.0
-    return marks

@@ -14,8 +14,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.inference.gaussian.hierarchy import gained, is_scale, is_temperature
-from bayesreg.inference.layout import others, slices, unravel
-from bayesreg.inference.target import Curvature, SmoothTarget
+from bayesreg.inference.layout import marked, unravel
+from bayesreg.inference.target import Curvature, Target, estimands_of, logdensity, without_walls
 from bayesreg.types import AnyArray, InputError
 
 # So many times what is expected of any of its kind, a parameter has no end.
@@ -46,23 +46,19 @@ class Reference(NamedTuple):
         return self.centre + self.factor @ xi
 
 
-def prior_shares(
-    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
-) -> Float[np.ndarray, "rows rows"]:
+def prior_shares(target: Target, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
     """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
     colder = flat - np.log(2) * is_temperature(target)
     here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
 
 
-def laplace(
-    target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
-) -> Reference:
+def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Reference:
     """The Gaussian reference about a flat position, with the curvature there (see `precision_at`)."""
     return gaussian(flat, precision_at(target, flat, data, joint))
 
 
-def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+def averaged(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
     """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `pulled` by all.
 
     Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
@@ -80,7 +76,7 @@ def averaged(target: SmoothTarget, flats: Sequence[Float[np.ndarray, "dimension"
     return pulled(target, gaussian(flats[0], precision), flats)
 
 
-def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+def pulled(target: Target, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
     """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
 
     Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
@@ -93,31 +89,31 @@ def pulled(target: SmoothTarget, reference: Reference, flats: Sequence[Float[np.
     return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
 
 
-def slope_at(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+def slope_at(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """∇log π of the density without walls."""
     return height_and_slope(target, target.data, flat)[1]
 
 
 def height_and_slope(
-    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]
+    target: Target, data: Any, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[float, Float[np.ndarray, "dimension"]]:
     """log π and ∇log π of the density without walls.
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     data : pytree
         The target's, or that of a similar problem.
     flat : (d,) array
         Flat position.
     """
-    height, slope = _height_and_slope(target, target.without_walls(data), jnp.asarray(flat))
+    height, slope = _height_and_slope(target, without_walls(target, data), jnp.asarray(flat))
     return float(height), np.asarray(slope)
 
 
 @partial(jax.jit, static_argnums=0)
-def _height_and_slope(target: SmoothTarget, data: Any, flat: AnyArray) -> tuple[AnyArray, AnyArray]:
-    return jax.value_and_grad(lambda x: target.logdensity_of(data, unravel(target)(x)))(flat)
+def _height_and_slope(target: Target, data: Any, flat: AnyArray) -> tuple[AnyArray, AnyArray]:
+    return jax.value_and_grad(lambda x: logdensity(target, data, unravel(target)(x)))(flat)
 
 
 def _convex(
@@ -142,7 +138,7 @@ def gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray
 
 
 def precision_at(
-    target: SmoothTarget, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
+    target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True
 ) -> Float[np.ndarray, "dimension dimension"]:
     """A positive definite curvature of minus the log density.
 
@@ -151,7 +147,7 @@ def precision_at(
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     flat : (d,) array
     data : pytree, optional
         Of a problem other than the target's own.
@@ -167,17 +163,18 @@ def precision_at(
     return _jointly(target, data, flat, _regular(_curvature(target, data, flat).gauss_newton), joint)
 
 
-def _curvature(target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
+def _curvature(target: Target, data: Any, flat: Float[np.ndarray, "dimension"]) -> Curvature:
     estimands = _estimands_at(target, data, jnp.asarray(flat))
-    expected = target.reference()
+    expected = target.coordinates.reference()
     for name in (name for name in estimands if name not in ("field", "u_boundary")):
         _require_an_end((np.asarray(estimands[name]) < FAR * np.asarray(expected[name]).max()).all())
-    return target.displacement_curvature(data, estimands)
+    assert target.mode_search is not None
+    return target.mode_search.curvature(data, estimands)
 
 
 @partial(jax.jit, static_argnums=0)
-def _estimands_at(target: SmoothTarget, data: Any, flat: AnyArray) -> Any:
-    return target.constrain_of(data, unravel(target)(flat))
+def _estimands_at(target: Target, data: Any, flat: AnyArray) -> Any:
+    return estimands_of(target, data, unravel(target)(flat))
 
 
 def _require_an_end(found: bool | np.bool_) -> None:
@@ -194,7 +191,7 @@ def _regular(curvature: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "ro
 
 
 def _jointly(
-    target: SmoothTarget,
+    target: Target,
     data: Any,
     flat: Float[np.ndarray, "dimension"],
     curvature: Float[np.ndarray, "rows rows"],
@@ -224,7 +221,7 @@ def _jointly(
         cross = rows[:, count:]
         inner = scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[count:, count:]), cross.T)
         schur = (rows[:, :count] + rows[:, :count].T) / 2 - cross @ inner
-        least = ravel_pytree(target.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
+        least = ravel_pytree(target.coordinates.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
         unit = np.sqrt(np.asarray(least)[order[:count]])
         values, vectors = np.linalg.eigh(schur / np.outer(unit, unit))
         vectors *= unit[:, None]
@@ -236,17 +233,13 @@ def _jointly(
     return precision
 
 
-def _curved(target: SmoothTarget, joint: bool) -> Bool[np.ndarray, "dimension"]:
+def _curved(target: Target, joint: bool) -> Bool[np.ndarray, "dimension"]:
     """Entries of a flat position whose curvature the target knows: "u_boundary" and, jointly, "field"."""
-    marked = np.ones(len(others(target)) + 3 * len(target.sampled), bool)
-    marked[others(target)] = False
-    if joint and "field" in slices(target):
-        marked[slices(target)["field"]] = True
-    return marked
+    return marked(target, "u_boundary", "field") if joint else marked(target, "u_boundary")
 
 
 def hessian_rows(
-    target: SmoothTarget, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
+    target: Target, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows dimension"]:
     """Rows of the Hessian of the log density without walls, by differences of its gradient.
 

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.layout import unravel
-from bayesreg.inference.target import Estimands, SmoothTarget
+from bayesreg.inference.target import Estimands, Target, estimands_of
 from bayesreg.types import AnyArray
 
 # Nodes that are moved alone. With each more the true density refuses more often what the approximate ones propose.
@@ -129,20 +129,21 @@ def loose(reference: Reference, first: int, nodes: Int[AnyArray, "k"], seen: Flo
     return Loose(jnp.asarray(nodes, int), columns, seen, jnp.linalg.cholesky(covariance + own))
 
 
-def searched(
-    target: SmoothTarget, data: Any, nodes: Loose, points: Any, key: AnyArray
-) -> Float[np.ndarray, "k seen 3"]:
+def searched(target: Target, data: Any, nodes: Loose, points: Any, key: AnyArray) -> Float[np.ndarray, "k seen 3"]:
     """Where the nodes come from the chains' estimands, each while all others stay, by moves from wide places."""
     keys = jax.random.split(key, len(next(iter(points.values()))))
     return np.concatenate(np.asarray(_searched(target, data, nodes, points, keys)), axis=1)
 
 
 @partial(jax.jit, static_argnums=0)
-def _searched(target: SmoothTarget, data: Any, nodes: Loose, points: Any, keys: AnyArray) -> AnyArray:
+def _searched(target: Target, data: Any, nodes: Loose, points: Any, keys: AnyArray) -> AnyArray:
+    assert target.single_nodes is not None
+    single_nodes = target.single_nodes
+
     def of_node(estimands: Estimands, key: AnyArray, which: AnyArray) -> AnyArray:
         middle = nodes.seen[which].mean(axis=0, keepdims=True)
         places = Kernels(middle, WIDE[1] * nodes.spread[which], WIDE[0])
-        height = target.local_logdensity(data, estimands, which)
+        height = single_nodes.log_density(data, estimands, which)
 
         def one(here: AnyArray, key: AnyArray) -> tuple[AnyArray, AnyArray]:
             there = _resampled(places, WIDE_PLACES, height, here, key)[0]
@@ -176,7 +177,7 @@ def _resampled(
 
 
 def moved_alone(
-    target: SmoothTarget,
+    target: Target,
     begin: Callable[[AnyArray], Any],
     data: Any,
     reference: Reference,
@@ -188,7 +189,7 @@ def moved_alone(
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     begin : callable
         Whitened position → state, with fields `position` and `logdensity`.
     data : pytree
@@ -198,14 +199,16 @@ def moved_alone(
     key : PRNG key
     state : state of the kernel
     """
+    assert target.single_nodes is not None
+    single_nodes = target.single_nodes
     key_move, key_test = jax.random.split(key)
-    estimands = target.constrain_of(data, unravel(target)(reference.place(state.position)))
+    estimands = estimands_of(target, data, unravel(target)(reference.place(state.position)))
 
     def move(key: AnyArray, which: AnyArray) -> tuple[AnyArray, AnyArray]:
         """The way of one node, and what it gained in its own density."""
         here = estimands["u_boundary"][nodes.nodes[which]]
         places = Kernels(nodes.seen[which], NARROW[1] * nodes.spread[which], NARROW[0])
-        there, gain = _resampled(places, PLACES, target.local_logdensity(data, estimands, which), here, key)
+        there, gain = _resampled(places, PLACES, single_nodes.log_density(data, estimands, which), here, key)
         return there - here, gain
 
     count = len(nodes.nodes)

@@ -24,8 +24,8 @@ from bayesreg.inference.gaussian.laplace import (
     slope_at,
 )
 from bayesreg.inference.gaussian.pockets import out_of_pockets
-from bayesreg.inference.layout import displacements, others, unravel
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.layout import displacements, node_count, others, unravel
+from bayesreg.inference.target import Target, clearance, without_normaliser
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
@@ -40,7 +40,7 @@ RESCUES = 3
 
 
 def find_mode(
-    target: SmoothTarget,
+    target: Target,
     start: Float[np.ndarray, "dimension"],
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
@@ -51,7 +51,7 @@ def find_mode(
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     start : (d,) array
         Flat position to start from; it need not lie in the support.
     say : callable
@@ -69,15 +69,16 @@ def find_mode(
     InputError
         If the density is not finite at the start.
     """
+    assert target.mode_search is not None
     flat = np.asarray(start)
-    for data in target.continuation():
+    for data in target.mode_search.continuation():
         flat = _improved(target, data, flat, False, iterations, say, gain=ROUGH)
     flat = settled(target, flat, say, iterations)
     for _ in range(RESCUES):
         elsewhere, nodes = out_of_pockets(target, flat)
         if not len(nodes):
             break
-        named = ", ".join(map(str, np.asarray(target.sampled)[nodes]))
+        named = ", ".join(map(str, np.asarray(target.variables.coords["node"])[nodes]))
         say(f"mode: moved to where they are more probable: nodes {named}")
         flat = settled(target, elsewhere, say, iterations)
     else:
@@ -86,7 +87,7 @@ def find_mode(
 
 
 def settled(
-    target: SmoothTarget,
+    target: Target,
     flat: Float[np.ndarray, "dimension"],
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
@@ -95,7 +96,7 @@ def settled(
     # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
     # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
     # skull and not in it, however great the force that presses.
-    shift = np.zeros(len(target.sampled))
+    shift = np.zeros(node_count(target))
     for _ in range(REPEATS):
         before, pressed = flat, shift
         flat = _improved(target, target.data, flat, True, iterations, say, shift)
@@ -108,7 +109,7 @@ def settled(
     return _admissible(target, flat)
 
 
-def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+def _tempered(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """The flat position with T_r, if it is inferred, nearer to the maximum of its evidence."""
     entry = np.flatnonzero(is_temperature(target))
     if not len(entry):
@@ -118,18 +119,18 @@ def _tempered(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Flo
     return tempered(target, flat, float(slope[0]), float(curvature[0]), prior_shares(target, target.data, flat))
 
 
-def _gaps(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
+def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
     """Signed distance of every sampled node to the forbidden region, mm; infinite where there is none."""
     u = unravel(target)(jnp.asarray(flat))["u_boundary"]
-    return np.asarray(target.clearance(target.data, u, jnp.arange(len(target.sampled))))
+    return np.asarray(clearance(target, target.data, u, jnp.arange(node_count(target))))
 
 
-def _factor(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
+def _factor(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
     return np.asarray(laplace(target, flat).factor)
 
 
 def _improved(
-    target: SmoothTarget,
+    target: Target,
     data: Any,
     flat: Float[np.ndarray, "dimension"],
     moves: bool,
@@ -139,11 +140,11 @@ def _improved(
     gain: float = FINE,
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
-    shift = np.zeros(len(target.sampled)) if shift is None else shift
+    shift = np.zeros(node_count(target)) if shift is None else shift
     reference = gaussian(flat, _apart(precision_at(target, flat, data, moves), is_scale(target) > 0))
     if not moves:
         # The same for all displacements.
-        data = target.without_normaliser(data)
+        data = without_normaliser(target, data)
     moving, own = 1 - is_scale(target), displacements(target)
     if not moves:
         moving[others(target)] = 0.0
@@ -188,16 +189,16 @@ def _apart(
     return precision
 
 
-def penalty(target: SmoothTarget, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
+def penalty(target: Target, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
     """What minus the log density gains in place of the hard skull, moved inwards by `shift`, mm."""
-    gap = target.clearance(data, u, jnp.arange(len(target.sampled)))
+    gap = clearance(target, data, u, jnp.arange(node_count(target)))
     return 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
 
 
 _penalty_with_slope = jax.jit(jax.value_and_grad(penalty, argnums=2), static_argnums=0)
 
 
-def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+def _admissible(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
     own = displacements(target)
     u = np.array(flat[own].reshape(-1, 3))
@@ -214,6 +215,6 @@ def _admissible(target: SmoothTarget, flat: Float[np.ndarray, "dimension"]) -> F
 
 
 @partial(jax.jit, static_argnums=0)
-def _clearance_with_slope(target: SmoothTarget, data: Any, u: AnyArray) -> tuple[AnyArray, AnyArray]:
-    gap, pullback = jax.vjp(lambda u: target.clearance(data, u, jnp.arange(len(u))), u)
+def _clearance_with_slope(target: Target, data: Any, u: AnyArray) -> tuple[AnyArray, AnyArray]:
+    gap, pullback = jax.vjp(lambda u: clearance(target, data, u, jnp.arange(len(u))), u)
     return gap, pullback(jnp.ones_like(gap))[0]

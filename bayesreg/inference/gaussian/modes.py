@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from bayesreg.inference.gaussian.laplace import Reference, laplace
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.kernel import Say
-from bayesreg.inference.layout import unravel
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.inference.target import Target, logdensity
 
 # Modes count as one where no coordinate lies further apart than this, in its standard deviations.
 SAME = 1.0
@@ -35,7 +34,7 @@ class Modes(NamedTuple):
     chains: list[int]
 
 
-def search_modes(target: SmoothTarget, points: Any, each: bool, say: Say) -> Modes:
+def search_modes(target: Target, points: Any, each: bool, say: Say) -> Modes:
     """Modes from the start points (chains as the leading axis): one from their mean, or one from each.
 
     One search costs as much as all of a short run; that it leads elsewhere from other starts is the exception.
@@ -48,10 +47,10 @@ def search_modes(target: SmoothTarget, points: Any, each: bool, say: Say) -> Mod
     for chain in range(chains):
         say(f"chain {chain}:")
         found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points)), say))
-    return told(target, distinct(target, np.stack(found)), say)
+    return report_modes(target, distinct(target, np.stack(found)), say)
 
 
-def distinct(target: SmoothTarget, found: Float[np.ndarray, "chains dimension"]) -> Modes:
+def distinct(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
     """The modes among those of every chain that differ, by their distance in standard deviations (see `SAME`)."""
     heights = [_height(target, mode) for mode in found]
     references: list[Reference] = []
@@ -71,8 +70,8 @@ def distance(reference: Reference, flat: Float[np.ndarray, "dimension"]) -> floa
     return float(np.abs((flat - np.asarray(reference.centre)) / sd).max())
 
 
-def told(target: SmoothTarget, modes: Modes, say: Say) -> Modes:
-    """The same modes, said."""
+def report_modes(target: Target, modes: Modes, say: Say) -> Modes:
+    """Report the modes and return them."""
     if len(modes.references) == 1:
         say("modes: every chain's search ended at one and the same")
         return modes
@@ -85,9 +84,9 @@ def told(target: SmoothTarget, modes: Modes, say: Say) -> Modes:
     return modes
 
 
-def _height(target: SmoothTarget, flat: np.ndarray) -> float:
-    return float(target.logdensity_of(target.data, unravel(target)(jnp.asarray(flat))))
+def _height(target: Target, flat: np.ndarray) -> float:
+    return float(logdensity(target, target.data, unravel(target)(jnp.asarray(flat))))
 
 
-def _flat(target: SmoothTarget, estimands: Any) -> np.ndarray:
-    return np.asarray(ravel_pytree(target.unconstrain_of(target.data, estimands))[0])
+def _flat(target: Target, estimands: Any) -> np.ndarray:
+    return np.asarray(flat_position(target, target.data, estimands))

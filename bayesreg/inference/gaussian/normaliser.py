@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.layout import others, unravel
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
 
 # With more parameters than this the stand-in is linear: its curvature would cost two gradients for each of them.
@@ -61,17 +61,17 @@ class Delayed(NamedTuple):
     log_normaliser: Scalar
 
 
-def no_stand_in(target: SmoothTarget) -> StandIn:
+def no_stand_in(target: Target) -> StandIn:
     """That of a density without a normaliser, or before it is found."""
     entries = others(target)
     return StandIn(jnp.asarray(entries), jnp.zeros(len(entries)), jnp.zeros((len(entries), len(entries))))
 
 
-def stand_in(target: SmoothTarget, reference: Reference, middle: AnyArray) -> StandIn:
+def stand_in(target: Target, reference: Reference, middle: AnyArray) -> StandIn:
     """The normaliser's slope at a flat position, and its curvature by differences over one sd of the reference."""
     found, entries = no_stand_in(target), others(target)
     count = len(entries)
-    if not target.costly_normaliser or not count:
+    if not has_costly_normaliser(target) or not count:
         return found
     slope_at = partial(_slope, target, target.data)
     found = found._replace(slope=slope_at(middle)[entries])
@@ -86,9 +86,10 @@ def stand_in(target: SmoothTarget, reference: Reference, middle: AnyArray) -> St
     return found._replace(curvature=(curvature + curvature.T) / 2)
 
 
-def log_normaliser_at(target: SmoothTarget, data: Any, flat: AnyArray) -> Scalar:
+def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
     """The true one, at a flat position."""
-    return target.log_normaliser(data, target.constrain_of(data, unravel(target)(flat)))
+    assert target.normaliser is not None
+    return target.normaliser.log(data, estimands_of(target, data, unravel(target)(flat)))
 
 
 _slope = jax.jit(jax.grad(log_normaliser_at, argnums=2), static_argnums=0)

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.laplace import height_and_slope
-from bayesreg.inference.layout import displacements, unravel
-from bayesreg.inference.target import Estimands, SmoothTarget
+from bayesreg.inference.layout import displacements, node_count, unravel
+from bayesreg.inference.target import Estimands, Target, estimands_of, without_normaliser
 from bayesreg.types import AnyArray
 
 # Places for a node: Normal about its equilibrium, with its distance from there, 1/2, 1/4, 1/8 and 1/16 of it as
@@ -31,14 +31,14 @@ AT_A_TIME = 512
 
 
 def out_of_pockets(
-    target: SmoothTarget, flat: Float[np.ndarray, "dimension"]
+    target: Target, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[Float[np.ndarray, "dimension"], Int[np.ndarray, "moved"]]:
     """Move single nodes to where the density is far higher.
 
     Parameters
     ----------
-    target : SmoothTarget
-        One that knows no neighbourhoods is left alone.
+    target : Target
+        One that knows no densities of single nodes is left alone.
     flat : (d,) array
         Flat position, a local maximum.
 
@@ -49,11 +49,11 @@ def out_of_pockets(
     nodes : (moved,) int array
         Their rows of "u_boundary".
     """
-    count, moved = len(target.sampled), []
+    count, moved = node_count(target), []
     # The same for all displacements.
-    data = target.without_normaliser(target.data)
-    estimands = target.constrain_of(data, unravel(target)(jnp.asarray(flat)))
-    for first in range(0, count if target.knows_neighbourhoods else 0, AT_A_TIME):
+    data = without_normaliser(target, target.data)
+    estimands = estimands_of(target, data, unravel(target)(jnp.asarray(flat)))
+    for first in range(0, 0 if target.single_nodes is None else count, AT_A_TIME):
         rows = np.arange(first, min(first + AT_A_TIME, count))
         near = target.conditioned(estimands, rows, quick=True)
         gains, places = (np.asarray(found) for found in _looked(target, near, estimands, jnp.asarray(rows)))
@@ -68,16 +68,19 @@ def out_of_pockets(
 
 
 @partial(jax.jit, static_argnums=0)
-def _looked(target: SmoothTarget, data: Any, estimands: Estimands, rows: Int[AnyArray, "k"]) -> tuple[Any, Any]:
+def _looked(target: Target, data: Any, estimands: Estimands, rows: Int[AnyArray, "k"]) -> tuple[Any, Any]:
     """Of every node the highest place that was seen, and by how much it is higher, approximately."""
+
+    assert target.single_nodes is not None
+    single_nodes = target.single_nodes
 
     def of_node(asked: tuple[AnyArray, AnyArray]) -> tuple[AnyArray, AnyArray]:
         which, row = asked
-        here, rest = estimands["u_boundary"][row], target.local_equilibrium(data, estimands, which)
+        here, rest = estimands["u_boundary"][row], single_nodes.equilibrium(data, estimands, which)
         width = jnp.linalg.norm(rest - here) / 2.0 ** (jnp.arange(PLACES) % WIDTHS)
         about = jax.random.normal(jax.random.fold_in(jax.random.key(0), row), (PLACES, 3))
         places = jnp.concatenate([here[None], rest[None], rest + width[:, None] * about])
-        heights = jax.vmap(target.local_logdensity(data, estimands, which))(places)
+        heights = jax.vmap(single_nodes.log_density(data, estimands, which))(places)
         heights = jnp.where(jnp.isnan(heights), -jnp.inf, heights)
         best = heights.argmax()
         return heights[best] - heights[0], places[best]

@@ -16,7 +16,6 @@ import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.gaussian.laplace import Reference, averaged, pulled, slope_at
 from bayesreg.inference.gaussian.loose import Loose, loose, moved_alone, searched, slowest
@@ -25,8 +24,16 @@ from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delayed, lo
 from bayesreg.inference.gaussian.reflection import Clearance, Walls, rotated, walls
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, require_sound, tuned
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
-from bayesreg.inference.layout import displacements, unravel
-from bayesreg.inference.target import Estimands, SmoothTarget
+from bayesreg.inference.layout import dimension, displacements, flat_position, node_count, unravel
+from bayesreg.inference.target import (
+    Estimands,
+    Target,
+    clearance,
+    estimands_of,
+    has_costly_normaliser,
+    logdensity,
+    without_normaliser,
+)
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # Chains start that much wider than Laplace's approximation.
@@ -82,17 +89,17 @@ class Moved(NamedTuple):
 
 
 # (target, data, setup, key, state) → (state, Moved)
-Transition = Callable[[SmoothTarget, Any, Setup, AnyArray, Any], tuple[Any, Moved]]
+Transition = Callable[[Target, Any, Setup, AnyArray, Any], tuple[Any, Moved]]
 # (target, data, setup) → the log density of the whitened coordinates that the transition works with
-Density = Callable[[SmoothTarget, Any, Setup], Callable[[AnyArray], AnyArray]]
+Density = Callable[[Target, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
 @partial(jax.jit, static_argnums=0)
 def setup_about(
-    target: SmoothTarget, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
+    target: Target, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
 ) -> Setup:
     """A setup before its tuning; the nodes in the rows `alone` of "u_boundary" are moved alone."""
-    nodes, own = len(target.sampled), displacements(target)
+    nodes, own = node_count(target), displacements(target)
     centre = reference.centre[own].reshape(nodes, 3)
     rows = reference.factor[own].reshape(nodes, 3, len(reference.centre))
     nothing = no_stand_in(target)
@@ -108,28 +115,28 @@ def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
     return jax.scipy.linalg.solve_triangular(reference.factor, flat - reference.centre, lower=False)
 
 
-def whitened_position(target: SmoothTarget, reference: Reference, xi: AnyArray) -> dict[str, AnyArray]:
+def whitened_position(target: Target, reference: Reference, xi: AnyArray) -> dict[str, AnyArray]:
     """The position at ξ."""
     return unravel(target)(reference.place(xi))
 
 
-def whitened_density(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
+def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ), up to a constant, with the stand-in for its normaliser."""
     reference = setup.reference
-    if not target.costly_normaliser:
-        return lambda xi: target.logdensity_of(data, whitened_position(target, reference, xi))
-    plain = target.without_normaliser(data)
+    if not has_costly_normaliser(target):
+        return lambda xi: logdensity(target, data, whitened_position(target, reference, xi))
+    plain = without_normaliser(target, data)
 
     def density(xi: AnyArray) -> AnyArray:
         flat = reference.place(xi)
-        return target.logdensity_of(plain, unravel(target)(flat)) + setup.stand_in(flat - setup.middle)
+        return logdensity(target, plain, unravel(target)(flat)) + setup.stand_in(flat - setup.middle)
 
     return density
 
 
-def clearance_of(target: SmoothTarget, data: Any, setup: Setup) -> Clearance:
+def clearance_of(target: Target, data: Any, setup: Setup) -> Clearance:
     """Signed distances of the walls' nodes."""
-    return lambda u: target.clearance(data, u, setup.walls.nodes)
+    return lambda u: clearance(target, data, u, setup.walls.nodes)
 
 
 @dataclass(frozen=True)
@@ -139,7 +146,7 @@ class Walk:
     Two are equal if their targets are and their functions are the same: what is compiled for one serves the other.
     """
 
-    target: SmoothTarget
+    target: Target
     transition: Transition
     begin: Callable[[AnyArray, Callable], Any]
     density: Density
@@ -148,7 +155,7 @@ class Walk:
     @partial(jax.jit, static_argnums=0)
     def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
         """The state of a chain there."""
-        flat = ravel_pytree(self.target.unconstrain_of(data, estimands))[0]
+        flat = flat_position(self.target, data, estimands)
         return self.begin(whitened(setup.reference, flat), self.density(self.target, data, setup))
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
@@ -167,7 +174,7 @@ class Walk:
 
     def estimands(self, data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
         """Where a chain is."""
-        return self.target.constrain_of(data, whitened_position(self.target, setup.reference, state.position))
+        return estimands_of(self.target, data, whitened_position(self.target, setup.reference, state.position))
 
     def observe(self, data: Any, setup: Setup, state: Any) -> Draw:
         """The same, with what the density is made of there."""
@@ -176,7 +183,7 @@ class Walk:
 
 
 def about_reference(
-    target: SmoothTarget,
+    target: Target,
     transition: Transition,
     tuning: Tuning | None = None,
     begin: Callable[[AnyArray, Callable], Any] = blackjax.mcmc.hmc.init,
@@ -189,7 +196,7 @@ def about_reference(
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     transition : callable
         (target, data, setup, key, state) → (state, Moved).
     tuning : Tuning, optional
@@ -215,8 +222,8 @@ def about_reference(
         raise InputError(f"mode_search must be {' or '.join(MODE_SEARCHES)}, got {mode_search!r}")
     if tuning is not None:
         require_sound(tuning)
-    alone = min(alone, len(target.sampled)) if target.knows_neighbourhoods else 0
-    unknowns = len(ravel_pytree(target.unconstrain(target.reference()))[0])
+    alone = 0 if target.single_nodes is None else min(alone, node_count(target))
+    unknowns = dimension(target)
     if unknowns > MOST_UNKNOWNS:
         raise InputError(
             f"the posterior has {unknowns} unknowns; samplers about the mode keep dense matrices of their square and "
@@ -249,14 +256,14 @@ def about_reference(
     data = partial(_conditioned, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
     # What is approximate anyway does without the normaliser's own value.
-    if target.costly_normaliser and exact:
+    if has_costly_normaliser(target) and exact:
         sampler = _with_normaliser(target, sampler)
     return _with_loose_nodes(target, sampler, begin, density) if alone else sampler
 
 
-def _conditioned(target: SmoothTarget, setup: Setup) -> Any:
+def _conditioned(target: Target, setup: Setup) -> Any:
     """The target's data, prepared for chains about the middle."""
-    return target.conditioned(target.constrain_of(target.data, unravel(target)(setup.middle)), setup.loose.nodes)
+    return target.conditioned(estimands_of(target, target.data, unravel(target)(setup.middle)), setup.loose.nodes)
 
 
 def _warmed_up(
@@ -279,7 +286,7 @@ def _warmed_up(
     # Of the second stage alone, where trajectories are whole from the first: before, they are short, and chains on
     # their way.
     nodes = slowest(np.asarray(path), alone)
-    say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.sampled)[nodes]))}")
+    say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.variables.coords['node'])[nodes]))}")
     late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])
     seen = np.moveaxis(late.reshape(-1, alone, 3), 1, 0)
     setup = setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen))
@@ -288,7 +295,7 @@ def _warmed_up(
     return setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen)), points
 
 
-def _with_loose_nodes(target: SmoothTarget, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
+def _with_loose_nodes(target: Target, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
     """A sampler that after each step moves some nodes alone.
 
     The normaliser, the same wherever they are, has no part in that. Nor would the move have a place in the step that
@@ -312,14 +319,17 @@ def _with_loose_nodes(target: SmoothTarget, sampler: Sampler, begin: Callable, d
     return sampler._replace(step=step)
 
 
-def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
+def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
     """A sampler of the density with the stand-in made one of the density with the normaliser."""
 
+    assert target.normaliser is not None
+    normaliser = target.normaliser
+
     def init(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
-        return Delayed(sampler.init(data, setup, estimands), target.log_normaliser(data, estimands))
+        return Delayed(sampler.init(data, setup, estimands), normaliser.log(data, estimands))
 
     def observe(data: Any, setup: Setup, state: Delayed) -> Draw:
-        estimands, evaluation = sampler.observe(target.without_normaliser(data), setup, state.kernel)
+        estimands, evaluation = sampler.observe(without_normaliser(target, data), setup, state.kernel)
         return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
 
     def flat_of(setup: Setup, state: Any) -> AnyArray:
@@ -329,26 +339,24 @@ def _with_normaliser(target: SmoothTarget, sampler: Sampler) -> Sampler:
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _about(
-    target: SmoothTarget, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
-) -> Setup:
+def _about(target: Target, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
     """A setup before its tuning, with the stand-in about the middle."""
     setup = setup_about(target, reference, middle, alone)
     return setup._replace(stand_in=stand_in(target, reference, jnp.asarray(middle)))
 
 
-def _averaged(target: SmoothTarget, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
+def _averaged(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there.
 
     Which nodes are moved alone is not known yet: the first stands for so many.
     """
-    flats = np.asarray(jax.vmap(lambda point: ravel_pytree(target.unconstrain_of(target.data, point))[0])(points))
+    flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
     return _about(target, averaged(target, places), np.mean(places, axis=0), np.zeros(alone, int))
 
 
-def _overdispersed(target: SmoothTarget, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
+def _overdispersed(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
     """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support.
 
     Raises
@@ -368,9 +376,9 @@ def _overdispersed(target: SmoothTarget, setup: Setup, mode: AnyArray, keys: Any
 
 @partial(jax.jit, static_argnums=0)
 def _start(
-    target: SmoothTarget, data: Any, setup: Setup, begin: AnyArray, key: AnyArray, width: AnyArray
+    target: Target, data: Any, setup: Setup, begin: AnyArray, key: AnyArray, width: AnyArray
 ) -> tuple[Any, AnyArray]:
     """Estimands, and whether the flight there was over in time."""
     momentum = width * jax.random.normal(key, begin.shape)
     xi, _ = rotated(setup.walls, clearance_of(target, data, setup), begin, momentum, jnp.pi / 2)
-    return target.constrain_of(data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()
+    return estimands_of(target, data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.optimizers.lbfgs import lbfgs_inverse_hessian_formula_1
 from blackjax.vi.pathfinder import approximate
-from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.mode_search import penalty
@@ -25,15 +24,15 @@ from bayesreg.inference.gaussian.whitened import (
     whitened,
 )
 from bayesreg.inference.kernel import Sampler, Say
-from bayesreg.inference.layout import unravel
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.inference.target import Target, logdensity, without_walls
 from bayesreg.types import AnyArray, InputError
 
 # Pathfinder: L-BFGS iterations, and draws by which the approximations along its path are judged.
 ITERATIONS, JUDGES = 30, 8
 
 
-def laplace_sampler(target: SmoothTarget, mode_search: str = "once") -> Sampler:
+def laplace_sampler(target: Target, mode_search: str = "once") -> Sampler:
     """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
 
     return about_reference(target, _turn, begin=_begin, mode_search=mode_search, exact=False)
@@ -49,7 +48,7 @@ def _begin(position: AnyArray, _density: Callable[[AnyArray], AnyArray]) -> _Pla
     return _Place(position)
 
 
-def _turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: _Place) -> tuple[_Place, Moved]:
+def _turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: _Place) -> tuple[_Place, Moved]:
     momentum = jax.random.normal(key, state.position.shape)
     position, _ = rotated(setup.walls, clearance_of(target, data, setup), state.position, momentum, jnp.pi / 2)
     # A turn that was not over in time is refused, as everywhere.
@@ -57,7 +56,7 @@ def _turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: _
     return _Place(jnp.where(done, position, state.position)), Moved(done.astype(float), diverging=~done)
 
 
-def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
+def pathfinder(target: Target, mode_search: str = "once") -> Sampler:
     """As `laplace`, from Pathfinder's Gaussian (Zhang et al. 2022): that of the greatest evidence bound on a path.
 
     The path is that of L-BFGS in the coordinates that Laplace's approximation whitens, from an overdispersed start; the
@@ -67,8 +66,7 @@ def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
 
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         setup, starts = about_mode.prepare(points, key, say)
-        first = target.unconstrain_of(target.data, jax.tree.map(lambda x: x[0], starts))
-        flat = ravel_pytree(first)[0]
+        flat = flat_position(target, target.data, jax.tree.map(lambda x: x[0], starts))
         path = _path(
             target, about_mode.data(setup), setup.reference, whitened(setup.reference, flat), jax.random.fold_in(key, 0)
         )
@@ -83,12 +81,12 @@ def pathfinder(target: SmoothTarget, mode_search: str = "once") -> Sampler:
 
 
 @partial(jax.jit, static_argnums=0)
-def _path(target: SmoothTarget, data: Any, reference: Reference, start: AnyArray, key: AnyArray) -> Any:
+def _path(target: Target, data: Any, reference: Reference, start: AnyArray, key: AnyArray) -> Any:
     """Evidence bound, mean and covariance in whitened coordinates."""
 
     def density(xi: AnyArray) -> AnyArray:
         position = unravel(target)(reference.place(xi))
-        height = target.logdensity_of(target.without_walls(data), position)
+        height = logdensity(target, without_walls(target, data), position)
         return height - penalty(target, data, position["u_boundary"])
 
     best, _ = approximate(key, density, start, JUDGES, maxiter=ITERATIONS)

@@ -13,18 +13,18 @@ from bayesreg.inference.gaussian.reflection import reflective_microcanonical, re
 from bayesreg.inference.gaussian.warm_up import Tuning
 from bayesreg.inference.gaussian.whitened import Moved, Setup, about_reference, clearance_of, whitened_density
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray
 
 
-def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
+def hmc(target: Target, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
     """Hamiltonian Monte Carlo: a quarter turn about the Gaussian reference, in as many steps as acceptance asks for.
 
     All steps of a trajectory are longer or shorter by up to a fifth, at random.
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     warm_up : int
         Transitions in which the step size is tuned and that are not kept.
     target_acceptance : float
@@ -37,7 +37,7 @@ def hmc(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75
     return about_reference(target, _quarter_turn, tuning, mode_search=mode_search, alone=LOOSE)
 
 
-def _quarter_turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
     key_step, key_move = jax.random.split(key)
     kernel = blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
     density = whitened_density(target, data, setup)
@@ -46,13 +46,13 @@ def _quarter_turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, 
     return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
 
-def nuts(target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:
+def nuts(target: Target, warm_up: int = 80, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:
     """The No-U-Turn sampler about the Gaussian reference; its settings are those of `hmc`."""
 
     return about_reference(target, _no_u_turn, Tuning(warm_up, target_acceptance), mode_search=mode_search)
 
 
-def _no_u_turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+def _no_u_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
     kernel = blackjax.mcmc.nuts.build_kernel(reflective_rotation(setup.walls, clearance_of(target, data, setup)))
     density = whitened_density(target, data, setup)
     unit = jnp.ones_like(state.position)
@@ -60,9 +60,7 @@ def _no_u_turn(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, sta
     return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
 
-def mclmc(
-    target: SmoothTarget, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once"
-) -> Sampler:
+def mclmc(target: Target, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
     """Microcanonical trajectories with a Metropolis test (adjusted MCLMC); its settings are those of `hmc`.
 
     The speed is one whatever the density, so that a time of √d does what a time of one does in `hmc`.
@@ -72,7 +70,7 @@ def mclmc(
     return about_reference(target, _microcanonical, tuning, mode_search=mode_search)
 
 
-def _microcanonical(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+def _microcanonical(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
     key_step, key_move = jax.random.split(key)
     kernel = blackjax.mcmc.adjusted_mclmc.build_kernel(
         reflective_microcanonical(setup.walls, clearance_of(target, data, setup))

@@ -23,23 +23,21 @@ from bayesreg.inference.gaussian.whitened import (
     whitened_density,
 )
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray
 
 # Steps of a random walk shrink with the square root of the dimension, and with what refuses them.
 LEAST = 1e-4
 
 
-def mala(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.574, mode_search: str = "once"
-) -> Sampler:
+def mala(target: Target, warm_up: int = 500, target_acceptance: float = 0.574, mode_search: str = "once") -> Sampler:
     """The Metropolis-adjusted Langevin algorithm: Hamiltonian Monte Carlo of a single leapfrog step (Neal 2011).
 
     Written so, it has a momentum that the skull can reflect.
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     warm_up : int
         Transitions in which the step size is tuned and that are not kept.
     target_acceptance : float
@@ -51,16 +49,14 @@ def mala(
     return about_reference(target, _leapfrog, Tuning(warm_up, target_acceptance, LEAST), mode_search=mode_search)
 
 
-def _leapfrog(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+def _leapfrog(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
     kernel = blackjax.mcmc.hmc.build_kernel(reflective_leapfrog(setup.walls, clearance_of(target, data, setup)))
     density = whitened_density(target, data, setup)
     state, info = kernel(key, state, density, setup.step_size, jnp.ones_like(state.position), 1)
     return state, Moved(info.acceptance_rate, info.is_divergent, gradients=1)
 
 
-def barker(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.4, mode_search: str = "once"
-) -> Sampler:
+def barker(target: Target, warm_up: int = 500, target_acceptance: float = 0.4, mode_search: str = "once") -> Sampler:
     """Barker's proposal, whose gradient decides on signs alone (Livingstone and Zanella 2022); settings of `mala`.
 
     It has no momentum: a proposal in the skull is refused.
@@ -70,7 +66,7 @@ def barker(
     return about_reference(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=mode_search)
 
 
-def _barker(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+def _barker(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
     density = whitened_density(target, data, setup)
     state, info = blackjax.mcmc.barker.build_kernel()(key, state, density, setup.step_size)
     # Outside the support the gradient, and with it the acceptance, may be NaN, which the kernel refuses.
@@ -79,7 +75,7 @@ def _barker(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state:
 
 
 def rwmh_adaptive(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
+    target: Target, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
 ) -> Sampler:
     """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned; settings of `mala`.
 
@@ -91,9 +87,7 @@ def rwmh_adaptive(
     return about_reference(target, transition, tuning, random_walk.init, whitened_density, mode_search)
 
 
-def pcn(
-    target: SmoothTarget, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
-) -> Sampler:
+def pcn(target: Target, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once") -> Sampler:
     """Preconditioned Crank–Nicolson on the Gaussian reference (Cotter et al. 2013); its settings are those of `mala`.
 
     ξ′ = cos β ξ + sin β p with p Normal is a rotation, reflected by the skull. It leaves the reference, cut off there,
@@ -108,7 +102,7 @@ def pcn(
 def _symmetric(motion: Callable, density: Density) -> Transition:
     """A motion with a Normal momentum for the time of a step, accepted with the ratio of a density."""
 
-    def transition(target: SmoothTarget, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
+    def transition(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
         def proposal(key: AnyArray, position: AnyArray) -> AnyArray:
             momentum = jax.random.normal(key, position.shape)
             return motion(setup.walls, clearance_of(target, data, setup), position, momentum, setup.step_size)[0]
@@ -119,7 +113,7 @@ def _symmetric(motion: Callable, density: Density) -> Transition:
     return transition
 
 
-def against_reference(target: SmoothTarget, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
+def against_reference(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ) − log N(ξ; 0, I), up to a constant."""
     density = whitened_density(target, data, setup)
     return lambda xi: density(xi) + 0.5 * (xi @ xi)

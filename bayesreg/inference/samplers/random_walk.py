@@ -39,7 +39,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
     for name, value in sigma.items():
         if not value > 0:
             raise InputError(f"the step of {name} must be positive, got {value}")
-    warm = [name for name in target.estimands(target.reference()) if name not in sigma]
+    warm = [name for name in target.coordinates.reference() if name not in sigma]
     if warm:
         raise InputError(f"rwmh has no step for {', '.join(sorted(warm))}; use the sampler hmc")
 
@@ -85,7 +85,7 @@ def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_
         # The setup is where the chains start, on average: the data are prepared for that neighbourhood.
         prepare=lambda points, _key, _say: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
         data=lambda start: target.conditioned(start, np.zeros(0, int)),
-        blank=lambda: target.estimands(target.reference()),
+        blank=lambda: target.coordinates.reference(),
         init=init,
         step=step,
         observe=lambda _data, _setup, state: Draw(state.kernel.position, state.evaluation),

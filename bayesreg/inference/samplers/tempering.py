@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
-from jax.flatten_util import ravel_pytree
 
 from bayesreg.inference.gaussian.reflection import reflective_rotation, rotated
 from bayesreg.inference.gaussian.whitened import (
@@ -21,8 +20,9 @@ from bayesreg.inference.gaussian.whitened import (
     whitened_position,
 )
 from bayesreg.inference.kernel import Sampler, Say
+from bayesreg.inference.layout import flat_position
 from bayesreg.inference.samplers.hamiltonian import hmc
-from bayesreg.inference.target import SmoothTarget
+from bayesreg.inference.target import Target, estimands_of
 from bayesreg.types import AnyArray, InputError
 
 # Quarter turns that spread the first particles; trajectories of each particle at each temperature; the share of the
@@ -31,7 +31,7 @@ _TURNS, _MOVES, _SHARE, _BATCH, _MOST = 20, 2, 0.7, 32, 500
 
 
 def smc(
-    target: SmoothTarget,
+    target: Target,
     particles: int = 128,
     spread: float = 2.0,
     warm_up: int = 80,
@@ -47,7 +47,7 @@ def smc(
 
     Parameters
     ----------
-    target : SmoothTarget
+    target : Target
     particles : int
         At least as many as chains.
     spread : float
@@ -66,20 +66,20 @@ def smc(
         setup, starts = chains_of.prepare(points, key, say)
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
-        one = target.unconstrain_of(data, jax.tree.map(lambda x: x[0], starts))
-        begin = whitened(setup.reference, ravel_pytree(one)[0])
+        one = jax.tree.map(lambda x: x[0], starts)
+        begin = whitened(setup.reference, flat_position(target, data, one))
         first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
         found, weights = _tempered(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
-        return setup, jax.vmap(partial(target.constrain_of, target.data))(positions)
+        return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
 
     return chains_of._replace(prepare=prepare)
 
 
 @partial(jax.jit, static_argnums=0)
 def _broad(
-    target: SmoothTarget, data: Any, setup: Setup, begin: AnyArray, spread: AnyArray | float, keys: AnyArray
+    target: Target, data: Any, setup: Setup, begin: AnyArray, spread: AnyArray | float, keys: AnyArray
 ) -> AnyArray:
     """Draws of N(0, spread² I) cut off by the skull: from a place in the support, by quarter turns."""
     clearance = clearance_of(target, data, setup)
@@ -96,7 +96,7 @@ def _broad(
 
 
 def _tempered(
-    target: SmoothTarget,
+    target: Target,
     data: Any,
     setup: Setup,
     spread: float,
@@ -122,7 +122,7 @@ def _tempered(
 
 @partial(jax.jit, static_argnums=0)
 def _rise(
-    target: SmoothTarget,
+    target: Target,
     data: Any,
     setup: Setup,
     spread: AnyArray | float,

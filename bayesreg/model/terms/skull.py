@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
@@ -45,6 +45,21 @@ class Skull(NamedTuple):
     ) -> Float[AnyArray, "*batch nodes"]:
         """Signed distance to Ω_SK, mm, of some rows of "u_boundary" displaced by u."""
         return self.distance(self.points[nodes] + u)
+
+
+class Walls:
+    """The skull, as the samplers see it (`bayesreg.inference.target.Walls`); the data are a `Problem`."""
+
+    def clearance(
+        self, data: Any, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
+    ) -> Float[AnyArray, "*batch nodes"]:
+        """See `Skull.clearance`; infinite in data without a skull."""
+        skull = data.terms.get("skull")
+        return jnp.full(u.shape[:-1], jnp.inf) if skull is None else skull.clearance(u, nodes)
+
+    def without(self, data: Any) -> Any:
+        """The data of the same problem without a skull."""
+        return data.without_term("skull")
 
 
 def is_allowed(distance: Interpolator, points: Float[AnyArray, "nodes 3"]) -> Bool[AnyArray, "nodes"]:

@@ -1,0 +1,80 @@
+"""A problem prepared for chains near some estimands: where solves are fast, and how single nodes move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
+from bayesreg.fem.multigrid import Multigrid
+from bayesreg.image import Interpolation
+from bayesreg.model.blocks import LAME, Values
+from bayesreg.model.coordinates import completed
+from bayesreg.model.neighbourhood import neighbourhoods
+from bayesreg.model.program import Problem
+from bayesreg.model.single_node import images_of
+from bayesreg.model.state import StaticMesh
+from bayesreg.model.terms.images import ImagePair
+
+# Of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance can tell.
+CHAIN_TOLERANCE = 1e-6
+
+# Of the solves behind their slopes. A slope that is a little off, and the same at the same place, leaves what is
+# sampled as it is: it only proposes.
+CHAIN_ADJOINT_TOLERANCE = 1e-3
+
+# Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
+NEAR = 1e3
+
+
+def conditioned(problem: Problem, estimands: Values, alone: Int[np.ndarray, "k"]) -> Problem:
+    """The problem with solves for chains, preconditioned at these λ, μ and field.
+
+    (By a dense inverse, that is; a multigrid hierarchy stays that of the problem's own reference.) Solves end at
+    `CHAIN_TOLERANCE`. The nodes in the rows `alone` of "u_boundary" may be moved alone, see
+    `bayesreg.model.single_node`.
+    """
+    body, values = problem.body, completed(problem.blocks, estimands)
+    # A tissue that is next to nothing leaves K_II without a factor.
+    reference = {name: np.asarray(problem.blocks[name].reference()) for name in LAME}
+    near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
+    lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell({**values, **near}))
+    system = _conditioned_system(body.mesh, body.system, lam, mu)
+    around = None
+    if len(alone):
+        slots, at = np.asarray(body.slots)[alone], np.asarray(estimands["u_boundary"])[alone]
+        images = images_of(problem)
+        assert images is not None
+        around = neighbourhoods(body.mesh.mesh, system, images.quadrature, lam, mu, slots, alone, at)
+    return problem._replace(body=body._replace(system=system), neighbourhoods=around)
+
+
+def at_four_points(problem: Problem, observations: Mapping[str, Any], interpolation: Interpolation) -> Problem:
+    """The problem with its images compared at four points of each tetrahedron, whatever the model's quadrature."""
+    for name, pair in observations.items():
+        if isinstance(pair, ImagePair):
+            term = pair.at_four_points(problem.terms[name], problem.body.mesh.mesh, interpolation)
+            problem = problem.with_term(name, term)
+    return problem
+
+
+def _conditioned_system(mesh: StaticMesh, system: ElasticSystem, lam: np.ndarray, mu: np.ndarray) -> ElasticSystem:
+    if isinstance(system.preconditioner, Multigrid):
+        # Another reference has aggregates of its own, of other shapes, and everything would be compiled again.
+        return system._replace(
+            tolerance=jnp.asarray(CHAIN_TOLERANCE), adjoint_tolerance=jnp.asarray(CHAIN_ADJOINT_TOLERANCE)
+        )
+    return _kept_system(mesh, tuple(np.asarray(system.prescribed).tolist()), tuple(lam.tolist()), tuple(mu.tolist()))
+
+
+@lru_cache(maxsize=2)
+def _kept_system(
+    mesh: StaticMesh, prescribed: tuple[int, ...], lam: tuple[float, ...], mu: tuple[float, ...]
+) -> ElasticSystem:
+    tolerances = CHAIN_TOLERANCE, CHAIN_ADJOINT_TOLERANCE
+    return elastic_system(mesh.mesh, np.array(prescribed, int), np.array(lam), np.array(mu), *tolerances)

@@ -1,0 +1,91 @@
+"""The coordinates of a posterior: values, estimands and positions of all blocks together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Bool
+
+from bayesreg.model.blocks import Blocks, Values
+from bayesreg.types import AnyArray, Scalar
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """The map between estimands and positions, as the samplers see it (`bayesreg.inference.target.Coordinates`).
+
+    The `data` of its functions are a `Problem`, the posterior's own or a similar one.
+
+    Attributes
+    ----------
+    blocks : dict
+        The posterior's own.
+    """
+
+    blocks: Blocks
+
+    def reference(self) -> dict[str, AnyArray]:
+        """Estimands at rest."""
+        return estimands_of(self.blocks, reference_values(self.blocks))
+
+    def constrain(self, data: Any, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
+        """Estimands of a position, and the logarithm of the Jacobian."""
+        return constrained(data.blocks, position)
+
+    def unconstrain(self, data: Any, estimands: Values) -> dict[str, AnyArray]:
+        """Position of estimands; the inverse of `constrain`."""
+        return unconstrained(data.blocks, estimands)
+
+    def least_curvature(self, data: Any, position: Values) -> dict[str, AnyArray]:
+        """Curvature of −log density in every coordinate of which the data say next to nothing."""
+        blocks = sampled_blocks(data.blocks)
+        return {name: block.least_curvature(position[name]) for name, block in blocks.items()}
+
+
+def sampled_blocks(blocks: Blocks) -> Blocks:
+    """The blocks that have unknown entries."""
+    return {name: block for name, block in blocks.items() if block.is_sampled}
+
+
+def reference_values(blocks: Blocks) -> dict[str, AnyArray]:
+    """The value of every block at rest."""
+    return {name: block.reference() for name, block in blocks.items()}
+
+
+def filled(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
+    """Values in which blocks without unknowns that were left out are filled in."""
+    return {name: values[name] if name in values else block.reference() for name, block in blocks.items()}
+
+
+def completed(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
+    """The values of estimands: known entries and known blocks are filled in."""
+    return {
+        name: block.complete(estimands[name]) if block.is_sampled else block.reference()
+        for name, block in blocks.items()
+    }
+
+
+def estimands_of(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
+    """The sampled entries of values."""
+    return {name: block.estimand(values[name]) for name, block in sampled_blocks(blocks).items()}
+
+
+def constrained(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
+    """The estimands of a position, and the logarithm of the Jacobian."""
+    found = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
+    return {name: estimand for name, (estimand, _) in found.items()}, sum(log for _, log in found.values())
+
+
+def unconstrained(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
+    """The position of estimands."""
+    return {name: block.unconstrain(estimands[name]) for name, block in sampled_blocks(blocks).items()}
+
+
+def allowed(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
+    """Whether every value lies in the range of its prior."""
+    found = jnp.array(True)
+    for name, block in blocks.items():
+        found &= block.allows(values[name])
+    return found

@@ -1,0 +1,88 @@
+"""How draws of a posterior are shown to a reader: names, dimensions and labels, known entries included."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from bayesreg.mesh import TetMesh
+from bayesreg.model.blocks import LAME, Blocks, Values
+from bayesreg.model.coordinates import sampled_blocks
+from bayesreg.types import AnyArray
+
+DIMS = {
+    "u_boundary": ("node", "axis"),
+    "lam": ("tissue",),
+    "mu": ("tissue",),
+    "ratio": ("tissue",),
+    "field": ("mode",),
+    "points": ("point", "axis"),
+    "cells": ("cell", "corner"),
+    "tissue": ("cell",),
+    "boundary": ("node",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Variables:
+    """Names and labels as in xarray (`bayesreg.inference.target.Variables`).
+
+    Attributes
+    ----------
+    blocks : dict
+    mesh : TetMesh
+    nodes : (b,) int array
+        The sampled nodes.
+    entry_names : sequence of str
+        What the entries of λ and μ stand for.
+    """
+
+    blocks: Blocks
+    mesh: TetMesh
+    nodes: Int[np.ndarray, "sampled"]
+    entry_names: Sequence[str]
+
+    @property
+    def dims(self) -> Mapping[str, Sequence[str]]:
+        """The dimensions of each variable and constant, without chain and draw."""
+        return DIMS
+
+    @property
+    def coords(self) -> dict[str, Any]:
+        """The labels along "node", "axis" and "tissue"."""
+        return {"node": np.asarray(self.nodes), "axis": list("xyz"), "tissue": list(self.entry_names)}
+
+    @property
+    def constants(self) -> dict[str, AnyArray]:
+        """Points (mm), cells, tissue of every cell and the sampled nodes."""
+        mesh = self.mesh
+        return {"points": mesh.points, "cells": mesh.cells, "tissue": mesh.tissue, "boundary": self.nodes}
+
+    def values(self, estimands: Values) -> dict[str, np.ndarray]:
+        """u_B, all entries of λ, μ and λ/μ, and what else is sampled; arrays may have leading axes.
+
+        They are made on the host: there may be many draws.
+        """
+        found = {"u_boundary": np.asarray(estimands["u_boundary"])}
+        leading = found["u_boundary"].shape[:-2]
+        for name in LAME:
+            block = self.blocks[name]
+            found[name] = np.tile(np.asarray(block.reference()), (*leading, 1))
+            if block.is_sampled:
+                found[name][..., block.free.index] = estimands[name]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found["ratio"] = found["lam"] / found["mu"]
+        others = (name for name in self.blocks if name in estimands and name not in found)
+        return found | {name: np.asarray(estimands[name]) for name in others}
+
+    def estimands(self, values: Values) -> dict[str, np.ndarray]:
+        """The sampled entries of such values."""
+        found = {}
+        for name, block in sampled_blocks(self.blocks).items():
+            value = np.asarray(values[name])
+            found[name] = value[..., block.free.index] if name in LAME else value
+        return found
