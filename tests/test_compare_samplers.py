@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import bayesreg as br
 from bayesreg.cli import app
-from bayesreg.config.sections import sampler_section
+from bayesreg.config.samplers import sampler_section
 from bayesreg.inference.samplers.registry import SAMPLERS
 from bayesreg.workflow.compare_samplers import compare_samplers
 from tests.test_pipeline import anatomy, folder  # noqa: F401

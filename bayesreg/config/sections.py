@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
     BaseModel,
@@ -12,11 +12,11 @@ from pydantic import (
     ConfigDict,
     Field,
     StrictBool,
-    TypeAdapter,
     ValidationInfo,
     field_validator,
 )
 
+from bayesreg.config.samplers import Hmc, SamplerConfig, name_hmc_where_unnamed
 from bayesreg.config.values import (
     Count,
     Direction,
@@ -151,100 +151,6 @@ class MeshConfig(Section):
     """A mesh (.vtu) made earlier; the other entries are then left alone."""
 
 
-class _Sampler(Section):
-    chains: Count = 4
-    thin: Count = 1
-    """Every how many transitions a draw is kept."""
-    block: Count | None = None
-    """Kept draws between two looks at the stop rule; null is 100, and fewer where many quadrature points make steps
-    slow."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What is the sampler's own, where it is given."""
-        return self.model_dump(exclude={"name", *_Sampler.model_fields}, exclude_none=True)
-
-
-class _AboutMode(_Sampler):
-    mode_search: Literal["once", "per_chain"] = "once"
-    """once: one mode, from the mean of the chains' starts; per_chain: one from the start of each, at as many times the
-    cost, and where they differ chains start about their own."""
-
-
-class _Tuned(_AboutMode):
-    warm_up: Count = 80
-    """Transitions that tune the step size and are not kept."""
-    target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
-    """Acceptance towards which the step size is tuned; null takes the sampler's own: 0.8 for nuts, 0.75 for the
-    others."""
-
-
-class Hamiltonian(_Tuned):
-    """Gradients, in coordinates whitened at the mode, trajectories reflected by the skull; see docs/samplers.md."""
-
-    name: Literal["hmc", "nuts", "mclmc"] = "hmc"
-    """hmc: Hamiltonian Monte Carlo with trajectories of a quarter turn; nuts: the No-U-Turn sampler; mclmc: adjusted
-    microcanonical trajectories."""
-
-
-class Local(_AboutMode):
-    """One evaluation a transition, in coordinates whitened at the mode; see docs/samplers.md."""
-
-    name: Literal["mala", "barker", "rwmh_adaptive", "pcn"]
-    """With gradients mala (Langevin) and barker, without rwmh_adaptive (random walk) and pcn (Crank–Nicolson)."""
-    thin: Count = 10
-    """Every how many transitions a draw is kept."""
-    warm_up: Count = 500
-    """Transitions that tune the step size and are not kept."""
-    target_acceptance: Annotated[float, Field(strict=True, gt=0, lt=1)] | None = None
-    """Acceptance towards which the step size is tuned; null takes what is best for the kernel in many dimensions: 0.574
-    for mala, 0.4 for barker, 0.234 for the others."""
-
-
-class Tempered(_Tuned):
-    """Particles tempered from a broad Gaussian into the posterior; chains start there and go on as with hmc."""
-
-    name: Literal["smc"]
-    particles: Count = 128
-    """Many: they are what finds several modes and weighs them."""
-    spread: Annotated[float, Field(strict=True, ge=1)] = 2.0
-    """How much wider than Laplace's approximation the first distribution is."""
-
-
-class Approximation(_AboutMode):
-    """Draws from a Gaussian about the mode, cut off by the skull: a quick look, approximate."""
-
-    name: Literal["laplace", "pathfinder"]
-    """laplace: the curvature at the mode; pathfinder: the Gaussian of the greatest evidence bound on the way there."""
-
-
-class RandomWalk(_Sampler):
-    """Random-walk Metropolis with the three Normal kernels of the paper."""
-
-    name: Literal["rwmh"]
-    chains: Count = 3
-    thin: Count = 10
-    """Every how many steps a draw is kept."""
-    sigma_u: Positive = 0.008
-    """Sd of a step of each sampled displacement, mm."""
-    sigma_lam: Positive = 0.03
-    """Sd of a step of each λ."""
-    sigma_mu: Positive = 0.003
-    """Sd of a step of each μ."""
-
-
-SamplerConfig = Hamiltonian | Local | Tempered | Approximation | RandomWalk
-
-
-def sampler_section(name: str) -> SamplerConfig:
-    """The section of a sampler by its name, with default settings."""
-    return TypeAdapter(Annotated[SamplerConfig, Field(discriminator="name")]).validate_python({"name": name})
-
-
-def _hamiltonian_if_unnamed(value: object) -> object:
-    return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value
-
-
 class StartConfig(Section):
     """Where the chains start."""
 
@@ -326,8 +232,8 @@ class Config(Section):
     sampler: Annotated[
         SamplerConfig,
         Field(discriminator="name"),
-        BeforeValidator(_hamiltonian_if_unnamed),
-    ] = Hamiltonian()
+        BeforeValidator(name_hmc_where_unnamed),
+    ] = Hmc()
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()

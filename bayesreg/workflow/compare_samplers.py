@@ -8,7 +8,8 @@ from pathlib import Path
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
-from bayesreg.config.sections import StopConfig, sampler_section
+from bayesreg.config.samplers import sampler_section
+from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.efficiency import Budget, Efficiency, efficiency
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.samplers.registry import SAMPLERS

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 
 import bayesreg as br
-from bayesreg.inference.samplers.registry import SAMPLERS, chosen_sampler
+from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.io import store
 from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_samplers import PAPERS_THIN, block_from
@@ -78,7 +78,7 @@ def estimands_of(posterior, draws):
 
 def papers_acceptance(posterior, draws):
     """Mean over the posterior of the probability that a step is accepted, and the share of steps in the support."""
-    kernel, places = SAMPLERS["rwmh"](posterior), estimands_of(posterior, draws)
+    kernel, places = choose_sampler("rwmh", posterior).sampler, estimands_of(posterior, draws)
 
     @jax.jit
     def tried(data, place, keys):
@@ -100,7 +100,7 @@ def papers_speed(posterior, draws):
     """Steps per second of each of three chains, from draws of the posterior, in blocks as a run makes them."""
     last = jax.tree.map(lambda x: x[-CHAINS:], estimands_of(posterior, draws))
     setup = jax.tree.map(lambda x: x.mean(axis=0), last)
-    block = block_from(chosen_sampler("rwmh", posterior, {}), setup, last, STEPS_TIMED // PAPERS_THIN, PAPERS_THIN)
+    block = block_from(choose_sampler("rwmh", posterior), setup, last, STEPS_TIMED // PAPERS_THIN, PAPERS_THIN)
     return STEPS_TIMED / _median(block)
 
 

@@ -21,7 +21,7 @@ import bayesreg as br
 from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.run import _first, checkpoint_from_arrays
-from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, chosen_sampler
+from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, choose_sampler
 from bayesreg.io import store
 from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
@@ -68,7 +68,7 @@ def block_from(chosen: Chosen, setup: Any, places: dict[str, jax.Array], draws: 
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "smc"])
 def bench_draw(name: str, finished: Finished, timed: Any) -> None:
     posterior, end, places = finished
-    sampler = chosen_sampler(name, posterior, {})
+    sampler = choose_sampler(name, posterior)
     setup = jax.tree.map(lambda x: x.mean(axis=0), places) if name == "rwmh" else end.setup
     count, thin = (STEPS, PAPERS_THIN) if name == "rwmh" else (DRAWS, 1)
     block = block_from(sampler, setup, places, count // thin, thin)

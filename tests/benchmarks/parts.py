@@ -28,7 +28,7 @@ from bayesreg.inference.gaussian.loose import moved_alone
 from bayesreg.inference.gaussian.reflection import rotated
 from bayesreg.inference.gaussian.whitened import clearance_of, whitened_density, whitened_position
 from bayesreg.inference.samplers.hamiltonian import _quarter_turn
-from bayesreg.inference.samplers.registry import chosen_sampler
+from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
 from bayesreg.model.coordinates import completed
@@ -56,7 +56,7 @@ def main() -> None:
         parser.error("RUN must be a run of hmc that has begun, with Gaussian noise and without a field of stiffness")
     arrays.pop("blocks")
     end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
-    sampler = chosen_sampler(options.name, posterior, options.settings).sampler
+    sampler = choose_sampler(options.name, posterior, **options.settings).sampler
     data, setup = sampler.data(end.setup), end.setup
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled, {int(setup.steps)} gradients a draw")
     print(f"\nA draw, {options.chains} chains")

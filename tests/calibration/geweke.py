@@ -19,7 +19,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.inference.samplers.registry import choose_sampler
 from tests.calibration.chains import (
     ALONE,
     BATCH,
@@ -79,7 +79,7 @@ def compare(
     """Moments of a kernel's chains against those where they start; a posterior not the simulator's own is an error."""
     posterior = simulator.posterior if posterior is None else posterior
     first = of_posterior(posterior, simulator.draw_prior(np.random.default_rng(seed), chains))
-    kernel = SAMPLERS[sampler](posterior, **(RANDOM_WALK if sampler == "rwmh" else {}))
+    kernel = choose_sampler(sampler, posterior, **(RANDOM_WALK if sampler == "rwmh" else {})).sampler
     setup, data = None, conditioned(posterior)
     if sampler != "rwmh":
         reference = prior_reference(simulator, posterior)

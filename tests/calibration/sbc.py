@@ -27,7 +27,7 @@ from bayesreg.inference.gaussian.mode_search import settled
 from bayesreg.inference.gaussian.reflection import rotated
 from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whitened, whitened_position
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
 from tests.calibration.chains import (
     ALONE,
@@ -173,7 +173,7 @@ def _chains(
     say: Say,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Quantities (draw, r, k) after the warm-up, and the mean acceptance of each replication."""
-    kernel = SAMPLERS[sampler](posterior)
+    kernel = choose_sampler(sampler, posterior).sampler
     say("a mode for each replication")
     problems = [replace(posterior, data=observing(posterior.data, f)) for f in observed]
     modes = _modes(problems, starts)

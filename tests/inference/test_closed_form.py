@@ -18,7 +18,7 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.whitened import setup_about
-from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.inference.samplers.registry import choose_sampler
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, linear_image, rotated_affine, smooth_image
 
@@ -247,7 +247,7 @@ class TestEverySamplerFromExactDraws:
         setup = setup_about(posterior, about, about.centre)._replace(
             step_size=jnp.asarray(size), steps=jnp.asarray(steps)
         )
-        kernel = SAMPLERS[name](posterior)
+        kernel = choose_sampler(name, posterior).sampler
 
         @jax.jit
         def run(data, setup, points, keys):

@@ -13,7 +13,7 @@ import pytest
 from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.devices import devices_for, require_joined, side_by_side
 from bayesreg.inference.chains.run import first_checkpoint, sample
-from bayesreg.inference.samplers.registry import chosen_sampler
+from bayesreg.inference.samplers.registry import choose_sampler
 from tests.inference.gaussians import GaussianTarget
 from tests.model.test_equality import posterior
 
@@ -25,7 +25,7 @@ def found(sampler):
     target = GaussianTarget() if sampler == "hmc" else posterior()
     settings = {} if sampler == "rwmh" else {"warm_up": 5}
     chosen, begun = (
-        chosen_sampler(sampler, target, settings),
+        choose_sampler(sampler, target, settings),
         first_checkpoint(target, sampler, CHAINS, 0, **settings),
     )
     data = chosen.sampler.data(begun.setup)

@@ -18,6 +18,7 @@ from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delayed, st
 from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.kernel import Info
 from bayesreg.inference.samplers.hamiltonian import hmc
+from bayesreg.inference.samplers.settings import Hmc
 from bayesreg.inference.target import estimands_of
 from tests.phantoms import box_mesh, smooth_image
 
@@ -112,7 +113,7 @@ def test_draws_are_of_the_density_with_the_normaliser(slope, curvature):
 
 def test_a_chain_knows_the_whole_density_where_it_stands():
     post = posterior()
-    sampler = hmc(post)
+    sampler = hmc(post, Hmc())
     estimands = post.estimands(post.reference())
     flat = jax.flatten_util.ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0]
     reference = Reference(flat, 0.05 * jnp.eye(len(flat)))
@@ -141,7 +142,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 def test_the_stand_in_is_about_the_centre_that_the_warm_up_ends_with():
     post = posterior()
     points = starting_points(post, br.Start(), 2, jax.random.key(0))
-    setup, _ = hmc(post, warm_up=2).prepare(points, jax.random.key(1), lambda text: None)
+    setup, _ = hmc(post, Hmc(warm_up=2)).prepare(points, jax.random.key(1), lambda text: None)
     expected = stand_in(post, setup.reference, setup.middle)
     np.testing.assert_allclose(setup.stand_in.slope, expected.slope, rtol=1e-9)
     np.testing.assert_allclose(setup.stand_in.curvature, expected.curvature, rtol=1e-6, atol=1e-9)

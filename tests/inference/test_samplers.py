@@ -1,6 +1,5 @@
 """Every sampler of the registry on a small Gaussian behind a wall; `test_closed_form` has them on a real posterior."""
 
-import inspect
 from functools import cache
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.config.sections import sampler_section
+from bayesreg.config.samplers import sampler_section
 from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.chains.run import checkpoint_from_arrays
 from bayesreg.inference.gaussian import loose, whitened
@@ -20,7 +19,7 @@ from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.modes import distance, search_modes
 from bayesreg.inference.gaussian.whitened import Moved, about_reference, setup_about
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.inference.samplers.registry import SAMPLERS, choose_sampler
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 
 # Steps at which a good part of the proposals is refused: only then does the test of acceptance matter.
@@ -62,13 +61,13 @@ def after_steps(name: str, alone: Any = ()) -> np.ndarray:
     """Where chains from exact draws are after some transitions, in which samplers that do so move some nodes alone."""
     size, steps = STEPS[name]
     if name == "rwmh":
-        kernel, setup = SAMPLERS[name](target(), sigma_u=size), None
+        kernel, setup = choose_sampler(name, target(), sigma_u=size).sampler, None
     else:
         setup = setup_about(target(), poor_reference(), poor_reference().centre)
         seen = np.moveaxis(exact()[CHAINS:][:300, alone], 1, 0)
         nodes = loose.loose(poor_reference(), 0, np.asarray(alone, int), seen)
         setup = setup._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps), loose=nodes)
-        kernel = nodes_alone() if name == "nodes alone" else SAMPLERS[name](target())
+        kernel = nodes_alone() if name == "nodes alone" else choose_sampler(name, target()).sampler
 
     @jax.jit
     def run(data, setup, points, keys):
@@ -107,7 +106,9 @@ def test_the_statistics_tell_a_slightly_different_distribution():
 
 def test_every_exact_sampler_is_looked_at():
     """All but smc, which moves by hmc's kernel."""
-    assert {name for name, make in SAMPLERS.items() if make(target()).exact} == {*STEPS, "smc"} - {"nodes alone"}
+    assert {name for name in SAMPLERS if choose_sampler(name, target()).sampler.exact} == {*STEPS, "smc"} - {
+        "nodes alone"
+    }
 
 
 @pytest.mark.slow
@@ -296,6 +297,10 @@ def test_places_have_the_density_that_is_said():
 
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_settings_left_out_are_the_same_from_a_configuration_and_from_python(name):
-    defaults = {key: given.default for key, given in inspect.signature(SAMPLERS[name]).parameters.items()}
-    for key, value in sampler_section(name).settings.items():
-        assert value == defaults[key], key
+    assert SAMPLERS[name].settings(**sampler_section(name).settings) == SAMPLERS[name].settings()
+
+
+def test_the_best_known_acceptances_are_the_defaults():
+    """Roberts and Rosenthal (1998, 2001), Livingstone and Zanella (2022), Hoffman and Gelman (2014)."""
+    best = {"rwmh_adaptive": 0.234, "pcn": 0.234, "barker": 0.4, "mala": 0.574, "hmc": 0.75, "nuts": 0.8}
+    assert {name: SAMPLERS[name].settings().target_acceptance for name in best} == best

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 import bayesreg as br
 from bayesreg.inference.gaussian.laplace import laplace
 from bayesreg.inference.gaussian.whitened import setup_about
-from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.inference.samplers.registry import choose_sampler
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -45,7 +45,7 @@ def chains():
     estimands = post.estimands(post.reference())
     flat = np.asarray(ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0])
     setup = setup_about(post, laplace(post, flat), flat)._replace(step_size=jnp.asarray(0.3), steps=jnp.asarray(5))
-    kernel = SAMPLERS["hmc"](post)
+    kernel = choose_sampler("hmc", post).sampler
 
     @jax.jit
     def draws(data):
@@ -86,7 +86,7 @@ def test_slopes_a_million_times_as_exact_are_accepted_no_more_often():
 def test_steps_of_the_papers_kernel_are_as_probable_as_exact_ones():
     """Its solves begin at the chain's present displacement, and end as early as those of the others."""
     post, count = posterior(), 200
-    kernel = SAMPLERS["rwmh"](post, sigma_u=0.05)
+    kernel = choose_sampler("rwmh", post, sigma_u=0.05).sampler
     start = post.estimands(post.reference())
     near = kernel.data(start)
     exact = with_tolerances(near, 1e4, 1)

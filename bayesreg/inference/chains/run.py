@@ -22,7 +22,7 @@ from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_inference_data
 from bayesreg.inference.draws.moments import pooled, scale_reduction, zero_moments
 from bayesreg.inference.kernel import Draw
-from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, chosen_sampler
+from bayesreg.inference.samplers.registry import Chosen, choose_sampler
 from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 
@@ -122,13 +122,11 @@ def sample(
     InputError
         If an option is out of range, a chain cannot start, or those to resume are not where their draws end.
     """
-    if sampler not in SAMPLERS:
-        raise InputError(f"unknown sampler {sampler!r}; there are {', '.join(SAMPLERS)}")
     for name, value in {"chains": chains, "draws": draws, "thin": thin, "block": block}.items():
         if value < 1:
             raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
-    chosen = chosen_sampler(sampler, posterior, settings)
+    chosen = choose_sampler(sampler, posterior, **settings)
     began = time.perf_counter()
     if resume is None:
         checkpoint = from_first(first_checkpoint(posterior, sampler, chains, seed, start, **settings))
@@ -171,7 +169,7 @@ def first_checkpoint(
     key_start, _ = jax.random.split(jax.random.key(seed))
     points = starting_points(posterior, start or Start(), chains, key_start)
     require_numbers(points)
-    chosen = chosen_sampler(sampler, posterior, settings)
+    chosen = choose_sampler(sampler, posterior, **settings)
     setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), say)
     data = chosen.sampler.data(setup)
     checkpoint = _first(chosen, data, setup, points)
@@ -189,7 +187,7 @@ def checkpoint_from_arrays(
     InputError
         If the arrays belong to another problem.
     """
-    chosen = chosen_sampler(sampler, posterior, settings)
+    chosen = choose_sampler(sampler, posterior, **settings)
     points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.coordinates.reference())
     expected = jax.eval_shape(partial(_first, chosen, posterior.data), chosen.sampler.blank(), points)
     leaves = [arrays[name] for name in sorted(arrays)]

@@ -11,7 +11,7 @@ from blackjax.adaptation.step_size import dual_averaging_adaptation
 
 from bayesreg.inference.kernel import Info, Say
 from bayesreg.inference.target import Estimands
-from bayesreg.types import AnyArray, InputError
+from bayesreg.types import AnyArray
 
 # The tuning of the step starts here, and is drawn to ten times as much.
 FIRST_STEP = 0.05
@@ -57,14 +57,6 @@ class Walking(Protocol):
 
     def estimands(self, data: Any, setup: Any, state: Any) -> dict[str, AnyArray]:
         """Where a chain is."""
-
-
-def require_sound(tuning: Tuning) -> None:
-    """Raise InputError where an option is out of range."""
-    if not 0 < tuning.acceptance < 1:
-        raise InputError(f"target_acceptance must lie between 0 and 1, got {tuning.acceptance}")
-    if tuning.warm_up < 1:
-        raise InputError(f"warm_up must be at least 1, got {tuning.warm_up}")
 
 
 def tuned(

@@ -22,7 +22,7 @@ from bayesreg.inference.gaussian.loose import Loose, loose, moved_alone, searche
 from bayesreg.inference.gaussian.modes import search_modes
 from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
 from bayesreg.inference.gaussian.reflection import Clearance, Walls, rotated, walls
-from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, require_sound, tuned
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, tuned
 from bayesreg.inference.kernel import Draw, Info, Sampler, Say
 from bayesreg.inference.layout import dimension, displacements, flat_position, node_count, unravel
 from bayesreg.inference.target import (
@@ -44,8 +44,6 @@ AVERAGED = 16
 
 # Laplace's approximation and the reflections keep eight dense matrices of the square of this: 9 GB.
 MOST_UNKNOWNS = 12_000
-
-MODE_SEARCHES = ("once", "per_chain")
 
 
 class Setup(NamedTuple):
@@ -216,12 +214,8 @@ def about_reference(
     Raises
     ------
     InputError
-        If an option is out of range, or the target has more than `MOST_UNKNOWNS` unknowns.
+        If the target has more than `MOST_UNKNOWNS` unknowns.
     """
-    if mode_search not in MODE_SEARCHES:
-        raise InputError(f"mode_search must be {' or '.join(MODE_SEARCHES)}, got {mode_search!r}")
-    if tuning is not None:
-        require_sound(tuning)
     alone = 0 if target.single_nodes is None else min(alone, node_count(target))
     unknowns = dimension(target)
     if unknowns > MOST_UNKNOWNS:

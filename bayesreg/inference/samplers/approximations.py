@@ -25,6 +25,7 @@ from bayesreg.inference.gaussian.whitened import (
 )
 from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.inference.samplers.settings import Laplace, Pathfinder
 from bayesreg.inference.target import Target, logdensity, without_walls
 from bayesreg.types import AnyArray, InputError
 
@@ -32,10 +33,9 @@ from bayesreg.types import AnyArray, InputError
 ITERATIONS, JUDGES = 30, 8
 
 
-def laplace_sampler(target: Target, mode_search: str = "once") -> Sampler:
+def laplace(target: Target, settings: Laplace) -> Sampler:
     """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
-
-    return about_reference(target, _turn, begin=_begin, mode_search=mode_search, exact=False)
+    return about_reference(target, _turn, begin=_begin, mode_search=settings.mode_search, exact=False)
 
 
 class _Place(NamedTuple):
@@ -56,13 +56,13 @@ def _turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: _Place)
     return _Place(jnp.where(done, position, state.position)), Moved(done.astype(float), diverging=~done)
 
 
-def pathfinder(target: Target, mode_search: str = "once") -> Sampler:
+def pathfinder(target: Target, settings: Pathfinder) -> Sampler:
     """As `laplace`, from Pathfinder's Gaussian (Zhang et al. 2022): that of the greatest evidence bound on a path.
 
     The path is that of L-BFGS in the coordinates that Laplace's approximation whitens, from an overdispersed start; the
     skull is soft there, and cuts off the draws.
     """
-    about_mode = laplace_sampler(target, mode_search)
+    about_mode = laplace(target, Laplace(mode_search=settings.mode_search))
 
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         setup, starts = about_mode.prepare(points, key, say)

@@ -13,28 +13,18 @@ from bayesreg.inference.gaussian.reflection import reflective_microcanonical, re
 from bayesreg.inference.gaussian.warm_up import Tuning
 from bayesreg.inference.gaussian.whitened import Moved, Setup, about_reference, clearance_of, whitened_density
 from bayesreg.inference.kernel import Sampler
+from bayesreg.inference.samplers.settings import Hmc, Mclmc, Nuts
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray
 
 
-def hmc(target: Target, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
+def hmc(target: Target, settings: Hmc) -> Sampler:
     """Hamiltonian Monte Carlo: a quarter turn about the Gaussian reference, in as many steps as acceptance asks for.
 
     All steps of a trajectory are longer or shorter by up to a fifth, at random.
-
-    Parameters
-    ----------
-    target : Target
-    warm_up : int
-        Transitions in which the step size is tuned and that are not kept.
-    target_acceptance : float
-        Between 0 and 1.
-    mode_search : str
-        "once" or "per_chain".
     """
-
-    tuning = Tuning(warm_up, target_acceptance, quarter_turns=True)
-    return about_reference(target, _quarter_turn, tuning, mode_search=mode_search, alone=LOOSE)
+    tuning = Tuning(settings.warm_up, settings.target_acceptance, quarter_turns=True)
+    return about_reference(target, _quarter_turn, tuning, mode_search=settings.mode_search, alone=LOOSE)
 
 
 def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -46,10 +36,10 @@ def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state:
     return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
 
-def nuts(target: Target, warm_up: int = 80, target_acceptance: float = 0.8, mode_search: str = "once") -> Sampler:
-    """The No-U-Turn sampler about the Gaussian reference; its settings are those of `hmc`."""
-
-    return about_reference(target, _no_u_turn, Tuning(warm_up, target_acceptance), mode_search=mode_search)
+def nuts(target: Target, settings: Nuts) -> Sampler:
+    """The No-U-Turn sampler about the Gaussian reference."""
+    tuning = Tuning(settings.warm_up, settings.target_acceptance)
+    return about_reference(target, _no_u_turn, tuning, mode_search=settings.mode_search)
 
 
 def _no_u_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -60,14 +50,13 @@ def _no_u_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: An
     return state, Moved(info.acceptance_rate, info.is_divergent, gradients=info.num_integration_steps)
 
 
-def mclmc(target: Target, warm_up: int = 80, target_acceptance: float = 0.75, mode_search: str = "once") -> Sampler:
-    """Microcanonical trajectories with a Metropolis test (adjusted MCLMC); its settings are those of `hmc`.
+def mclmc(target: Target, settings: Mclmc) -> Sampler:
+    """Microcanonical trajectories with a Metropolis test (adjusted MCLMC).
 
     The speed is one whatever the density, so that a time of √d does what a time of one does in `hmc`.
     """
-
-    tuning = Tuning(warm_up, target_acceptance, quarter_turns=True)
-    return about_reference(target, _microcanonical, tuning, mode_search=mode_search)
+    tuning = Tuning(settings.warm_up, settings.target_acceptance, quarter_turns=True)
+    return about_reference(target, _microcanonical, tuning, mode_search=settings.mode_search)
 
 
 def _microcanonical(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:

@@ -23,6 +23,7 @@ from bayesreg.inference.gaussian.whitened import (
     whitened_density,
 )
 from bayesreg.inference.kernel import Sampler
+from bayesreg.inference.samplers.settings import Barker, Mala, Pcn, RwmhAdaptive
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray
 
@@ -30,23 +31,13 @@ from bayesreg.types import AnyArray
 LEAST = 1e-4
 
 
-def mala(target: Target, warm_up: int = 500, target_acceptance: float = 0.574, mode_search: str = "once") -> Sampler:
+def mala(target: Target, settings: Mala) -> Sampler:
     """The Metropolis-adjusted Langevin algorithm: Hamiltonian Monte Carlo of a single leapfrog step (Neal 2011).
 
     Written so, it has a momentum that the skull can reflect.
-
-    Parameters
-    ----------
-    target : Target
-    warm_up : int
-        Transitions in which the step size is tuned and that are not kept.
-    target_acceptance : float
-        Between 0 and 1; the default is the best in many dimensions (Roberts and Rosenthal 1998).
-    mode_search : str
-        "once" or "per_chain".
     """
-
-    return about_reference(target, _leapfrog, Tuning(warm_up, target_acceptance, LEAST), mode_search=mode_search)
+    tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
+    return about_reference(target, _leapfrog, tuning, mode_search=settings.mode_search)
 
 
 def _leapfrog(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -56,14 +47,13 @@ def _leapfrog(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any
     return state, Moved(info.acceptance_rate, info.is_divergent, gradients=1)
 
 
-def barker(target: Target, warm_up: int = 500, target_acceptance: float = 0.4, mode_search: str = "once") -> Sampler:
-    """Barker's proposal, whose gradient decides on signs alone (Livingstone and Zanella 2022); settings of `mala`.
+def barker(target: Target, settings: Barker) -> Sampler:
+    """Barker's proposal, whose gradient decides on signs alone (Livingstone and Zanella 2022).
 
     It has no momentum: a proposal in the skull is refused.
     """
-
-    tuning = Tuning(warm_up, target_acceptance, LEAST)
-    return about_reference(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=mode_search)
+    tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
+    return about_reference(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=settings.mode_search)
 
 
 def _barker(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -74,28 +64,26 @@ def _barker(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) 
     return state, Moved(jnp.nan_to_num(info.acceptance_rate), outside_support=outside, gradients=1)
 
 
-def rwmh_adaptive(
-    target: Target, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once"
-) -> Sampler:
-    """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned; settings of `mala`.
+def rwmh_adaptive(target: Target, settings: RwmhAdaptive) -> Sampler:
+    """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned.
 
     A step is a straight flight with a Normal momentum, reflected by the skull: back with the momentum reversed it
     takes the same way, so that the proposal is symmetric.
     """
+    tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
+    transition = _symmetric(shifted, whitened_density)
+    return about_reference(target, transition, tuning, random_walk.init, whitened_density, settings.mode_search)
 
-    tuning, transition = Tuning(warm_up, target_acceptance, LEAST), _symmetric(shifted, whitened_density)
-    return about_reference(target, transition, tuning, random_walk.init, whitened_density, mode_search)
 
-
-def pcn(target: Target, warm_up: int = 500, target_acceptance: float = 0.234, mode_search: str = "once") -> Sampler:
-    """Preconditioned Crank–Nicolson on the Gaussian reference (Cotter et al. 2013); its settings are those of `mala`.
+def pcn(target: Target, settings: Pcn) -> Sampler:
+    """Preconditioned Crank–Nicolson on the Gaussian reference (Cotter et al. 2013).
 
     ξ′ = cos β ξ + sin β p with p Normal is a rotation, reflected by the skull. It leaves the reference, cut off there,
     unchanged and is reversible, so that the test sees only the ratio of the posterior to the reference.
     """
-
-    tuning, transition = Tuning(warm_up, target_acceptance, LEAST), _symmetric(rotated, against_reference)
-    return about_reference(target, transition, tuning, random_walk.init, against_reference, mode_search)
+    tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
+    transition = _symmetric(rotated, against_reference)
+    return about_reference(target, transition, tuning, random_walk.init, against_reference, settings.mode_search)
 
 
 @cache

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayesreg.inference.kernel import Draw, Info, Sampler
+from bayesreg.inference.samplers.settings import RandomWalk
 from bayesreg.inference.target import Estimands, Target
 from bayesreg.types import AnyArray, InputError
 
@@ -21,24 +22,15 @@ class State(NamedTuple):
     evaluation: Any
 
 
-def rwmh(target: Target, sigma_u: float = 0.008, sigma_lam: float = 0.03, sigma_mu: float = 0.003) -> Sampler:
+def rwmh(target: Target, settings: RandomWalk) -> Sampler:
     """Random-walk Metropolis with the paper's three Normal kernels (eqs. 13 and 14), all proposed at once.
-
-    Parameters
-    ----------
-    target : Target
-    sigma_u, sigma_lam, sigma_mu : float
-        Standard deviations of the steps, positive: mm, and the unit of λ and μ.
 
     Raises
     ------
     InputError
-        If a standard deviation is not positive, or a temperature is to be sampled: the paper has no step for it.
+        If a temperature is to be sampled: the paper has no step for it.
     """
-    sigma = {"u_boundary": sigma_u, "lam": sigma_lam, "mu": sigma_mu}
-    for name, value in sigma.items():
-        if not value > 0:
-            raise InputError(f"the step of {name} must be positive, got {value}")
+    sigma = {"u_boundary": settings.sigma_u, "lam": settings.sigma_lam, "mu": settings.sigma_mu}
     warm = [name for name in target.coordinates.reference() if name not in sigma]
     if warm:
         raise InputError(f"rwmh has no step for {', '.join(sorted(warm))}; use the sampler hmc")

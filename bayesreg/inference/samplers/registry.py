@@ -1,4 +1,4 @@
-"""The registry of samplers, all through BlackJAX: name to (target, settings…) → `Sampler`.
+"""The registry of samplers, all through BlackJAX: name to record of settings and maker.
 
 The paper's kernel moves in the constrained space of the estimands; the others in the coordinates in which Laplace's
 approximation is N(0, I) (`bayesreg.inference.gaussian.whitened`), most of them reflected by the skull
@@ -9,31 +9,41 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
+from pydantic import ValidationError
 
 from bayesreg.inference.kernel import Sampler
-from bayesreg.inference.samplers.approximations import laplace_sampler, pathfinder
+from bayesreg.inference.samplers import settings
+from bayesreg.inference.samplers.approximations import laplace, pathfinder
 from bayesreg.inference.samplers.hamiltonian import hmc, mclmc, nuts
 from bayesreg.inference.samplers.local import barker, mala, pcn, rwmh_adaptive
 from bayesreg.inference.samplers.random_walk import rwmh
+from bayesreg.inference.samplers.settings import Settings
 from bayesreg.inference.samplers.tempering import smc
 from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 
-SAMPLERS: dict[str, Callable[..., Sampler]] = {
-    "rwmh": rwmh,
-    "hmc": hmc,
-    "nuts": nuts,
-    "mclmc": mclmc,
-    "mala": mala,
-    "barker": barker,
-    "rwmh_adaptive": rwmh_adaptive,
-    "pcn": pcn,
-    "smc": smc,
-    "laplace": laplace_sampler,
-    "pathfinder": pathfinder,
+
+class Entry(NamedTuple):
+    """A sampler of the registry: the class of its settings, and (target, settings) → `Sampler`."""
+
+    settings: type[Settings]
+    make: Callable[..., Sampler]
+
+
+SAMPLERS: dict[str, Entry] = {
+    "rwmh": Entry(settings.RandomWalk, rwmh),
+    "hmc": Entry(settings.Hmc, hmc),
+    "nuts": Entry(settings.Nuts, nuts),
+    "mclmc": Entry(settings.Mclmc, mclmc),
+    "mala": Entry(settings.Mala, mala),
+    "barker": Entry(settings.Barker, barker),
+    "rwmh_adaptive": Entry(settings.RwmhAdaptive, rwmh_adaptive),
+    "pcn": Entry(settings.Pcn, pcn),
+    "smc": Entry(settings.Smc, smc),
+    "laplace": Entry(settings.Laplace, laplace),
+    "pathfinder": Entry(settings.Pathfinder, pathfinder),
 }
 
 
@@ -47,31 +57,40 @@ class Chosen:
     Raises
     ------
     InputError
-        If a setting is out of range, or the target is not for this sampler.
+        If the target is not for this sampler.
     """
 
     name: str
     target: Target = field(repr=False)
-    settings: tuple[tuple[str, Any], ...]
+    settings: Settings
     sampler: Sampler = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sampler", SAMPLERS[self.name](self.target, **dict(self.settings)))
+        object.__setattr__(self, "sampler", SAMPLERS[self.name].make(self.target, self.settings))
 
 
-def chosen_sampler(name: str, target: Target, settings: dict[str, Any]) -> Chosen:
-    """The sampler of that name, with these settings: numbers and words.
+def choose_sampler(name: str, target: Target, **given: Any) -> Chosen:
+    """The sampler of that name, made for a target with these settings.
 
     Raises
     ------
     InputError
-        If a setting is neither, or see `Chosen`.
+        If there is no such sampler or setting, a setting is out of range, or see `Chosen`.
     """
-    plain = {
-        key: value.item() if hasattr(value, "item") and np.size(value) == 1 else value
-        for key, value in settings.items()
-    }
-    for key, value in plain.items():
-        if not isinstance(value, (bool, int, float, str)):
-            raise InputError(f"{key} must be a number or a word, got {value!r}")
-    return Chosen(name, target, tuple(sorted(plain.items())))
+    if name not in SAMPLERS:
+        raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
+    record = SAMPLERS[name].settings
+    plain = {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in given.items()}
+    try:
+        return Chosen(name, target, record(**plain))
+    except ValidationError as error:
+        wrong = "; ".join(_said(details, record) for details in error.errors(include_url=False))
+        raise InputError(f"sampler {name}: {wrong}") from None
+
+
+def _said(details: Any, record: type[Settings]) -> str:
+    """One of pydantic's errors as a message."""
+    key = ".".join(map(str, details["loc"]))
+    if details["type"] == "extra_forbidden":
+        return f"there is no setting {key}; there are {', '.join(record.model_fields) or 'none'}"
+    return f"{key} = {details['input']!r}: {details['msg'].replace('Input should be', 'expected')}"

@@ -22,6 +22,7 @@ from bayesreg.inference.gaussian.whitened import (
 from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.layout import flat_position
 from bayesreg.inference.samplers.hamiltonian import hmc
+from bayesreg.inference.samplers.settings import Hmc, Smc
 from bayesreg.inference.target import Target, estimands_of
 from bayesreg.types import AnyArray, InputError
 
@@ -30,34 +31,16 @@ from bayesreg.types import AnyArray, InputError
 _TURNS, _MOVES, _SHARE, _BATCH, _MOST = 20, 2, 0.7, 32, 500
 
 
-def smc(
-    target: Target,
-    particles: int = 128,
-    spread: float = 2.0,
-    warm_up: int = 80,
-    target_acceptance: float = 0.75,
-    mode_search: str = "once",
-) -> Sampler:
+def smc(target: Target, settings: Smc) -> Sampler:
     """Adaptive tempered sequential Monte Carlo, whose particles are where chains of `hmc` start.
 
     Particles drawn from Laplace's approximation π₀, widened and cut off by the skull, are reweighted, resampled and
     moved by `hmc`'s kernel along π₀^(1−β) π^β, β rising from 0 to 1. Modes that the broad Gaussian reaches then hold
     particles in proportion to their mass, up to the noise of so many. Chains start at a resampled few and go on with
     `hmc`, which leaves the posterior unchanged: it, not the tempering, is what makes the draws exact.
-
-    Parameters
-    ----------
-    target : Target
-    particles : int
-        At least as many as chains.
-    spread : float
-        By how much the first distribution is wider than Laplace's approximation, at least 1.
-    warm_up, target_acceptance, mode_search
-        Of `hmc`, before the tempering.
     """
-    if not spread >= 1:
-        raise InputError(f"spread must be at least 1, got {spread}")
-    chains_of = hmc(target, warm_up, target_acceptance, mode_search)
+    particles, spread, target_acceptance = settings.particles, settings.spread, settings.target_acceptance
+    chains_of = hmc(target, Hmc(**settings.model_dump(include=set(Hmc.model_fields))))
 
     def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
         chains = len(next(iter(points.values())))

@@ -1,0 +1,113 @@
+"""The samplers' sections of a configuration: their settings, and how many chains and draws there are."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field, TypeAdapter
+
+from bayesreg.config.values import Count
+from bayesreg.inference.samplers import settings
+
+
+class _Chains(BaseModel):
+    """What all samplers' sections share."""
+
+    chains: Count = 4
+    thin: Count = 1
+    """Every how many transitions a draw is kept."""
+    block: Count | None = None
+    """Kept draws between two looks at the stop rule; null is 100, and fewer where many quadrature points make steps
+    slow."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What is the sampler's own."""
+        return self.model_dump(exclude={"name", *_Chains.model_fields})
+
+
+class _Thinned(_Chains):
+    """Chains whose transitions are short."""
+
+    thin: Count = 10
+    """Every how many transitions a draw is kept."""
+
+
+class RandomWalk(settings.RandomWalk, _Thinned):
+    """The kernel of the paper, random-walk Metropolis."""
+
+    name: Literal["rwmh"]
+    chains: Count = 3
+
+
+class Hmc(settings.Hmc, _Chains):
+    """Hamiltonian Monte Carlo; the default."""
+
+    name: Literal["hmc"] = "hmc"
+
+
+class Nuts(settings.Nuts, _Chains):
+    """The No-U-Turn sampler."""
+
+    name: Literal["nuts"]
+
+
+class Mclmc(settings.Mclmc, _Chains):
+    """Adjusted microcanonical trajectories."""
+
+    name: Literal["mclmc"]
+
+
+class Smc(settings.Smc, _Chains):
+    """Sequential Monte Carlo."""
+
+    name: Literal["smc"]
+
+
+class Mala(settings.Mala, _Thinned):
+    """Langevin steps."""
+
+    name: Literal["mala"]
+
+
+class Barker(settings.Barker, _Thinned):
+    """Barker's proposal."""
+
+    name: Literal["barker"]
+
+
+class RwmhAdaptive(settings.RwmhAdaptive, _Thinned):
+    """A random walk in whitened coordinates."""
+
+    name: Literal["rwmh_adaptive"]
+
+
+class Pcn(settings.Pcn, _Thinned):
+    """Preconditioned Crank–Nicolson."""
+
+    name: Literal["pcn"]
+
+
+class Laplace(settings.Laplace, _Chains):
+    """Laplace's approximation."""
+
+    name: Literal["laplace"]
+
+
+class Pathfinder(settings.Pathfinder, _Chains):
+    """Pathfinder's approximation."""
+
+    name: Literal["pathfinder"]
+
+
+SamplerConfig = Hmc | Nuts | Mclmc | Smc | Mala | Barker | RwmhAdaptive | Pcn | Laplace | Pathfinder | RandomWalk
+
+
+def sampler_section(name: str) -> SamplerConfig:
+    """The section of a sampler by its name, with default settings."""
+    return TypeAdapter(Annotated[SamplerConfig, Field(discriminator="name")]).validate_python({"name": name})
+
+
+def name_hmc_where_unnamed(value: object) -> object:
+    """A section without a name is one of hmc."""
+    return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value

@@ -1,0 +1,111 @@
+"""The settings of every sampler: a record for each, from which its section of a configuration is made.
+
+They stand apart from the kernels because a configuration is read before anything heavy is imported.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+Positive = Annotated[float, Field(strict=True, gt=0)]
+Share = Annotated[float, Field(strict=True, gt=0, lt=1)]
+
+
+class Settings(BaseModel):
+    """What all records share: no unknown keys, no changes after the making."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class RandomWalk(Settings):
+    """Random-walk Metropolis with the three Normal kernels of the paper."""
+
+    sigma_u: Positive = 0.008
+    """Sd of a step of each sampled displacement, mm."""
+    sigma_lam: Positive = 0.03
+    """Sd of a step of each λ."""
+    sigma_mu: Positive = 0.003
+    """Sd of a step of each μ."""
+
+
+class AboutMode(Settings):
+    """What the samplers about a mode share; see docs/samplers.md."""
+
+    mode_search: Literal["once", "per_chain"] = "once"
+    """once: one mode, from the mean of the chains' starts; per_chain: one from the start of each, at as many times the
+    cost, and where they differ chains start about their own."""
+
+
+class Laplace(AboutMode):
+    """Draws from the Gaussian with the curvature at the mode, cut off by the skull: a quick look, approximate."""
+
+
+class Pathfinder(AboutMode):
+    """Draws from the Gaussian of the greatest evidence bound on the way to the mode: a quick look, approximate."""
+
+
+class Tuned(AboutMode):
+    """What the samplers share whose step size is tuned."""
+
+    warm_up: Count = 80
+    """Transitions that tune the step size and are not kept."""
+    target_acceptance: Share = 0.75
+    """Acceptance towards which the step size is tuned."""
+
+
+class Hmc(Tuned):
+    """Hamiltonian Monte Carlo in coordinates whitened at the mode, trajectories of a quarter turn."""
+
+
+class Nuts(Tuned):
+    """The No-U-Turn sampler in coordinates whitened at the mode."""
+
+    target_acceptance: Share = 0.8
+    """Acceptance towards which the step size is tuned."""
+
+
+class Mclmc(Tuned):
+    """Adjusted microcanonical trajectories in coordinates whitened at the mode."""
+
+
+class Smc(Tuned):
+    """Particles tempered from a broad Gaussian into the posterior; chains start there and go on as with hmc."""
+
+    particles: Count = 128
+    """At least as many as chains. Many: they are what finds several modes and weighs them."""
+    spread: Annotated[float, Field(strict=True, ge=1)] = 2.0
+    """How much wider than Laplace's approximation the first distribution is."""
+
+
+class SingleStep(Tuned):
+    """What the samplers of one evaluation a transition share."""
+
+    warm_up: Count = 500
+    """Transitions that tune the step size and are not kept."""
+    target_acceptance: Share = 0.234
+    """Acceptance towards which the step size is tuned; the default is the best in many dimensions."""
+
+
+class Mala(SingleStep):
+    """The Metropolis-adjusted Langevin algorithm in coordinates whitened at the mode."""
+
+    target_acceptance: Share = 0.574
+    """Acceptance towards which the step size is tuned; the default is the best in many dimensions."""
+
+
+class Barker(SingleStep):
+    """Barker's proposal, whose gradient decides on signs alone, in coordinates whitened at the mode."""
+
+    target_acceptance: Share = 0.4
+    """Acceptance towards which the step size is tuned; the default is the best in many dimensions."""
+
+
+class RwmhAdaptive(SingleStep):
+    """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned."""
+
+
+class Pcn(SingleStep):
+    """Preconditioned Crank–Nicolson on the Gaussian about the mode."""
