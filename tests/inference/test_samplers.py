@@ -250,10 +250,10 @@ def test_tempered_particles_find_both_modes():
     ("name", "wrong", "message"),
     [
         ("smc", {"particles": 2}, "particles must be at least as many as the 3 chains, got 2"),
-        ("smc", {"spread": 0.5}, "spread must be at least 1, got 0.5"),
-        ("mala", {"target_acceptance": 1.2}, "target_acceptance must lie between 0 and 1, got 1.2"),
-        ("pcn", {"warm_up": 0}, "warm_up must be at least 1, got 0"),
-        ("hmc", {"mode_search": "twice"}, "mode_search must be once or per_chain, got 'twice'"),
+        ("smc", {"spread": 0.5}, "spread = 0.5: expected greater than or equal to 1"),
+        ("mala", {"target_acceptance": 1.2}, "target_acceptance = 1.2: expected less than 1"),
+        ("pcn", {"warm_up": 0}, "warm_up = 0: expected greater than or equal to 1"),
+        ("hmc", {"mode_search": "twice"}, "mode_search = 'twice': expected 'once' or 'per_chain'"),
     ],
 )
 def test_wrong_settings_are_told(name, wrong, message):
