@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayesreg.tissues import BRAIN
 from bayesreg.types import AnyArray, InputError
 
 # The faces of a positively oriented tetrahedron, their normals pointing outwards.
@@ -38,9 +39,7 @@ class TetMesh:
     names: tuple[str, ...]
 
     @classmethod
-    def from_arrays(
-        cls, points: AnyArray, cells: AnyArray, tissue: AnyArray, names: Sequence[str] = ("csf", "gm", "wm")
-    ) -> TetMesh:
+    def from_arrays(cls, points: AnyArray, cells: AnyArray, tissue: AnyArray, names: Sequence[str] = BRAIN) -> TetMesh:
         """Validate arrays and make a mesh of them.
 
         Raises

@@ -18,10 +18,10 @@ from ruamel.yaml import YAML
 
 import bayesreg as br
 from bayesreg.fem.equilibrium import elastic_system
+from bayesreg.fem.location import interpolation_at
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
-from bayesreg.model.state import interpolation_at
 from bayesreg.workflow import preparation
 from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of

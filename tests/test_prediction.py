@@ -12,11 +12,11 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
-from bayesreg.workflow.prediction import default_landmarks, predict, require_inside
+from bayesreg.workflow.prediction import default_places, predict, require_inside
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(3)
-LANDMARKS = {"corner": tuple(MESH.points[0]), "within": (9.0, 11.0, 8.0)}
+PLACES = {"corner": tuple(MESH.points[0]), "within": (9.0, 11.0, 8.0)}
 
 
 @cache
@@ -55,7 +55,7 @@ def everywhere() -> np.ndarray:
 def predicted():
     posterior, draws, _ = problem()
     mean, sd = everywhere().mean(axis=(0, 1)), everywhere().std(axis=(0, 1))
-    return predict(posterior, draws, mean, sd, LANDMARKS, seed=1)
+    return predict(posterior, draws, mean, sd, PLACES, seed=1)
 
 
 def test_maps_are_those_of_all_draws():
@@ -67,16 +67,16 @@ def test_maps_are_those_of_all_draws():
     assert found.far.min() > 0.1
 
 
-def test_landmarks_move_as_the_mesh_does():
+def test_places_move_as_the_mesh_does():
     found = predicted()
-    np.testing.assert_allclose(found.landmark_draws[:, :, 0], everywhere()[:, :, 0], atol=1e-6)
+    np.testing.assert_allclose(found.place_draws[:, :, 0], everywhere()[:, :, 0], atol=1e-6)
     # The mesh as a function: any other way to interpolate on tetrahedra, here by volumes.
-    place = np.array(LANDMARKS["within"])
+    place = np.array(PLACES["within"])
     shares = np.array([_shares(MESH.points[cell], place) for cell in MESH.cells])
     holding = int(np.argmax(shares.min(axis=1)))
     expected = np.einsum("a,cdai->cdi", shares[holding], everywhere()[:, :, MESH.cells[holding]])
-    np.testing.assert_allclose(found.landmark_draws[:, :, 1], expected, atol=1e-6)
-    assert list(found.landmark_names) == ["corner", "within"]
+    np.testing.assert_allclose(found.place_draws[:, :, 1], expected, atol=1e-6)
+    assert list(found.place_names) == ["corner", "within"]
 
 
 def _shares(corners: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -112,9 +112,9 @@ def test_replications_differ_between_draws_and_follow_the_seed():
 
 def test_the_residual_at_the_truth_is_standard_normal():
     posterior, _, u = problem()
-    z = np.asarray(standardised_residual(posterior, u, 0.05))
+    z = np.asarray(standardised_residual(posterior.images, u, 0.05))
     assert z.std() == pytest.approx(1, abs=4 / np.sqrt(2 * len(z)))
-    np.testing.assert_allclose(standardised_residual(posterior, u, 0.2), z / 2, rtol=1e-12)
+    np.testing.assert_allclose(standardised_residual(posterior.images, u, 0.2), z / 2, rtol=1e-12)
 
 
 def test_a_sampled_temperature_sets_the_unit_of_its_draw():
@@ -122,7 +122,7 @@ def test_a_sampled_temperature_sets_the_unit_of_its_draw():
     posterior = _Heated(**vars(posterior))
     heated = draws.assign(t_similarity=(("chain", "draw"), np.full((3, 12), 0.2)))
     mean = everywhere().mean(axis=(0, 1))
-    found = predict(posterior, heated, mean, mean, LANDMARKS, seed=1)
+    found = predict(posterior, heated, mean, mean, PLACES, seed=1)
     np.testing.assert_allclose(found.observed[..., :2], predicted().observed[..., :2] / 2, rtol=1e-6)
     np.testing.assert_allclose(found.residual, predicted().residual / 2, rtol=1e-5)
 
@@ -153,18 +153,18 @@ def test_discrepancies_are_those_of_a_plain_loop():
     np.testing.assert_allclose(discrepancies(z, cells, MESH.neighbours, len(MESH.cells)), expected, rtol=1e-10)
 
 
-def test_a_landmark_outside_the_mesh_is_refused():
-    with pytest.raises(br.InputError, match=r"landmark 'far' at \[99.0, 0.0, 0.0\] mm lies outside the mesh"):
-        require_inside(MESH, LANDMARKS | {"far": (99.0, 0.0, 0.0)})
-    require_inside(MESH, LANDMARKS)
+def test_a_place_outside_the_mesh_is_refused():
+    with pytest.raises(br.InputError, match=r"place 'far' at \[99.0, 0.0, 0.0\] mm lies outside the mesh"):
+        require_inside(MESH, PLACES | {"far": (99.0, 0.0, 0.0)})
+    require_inside(MESH, PLACES)
     require_inside(MESH, {})
 
 
-def test_chosen_landmarks_are_where_their_names_say():
+def test_chosen_places_are_where_their_names_say():
     rng = np.random.default_rng(4)
     u_mean, u_sd = rng.normal(size=(2, len(MESH.points), 3))
     u_mean[7], u_sd[9] = 50, 50
-    found = default_landmarks(MESH, u_mean, u_sd)
+    found = default_places(MESH, u_mean, u_sd)
     assert found["largest shift"] == tuple(MESH.points[7])
     assert found["largest sd"] == tuple(MESH.points[9])
     low, high = MESH.points.min(axis=0), MESH.points.max(axis=0)
@@ -191,7 +191,7 @@ def test_replicates_follow_students_t_where_the_model_does():
         {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
     )
     zero = np.zeros_like(MESH.points)
-    found = predict(posterior, draws, zero, zero, LANDMARKS, seed=0)
+    found = predict(posterior, draws, zero, zero, PLACES, seed=0)
     for k in range(len(found.discrepancies)):
         assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, found.discrepancies[k]
 

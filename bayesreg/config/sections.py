@@ -2,140 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    StrictBool,
-    ValidationInfo,
-    field_validator,
-)
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData, Mni152Data, PaperPair
 from bayesreg.config.samplers import Hmc, SamplerConfig, name_hmc_where_unnamed
 from bayesreg.config.values import (
+    ByTissue,
     Count,
-    Direction,
     FoundFile,
-    Labels,
     NotNegative,
     Positive,
     Range,
+    Section,
     find_boundary,
     find_field,
 )
 from bayesreg.model.options import ModelConfig, Vector
 from bayesreg.model.options import wrong as _wrong
-
-
-class Section(BaseModel):
-    """What all parts of a configuration share: no unknown keys, no changes after the making."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-class Tissues(Section):
-    """One positive value per tissue."""
-
-    csf: Positive
-    gm: Positive
-    wm: Positive
-
-    def as_tuple(self) -> tuple[float, float, float]:
-        """The values in the order of the tissues: CSF, GM, WM."""
-        return self.csf, self.gm, self.wm
-
-
-class Mni152Data(Section):
-    """The MNI152 brain that ships with nilearn; a synthetic pair is made of it."""
-
-    source: Literal["mni152"]
-
-
-class BrainWebData(Section):
-    """BrainWeb's label phantom with the T1 of Colin27; a synthetic pair is made of them."""
-
-    source: Literal["brainweb"]
-    labels: FoundFile
-    """Discrete BrainWeb labels: 1 CSF, 2 GM, 3 WM, 8 glial."""
-    t1: FoundFile
-    """T1 image on the same grid."""
-    intracranial_labels: Labels = (1, 2, 3, 8)
-    """Labels inside the skull; of their union the largest connected part is taken."""
-
-
-class LabelTable(Section):
-    """Which values of a label file stand for which tissue."""
-
-    csf: Labels
-    gm: Labels
-    wm: Labels
-
-    @field_validator("gm", "wm")
-    @classmethod
-    def _no_value_twice(cls, labels: tuple[int, ...], info: ValidationInfo) -> tuple[int, ...]:
-        for other, theirs in info.data.items():
-            if shared := sorted(set(labels) & set(theirs)):
-                raise ValueError(f"label {shared[0]} belongs to {other} already")
-        return labels
-
-    def as_dict(self) -> dict[str, tuple[int, ...]]:
-        """Tissue name to label values, in the order of the tissues."""
-        return {"csf": self.csf, "gm": self.gm, "wm": self.wm}
-
-
-class FilesData(Section):
-    """A pair of one's own, in one world space (aligned beforehand)."""
-
-    source: Literal["files"]
-    fixed: FoundFile
-    """Pre-operative image."""
-    moving: FoundFile
-    """Intra-operative image."""
-    labels: FoundFile
-    """Tissue labels of the fixed image, on its grid."""
-    label_table: LabelTable
-    intracranial: FoundFile | None = None
-    """Image that is not zero where the brain may go; without it nothing bounds the motion."""
-    same_contrast: StrictBool = True
-    """Scale the intensities of both images by one common scale."""
-
-
-class _Pair(Section):
-    displacement: Positive = 15.0
-    """How far the patch moves towards the centre of gravity, mm."""
-    patch_nodes: Annotated[int, Field(strict=True, ge=3)] = 20
-    """Number of boundary nodes in the patch."""
-    direction: Direction | None = None
-    """From the centre of gravity to the patch, world RAS; null takes the first of several that inverts no element."""
-    lam: Tissues = Tissues(csf=1e-6, gm=10.0, wm=30.0)
-    """True first Lamé parameters."""
-    mu: Tissues = Tissues(csf=1e-6, gm=1.0, wm=1.0)
-    """True second Lamé parameters."""
-    smoothing_mm: NotNegative | None = None
-    """Width (sd, mm) of the smoothing of the anatomy beforehand; null lets the kind of pair choose."""
-
-
-class PaperPair(_Pair):
-    """A synthetic pair as in section 4.1 of the paper: one mesh for making and registering."""
-
-    kind: Literal["paper"]
-    noise_sd: NotNegative = 0.003
-    """Noise on each image; intensities run from 0 to 1."""
-
-
-class CalibratedPair(_Pair):
-    """A synthetic pair made on a finer mesh, for checks of coverage."""
-
-    kind: Literal["calibrated"]
-    noise_sd: NotNegative = 0.01
-    """Noise on each image; intensities run from 0 to 1."""
-    making_edge_length: Positive = 10.0
-    """Edge length of the making mesh, mm."""
 
 
 class MeshConfig(Section):
@@ -158,17 +45,17 @@ class StartConfig(Section):
     """identity, truth (of a synthetic pair), or a file with a displacement of every node (.npz, .vtu)."""
     fraction: Range = (0.0, 1.0)
     """Every chain starts at its own fraction of the field, evenly spread from the first to the second."""
-    lam: Positive | Tissues | None = None
-    """First Lamé parameter, for all or by tissue; null is 10, in CSF 0.01. Fixed ones keep their value."""
-    mu: Positive | Tissues | None = None
-    """Second Lamé parameter, for all or by tissue; null is 1, in CSF 0.01. Fixed ones keep their value."""
+    lam: Positive | ByTissue | None = None
+    """First Lamé parameter, for all or by tissue; null is 10, in a fluid 0.01. Fixed ones keep their value."""
+    mu: Positive | ByTissue | None = None
+    """Second Lamé parameter, for all or by tissue; null is 1, in a fluid 0.01. Fixed ones keep their value."""
     spread: NotNegative = 0.1
     """Sd, between chains, of the logarithm of the Lamé parameters that they start with."""
 
     def entries(self, name: Literal["lam", "mu"], names: Iterable[str]) -> dict[str, float] | None:
         """Start value of every named entry of λ or μ; None where the model is to choose."""
         given = getattr(self, name)
-        return dict.fromkeys(names, given) if isinstance(given, float) else given and given.model_dump()
+        return dict.fromkeys(names, given) if isinstance(given, float) else given
 
 
 class StopConfig(Section):
@@ -200,8 +87,25 @@ class DistributedConfig(Section):
 class ReportConfig(Section):
     """What the report is to show."""
 
-    landmarks: dict[str, Vector] = {}
+    places: dict[str, Vector] = Field(default={})
     """Places (x, y, z) in the fixed image, world RAS mm, by name; empty lets the program choose some."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _landmarks_are_data(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "landmarks" in given:
+            raise _wrong("landmarks", "this key is called report.places now; landmarks are data, see observations")
+        return given
+
+
+def _require_tissues(key: str, given: object, names: Sequence[str] | None, whole: bool = False) -> None:
+    """Refuse names that no tissue has, and where it must be `whole`, tissues that are left out."""
+    if not isinstance(given, Mapping) or names is None:
+        return
+    for tissue in sorted(set(given) - set(names)):
+        raise _wrong(f"{key}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
+    if whole and (missing := [name for name in names if name not in given]):
+        raise _wrong(key, f"lacks {', '.join(missing)}; expected a value for every tissue")
 
 
 def _require_nothing_else(model: ModelConfig) -> None:
@@ -261,6 +165,9 @@ class Config(Section):
             and simulate.making_edge_length >= mesh.edge_length
         ):
             raise _wrong("making_edge_length", f"expected less than mesh.edge_length, {mesh.edge_length:g} mm")
+        if simulate is not None:
+            _require_tissues("lam", simulate.lam, data and data.tissues, whole=True)
+            _require_tissues("mu", simulate.mu, data and data.tissues, whole=True)
         return simulate
 
     @field_validator("known_boundary")
@@ -273,13 +180,12 @@ class Config(Section):
     @field_validator("model")
     @classmethod
     def _names_tissues_and_nodes(cls, model: ModelConfig, info: ValidationInfo) -> ModelConfig:
-        names = tuple(Tissues.model_fields)
+        if "data" not in info.data:
+            return model
+        names = info.data["data"].tissues
         for key, section in (("fixed", model.fixed or {}), ("priors", model.priors)):
             for parameter, given in section.items():
-                unknown = set(given) - set(names) if isinstance(given, dict) else None
-                if unknown:
-                    tissue = min(unknown)
-                    raise _wrong(f"{key}.{parameter}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
+                _require_tissues(f"{key}.{parameter}", given, names)
         if info.data.get("known_boundary") is not None:
             _require_nothing_else(model)
             model.model_copy(update={"sampled": []}).require_proper_priors(names)
@@ -291,13 +197,14 @@ class Config(Section):
     @field_validator("start")
     @classmethod
     def _can_start(cls, start: StartConfig, info: ValidationInfo) -> StartConfig:
-        model = info.data.get("model")
+        model, data = info.data.get("model"), info.data.get("data")
         if start.field == "truth" and "simulate" in info.data and info.data["simulate"] is None:
             raise _wrong("field", "the truth of this pair is not known; expected identity or a file")
         for name in ("lam", "mu"):
+            _require_tissues(name, getattr(start, name), data and data.tissues)
             if model is None or model.elasticity in ("tissue", "field"):
                 continue
-            if isinstance(getattr(start, name), Tissues):
+            if isinstance(getattr(start, name), dict):
                 raise _wrong(name, f"expected one number, since model.elasticity is {model.elasticity}")
         return start
 

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from bayesreg.types import DATA_FOLDER
 
@@ -74,3 +74,29 @@ FoundFile = Annotated[Path, BeforeValidator(_find_file)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=2)]
 Range = Annotated[tuple[Fraction, Fraction], BeforeValidator(_as_pair), AfterValidator(_ascending)]
 Direction = Annotated[tuple[Number, Number, Number], AfterValidator(_unit)]
+
+
+def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """Refuse names that are none, the background, and a label of two tissues."""
+    if not table:
+        raise ValueError("expected at least one tissue with its labels, such as liver: 1")
+    owners: dict[int, str] = {}
+    for name, labels in table.items():
+        if not name.isidentifier() or name == "all":
+            raise ValueError(f"{name!r} is no name of a tissue; expected letters, digits and _, such as left_lobe")
+        for label in labels:
+            if label == 0:
+                raise ValueError(f"label 0 is the background, and cannot belong to {name}")
+            if owners.setdefault(label, name) != name:
+                raise ValueError(f"label {label} belongs to {owners[label]} already, and cannot belong to {name}")
+    return table
+
+
+LabelTable = Annotated[dict[str, Labels], AfterValidator(_table)]
+ByTissue = dict[str, Positive]
+
+
+class Section(BaseModel):
+    """What all parts of a configuration share: no unknown keys, no changes after the making."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from bayesreg.mesh import TetMesh
+from bayesreg.types import InputError
 
 _CHUNK, _THREADS = 50_000, 4
 
@@ -63,6 +64,37 @@ def locate(
     origin, to_barycentric = corners[:, 0], _barycentric_maps(corners)
     bins = _Bins(corners, to_barycentric, pairs=min(max(len(query) // 4, 30 * len(cells)), 3_000_000))
     return _in_threads(lambda part: _search(part, bins, origin, to_barycentric, tolerance), query, 4)
+
+
+def interpolation_at(
+    mesh: TetMesh, points: Float[np.ndarray, "k 3"], labels: Sequence[str] | None = None
+) -> tuple[Int[np.ndarray, "k 4"], Float[np.ndarray, "k 4"]]:
+    """Nodes and barycentric weights of points inside a mesh.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    points : (k, 3) array
+        World RAS, mm.
+    labels : sequence of str, optional
+        What to call each point in an error, such as "place 'ventricle'"; the default is its number.
+
+    Raises
+    ------
+    InputError
+        If a point lies outside the mesh, where no displacement is estimated.
+    """
+    # Nodes on a curved boundary may lie outside every cell by rounding.
+    cell, barycentric = locate(mesh.points, mesh.cells, points, tolerance=1e-6)
+    outside = np.flatnonzero(cell < 0)
+    if len(outside):
+        first = outside[0]
+        low, high = (corner.round(1).tolist() for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
+        raise InputError(
+            f"{labels[first] if labels else f'point {first}'} at {points[first].round(2).tolist()} mm lies outside the "
+            f"mesh ({len(outside)} of {len(points)} do), which runs from {low} to {high} mm (world RAS, fixed image)"
+        )
+    return mesh.cells[cell], barycentric
 
 
 def _barycentric_maps(corners: np.ndarray) -> np.ndarray:

@@ -12,34 +12,37 @@ import nibabel as nib
 import numpy as np
 
 from bayesreg.image import Image
-from bayesreg.io.domain import TISSUES, main_part
+from bayesreg.io.domain import main_part
 from bayesreg.io.volumes import LabelTable, check_same_grid, check_same_space, load_image, load_labels
+from bayesreg.tissues import BRAIN
 from bayesreg.types import DATA_FOLDER, InputError
 
 __all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152"]
 
-BRAINWEB_TABLE: dict[str, tuple[int, ...]] = {"csf": (1,), "gm": (2, 8), "wm": (3,)}
+BRAINWEB_TABLE: dict[str, tuple[int, ...]] = dict(zip(BRAIN, ((1,), (2, 8), (3,)), strict=True))
 BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
 # How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
 MNI152_SKULL = 3.0
 
 
 class Anatomy(NamedTuple):
-    """One head: an image, its tissues, and where the brain may be.
+    """One organ: an image, its tissues, and where it may be.
 
     Attributes
     ----------
     image : Image
-        T1.
     tissue : Image
-        int8 on the grid of the image: 0 outside, 1 CSF, 2 GM, 3 WM.
+        int8 on the grid of the image: 0 outside, 1 + index into the names inside.
     intracranial : Image or None
         uint8 on the grid of the image, 1 inside the skull; None where it is not known.
+    names : tuple of str
+        Of the tissues.
     """
 
     image: Image
     tissue: Image
     intracranial: Image | None
+    names: tuple[str, ...] = BRAIN
 
 
 def mni152() -> Anatomy:
@@ -114,26 +117,23 @@ def from_files(
     labels_path : path
         Tissue labels on its grid.
     label_table : mapping
-        Label values of "csf", "gm" and "wm".
+        Label values of every tissue by its name, in the order that the mesh will have.
     intracranial_path : path, optional
-        Image on the same grid that is not zero where the brain may be.
+        Image on the same grid that is not zero where the organ may be.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, the table names other tissues or labels that are absent, or the grids
-        differ.
+        If a file is missing or unreadable, the table names labels that are absent, or the grids differ.
     """
-    if set(label_table) != set(TISSUES):
-        raise InputError(f"the label table must name {', '.join(TISSUES)}; got {', '.join(label_table) or 'nothing'}")
     image = load_image(image_path)
-    tissue = load_labels(labels_path, {name: label_table[name] for name in TISSUES})
+    tissue = load_labels(labels_path, label_table)
     check_same_grid(image, tissue, ("fixed", "label"))
     if intracranial_path is None:
-        return Anatomy(image, tissue, None)
+        return Anatomy(image, tissue, None, tuple(label_table))
     mask = load_image(intracranial_path)
     check_same_grid(image, mask, ("fixed", "intracranial"))
-    return Anatomy(image, tissue, mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)))
+    return Anatomy(image, tissue, mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)), tuple(label_table))
 
 
 def _from_nibabel(source: nib.Nifti1Image) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import edt
 import numpy as np
@@ -11,10 +12,9 @@ from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.volumes import check_same_grid
+from bayesreg.tissues import BRAIN, is_fluid, label_of
 from bayesreg.types import InputError
 
-TISSUES = ("csf", "gm", "wm")
-CSF, GM, WM = 1, 2, 3
 SPECK = 0.01
 
 _log = logging.getLogger(__name__)
@@ -24,19 +24,24 @@ class MeshError(InputError):
     """Labels cannot be meshed, or a mesh does not stand for its labels."""
 
 
-def mesh_domain(tissue: Image, intracranial: Image | None = None, closing: float = 8.0) -> Image:
-    """The region Ω: the hull of grey and white matter, inside the intracranial mask.
+def mesh_domain(
+    tissue: Image, intracranial: Image | None = None, closing: float = 8.0, names: Sequence[str] = BRAIN
+) -> Image:
+    """The region Ω: the hull of the solid tissues, inside the intracranial mask.
 
-    The hull is GM and WM closed by a ball, its holes filled, so that ventricles and sulci belong to it.
+    Where there is a fluid (`bayesreg.tissues.is_fluid`), the hull is the solid tissues closed by a ball, so that
+    ventricles and sulci belong to it. Its holes are filled.
 
     Parameters
     ----------
     tissue : Image
-        0 outside, 1 CSF, 2 GM, 3 WM.
+        0 outside, 1 + index into the names inside.
     intracranial : Image, optional
         Nonzero inside the skull, on the grid of the tissue map; without it nothing bounds the hull.
     closing : float
         Radius of the ball, mm. Exact for affines whose axes are orthogonal.
+    names : sequence of str
+        Of the tissues.
 
     Returns
     -------
@@ -46,40 +51,55 @@ def mesh_domain(tissue: Image, intracranial: Image | None = None, closing: float
     Raises
     ------
     MeshError
-        If there is no GM or no WM, the intracranial mask is empty or misses them, or a mask has several
+        If there is none of a solid tissue, the intracranial mask is empty or misses them, or a mask has several
         large parts. Parts below 1 % of a mask are left out, and the log says so.
     """
     voxels = np.asarray(tissue.voxels)
-    for name, index in (("gm", GM), ("wm", WM)):
+    solid_names = {index: name for index, name in enumerate(names, start=1) if not is_fluid(name)}
+    for index, name in solid_names.items():
         if not (voxels == index).any():
             raise MeshError(f"the tissue map holds no {name} (value {index}); it holds {np.unique(voxels).tolist()}")
-    brain = (voxels == GM) | (voxels == WM)
-    hull = _filled(_closed(brain, tissue.voxel_sizes, closing))
+    solid = np.isin(voxels, list(solid_names))
+    if not solid.any():
+        raise MeshError(f"there is no solid tissue to mesh among {', '.join(names)}")
+    hull = _filled(_closed(solid, tissue.voxel_sizes, closing) if len(solid_names) < len(names) else solid)
     if intracranial is not None:
         hull &= _intracranial_part(tissue, intracranial)
-        if (hull & brain).sum() < 0.5 * brain.sum():
+        if (hull & solid).sum() < 0.5 * solid.sum():
             raise MeshError(
-                "more than half of the GM and WM lies outside the intracranial mask; do the two belong together?"
+                f"more than half of {' and '.join(map(label_of, solid_names.values()))} lies outside the intracranial "
+                "mask; do the two belong together?"
             )
     # The skull may cut the hull, and what it cuts off may leave holes.
     return tissue.with_voxels(_filled(main_part(hull, "region to mesh")).astype(np.uint8))
 
 
-def domain_labels(tissue: Image, domain: Image) -> Image:
-    """Tissue of every voxel of Ω, int8: 0 outside, GM and WM as in the tissue map, all else CSF.
+def domain_labels(tissue: Image, domain: Image, names: Sequence[str] = BRAIN) -> Image:
+    """Tissue of every voxel of Ω, int8: 0 outside, 1 + index into the names inside.
+
+    What has no label in Ω is the first fluid, or where there is none the nearest tissue.
 
     Raises
     ------
     MeshError
-        If one of the three is missing.
+        If a tissue is missing.
     """
-    voxels = np.asarray(tissue.voxels)
-    inside = np.where((voxels == GM) | (voxels == WM), voxels, CSF)
-    labels = np.where(np.asarray(domain.voxels) != 0, inside, 0).astype(np.int8)
-    missing = [name for index, name in enumerate(TISSUES, start=1) if not (labels == index).any()]
+    labels = np.where(np.asarray(domain.voxels) != 0, labels_everywhere(tissue, names).voxels, 0).astype(np.int8)
+    missing = [name for index, name in enumerate(names, start=1) if not (labels == index).any()]
     if missing:
         raise MeshError(f"the region to mesh holds no {' and no '.join(missing)}")
     return tissue.with_voxels(labels)
+
+
+def labels_everywhere(tissue: Image, names: Sequence[str]) -> Image:
+    """The tissue map without zeros: they become the first fluid, or where there is none the nearest tissue."""
+    voxels = np.asarray(tissue.voxels)
+    fluid = next((index for index, name in enumerate(names, start=1) if is_fluid(name)), None)
+    if fluid is not None:
+        return tissue.with_voxels(np.where(voxels == 0, fluid, voxels))
+    sizes = tuple(tissue.voxel_sizes)
+    nearest = ndimage.distance_transform_edt(voxels == 0, sizes, return_distances=False, return_indices=True)
+    return tissue.with_voxels(voxels[tuple(nearest)])
 
 
 def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X Y Z"]:

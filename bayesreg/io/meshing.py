@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -16,13 +16,14 @@ from jaxtyping import Float, Int
 from bayesreg.distance import forbidden, signed_distance
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
-from bayesreg.io.domain import TISSUES, MeshError, domain_labels, mesh_domain
+from bayesreg.io.domain import MeshError, domain_labels, labels_everywhere, mesh_domain
 from bayesreg.io.fitting import pull_inside
 from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, tissue_surfaces
 from bayesreg.io.tetwild import tetrahedralize
 from bayesreg.mesh import TetMesh
+from bayesreg.tissues import BRAIN
 from bayesreg.types import AnyArray, InputError
 
 __all__ = [
@@ -58,7 +59,7 @@ class MeshOptions:
     skull_gap : float
         Least distance of the boundary nodes from what lies outside the intracranial mask, mm.
     closing : float
-        Radius of the closing that makes the hull of GM and WM, mm.
+        Radius of the closing that makes the hull where there is a fluid, mm.
     stop_energy : float
         Quality at which fTetWild may stop (AMIPS energy, 3 at best); half as much takes several times as long.
     threads : int
@@ -99,25 +100,28 @@ def build_mesh(
     intracranial: Image | None = None,
     options: MeshOptions = MeshOptions(),
     domain: Image | None = None,
+    names: Sequence[str] = BRAIN,
 ) -> TetMesh:
-    """Mesh the brain: Ω, one tissue per tetrahedron, the boundary nodes clear of the skull.
+    """Mesh an organ: Ω, one tissue per tetrahedron, the boundary nodes clear of the skull.
 
     Not deterministic, since fTetWild is not: keep the mesh, do not build it again.
 
     Parameters
     ----------
     tissue : Image
-        0 outside, 1 CSF, 2 GM, 3 WM.
+        0 outside, 1 + index into the names inside.
     intracranial : Image, optional
         Nonzero inside the skull, on the same grid; without it nothing bounds the mesh.
     options : MeshOptions
     domain : Image, optional
         Ω, where `mesh_domain` has made it already.
+    names : sequence of str
+        Of the tissues; the default is those of the brains that the package ships.
 
     Returns
     -------
     TetMesh
-        World RAS, mm; names ("csf", "gm", "wm").
+        World RAS, mm.
 
     Raises
     ------
@@ -125,13 +129,13 @@ def build_mesh(
         If the labels or the mask cannot be meshed (see `mesh_domain`), or no attempt gave a mesh that passes
         `check_mesh`.
     """
-    labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing))
-    surfaces = tissue_surfaces(labels, options.edge_length)
+    labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing, names), names)
+    surfaces = tissue_surfaces(labels, options.edge_length, names)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
     distance = None if intracranial is None else signed_distance(forbidden(intracranial))
     for attempt in range(1, options.attempts + 1):
         try:
-            mesh = _attempt(labels, surfaces, sizing, distance, options)
+            mesh = _attempt(labels, names, surfaces, sizing, distance, options)
             _log.info("mesh made: %s", check_mesh(mesh, labels))
             return mesh
         except ValueError as error:
@@ -143,21 +147,21 @@ def build_mesh(
 def tissue_of_cells(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], labels: Image, samples: int = 6
 ) -> Int[np.ndarray, "cells"]:
-    """The tissue that holds most of each tetrahedron: 0 CSF, 1 GM, 2 WM.
+    """The tissue that holds most of each tetrahedron, an index into the names.
 
     Parameters
     ----------
     points, cells : (n, 3), (m, 4) array
     labels : Image
-        1 + tissue; 0, and all that lies off the grid, counts as CSF.
+        1 + tissue, without zeros (`labels_everywhere`).
     samples : int
         Points per edge of the lattice inside each tetrahedron; 6 makes 56 points.
     """
-    votes = np.zeros((len(cells), len(TISSUES)), int)
+    votes = np.zeros((len(cells), int(labels.voxels.max())), int)
     corner = points[cells]
     row = np.arange(len(cells))
     for weights in _inner_lattice(samples):
-        votes[row, np.maximum(_nearest(labels, weights @ corner), 1) - 1] += 1
+        votes[row, _nearest(labels, weights @ corner) - 1] += 1
     return votes.argmax(axis=1)
 
 
@@ -206,10 +210,14 @@ def _rows(given: Mapping[str, AnyArray] | None, count: int, what: str) -> dict[s
     return arrays
 
 
-def load_mesh(path: str | Path) -> TetMesh:
+def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
     """Read a mesh as `save_mesh` writes it.
 
-    Without names in the file, tissues 0, 1, 2 are taken to be CSF, GM and WM.
+    Parameters
+    ----------
+    path : path
+    names : sequence of str
+        Of the tissues, where the file does not say them; the default is those of the brains that the package ships.
 
     Raises
     ------
@@ -233,13 +241,18 @@ def load_mesh(path: str | Path) -> TetMesh:
     cells = np.concatenate([block.data for block in content.cells])
     tissue = np.concatenate(content.cell_data["tissue"])
     try:
-        return TetMesh.from_arrays(content.points, cells, tissue, _stored_names(content))
+        return TetMesh.from_arrays(content.points, cells, tissue, _stored_names(content) or names)
     except ValueError as error:
         raise InputError(f"mesh {path}: {error}") from error
 
 
 def _attempt(
-    labels: Image, surfaces: list[Surface], sizing: Sizing, distance: Image | None, options: MeshOptions
+    labels: Image,
+    names: Sequence[str],
+    surfaces: list[Surface],
+    sizing: Sizing,
+    distance: Image | None,
+    options: MeshOptions,
 ) -> TetMesh:
     points, cells = tetrahedralize(
         surfaces,
@@ -250,10 +263,11 @@ def _attempt(
         quiet=options.quiet,
     )
     points, cells = without_loose_nodes(points, cells)
-    mesh = TetMesh.from_arrays(points, cells, np.zeros(len(cells), int), TISSUES)
+    mesh = TetMesh.from_arrays(points, cells, np.zeros(len(cells), int), names)
     if distance is not None:
         mesh = pull_inside(mesh, distance, options.skull_gap)
-    return TetMesh.from_arrays(mesh.points, cells, tissue_of_cells(mesh.points, cells, labels), TISSUES)
+    tissue = tissue_of_cells(mesh.points, cells, labels_everywhere(labels, names))
+    return TetMesh.from_arrays(mesh.points, cells, tissue, names)
 
 
 def _inner_lattice(samples: int) -> Float[np.ndarray, "points 4"]:
@@ -264,12 +278,9 @@ def _inner_lattice(samples: int) -> Float[np.ndarray, "points 4"]:
 
 
 def _nearest(labels: Image, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """Label of the voxel that holds each point; 0 off the grid."""
-    index = np.rint(labels.world_to_voxel(points)).astype(int)
-    on_grid = ((index >= 0) & (index < labels.shape)).all(axis=1)
-    value = np.zeros(len(points), int)
-    value[on_grid] = labels.voxels[tuple(index[on_grid].T)]
-    return value
+    """Label of the voxel nearest to each point."""
+    index = np.clip(np.rint(labels.world_to_voxel(points)).astype(int), 0, np.array(labels.shape) - 1)
+    return np.asarray(labels.voxels)[tuple(index.T)].astype(int)
 
 
 def _insert_names(path: Path, names: tuple[str, ...]) -> None:
@@ -288,5 +299,5 @@ def _insert_names(path: Path, names: tuple[str, ...]) -> None:
 
 def _stored_names(content: meshio.Mesh) -> tuple[str, ...]:
     if NAMES_FIELD not in content.field_data:
-        return TISSUES
+        return ()
     return tuple(bytes(content.field_data[NAMES_FIELD].astype(np.uint8)).decode().split("\0"))

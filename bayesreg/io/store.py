@@ -60,11 +60,11 @@ class Predicted(NamedTuple):
         P(|u − ū| > far_mm) at every node, ū the posterior mean.
     reach : (n,) array
         |u − ū|, mm, that 95 % of the draws do not exceed.
-    landmark_names : (L,) array of str
-    landmark_points : (L, 3) array
+    place_names : (L,) array of str
+    place_points : (L, 3) array
         World mm, in the fixed image.
-    landmark_draws : (chains, draws, L, 3) array
-        Displacement of the landmarks, mm.
+    place_draws : (chains, draws, L, 3) array
+        Displacement of the places, mm.
     residual : (q,) array
         f − m(x + ū) at the quadrature points over the noise sd that T_s implies there.
     residual_tissue : (q,) int array
@@ -83,9 +83,9 @@ class Predicted(NamedTuple):
     far_mm: AnyArray
     far: AnyArray
     reach: AnyArray
-    landmark_names: np.ndarray
-    landmark_points: AnyArray
-    landmark_draws: AnyArray
+    place_names: np.ndarray
+    place_points: AnyArray
+    place_draws: AnyArray
     residual: AnyArray
     residual_tissue: AnyArray
     discrepancies: np.ndarray

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import permutations
 from typing import NamedTuple
 
@@ -12,8 +13,9 @@ from scipy import ndimage
 from skimage import measure
 
 from bayesreg.image import Image
-from bayesreg.io.domain import CSF, WM, main_part
+from bayesreg.io.domain import main_part
 from bayesreg.mesh import signed_volumes
+from bayesreg.tissues import BRAIN, is_fluid
 
 # In units of the edge length: what the mesh cannot show is smoothed away (standard deviation), and the
 # triangles that describe the rest need not be finer than the stride.
@@ -63,10 +65,15 @@ class Sizing(NamedTuple):
     values: Float[np.ndarray, "nodes"]
 
 
-def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
-    """Surfaces of Ω, of its white matter with the CSF deep inside, and of this CSF, as far as a mesh can show them.
+def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BRAIN) -> list[Surface]:
+    """Surfaces of Ω and of the tissues in it, one inside the other, as far as a mesh can show them.
 
-    CSF nearer to the outer surface than half an edge length (sulci, the film under the skull) gets no surface
+    Tissues are ordered from the one that lies most along the surface of Ω, which gets none of its own, over the other
+    solid ones, the largest first, to the fluids. Every further surface encloses a tissue and all that follow it, lest a
+    wall between two of them be there twice, a little apart: in a brain that of white matter with the fluid deep
+    inside, and that of this fluid.
+
+    Fluid nearer to the outer surface than half an edge length (sulci, the film under the skull) gets no surface
     of its own, nor do parts and holes of a tissue smaller than a cube of half an edge length.
 
     Parameters
@@ -75,6 +82,8 @@ def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
         As `domain_labels` makes it.
     edge_length : float
         mm.
+    names : sequence of str
+        Of the tissues.
 
     Returns
     -------
@@ -91,16 +100,31 @@ def tissue_surfaces(labels: Image, edge_length: float) -> list[Surface]:
     smallest = (edge_length / 2) ** 3 / grid.voxel_volume
     outer = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length)
     inside = main_part(outer > 0.5, f"region to mesh, smoothed for an edge length of {edge_length:g} mm,")
-    depth = edt.edt(inside, anisotropy=tuple(grid.spacing))
-    deep = depth > edge_length / 2
-    fluid = labels.voxels == CSF
-    # Together with the fluid, lest the walls of the ventricles be there twice, a little apart.
-    white = grid.smoothed(labels.voxels == WM, SMOOTHING * edge_length)
-    white += deep * grid.smoothed(fluid, SMOOTHING * edge_length)
-    inner = (white, deep * grid.smoothed(fluid, FLUID_SMOOTHING * edge_length))
+    deep = edt.edt(inside, anisotropy=tuple(grid.spacing)) > edge_length / 2
     outer[(outer > 0.5) & ~inside] = 0
+    solids, fluids = _from_outside_in(np.asarray(labels.voxels), names)
+    inner: list[np.ndarray] = []
+    enclosed = deep * grid.smoothed(np.isin(labels.voxels, fluids), SMOOTHING * edge_length)
+    for solid in reversed(solids[1:]):
+        enclosed = enclosed + grid.smoothed(labels.voxels == solid, SMOOTHING * edge_length)
+        inner.insert(0, enclosed)
+    if fluids:
+        inner.append(deep * grid.smoothed(np.isin(labels.voxels, fluids), FLUID_SMOOTHING * edge_length))
     fields = [outer, *(_without_specks(field, smallest) for field in inner)]
     return [_surface(field, grid) for field in fields if field.max() > 0.5]
+
+
+def _from_outside_in(labels: Int[np.ndarray, "X Y Z"], names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Labels of the solid tissues, the one that lies most along the surface first, and those of the fluids."""
+    fluids = [index for index, name in enumerate(names, start=1) if is_fluid(name)]
+    solids = [index for index in range(1, len(names) + 1) if index not in fluids]
+    solid = np.isin(labels, solids)
+    # A fluid may lie all around.
+    rim = labels[solid & ~ndimage.binary_erosion(ndimage.binary_fill_holes(solid))]
+    counts = np.bincount(rim.ravel(), minlength=len(names) + 1)
+    sizes = np.bincount(labels.ravel(), minlength=len(names) + 1)
+    first = max(solids, key=lambda index: counts[index])
+    return [first, *sorted(set(solids) - {first}, key=lambda index: -sizes[index])], fluids
 
 
 def depth_sizing(labels: Image, edge_length: float, inner_edge_length: float) -> Sizing:

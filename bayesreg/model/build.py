@@ -48,8 +48,8 @@ def build_posterior(
         Nonzero = forbidden; off its grid is forbidden too. None: no constraint.
     reference : mapping, optional
         "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start, and the scale of the
-        coordinate of a parameter without an upper bound; the nearer to the posterior the faster. Default: λ = 10,
-        μ = 1, and 0.01 for a tissue named "csf".
+        coordinate of a parameter without an upper bound; the nearer to the posterior the faster. Default:
+        `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01 for a fluid.
     observations : sequence, optional
         In place of `fixed` and `moving`: `ImagePair`, `Landmarks`, or any object with a `name` and a function
         `log(state)` that JAX can trace, the log of its factor of the density. It sees the displacement of every node,

@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 from pydantic_core import PydanticCustomError
 
+from bayesreg.tissues import reference_tissue
+
 Lame = Literal["lam", "mu"]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
-
-USUAL_TISSUES = ("csf", "gm", "wm")
 
 
 class PriorConfig(BaseModel):
@@ -96,11 +96,11 @@ class ModelConfig(BaseModel):
     field : FieldConfig, optional
         Prior of that field; for "field" alone.
     fixed : mapping, optional
-        Parameters that are known: ``{"mu": {"gm": 1.0}}`` by tissue name (by element it fixes every
-        element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of "gm" (or
-        of the first tissue) at 1, uniform: μ at 1; the scale of λ, μ is not identified otherwise.
+        Parameters that are known: ``{"mu": {"liver": 1.0}}`` by tissue name (by element it fixes every
+        element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of one tissue
+        (`bayesreg.tissues.reference_tissue`) at 1, uniform: μ at 1; the scale of λ, μ is not identified otherwise.
     priors : mapping
-        A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"gm": PriorConfig(high=60)}}``;
+        A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"liver": PriorConfig(high=60)}}``;
         what is not named has the flat prior on [0, ∞).
     similarity : {"ssd", "student_t"}
         Sum of squared differences, eq. (1): Gaussian noise; or Student's t noise, which forgives outliers.
@@ -164,7 +164,8 @@ class ModelConfig(BaseModel):
                 raise wrong("normalised", "expected false where no node is sampled: a given u_B has no prior")
             self._require_rest()
         if self.normalised or self.is_elastography:
-            self.require_proper_priors(self._named_tissues or USUAL_TISSUES)
+            # Of a mesh without named tissues one at least is free, or known as `known` says.
+            self.require_proper_priors(self._named_tissues or ("the tissue",))
         return self
 
     @property
@@ -212,7 +213,7 @@ class ModelConfig(BaseModel):
         """`fixed`, or its default for these tissues."""
         if self.fixed is not None:
             return self.fixed
-        return {"mu": 1.0 if self.elasticity == "uniform" else {"gm" if "gm" in tissues else tissues[0]: 1.0}}
+        return {"mu": 1.0 if self.elasticity == "uniform" else {reference_tissue(tissues): 1.0}}
 
     @property
     def _named_tissues(self) -> list[str]:

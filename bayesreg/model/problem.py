@@ -38,6 +38,7 @@ from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.rigid import RigidPrior
 from bayesreg.model.terms.skull import Skull, is_allowed
 from bayesreg.model.terms.term import Outside, Term, Terms
+from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
 
 # Names of blocks and of the other factors of the program.
@@ -278,10 +279,8 @@ def lame_parameter(
 
 
 def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: int) -> Float[np.ndarray, "entries"]:
-    """λ = 10, μ = 1 (the literature's λ/μ is about 24); fluid-like 0.01 in CSF."""
-    solid = 10.0 if name == "lam" else 1.0
-    by_tissue = np.array([0.01 if tissue == "csf" else solid for tissue in mesh.names])
-    return {"uniform": np.full(1, solid), "element": by_tissue[mesh.tissue]}.get(model.elasticity, by_tissue)
+    by_tissue = np.array([usual_value(name, tissue) for tissue in mesh.names])
+    return {"uniform": np.full(1, SOLID[name]), "element": by_tissue[mesh.tissue]}.get(model.elasticity, by_tissue)
 
 
 def _within(prior: list[PriorConfig], values: Float[np.ndarray, "entries"]) -> Float[np.ndarray, "entries"]:

@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float, Int
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.elements import Elements
 from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
-from bayesreg.fem.location import locate
+from bayesreg.fem.location import interpolation_at
 from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Blocks, Values
 from bayesreg.model.field import StiffnessField
-from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
+from bayesreg.types import AnyArray, Equilibrium, Scalar
 
 
 @jax.tree_util.register_static
@@ -170,27 +170,3 @@ def physical_lame_by_cell(
 @lru_cache(maxsize=64)
 def _located(mesh: StaticMesh, points: bytes, count: int) -> tuple[np.ndarray, np.ndarray]:
     return interpolation_at(mesh.mesh, np.frombuffer(points).reshape(count, 3))
-
-
-def interpolation_at(
-    mesh: TetMesh, points: Float[np.ndarray, "k 3"], names: tuple[str, ...] | None = None
-) -> tuple[Int[np.ndarray, "k 4"], Float[np.ndarray, "k 4"]]:
-    """Nodes and barycentric weights of points inside a mesh.
-
-    Raises
-    ------
-    InputError
-        If a point lies outside the mesh, where no displacement is estimated.
-    """
-    # Nodes on a curved boundary may lie outside every cell by rounding.
-    cell, barycentric = locate(mesh.points, mesh.cells, points, tolerance=1e-6)
-    outside = np.flatnonzero(cell < 0)
-    if len(outside):
-        first = outside[0]
-        name = f"point {names[first]!r}" if names else f"point {first}"
-        raise InputError(
-            f"{name} at {points[first].round(2).tolist()} mm lies outside the mesh ({len(outside)} of {len(points)} "
-            f"do), which runs from {mesh.points.min(axis=0).round(1).tolist()} to "
-            f"{mesh.points.max(axis=0).round(1).tolist()} mm (world RAS, in the fixed image)"
-        )
-    return mesh.cells[cell], barycentric

@@ -14,11 +14,11 @@ from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.io.store import Predicted
 from bayesreg.report import panels, style
 from bayesreg.report.panels import View
-from bayesreg.report.places import tissue_label
 from bayesreg.report.slices import Plane, sample
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import number, part
+from bayesreg.tissues import colours_of, label_of
 
 NAMES = {
     "sd": "sd of the residual",
@@ -139,13 +139,11 @@ def _histogram(axes: Axes, view: View) -> None:
     z = np.asarray(predicted.residual, float)
     reach = float(np.clip(np.quantile(np.abs(z), 0.995) * 1.15, 4.5, None))
     edges = np.linspace(-reach, reach, BINS + 1)
-    for index, (name, colour) in enumerate(zip(names, style.tissue_colours(names), strict=True)):
+    for index, (name, colour) in enumerate(zip(names, colours_of(names), strict=True)):
         inside = z[predicted.residual_tissue == index]
         if len(inside) >= LEAST_POINTS:
             density = np.histogram(inside, edges)[0] / len(inside) / np.diff(edges)
-            axes.stairs(
-                density, edges, color=colour, lw=1.3, label=f"{tissue_label(name)}, sd {number(inside.std(), 2)}"
-            )
+            axes.stairs(density, edges, color=colour, lw=1.3, label=f"{label_of(name)}, sd {number(inside.std(), 2)}")
     x = np.linspace(-reach, reach, 300)
     expected = noise_of(view.run.manifest)
     axes.fill_between(x, expected.density(x), color=style.FAINT, lw=0, label=expected.name, zorder=0)

@@ -180,7 +180,7 @@ def _divergence(figure: Figure, axes: Axes, view: View, u: np.ndarray, like: np.
 
 def _focus(view: View) -> str:
     return (
-        "Planes through the node of greatest displacement, moved inwards where they would only graze the brain: "
+        "Planes through the node of greatest displacement, moved inwards where they would only graze the organ: "
         + "; ".join(plane.title for plane in view.planes[::-1])
         + "."
     )

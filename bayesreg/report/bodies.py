@@ -14,11 +14,11 @@ from bayesreg.mesh import TetMesh
 from bayesreg.report import style
 from bayesreg.report.estimands import parameter_groups
 from bayesreg.report.identifiability import RATIO_LEVELS
-from bayesreg.report.places import tissue_label
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import number
 from bayesreg.synthetic.recalibration import RANGE, Response, least_bodies, recalibrated, response
+from bayesreg.tissues import label_of
 
 
 class Allowed(NamedTuple):
@@ -27,7 +27,7 @@ class Allowed(NamedTuple):
     Attributes
     ----------
     names : list of str
-        Tissues, without CSF.
+        Solid tissues.
     true, found : (k, t) arrays
         Of the simulated bodies whose search has not failed.
     response : Response
@@ -83,7 +83,7 @@ def mesh_table(it: Allowed) -> Table:
     for index, name in enumerate(it.names):
         for label, draws in (("on this mesh", it.draws), ("allowing for it", it.allowed)):
             levels = np.quantile(draws[:, index], RATIO_LEVELS)
-            rows.append([f"{tissue_label(name)}, {label}", *map(number, levels)])
+            rows.append([f"{label_of(name)}, {label}", *map(number, levels)])
     low, high = np.log(RANGE)
     rows.append(["Prior", *(number(float(np.exp(low + level * (high - low)))) for level in RATIO_LEVELS)])
     header = ["", *(f"{level:.0%}".replace("%", " %") for level in RATIO_LEVELS)]
@@ -116,7 +116,7 @@ def scatter(it: Allowed) -> Drawing:
         "this run’s central 95 % interval; bar at the foot: the interval of the body’s own λ/μ that it stands for, "
         "with its median."
     )
-    alternative = f"Scatter of found over true λ/μ for {', '.join(map(tissue_label, it.names))}."
+    alternative = f"Scatter of found over true λ/μ for {', '.join(map(label_of, it.names))}."
     return Drawing("bodies", "What the mesh does to λ/μ", caption, alternative, uri)
 
 
@@ -137,6 +137,6 @@ def _panel(panel: Axes, it: Allowed, index: int) -> None:
     panel.plot([own_low, own_high], [foot] * 2, color=style.ACCENT, linewidth=4, solid_capstyle="butt")
     panel.plot([own], [foot], "o", color="white", markeredgecolor=style.ACCENT, markersize=6, zorder=4)
     panel.set(xscale="log", yscale="log", xlim=reach, ylim=heights)
-    panel.set(title=tissue_label(it.names[index]), xlabel="λ/μ of the body")
+    panel.set(title=label_of(it.names[index]), xlabel="λ/μ of the body")
     if index == 0:
         panel.set_ylabel("λ/μ found")

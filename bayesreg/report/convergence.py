@@ -126,7 +126,7 @@ def _ranks(axes: Axes, draws: np.ndarray) -> None:
 
 
 def distributions(mesh: TetMesh, entries: Sequence[Estimand], nodes: np.ndarray, threshold: float) -> Drawing:
-    """Histograms of R-hat and ESS over all estimands, and where on the brain R-hat is worst."""
+    """Histograms of R-hat and ESS over all estimands, and where in the organ R-hat is worst."""
     with style.look():
         rows = 2 if len(nodes) else 1
         figure = style.new_figure(5.6 if len(nodes) else 2.5)

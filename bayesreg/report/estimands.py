@@ -36,7 +36,7 @@ class Estimand(NamedTuple):
     position : tuple of int
         Its place in that variable's array, after chain and draw.
     name : str
-        For people, as "u_x of node 12" or "λ gm".
+        For people, as "u_x of node 12" or "λ tumour".
     place : tuple of float or None
         World position of its node, mm.
     rhat, ess_bulk, ess_tail : float

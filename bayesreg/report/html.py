@@ -95,7 +95,7 @@ def write_report(
     drawings = [
         *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
         uncertainty.maps(view, predicted) if predicted else None,
-        uncertainty.landmarks(view, predicted) if predicted else None,
+        uncertainty.places(view, predicted) if predicted else None,
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
         bodies.scatter(allowed) if allowed else None,
@@ -117,7 +117,7 @@ def write_report(
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
         "error_tables": error_tables(metrics, run.mesh.names),
-        "landmarks": uncertainty.landmark_table(view, predicted) if predicted else None,
+        "places": uncertainty.place_table(view, predicted) if predicted else None,
         "groups": modes.explanation(groups) if apart else "",
         "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
         "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),

@@ -12,9 +12,9 @@ from scipy import stats
 
 from bayesreg.mesh import TetMesh
 from bayesreg.report.estimands import SYMBOLS, TEMPERATURES, Diagnosed, Group, parameter_groups, sampled_temperatures
-from bayesreg.report.places import tissue_label
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import NONE, number, part, rhat_text, threshold_of
+from bayesreg.tissues import label_of
 
 RATIO_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 # Identified: the central 90 % interval spans less than a factor of ten.
@@ -133,7 +133,7 @@ def width_table(mesh: TetMesh, posterior: xr.Dataset, diagnosed: Diagnosed, mani
             for name in LAME
             if np.ptp(getattr(group, name)) > 0
         ]
-        groups.append((tissue_label(group.name), rows or [["λ, μ", NONE, "fixed", NONE, NONE]]))
+        groups.append((label_of(group.name), rows or [["λ, μ", NONE, "fixed", NONE, NONE]]))
     rows = [
         _width_row(
             SYMBOLS[name],
@@ -168,7 +168,7 @@ def ratio_table(mesh: TetMesh, posterior: xr.Dataset) -> Table:
         known = group.ratio[np.isfinite(group.ratio)]
         levels = np.quantile(known, RATIO_LEVELS) if known.size else np.full(len(RATIO_LEVELS), np.nan)
         spread, correlation = log_figures(group)
-        rows.append([tissue_label(group.name), *map(number, levels), number(spread, 2), number(correlation, 2)])
+        rows.append([label_of(group.name), *map(number, levels), number(spread, 2), number(correlation, 2)])
     header = ["", *(f"{level:.0%}".replace("%", " %") for level in RATIO_LEVELS), "sd of log λ/μ", "corr(log λ, log μ)"]
     header[1 + RATIO_LEVELS.index(0.5)] = "Median"
     caption = (
@@ -199,7 +199,7 @@ def readings(mesh: TetMesh, posterior: xr.Dataset, diagnosed: Diagnosed, manifes
 
 
 def _sentence(group: Group, index: int, diagnosed: Diagnosed, model: Mapping[str, Any], threshold: float) -> str:
-    label = tissue_label(group.name)
+    label = label_of(group.name)
     if group.lam.shape[-1] > 1:
         return (
             f"{label}: {group.lam.shape[-1]:,} elements pooled; the figures mix how they differ with what is unknown."

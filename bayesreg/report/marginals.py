@@ -20,6 +20,7 @@ from bayesreg.report.estimands import SYMBOLS, Group, parameter_groups, sampled_
 from bayesreg.report.slices import COORDINATES, IN_PLANE, Plane, sample
 from bayesreg.report.style import Drawing
 from bayesreg.report.verdict import number, part, place_text
+from bayesreg.tissues import colours_of, label_of
 
 BINS = 32
 REACH = 6.0
@@ -72,7 +73,7 @@ def ratio_panel(axes: Axes, run: Run, group: Group) -> None:
         for name, value in truths.items()
     ]
     histogram(axes, group.ratio.reshape(len(group.ratio), -1), colour, marks, ratio=True)
-    axes.set_title(group.name.upper() if len(group.name) <= 3 else group.name, weight="bold")
+    axes.set_title(label_of(group.name), weight="bold")
     axes.set_xlabel("λ / μ")
 
 
@@ -137,7 +138,7 @@ def _edges(values: np.ndarray, logarithmic: bool) -> np.ndarray:
 
 
 def _colour(run: Run, name: str) -> str:
-    return dict(zip(run.mesh.names, style.tissue_colours(run.mesh.names), strict=True))[name]
+    return dict(zip(run.mesh.names, colours_of(run.mesh.names), strict=True))[name]
 
 
 def _true_ratios(run: Run, name: str) -> dict[str, float]:

@@ -23,6 +23,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.report import style
 from bayesreg.report.metrics import divergence
 from bayesreg.report.slices import DIRECTIONS, IN_PLANE, MeshSlice, Plane, cut, main_plane, planes_through, sample
+from bayesreg.tissues import colours_of, label_of
 
 BAR_LENGTHS = (5, 10, 20, 50, 100)
 
@@ -115,7 +116,7 @@ def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True) -> No
 def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
     """Tissue labels and skull."""
     points = plane.points()
-    palette = np.array([to_rgb("white"), *map(to_rgb, style.tissue_colours(run.mesh.names))])
+    palette = np.array([to_rgb("white"), *map(to_rgb, colours_of(run.mesh.names))])
     labels = sample(run.tissue, points, order=0, outside=0.0).astype(int)
     picture = palette[np.clip(labels, 0, len(run.mesh.names))]
     if run.skull is not None:
@@ -127,7 +128,7 @@ def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
 def mesh_panel(axes: Axes, mesh: TetMesh, plane: Plane) -> None:
     """The exact cut through the mesh, coloured by tissue."""
     section = cut(mesh, plane.axis, plane.position)
-    colours = np.array([to_rgb(colour) for colour in style.tissue_colours(mesh.names)])[mesh.tissue[section.cell]]
+    colours = np.array([to_rgb(colour) for colour in colours_of(mesh.names)])[mesh.tissue[section.cell]]
     axes.add_collection(PolyCollection(list(section.polygons), facecolors=colours, edgecolors="white", linewidths=0.45))
     _frame(axes, plane, dark=False)
 
@@ -190,10 +191,7 @@ def colourbar(figure: FigureBase, drawn: ScalarMappable, axes: Axes | Sequence[A
 
 def tissue_legend(names: Sequence[str], skull: bool) -> list[Patch]:
     """Handles for the tissues, and the skull."""
-    handles = [
-        Patch(color=colour, label=name.upper() if len(name) <= 3 else name)
-        for name, colour in zip(names, style.tissue_colours(names), strict=True)
-    ]
+    handles = [Patch(color=colour, label=label_of(name)) for name, colour in zip(names, colours_of(names), strict=True)]
     return handles + ([Patch(color=style.SKULL, label="skull (forbidden)")] if skull else [])
 
 

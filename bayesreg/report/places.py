@@ -1,4 +1,4 @@
-"""Places in the brain in words: sides by world RAS axes relative to the mesh's centre, and the nearest tissue."""
+"""Places in the organ in words: sides by world RAS axes relative to the mesh's centre, and the nearest tissue."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from bayesreg.mesh import TetMesh
+from bayesreg.tissues import label_of
 from bayesreg.types import AnyArray
 
 SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
@@ -14,18 +15,13 @@ SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
 MIDDLE = 0.15
 
 
-def tissue_label(name: str) -> str:
-    """A tissue's name for people: abbreviations in capitals."""
-    return name.upper() if len(name) <= 3 else name
-
-
 def regions(mesh: TetMesh, places: Float[AnyArray, "places 3"]) -> list[str]:
-    """Each place in words, as "right anterior superior, GM"; the tissue is that of the nearest tetrahedron's centre."""
+    """Each place in words, as "right anterior, tumour"; the tissue is that of the nearest tetrahedron's centre."""
     places = np.asarray(places, float)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     offset = (places - (low + high) / 2) / ((high - low) / 2)
     _, nearest = cKDTree(mesh.points[mesh.cells].mean(axis=1)).query(places)
-    labels = [tissue_label(mesh.names[k]) for k in mesh.tissue[nearest]]
+    labels = [label_of(mesh.names[k]) for k in mesh.tissue[nearest]]
     return [f"{_sides(one)}, {label}" for one, label in zip(offset, labels, strict=True)]
 
 

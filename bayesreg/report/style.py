@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -18,9 +18,6 @@ FAINT = "#cbd2d9"
 ACCENT = "#9b2335"
 TRUTH = "#111111"
 
-# Distinct in hue and in lightness, also for colour-blind eyes and in grey.
-KNOWN_TISSUES = {"csf": "#3a6ea5", "gm": "#c26a6f", "wm": "#e3b95a"}
-OTHER_TISSUES = ("#5c9a86", "#7d6aa8", "#b07c46", "#8aa34f", "#a3597f", "#4f8fa3")
 SKULL = "#39424e"
 UNIFORM = "#5b6b7b"
 
@@ -103,12 +100,6 @@ def data_uri(figure: Figure, kind: str = "png") -> str:
     figure.savefig(buffer, format=kind, dpi=DPI, metadata={"Date": None} if kind == "svg" else None)
     media = "image/svg+xml" if kind == "svg" else "image/png"
     return f"data:{media};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-
-
-def tissue_colours(names: Sequence[str]) -> list[str]:
-    """A colour per tissue, the same in every figure."""
-    others = iter(OTHER_TISSUES * (1 + len(names) // len(OTHER_TISSUES)))
-    return [KNOWN_TISSUES.get(name.lower()) or next(others) for name in names]
 
 
 def chain_colours(count: int) -> list[str]:

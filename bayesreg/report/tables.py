@@ -13,6 +13,7 @@ from bayesreg.io.store import Run
 from bayesreg.report.estimands import SYMBOLS, Diagnosed, Estimand, Group, parameter_groups, worst
 from bayesreg.report.metrics import WHOLE
 from bayesreg.report.verdict import NONE, fixed, number, percent, place_text, rhat_text
+from bayesreg.tissues import BRAIN, label_of
 
 PAPER_TABLE_1 = {
     "Initial configuration": (2.56, 8.24, 15.08),
@@ -20,8 +21,8 @@ PAPER_TABLE_1 = {
     "Uniform": (0.18, 0.83, 2.40),
 }
 PAPER_TABLE_2 = {
-    "By tissue": {WHOLE: 0.040, "csf": 0.049, "gm": 0.049, "wm": 0.023},
-    "Uniform": {WHOLE: 0.065, "csf": 0.087, "gm": 0.067, "wm": 0.048},
+    "By tissue": dict(zip((WHOLE, *BRAIN), (0.040, 0.049, 0.049, 0.023), strict=True)),
+    "Uniform": dict(zip((WHOLE, *BRAIN), (0.065, 0.087, 0.067, 0.048), strict=True)),
 }
 STAGES = {"unregistered": "No motion", "initial": "Start of the chains", "posterior_mean": "Posterior mean"}
 WORST_SHOWN = 10
@@ -75,7 +76,7 @@ def squared_error_table(metrics: Mapping[str, Mapping[str, Any]], tissues: Seque
     ours = [[label, *(number(found.get(key)) for key in columns)] for label, found in _stages(errors)]
     paper = [[name, *(fixed(row.get(key), 3) for key in columns)] for name, row in PAPER_TABLE_2.items()]
     caption = "Mean squared error of the displacement over the domain and each tissue (exact for linear elements), mm²."
-    header = ["", "Ω", *(f"Ω {name.upper() if len(name) <= 3 else name}" for name in tissues)]
+    header = ["", "Ω", *(f"Ω {label_of(name)}" for name in tissues)]
     return Table("Table 2. Mean squared error", caption, header, _beside(ours, paper, metrics))
 
 
@@ -119,7 +120,7 @@ def parameter_table(run: Run, posterior: xr.Dataset, diagnosed: Diagnosed) -> Ta
             _parameter_row(name, draws, truth.get(name), _figures(diagnosed, name, index, group))
             for name, draws in (("ratio", group.ratio), ("lam", group.lam), ("mu", group.mu))
         ]
-        groups.append((group.name.upper() if len(group.name) <= 3 else group.name, rows))
+        groups.append((label_of(group.name), rows))
     caption = (
         "With no forces inside, only ratios shape the deformation; the scale enters through the elastic temperature "
         "alone. A fixed parameter has no interval."

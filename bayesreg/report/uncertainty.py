@@ -1,4 +1,4 @@
-"""How far to trust the displacement, in millimetres: maps, and regions at landmarks."""
+"""How far to trust the displacement, in millimetres: maps, and regions at places."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ def region(draws: Float[AnyArray, "draws 3"]) -> Region:
     return Region(mean, covariance * np.quantile(squared, LEVEL))
 
 
-def landmark_table(view: View, predicted: Predicted) -> Table:
-    """Displacement and 95 % region of every landmark."""
-    words = regions(view.run.mesh, predicted.landmark_points)
+def place_table(view: View, predicted: Predicted) -> Table:
+    """Displacement and 95 % region of every place."""
+    words = regions(view.run.mesh, predicted.place_points)
     rows = []
-    for k, (name, point) in enumerate(zip(predicted.landmark_names, predicted.landmark_points, strict=True)):
-        draws = np.asarray(predicted.landmark_draws)[:, :, k].reshape(-1, 3)
+    for k, (name, point) in enumerate(zip(predicted.place_names, predicted.place_points, strict=True)):
+        draws = np.asarray(predicted.place_draws)[:, :, k].reshape(-1, 3)
         found = region(draws)
         far = (np.linalg.norm(draws - found.mean, axis=1) > predicted.far_mm).mean()
         rows.append(
@@ -79,29 +79,29 @@ def landmark_table(view: View, predicted: Predicted) -> Table:
     caption = (
         "Mean displacement (to the right, to the front, upwards) and the semi-axes of the ellipsoid that holds 95 % of "
         f"{draws.shape[0]:,} evenly spaced draws; last, the share of draws more than {predicted.far_mm:g} mm from the "
-        "mean. Where no landmarks are given some are chosen; report.landmarks in the configuration names others."
+        "mean. Where no places are given some are chosen; report.places in the configuration names others."
     )
     header = ["", "Place (x, y, z)", "Where", "Shift x, y, z, mm", "Norm, mm", "95 % semi-axes, mm", _beyond(predicted)]
-    return Table("Landmarks", caption, header, [("", rows)])
+    return Table("Places", caption, header, [("", rows)])
 
 
 def _beyond(predicted: Predicted) -> str:
     return f"P(> {predicted.far_mm:g} mm)"
 
 
-def landmarks(view: View, predicted: Predicted) -> Drawing:
-    """Where each landmark goes, on the moving image: the draws and their 95 % region."""
-    count = len(predicted.landmark_names)
+def places(view: View, predicted: Predicted) -> Drawing:
+    """Where each place goes, on the moving image: the draws and their 95 % region."""
+    count = len(predicted.place_names)
     bands, columns = -(-count // COLUMNS), min(max(count, 4), COLUMNS)
     size = style.WIDTH / columns
     with style.look():
         figure = style.new_figure(bands * (3 * size + 0.35))
         axes = figure.subplots(3 * bands, columns, squeeze=False)
         limits = panels.grey_limits(view.run)
-        for k, name in enumerate(predicted.landmark_names):
+        for k, name in enumerate(predicted.place_names):
             band, column = divmod(k, COLUMNS)
             for row, axis in enumerate((2, 1, 0)):
-                _landmark(axes[3 * band + row, column], view, predicted, k, axis, limits)
+                _place(axes[3 * band + row, column], view, predicted, k, axis, limits)
             axes[3 * band, column].set_title(str(name), fontsize=8)
         for band in range(bands):
             for row, axis in enumerate((2, 1, 0)):
@@ -111,17 +111,17 @@ def landmarks(view: View, predicted: Predicted) -> Drawing:
                 panel.remove()
         uri = style.data_uri(figure)
     caption = (
-        "Where each landmark of the fixed image is to be found in the moving image, magnified. Dots: one per draw, "
+        "Where each place of the fixed image is to be found in the moving image, magnified. Dots: one per draw, "
         "coloured by chain; cross and ellipse: mean and outline of the ellipsoid that holds 95 % of the draws; dashed: "
         "the way from its place in the fixed image (ring, where it is near enough to be seen)."
     )
-    alt = "Landmarks with their displaced positions: " + ", ".join(str(name) for name in predicted.landmark_names) + "."
-    return Drawing("landmarks", "Where the landmarks go", caption, alt, uri)
+    alt = "Places with their displaced positions: " + ", ".join(str(name) for name in predicted.place_names) + "."
+    return Drawing("places", "Where the places go", caption, alt, uri)
 
 
-def _landmark(axes: Axes, view: View, predicted: Predicted, k: int, axis: int, limits: tuple[float, float]) -> None:
+def _place(axes: Axes, view: View, predicted: Predicted, k: int, axis: int, limits: tuple[float, float]) -> None:
     across, up = IN_PLANE[axis]
-    point, u = np.asarray(predicted.landmark_points)[k], np.asarray(predicted.landmark_draws)[:, :, k]
+    point, u = np.asarray(predicted.place_points)[k], np.asarray(predicted.place_draws)[:, :, k]
     found = region(u.reshape(-1, 3))
     goes = point + found.mean
     half = max(ZOOM, 2 * float(found.semi_axes[0]))

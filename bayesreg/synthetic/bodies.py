@@ -19,6 +19,7 @@ from bayesreg.model.options import ModelConfig, of_tissue
 from bayesreg.model.posterior import Posterior
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.synthetic.recalibration import RANGE
+from bayesreg.tissues import is_fluid
 from bayesreg.types import InputError
 
 # How far the μ of a body may lie from that of the run, as a factor, and its push, as a share of the run's.
@@ -27,7 +28,6 @@ FACTOR, PUSH = 1.5, (0.85, 1.15)
 ATTEMPTS = 30
 # Share of the nodes on the boundary that are pushed.
 PATCH_SHARE = 0.045
-CSF = "csf"
 
 
 class Subject(NamedTuple):
@@ -42,7 +42,7 @@ class Subject(NamedTuple):
     model : ModelConfig
         Of the registration.
     lam, mu : mapping
-        Tissue name to the value of CSF, and to one about which those of the other tissues lie.
+        Tissue name to the value of a fluid, or to one about which those of a solid tissue lie.
     displacement, noise_sd, smoothing_mm : float
         How far a patch moves, mm; the noise on each image; the width of a smoothing of `fixed` beforehand.
     """
@@ -68,7 +68,7 @@ class Body(NamedTuple):
     seed : int
     true, found : dict
         Tissue to λ/μ, of the body and at the mode of its posterior on the registering mesh; of tissues whose λ/μ the
-        registration has to find. CSF is none of them.
+        registration has to find; a fluid is none of them.
     failed : str
         Why the registration cannot be counted; empty if it can.
     """
@@ -80,9 +80,9 @@ class Body(NamedTuple):
 
 
 def sought(model: ModelConfig, names: tuple[str, ...]) -> list[str]:
-    """Tissues but CSF of which λ or μ is free."""
+    """Solid tissues of which λ or μ is free."""
     known = [model.known(names).get(parameter) for parameter in ("lam", "mu")]
-    return [name for name in names if name != CSF and not all(of_tissue(model, given, name) for given in known)]
+    return [name for name in names if not is_fluid(name) and not all(of_tissue(model, given, name) for given in known)]
 
 
 def register_body(subject: Subject, seed: int) -> Body:
@@ -97,7 +97,7 @@ def register_body(subject: Subject, seed: int) -> Body:
     for name in names:
         ratio, factor = float(np.exp(rng.uniform(low, high))), FACTOR ** float(rng.uniform(-1, 1))
         lam_known, mu_known = (of_tissue(model, known.get(parameter), name) for parameter in ("lam", "mu"))
-        if name != CSF:
+        if not is_fluid(name):
             mu[name] = mu_known or (lam_known / ratio if lam_known else mu[name] * factor)
             lam[name] = lam_known or ratio * mu[name]
     tissues = sought(model, names)
@@ -122,7 +122,7 @@ def _pushed(
     lam: Float[np.ndarray, "tissues"],
     mu: Float[np.ndarray, "tissues"],
 ) -> SyntheticPair:
-    """A pair with a patch of its own in the upper half, where the brain is free."""
+    """A pair with a patch of its own in the upper half, where a brain is free."""
     patch_nodes = max(round(PATCH_SHARE * len(subject.making.boundary)), 3)
     for _ in range(ATTEMPTS):
         direction = rng.normal(size=3)

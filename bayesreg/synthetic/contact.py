@@ -238,7 +238,7 @@ class _Compliance:
         degrees = np.arange(stiffness.shape[0]).reshape(-1, 3)
         self.free = np.delete(degrees, held, axis=0).ravel()
         self.rows = degrees[nodes].ravel()
-        # Stiffness spans seven decades between CSF and brain; a unit diagonal lets the factor see both alike.
+        # Stiffness spans seven decades between a fluid and a solid; a unit diagonal lets the factor see both alike.
         self.scale = 1 / np.sqrt(stiffness.diagonal()[self.free])
         scaled = scipy.sparse.diags(self.scale) @ stiffness[self.free][:, self.free] @ scipy.sparse.diags(self.scale)
         self.factor = splu(

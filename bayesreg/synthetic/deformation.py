@@ -19,7 +19,7 @@ from bayesreg.types import InputError
 
 Direction = tuple[float, float, float]
 
-# Frontal (right, left, right and lower), lateral (right, left) and parietal: all where the hull of the brain is free.
+# Frontal (right, left, right and lower), lateral (right, left) and parietal: all where the hull of a brain is free.
 DIRECTIONS: tuple[Direction, ...] = (
     (0.6, 0.3, 0.75),
     (-0.6, 0.3, 0.75),

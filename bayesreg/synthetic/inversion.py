@@ -14,7 +14,7 @@ from bayesreg.model.warp import covered_voxels
 
 
 def deformed_image(
-    fixed: Image, tissue: Image, skull: Image, mesh: TetMesh, u: Float[np.ndarray, "nodes 3"], csf_intensity: float
+    fixed: Image, tissue: Image, skull: Image, mesh: TetMesh, u: Float[np.ndarray, "nodes 3"], filling: float
 ) -> Image:
     """The image m with m(x + u(x)) = f(x).
 
@@ -25,7 +25,7 @@ def deformed_image(
     Outside the deformed mesh y is one of these, in this order: a voxel next to it, which the interpolation of
     m inside the mesh reads too: m(y) = f(y − u), u being the displacement of the nearest point of the surface;
     skull, which stays where it is: m(y) = f(y); tissue that the mesh left out and that rides on its surface:
-    m(y) = f(y − u) again; space that tissue has left: CSF; nothing labelled before or after: m(y) = f(y).
+    m(y) = f(y − u) again; space that tissue has left: `filling`; nothing labelled before or after: m(y) = f(y).
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def deformed_image(
         At rest, in the space of `fixed`.
     u : (n, 3) array
         Displacement of every node, mm; no tetrahedron inverted.
-    csf_intensity : float
+    filling : float
         Fills the space that tissue has left.
     """
     deformed = mesh.moved(u)
@@ -55,7 +55,7 @@ def deformed_image(
     rest -= _surface_displacement(mesh, deformed, rest)
     carried = beside[tuple(index.T)] | _is_tissue(tissue, rest)
     left = np.asarray(tissue.voxels)[tuple(index.T)] > 0
-    values[tuple(index[left & ~carried].T)] = csf_intensity
+    values[tuple(index[left & ~carried].T)] = filling
     values[tuple(index[carried].T)] = _cubic(fixed, rest[carried])
     return fixed.with_voxels(values)
 

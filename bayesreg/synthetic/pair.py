@@ -11,6 +11,7 @@ from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.synthetic.deformation import Deformation, Direction, push_patch
 from bayesreg.synthetic.inversion import deformed_image, residuals
+from bayesreg.tissues import is_fluid
 from bayesreg.types import InputError
 
 
@@ -82,7 +83,8 @@ def make_pair(
     skull : Image
         Nonzero = forbidden; on the same grid.
     mesh : TetMesh
-        One of its tissues is named "csf".
+        Space that its tissues leave is filled with its fluid (`bayesreg.tissues`), or with what lies outside the
+        tissues where none is a fluid.
     lam, mu : (T,) array
         Lamé parameters by tissue.
     displacement, patch_nodes, direction, margin
@@ -98,14 +100,14 @@ def make_pair(
     Raises
     ------
     InputError
-        If the images are on different grids or do not cover the mesh, no tissue is called CSF or the image
-        has none of it, or as `push_patch` says.
+        If the images are on different grids or do not cover the mesh, the image has no voxel
+        to fill free space with, or as `push_patch` says.
     """
     _require_one_grid(fixed, tissue, skull, mesh)
     if smoothing_mm < 0 or noise_sd < 0:
         raise InputError(f"smoothing_mm and noise_sd must not be negative, got {smoothing_mm} and {noise_sd}")
     fixed = fixed.smoothed(smoothing_mm)
-    csf = _csf_intensity(fixed, tissue, mesh)
+    filling = _filling_intensity(fixed, tissue, mesh)
     truth = push_patch(
         mesh,
         skull,
@@ -116,7 +118,7 @@ def make_pair(
         direction=direction,
         margin=margin,
     )
-    moving = deformed_image(fixed, tissue, skull, mesh, truth.u, csf)
+    moving = deformed_image(fixed, tissue, skull, mesh, truth.u, filling)
     noisy = [_noisy(image, noise_sd, stream) for image, stream in zip((fixed, moving), _streams(seed), strict=True)]
     return SyntheticPair(
         fixed=noisy[0],
@@ -133,12 +135,13 @@ def make_pair(
     )
 
 
-def _csf_intensity(fixed: Image, tissue: Image, mesh: TetMesh) -> float:
-    if "csf" not in mesh.names:
-        raise InputError(f"space that the brain leaves is filled as CSF, but no tissue of {mesh.names} is named csf")
-    values = np.asarray(fixed.voxels)[np.asarray(tissue.voxels) == mesh.names.index("csf") + 1]
+def _filling_intensity(fixed: Image, tissue: Image, mesh: TetMesh) -> float:
+    """The median of the fluid, or of what is no tissue where there is no fluid."""
+    fluids = [index for index, name in enumerate(mesh.names, start=1) if is_fluid(name)]
+    values = np.asarray(fixed.voxels)[np.isin(np.asarray(tissue.voxels), fluids or [0])]
     if values.size == 0:
-        raise InputError("the tissue image has no CSF voxel to take the intensity of CSF from")
+        what = " or ".join(mesh.names[index - 1] for index in fluids) or "place without tissue"
+        raise InputError(f"free space cannot be filled: the tissue image has no {what} voxel to take an intensity from")
     return float(np.median(values))
 
 

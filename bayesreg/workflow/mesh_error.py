@@ -14,7 +14,7 @@ from bayesreg.io.meshing import MeshOptions, build_mesh, load_mesh, save_mesh
 from bayesreg.mesh import TetMesh
 from bayesreg.report.bodies import allowing, enough, mesh_table, sound
 from bayesreg.report.tables import Table
-from bayesreg.synthetic.bodies import CSF, Subject, register_body, sought
+from bayesreg.synthetic.bodies import Subject, register_body, sought
 from bayesreg.synthetic.recalibration import least_bodies
 from bayesreg.types import InputError
 from bayesreg.workflow.result import Result, load_result, report
@@ -68,8 +68,11 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
 def _require_ratios(result: Result) -> None:
     """Raise InputError where a run has no λ/μ by tissue that could be the mesh's, or no body can be pushed."""
     run, model = result.run, model_of(result.run.config)
-    if model.elasticity != "tissue" or CSF not in run.mesh.names or not sought(model, run.mesh.names):
-        raise InputError("the mesh's share is that of λ/μ by tissue: the run needs elasticity: tissue, and a CSF")
+    if model.elasticity != "tissue" or not sought(model, run.mesh.names):
+        raise InputError(
+            "the mesh's share is that of λ/μ by tissue: the run needs elasticity: tissue, and a solid tissue of "
+            "which λ or μ is free"
+        )
     if run.boundary is not None or model.held or model.is_elastography:
         raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
     if run.skull is None:
@@ -108,7 +111,7 @@ def _finer(result: Result) -> TetMesh:
         domain = run.tissue.with_voxels((np.asarray(run.tissue.voxels) != 0).astype(np.uint8))
         intracranial = run.skull.with_voxels((np.asarray(run.skull.voxels) == 0).astype(np.uint8))
         options = MeshOptions(edge_length=FINER * _edge_length(run.mesh))
-        save_mesh(build_mesh(run.tissue, intracranial, options, domain), path)
+        save_mesh(build_mesh(run.tissue, intracranial, options, domain, run.mesh.names), path)
     return load_mesh(path)
 
 

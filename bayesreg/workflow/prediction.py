@@ -13,16 +13,17 @@ import xarray as xr
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from bayesreg.fem.location import locate
+from bayesreg.fem.location import interpolation_at
 from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thinned
 from bayesreg.io.store import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
 from bayesreg.model.coordinates import filled
 from bayesreg.model.posterior import Posterior
-from bayesreg.types import AnyArray, InputError
+from bayesreg.tissues import label_of
+from bayesreg.types import AnyArray
 
-Landmarks = Mapping[str, tuple[float, float, float]]
+Places = Mapping[str, tuple[float, float, float]]
 
 MOST_DRAWS = 400
 FAR = 2.0
@@ -35,10 +36,10 @@ def predict(
     draws: xr.Dataset,
     u_mean: Float[np.ndarray, "nodes 3"],
     u_sd: Float[np.ndarray, "nodes 3"],
-    landmarks: Landmarks,
+    places: Places,
     seed: int,
 ) -> Predicted:
-    """Push at most 400 evenly spaced draws forward: u at nodes and landmarks, stiffness, residuals and replications.
+    """Push at most 400 evenly spaced draws forward: u at nodes and places, stiffness, residuals and replications.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def predict(
         The group `posterior` of the run.
     u_mean, u_sd : (n, 3) arrays
         Posterior mean and standard deviation at every node over all draws, mm.
-    landmarks : mapping
+    places : mapping
         Name to place (world mm, in the fixed image); where it is empty some are chosen.
     seed : int
         Of the replicated noise.
@@ -55,11 +56,11 @@ def predict(
     Raises
     ------
     InputError
-        If a landmark lies outside the mesh.
+        If a place lies outside the mesh.
     """
     mesh = posterior.mesh
-    landmarks = landmarks or default_landmarks(mesh, u_mean, u_sd)
-    nodes, weights = _interpolation(mesh, landmarks)
+    places = places or default_places(mesh, u_mean, u_sd)
+    nodes, weights = _interpolation(mesh, places)
     given = posterior.data, jnp.asarray(mesh.neighbours), jnp.asarray(u_mean), jnp.asarray(nodes), jnp.asarray(weights)
     key = jax.random.key(seed)
 
@@ -75,14 +76,14 @@ def predict(
         distance = jnp.linalg.norm(u - u_mean, axis=1)
         marks = jnp.einsum("la,lai->li", weights, u[nodes])
         stiffness = here.data.body.stiffness_factor(draw)
-        return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "landmarks": marks,
+        return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "places": marks,
                 "observed": observed, "replicated": replicated,
                 "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
 
     some = thinned(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    aside: dict[str, list[np.ndarray]] = {"landmarks": [], "observed": [], "replicated": []}
+    aside: dict[str, list[np.ndarray]] = {"places": [], "observed": [], "replicated": []}
     found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
     at_mean = standardised_residual(posterior.images, u_mean, _median_t_similarity(posterior, some))
@@ -91,9 +92,9 @@ def predict(
         far_mm=np.array(FAR),
         far=found.mean["far"],
         reach=found.quantiles["distance"][0],
-        landmark_names=np.array(list(landmarks)),
-        landmark_points=np.array(list(landmarks.values()), float),
-        landmark_draws=whole["landmarks"],
+        place_names=np.array(list(places)),
+        place_points=np.array(list(places.values()), float),
+        place_draws=whole["places"],
         residual=np.asarray(at_mean, np.float32),
         residual_tissue=mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
         discrepancies=np.array(DISCREPANCIES),
@@ -121,31 +122,22 @@ def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]
 
 
 def _median_t_similarity(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> float:
-    median = {name: np.median(draws[name]) for name in ("t_similarity",) if name in draws}
+    median = {name: np.asarray(np.median(draws[name])) for name in ("t_similarity",) if name in draws}
     return float(filled(posterior.data.blocks, median)["t_similarity"])
 
 
-def require_inside(mesh: TetMesh, landmarks: Landmarks) -> None:
-    """Raise InputError if a landmark lies outside the mesh, where no displacement is estimated."""
-    _interpolation(mesh, landmarks)
+def require_inside(mesh: TetMesh, places: Places) -> None:
+    """Raise InputError if a place lies outside the mesh, where no displacement is estimated."""
+    _interpolation(mesh, places)
 
 
-def _interpolation(mesh: TetMesh, landmarks: Landmarks) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (landmark, 4) and barycentric weights (landmark, 4) of places in the mesh."""
-    places = np.array(list(landmarks.values()), float).reshape(-1, 3)
-    # Nodes on a curved boundary may lie outside every cell by rounding.
-    cell, barycentric = locate(mesh.points, mesh.cells, places, tolerance=1e-6)
-    for name, place, where in zip(landmarks, places, cell, strict=True):
-        if where < 0:
-            raise InputError(
-                f"landmark {name!r} at {place.tolist()} mm lies outside the mesh, which runs from "
-                f"{mesh.points.min(axis=0).round(1).tolist()} to {mesh.points.max(axis=0).round(1).tolist()} mm "
-                "(world RAS, in the fixed image); give a place inside the brain"
-            )
-    return mesh.cells[cell], barycentric
+def _interpolation(mesh: TetMesh, places: Places) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (place, 4) and barycentric weights (place, 4) of places in the mesh."""
+    points = np.array(list(places.values()), float).reshape(-1, 3)
+    return interpolation_at(mesh, points, [f"place {name!r}" for name in places])
 
 
-def default_landmarks(
+def default_places(
     mesh: TetMesh, u_mean: Float[np.ndarray, "nodes 3"], u_sd: Float[np.ndarray, "nodes 3"]
 ) -> dict[str, tuple[float, float, float]]:
     """The nodes of the largest shift, the least certainty and the greatest depth, and the middle of each tissue.
@@ -164,5 +156,5 @@ def default_landmarks(
         if inside.any():
             centroid = np.average(centres[inside], axis=0, weights=mesh.volumes[inside])
             nearest = np.linalg.norm(centres[inside] - centroid, axis=1).argmin()
-            found[f"middle of {name.upper() if len(name) <= 3 else name}"] = centres[inside][nearest]
+            found[f"middle of {label_of(name)}"] = centres[inside][nearest]
     return {name: (float(x), float(y), float(z)) for name, (x, y, z) in found.items()}

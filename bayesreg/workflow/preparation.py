@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
-from bayesreg.config.sections import BrainWebData, CalibratedPair, FilesData, MeshConfig
+from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData
+from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
@@ -23,6 +24,7 @@ from bayesreg.io.store import Inputs, Truth
 from bayesreg.io.volumes import load_image
 from bayesreg.mesh import TetMesh
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
+from bayesreg.types import InputError
 from bayesreg.workflow.prediction import require_inside
 
 PROVENANCE = Path("inputs") / "provenance.json"
@@ -59,8 +61,8 @@ def prepare(config: Config) -> Prepared:
     if anatomy.intracranial is not None:
         anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
     clock.lap("anatomy")
-    domain = mesh_domain(anatomy.tissue, anatomy.intracranial)
-    tissue = _as_stored(domain_labels(anatomy.tissue, domain))
+    domain = mesh_domain(anatomy.tissue, anatomy.intracranial, names=anatomy.names)
+    tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
     mesh = _mesh(anatomy, domain, config.mesh)
     clock.lap("mesh")
     _require_start(config, mesh)
@@ -86,7 +88,7 @@ def prepare(config: Config) -> Prepared:
 def prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
     """The images, mesh and truth of a configuration, and where they come from."""
     prepared = prepare(config)
-    require_inside(prepared.inputs.mesh, config.report.landmarks)
+    require_inside(prepared.inputs.mesh, config.report.places)
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
 
 
@@ -136,7 +138,7 @@ def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
     """The fixed side, and the moving image of a pair from files."""
     data = config.data
     if isinstance(data, FilesData):
-        anatomy = from_files(data.fixed, data.labels, data.label_table.as_dict(), data.intracranial)
+        anatomy = from_files(data.fixed, data.labels, data.label_table, data.intracranial)
         moving = load_image(data.moving)
         check_same_space(anatomy.image, moving, ("fixed", "moving"))
         return anatomy, moving
@@ -147,13 +149,24 @@ def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
 
 def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
     if settings.file is not None and edge_length is None:
-        return load_mesh(settings.file)
+        return _loaded_mesh(settings.file, anatomy.names)
     options = MeshOptions(
         edge_length=edge_length or settings.edge_length,
         envelope=None if edge_length else settings.envelope,
         skull_gap=settings.skull_gap,
     )
-    return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain)
+    return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain, anatomy.names)
+
+
+def _loaded_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
+    """A mesh from a file; InputError where its tissues are not those of the labels."""
+    mesh = load_mesh(path, names)
+    if mesh.names != names:
+        raise InputError(
+            f"mesh.file {path} has the tissues {', '.join(mesh.names)}, and the labels have {', '.join(names)}: both "
+            "need the same names in the same order"
+        )
+    return mesh
 
 
 def _as_stored(image: Image) -> Image:
@@ -182,8 +195,8 @@ def _pair(
         anatomy.tissue,
         skull,
         making,
-        lam=np.asarray(settings.lam.as_tuple()),
-        mu=np.asarray(settings.mu.as_tuple()),
+        lam=np.array([settings.lam[name] for name in anatomy.names]),
+        mu=np.array([settings.mu[name] for name in anatomy.names]),
         displacement=settings.displacement,
         patch_nodes=settings.patch_nodes,
         direction=settings.direction,

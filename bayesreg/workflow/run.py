@@ -269,7 +269,7 @@ def _finish(
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
-    predicted = predict(posterior, draws, samples.u_mean, samples.u_sd, config.report.landmarks, config.seed)
+    predicted = predict(posterior, draws, samples.u_mean, samples.u_sd, config.report.places, config.seed)
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, draws, judged, provenance, began),
         u_mean=samples.u_mean,

@@ -30,7 +30,7 @@ def files(tmp_path):
     return paths
 
 
-OWN_TABLE = {"wm": 13, "gm": 12, "csf": 11}
+OWN_TABLE = {"csf": 11, "gm": 12, "wm": 13}
 
 
 def check_anatomy(anatomy):
@@ -101,9 +101,10 @@ class TestFromFiles:
     def test_goes_without_an_intracranial_mask(self, files):
         assert from_files(files["t1"], files["labels"], OWN_TABLE).intracranial is None
 
-    def test_refuses_other_tissues(self, files):
-        with pytest.raises(ValueError, match="must name csf, gm, wm; got gm, tumour"):
-            from_files(files["t1"], files["labels"], {"gm": 12, "tumour": 13})
+    def test_takes_any_tissues_in_the_order_of_the_table(self, files):
+        anatomy = from_files(files["t1"], files["labels"], {"tumour": 13, "gm": 12})
+        assert anatomy.names == ("tumour", "gm")
+        assert anatomy.tissue.voxels[2, 2, 2] == 1
 
     def test_refuses_labels_on_another_grid(self, files, tmp_path):
         nib.save(nib.Nifti1Image(np.zeros((6, 6, 6)), np.eye(4)), tmp_path / "other.nii")

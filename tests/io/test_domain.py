@@ -66,7 +66,7 @@ class TestDomain:
     def test_refuses_a_mask_elsewhere(self, phantom):
         tissue, inside = phantom
         elsewhere = inside.with_voxels(inside.voxels * (offset_from_centre(tissue)[0] > 10))
-        with pytest.raises(MeshError, match="more than half of the GM and WM lies outside the intracranial mask"):
+        with pytest.raises(MeshError, match="more than half of GM and WM lies outside the intracranial mask"):
             mesh_domain(tissue, elsewhere)
 
     def test_refuses_another_grid(self, phantom):

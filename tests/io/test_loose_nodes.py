@@ -9,6 +9,7 @@ from bayesreg.io.loose_nodes import FEWEST, may_be_contracted, without_loose_nod
 from bayesreg.io.quality import EDGES, check_topology
 from bayesreg.io.surfaces import depth_sizing
 from bayesreg.mesh import FACES, TetMesh
+from bayesreg.tissues import BRAIN
 from tests.io.balls import balls, grid
 from tests.phantoms import ball_mesh
 
@@ -127,5 +128,5 @@ def test_no_mesh_of_a_brain_has_any(monkeypatch):
     monkeypatch.setattr(meshing, "tetrahedralize", lambda *_, **__: with_ears(BALL.points, BALL.cells))
     monkeypatch.setattr(meshing, "tissue_of_cells", lambda points, cells, labels: np.zeros(len(cells), int))
     labels, _ = balls(grid())
-    mesh = meshing._attempt(labels, [], depth_sizing(labels, 15.0, 30.0), None, meshing.MeshOptions())
+    mesh = meshing._attempt(labels, BRAIN, [], depth_sizing(labels, 15.0, 30.0), None, meshing.MeshOptions())
     assert (held_by(mesh) >= FEWEST).all()

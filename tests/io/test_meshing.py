@@ -10,6 +10,7 @@ from bayesreg.distance import signed_distance
 from bayesreg.image import Image
 from bayesreg.io import meshing, tetwild
 from bayesreg.io.datasets import brainweb, mni152
+from bayesreg.io.domain import labels_everywhere
 from bayesreg.io.meshing import (
     MeshError,
     MeshOptions,
@@ -123,10 +124,13 @@ class TestTissueOfCells:
         assert 0 < (share > 0.5)[clear].mean() < 1
         np.testing.assert_array_equal(tissue[clear], np.where(share[clear] > 0.5, 2, 0))
 
-    def test_counts_all_beyond_the_labels_as_csf(self):
+    @pytest.mark.parametrize(("names", "expected"), [(("csf", "gm"), 0), (("liver", "vessels"), 1)])
+    def test_counts_all_beyond_the_labels_as_fluid_or_as_the_nearest_tissue(self, names, expected):
         mesh = box_mesh(2)
-        image = Image(np.full((3, 3, 3), 2, np.int8), np.diag([-1.0, -1.0, -1.0, 1.0]))
-        np.testing.assert_array_equal(tissue_of_cells(mesh.points, mesh.cells, image), 0)
+        labels = np.zeros((4, 3, 3), np.int8)
+        labels[2:] = 2
+        image = labels_everywhere(Image(labels, np.diag([-1.0, -1.0, -1.0, 1.0])), names)
+        np.testing.assert_array_equal(tissue_of_cells(mesh.points, mesh.cells, image), expected)
 
 
 class TestFiles:

@@ -68,10 +68,10 @@ def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
     arrays = {name: np.arange(k + 2.0) for k, name in enumerate(Predicted._fields)}
     by_cell = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
     arrays |= {name: np.linspace(0, k + 1.0, len(run.mesh.cells)) for k, name in enumerate(by_cell)}
-    names = {"landmark_names": np.array(["third ventricle", "λ"]), "discrepancies": np.array(["sd"])}
+    names = {"place_names": np.array(["third ventricle", "λ"]), "discrepancies": np.array(["sd"])}
     write(tmp_path, replace(run, predicted=Predicted(**arrays | names)))
     back = store.read_run(tmp_path).predicted
-    assert list(back.landmark_names) == ["third ventricle", "λ"]
+    assert list(back.place_names) == ["third ventricle", "λ"]
     np.testing.assert_array_equal(back.reach, arrays["reach"])
     stored = meshio.read(tmp_path / "mesh.vtu").cell_data
     for name in by_cell:

@@ -168,7 +168,7 @@ def make_posterior(rng: np.random.Generator, mesh: TetMesh, u: np.ndarray, memor
 
 
 def make_predicted(rng: np.random.Generator, mesh: TetMesh, u_mean: np.ndarray, chains: int) -> Predicted:
-    """Two landmarks with a covariance of known axes; P(> 2 mm) that rises with x; residuals of sd 1.3."""
+    """Two places with a covariance of known axes; P(> 2 mm) that rises with x; residuals of sd 1.3."""
     nodes = [int(np.linalg.norm(u_mean, axis=1).argmax()), int(mesh.interior[0])]
     spread = rng.normal(size=(chains, 100, 2, 3)) * (0.9, 0.3, 0.1)
     observed = rng.normal((1.3, 4.0, 0.0), (0.01, 0.2, 0.05), (chains, 100, 3))
@@ -177,9 +177,9 @@ def make_predicted(rng: np.random.Generator, mesh: TetMesh, u_mean: np.ndarray, 
         far_mm=np.array(2.0),
         far=np.clip((mesh.points[:, 0] - CENTRE[0]) / RADII[0], 0, 1),
         reach=np.full(len(u_mean), 1.25),
-        landmark_names=np.array(["ventricle", "tip <b>"]),
-        landmark_points=mesh.points[nodes],
-        landmark_draws=u_mean[nodes] + spread,
+        place_names=np.array(["ventricle", "tip <b>"]),
+        place_points=mesh.points[nodes],
+        place_draws=u_mean[nodes] + spread,
         residual=1.3 * rng.normal(size=4 * len(mesh.cells)),
         residual_tissue=np.repeat(mesh.tissue, 4),
         discrepancies=np.array(["sd", "greatest", "neighbours"]),

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from bayesreg.report import anatomy, convergence, marginals, style
 from bayesreg.report.estimands import Diagnosed, estimands, parameter_groups
 from bayesreg.report.panels import View, from_zero, symmetric
+from bayesreg.tissues import colours_of
 from tests.report.conftest import make_study
 
 
@@ -135,8 +136,8 @@ def test_only_ratios_get_a_logarithmic_axis():
 
 def test_many_chains_have_many_colours():
     assert len(set(style.chain_colours(16))) == 16
-    assert len(set(style.tissue_colours(["csf", "gm", "wm", "tumour", "oedema"]))) == 5
-    assert style.tissue_colours(["WM", "tumour"])[0] == style.tissue_colours(["csf", "gm", "wm"])[2]
+    assert len(set(colours_of(["csf", "gm", "wm", "tumour", "oedema"]))) == 5
+    assert colours_of(["WM", "tumour"])[0] == colours_of(["csf", "gm", "wm"])[2]
 
 
 def test_areas_on_a_logarithmic_axis_are_shares_of_the_draws():

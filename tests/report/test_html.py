@@ -13,7 +13,7 @@ from bayesreg.report.html import write_report
 from bayesreg.report.places import regions
 
 FIGURES = {"registration", "data", "result", "displacement", "stiffness", "node", "traces", "distributions"}
-FORWARD = {"uncertainty", "landmarks", "residual"}
+FORWARD = {"uncertainty", "places", "residual"}
 
 
 class Page(HTMLParser):
@@ -174,10 +174,10 @@ def test_chains_that_did_not_converge_are_called_so(clinical):
     assert "parameters uniform" in clinical.text
 
 
-def test_landmarks_are_listed_with_their_region_and_name_as_text(full, study):
+def test_places_are_listed_with_their_region_and_name_as_text(full, study):
     predicted = study.run.predicted
     row = full.row("tip <b>")
-    draws = predicted.landmark_draws[:, :, 1].reshape(-1, 3)
+    draws = predicted.place_draws[:, :, 1].reshape(-1, 3)
     assert row[2] == ", ".join(f"{x:.1f}" for x in draws.mean(axis=0)).replace("-", "−")
     # The draws are Normal with these sds: the radius of 95 % is the root of a chi-square quantile.
     expected = np.sqrt(7.815) * np.array([0.9, 0.3, 0.1])
@@ -193,7 +193,7 @@ def test_the_checks_name_what_the_model_does_not_explain(full):
 
 def test_a_page_without_predictions_and_with_one_group_of_chains_lacks_those_sections(full, clinical):
     assert "Does the model fit" not in clinical.text
-    assert "Landmarks" not in clinical.text
+    assert "Places" not in clinical.text
     assert "Chains that disagree" not in full.text
     assert "#groups" not in full.links
     assert "#fit" in full.links

@@ -1,7 +1,8 @@
 import numpy as np
 
 from bayesreg.mesh import TetMesh
-from bayesreg.report.places import regions, tissue_label
+from bayesreg.report.places import regions
+from bayesreg.tissues import label_of
 
 
 def test_sides_follow_the_axes_and_the_tissue_is_the_nearest():
@@ -21,4 +22,4 @@ def test_sides_follow_the_axes_and_the_tissue_is_the_nearest():
 
 
 def test_abbreviations_are_capitals():
-    assert [tissue_label(name) for name in ("wm", "tumour")] == ["WM", "tumour"]
+    assert [label_of(name) for name in ("wm", "tumour")] == ["WM", "tumour"]

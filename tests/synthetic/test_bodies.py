@@ -11,6 +11,7 @@ from bayesreg.cli import app
 from bayesreg.io import store
 from bayesreg.report.bodies import enough
 from bayesreg.report.html import write_report
+from bayesreg.synthetic import bodies as bodies_module
 from bayesreg.synthetic.bodies import Body, Subject, register_body
 from bayesreg.workflow import mesh_error as module
 from bayesreg.workflow.mesh_error import mesh_error
@@ -84,7 +85,7 @@ def test_bodies_have_the_parameters_that_the_registration_knows(known, monkeypat
         made.append((lam, mu))
         raise br.InputError("it folds")
 
-    monkeypatch.setattr(module, "make_pair", refuse)
+    monkeypatch.setattr(bodies_module, "make_pair", refuse)
     body = register_body(subject_of(fixed=known), seed=1)
     assert body.failed == "no patch can be pushed by 7.0 mm; the last attempt: it folds"
     lam, mu = (dict(zip(NAMES, values.tolist(), strict=True)) for values in made[0])
@@ -150,7 +151,7 @@ def test_a_damaged_file_is_told(tmp_path, content):
         ({"config": "model: {elasticity: uniform}"}, "elasticity: tissue"),
         ({"config": "model: {fixed: {lam: 9.0, mu: 1.0}}"}, "elasticity: tissue"),
         ({"manifest": {"inverted_elements": 2}}, "inside out"),
-        ({"mesh": ("water", "gm", "wm")}, "and a CSF"),
+        ({"mesh": ("csf", "fluid", "FLUID")}, "and a solid tissue"),
     ],
 )
 def test_what_has_no_ratio_of_its_own_is_refused(folder, study, monkeypatch, changed, message):

@@ -243,14 +243,15 @@ def test_bad_images(small):
     shifted = small.tissue.affine.copy()
     shifted[0, 3] += 3
     tight = small.skull.with_voxels((np.linalg.norm(small.skull.grid_points() - CENTRE, axis=-1) > 36).astype(np.uint8))
+    no_tissue_free = small.tissue.with_voxels(np.maximum(small.tissue.voxels, 1))
     no_csf = small.tissue.with_voxels(np.where(small.tissue.voxels == 1, 2, small.tissue.voxels))
     unnamed = TetMesh.from_arrays(small.mesh.points, small.mesh.cells, small.mesh.tissue, ("a", "b", "c"))
     corner = Image(small.fixed.voxels, small.fixed.affine + np.outer([1, 0, 0, 0], [0, 0, 0, 60.0]))
     for changed, message in (
         ({"tissue": Image(small.tissue.voxels, shifted)}, "tissue image must lie on the grid"),
         ({"skull": tight}, r"\d+ boundary nodes lie in the skull before"),
-        ({"tissue": no_csf}, "no CSF voxel"),
-        ({"mesh": unnamed}, "named csf"),
+        ({"tissue": no_csf}, "no csf voxel"),
+        ({"mesh": unnamed, "tissue": no_tissue_free}, "no place without tissue voxel"),
         (dict(zip(("fixed", "tissue", "skull"), (corner,) * 3, strict=True)), "nodes of the mesh lie off the grid"),
     ):
         with pytest.raises(InputError, match=message):

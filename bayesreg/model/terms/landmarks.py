@@ -9,9 +9,10 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Float, Int
 
+from bayesreg.fem.location import interpolation_at
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
-from bayesreg.model.state import State, interpolation_at
+from bayesreg.model.state import State
 from bayesreg.model.terms.term import Label, PointCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
 

@@ -1,0 +1,103 @@
+"""The sections of a configuration that say which images there are: files, datasets, and pairs made of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StrictBool
+
+from bayesreg.config.values import (
+    ByTissue,
+    Direction,
+    FoundFile,
+    Labels,
+    LabelTable,
+    NotNegative,
+    Positive,
+    Section,
+)
+from bayesreg.tissues import BRAIN, PAPER_LAM, PAPER_MU
+
+
+class Mni152Data(Section):
+    """The MNI152 brain that ships with nilearn; a synthetic pair is made of it."""
+
+    source: Literal["mni152"]
+
+    @property
+    def tissues(self) -> tuple[str, ...]:
+        """Names of the tissues."""
+        return BRAIN
+
+
+class BrainWebData(Section):
+    """BrainWeb's label phantom with the T1 of Colin27; a synthetic pair is made of them."""
+
+    source: Literal["brainweb"]
+    labels: FoundFile
+    """Discrete BrainWeb labels, as they are published."""
+    t1: FoundFile
+    """T1 image on the same grid."""
+    intracranial_labels: Labels = (1, 2, 3, 8)
+    """Labels inside the skull; of their union the largest connected part is taken."""
+
+    @property
+    def tissues(self) -> tuple[str, ...]:
+        """Names of the tissues."""
+        return BRAIN
+
+
+class FilesData(Section):
+    """A pair of one's own, in one world space (aligned beforehand)."""
+
+    source: Literal["files"]
+    fixed: FoundFile
+    """Pre-operative image."""
+    moving: FoundFile
+    """Intra-operative image."""
+    labels: FoundFile
+    """Tissue labels of the fixed image, on its grid."""
+    label_table: LabelTable
+    """Values of the label file by tissue: any names, any number of them."""
+    intracranial: FoundFile | None = None
+    """Image that is not zero where the organ may go; without it nothing bounds the motion."""
+    same_contrast: StrictBool = True
+    """Scale the intensities of both images by one common scale."""
+
+    @property
+    def tissues(self) -> tuple[str, ...]:
+        """Names of the tissues."""
+        return tuple(self.label_table)
+
+
+class _Pair(Section):
+    displacement: Positive = 15.0
+    """How far the patch moves towards the centre of gravity, mm."""
+    patch_nodes: Annotated[int, Field(strict=True, ge=3)] = 20
+    """Number of boundary nodes in the patch."""
+    direction: Direction | None = None
+    """From the centre of gravity to the patch, world RAS; null takes the first of several that inverts no element."""
+    lam: ByTissue = Field(default=dict(PAPER_LAM))
+    """True first Lamé parameter of every tissue."""
+    mu: ByTissue = Field(default=dict(PAPER_MU))
+    """True second Lamé parameter of every tissue."""
+    smoothing_mm: NotNegative | None = None
+    """Width (sd, mm) of the smoothing of the anatomy beforehand; null lets the kind of pair choose."""
+
+
+class PaperPair(_Pair):
+    """A synthetic pair as in section 4.1 of the paper: one mesh for making and registering."""
+
+    kind: Literal["paper"]
+    noise_sd: NotNegative = 0.003
+    """Noise on each image; intensities run from 0 to 1."""
+
+
+class CalibratedPair(_Pair):
+    """A synthetic pair made on a finer mesh, for checks of coverage."""
+
+    kind: Literal["calibrated"]
+    noise_sd: NotNegative = 0.01
+    """Noise on each image; intensities run from 0 to 1."""
+    making_edge_length: Positive = 10.0
+    """Edge length of the making mesh, mm."""

@@ -1,0 +1,79 @@
+"""Facts about tissues that a name tells: the presets of brains, and neutral ones of all other names.
+
+The only place besides the datasets (`bayesreg.io.datasets`) where tissues are named.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+
+class Tissue(NamedTuple):
+    """What is known of a tissue.
+
+    Attributes
+    ----------
+    label : str
+        Its name for people.
+    colour : str
+        In figures.
+    is_fluid : bool
+        Whether it hardly resists: it starts at λ = μ = 0.01, fills the space that others leave, and its stiffness is
+        not worth looking for.
+    is_reference : bool
+        Whether its μ is the one that is fixed at 1 where nothing else is said.
+    """
+
+    label: str
+    colour: str
+    is_fluid: bool = False
+    is_reference: bool = False
+
+
+# By name in small letters. Colours are distinct in hue and in lightness, also for colour-blind eyes and in grey.
+PRESETS: Mapping[str, Tissue] = {
+    "csf": Tissue("CSF", "#3a6ea5", is_fluid=True),
+    "gm": Tissue("GM", "#c26a6f", is_reference=True),
+    "wm": Tissue("WM", "#e3b95a"),
+    "fluid": Tissue("fluid", "#6f9fc8", is_fluid=True),
+}
+COLOURS = ("#5c9a86", "#7d6aa8", "#b07c46", "#8aa34f", "#a3597f", "#4f8fa3")
+
+# The tissues of the brains that the package ships or reads, in the order of the paper, and the paper's true values.
+BRAIN = ("csf", "gm", "wm")
+PAPER_LAM: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 10.0, 30.0), strict=True))
+PAPER_MU: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 1.0, 1.0), strict=True))
+
+# λ and μ where nothing is said (the literature's λ/μ is about 24), and those of a fluid.
+SOLID = {"lam": 10.0, "mu": 1.0}
+FLUID = 0.01
+
+
+def is_fluid(name: str) -> bool:
+    """Whether a tissue of this name hardly resists."""
+    return name.lower() in PRESETS and PRESETS[name.lower()].is_fluid
+
+
+def label_of(name: str) -> str:
+    """A tissue's name for people."""
+    preset = PRESETS.get(name.lower())
+    return preset.label if preset else name
+
+
+def colours_of(names: Sequence[str]) -> list[str]:
+    """A colour for each tissue, the same in every figure."""
+    others = itertools.cycle(COLOURS)
+    return [PRESETS[name.lower()].colour if name.lower() in PRESETS else next(others) for name in names]
+
+
+def reference_tissue(names: Sequence[str]) -> str:
+    """The tissue whose μ is 1 where nothing else is said: the preset's, else the first that is no fluid."""
+    preset = (name for name in names if name.lower() in PRESETS and PRESETS[name.lower()].is_reference)
+    return next(preset, next((name for name in names if not is_fluid(name)), names[0]))
+
+
+def usual_value(parameter: str, name: str) -> float:
+    """λ ("lam") or μ ("mu") of a tissue where nothing is said."""
+    return FLUID if is_fluid(name) else SOLID[parameter]
