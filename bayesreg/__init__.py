@@ -21,6 +21,7 @@ _HOME = {
     "solve_interior": "fem.equilibrium",
     "ModelConfig": "model.options",
     "PriorConfig": "model.options",
+    "ScalePrior": "model.options",
     "TemperaturePrior": "model.options",
     "Posterior": "model.posterior",
     "build_posterior": "model.build",

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import meshio
 import nibabel as nib
@@ -19,7 +20,7 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import interpolation_at
-from bayesreg.io import store
+from bayesreg.io import checkpoints, store
 from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
 from bayesreg.workflow import preparation
@@ -142,9 +143,9 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
             raise cause
         return save(where, arrays)
 
-    save = store.save_state
+    save = checkpoints.save_state
     shutil.rmtree(folder / "cut", ignore_errors=True)
-    monkeypatch.setattr(store, "save_state", cut_off)
+    monkeypatch.setattr(checkpoints, "save_state", cut_off)
     with pytest.raises(type(cause)):
         br.run(folder / "run.yaml", folder / "cut", progress=False)
     monkeypatch.undo()
@@ -216,9 +217,12 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
     np.testing.assert_allclose(posterior.reference()["mu"], mu)
 
 
-@pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
-def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(points, draws):
-    assert run_module._block(points) == draws
+@pytest.mark.parametrize(("points", "draws"), [(None, 100), (900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
+def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(points, draws, monkeypatch):
+    quadrature = SimpleNamespace(weights=range(points or 0))
+    images = None if points is None else SimpleNamespace(quadrature=quadrature)
+    monkeypatch.setattr(run_module, "images_of", lambda _: images)
+    assert run_module._block(SimpleNamespace(data=None)) == draws
 
 
 def test_check_estimates_without_writing(folder):

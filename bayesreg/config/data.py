@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool
+from pydantic import Field, StrictBool, ValidationInfo, field_validator
 
 from bayesreg.config.values import (
     ByTissue,
@@ -48,16 +49,16 @@ class BrainWebData(Section):
 
 
 class FilesData(Section):
-    """A pair of one's own, in one world space (aligned beforehand)."""
+    """An organ of one's own; both images are in one world space (aligned beforehand)."""
 
     source: Literal["files"]
-    fixed: FoundFile
-    """Pre-operative image."""
-    moving: FoundFile
+    fixed: FoundFile | None = None
+    """Pre-operative image; null where only other observations are to be used."""
+    moving: Annotated[FoundFile | None, Field(validate_default=True)] = None
     """Intra-operative image."""
-    labels: FoundFile
-    """Tissue labels of the fixed image, on its grid."""
-    label_table: LabelTable
+    labels: Annotated[FoundFile | None, Field(validate_default=True)] = None
+    """Tissue labels of the fixed image, on its grid; null takes the tissues of mesh.file."""
+    label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
     """Values of the label file by tissue: any names, any number of them."""
     intracranial: FoundFile | None = None
     """Image that is not zero where the organ may go; without it nothing bounds the motion."""
@@ -65,9 +66,30 @@ class FilesData(Section):
     """Scale the intensities of both images by one common scale."""
 
     @property
-    def tissues(self) -> tuple[str, ...]:
-        """Names of the tissues."""
-        return tuple(self.label_table)
+    def tissues(self) -> tuple[str, ...] | None:
+        """Names of the tissues; None where only the mesh knows them."""
+        return None if self.label_table is None else tuple(self.label_table)
+
+    @field_validator("moving")
+    @classmethod
+    def _is_a_pair(cls, moving: Path | None, info: ValidationInfo) -> Path | None:
+        if "fixed" in info.data and (moving is None) != (info.data["fixed"] is None):
+            raise ValueError("a pair of images needs both, fixed and moving")
+        return moving
+
+    @field_validator("labels")
+    @classmethod
+    def _is_there_with_images(cls, labels: Path | None, info: ValidationInfo) -> Path | None:
+        if labels is None and info.data.get("fixed") is not None:
+            raise ValueError("missing; expected tissue labels of the fixed image")
+        return labels
+
+    @field_validator("label_table")
+    @classmethod
+    def _belongs_to_labels(cls, table: LabelTable | None, info: ValidationInfo) -> LabelTable | None:
+        if "labels" in info.data and (table is None) != (info.data["labels"] is None):
+            raise ValueError("labels and label_table belong together; give both, or neither and mesh.file")
+        return table
 
 
 class _Pair(Section):

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData, Mni152Data, PaperPair
+from bayesreg.config.observations import ImagesSection, Observations
 from bayesreg.config.samplers import Hmc, SamplerConfig, name_hmc_where_unnamed
 from bayesreg.config.values import (
     ByTissue,
@@ -124,7 +125,7 @@ class Config(Section):
     """What the run is for."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
     data: Annotated[Mni152Data | BrainWebData | FilesData, Field(discriminator="source")]
-    mesh: MeshConfig = MeshConfig()
+    mesh: Annotated[MeshConfig, Field(validate_default=True)] = MeshConfig()
     simulate: Annotated[
         Annotated[PaperPair | CalibratedPair, Field(discriminator="kind")] | None, Field(validate_default=True)
     ] = None
@@ -132,6 +133,8 @@ class Config(Section):
     known_boundary: Annotated[Literal["truth"] | Path | None, BeforeValidator(find_boundary)] = None
     """Elastography: the displacement of the boundary is known, truth (of a synthetic pair) or a file (.vtu or .npz of
     this mesh, or a displacement field .nii, .nii.gz), and λ, μ alone are sampled; null samples both."""
+    observations: Annotated[Observations, Field(validate_default=True)] = None
+    """What was observed; null is the pair of images alone."""
     model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
     sampler: Annotated[
         SamplerConfig,
@@ -170,6 +173,31 @@ class Config(Section):
             _require_tissues("mu", simulate.mu, data and data.tissues, whole=True)
         return simulate
 
+    @field_validator("mesh")
+    @classmethod
+    def _is_there(cls, mesh: MeshConfig, info: ValidationInfo) -> MeshConfig:
+        data = info.data.get("data")
+        if isinstance(data, FilesData) and data.labels is None and mesh.file is None:
+            raise _wrong("file", "missing: without data.labels nothing can be meshed; expected a .vtu file")
+        return mesh
+
+    @field_validator("observations")
+    @classmethod
+    def _are_there(cls, observations: Observations, info: ValidationInfo) -> Observations:
+        data = info.data.get("data")
+        pictures = not isinstance(data, FilesData) or data.fixed is not None
+        wanted = observations is not None and any(isinstance(one, ImagesSection) for one in observations)
+        if wanted and not pictures:
+            raise ValueError("images are observed, and data has none; expected data.fixed and data.moving")
+        return observations
+
+    @property
+    def compares_images(self) -> bool:
+        """Whether the pair of images is among the observations."""
+        if self.observations is None:
+            return not isinstance(self.data, FilesData) or self.data.fixed is not None
+        return any(isinstance(one, ImagesSection) for one in self.observations)
+
     @field_validator("known_boundary")
     @classmethod
     def _is_known(cls, boundary: Path | str | None, info: ValidationInfo) -> Path | str | None:
@@ -188,10 +216,12 @@ class Config(Section):
                 _require_tissues(f"{key}.{parameter}", given, names)
         if info.data.get("known_boundary") is not None:
             _require_nothing_else(model)
-            model.model_copy(update={"sampled": []}).require_proper_priors(names)
+            if names is not None:
+                model.model_copy(update={"sampled": []}).require_proper_priors(names)
         elif not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
             raise _wrong("sampled", "expected at least three nodes, held ones included; fewer do not hold the mesh")
-        model.require_proper_priors(names)
+        if names is not None:
+            model.require_proper_priors(names)
         return model
 
     @field_validator("start")

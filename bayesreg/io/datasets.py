@@ -30,7 +30,8 @@ class Anatomy(NamedTuple):
 
     Attributes
     ----------
-    image : Image
+    image : Image or None
+        None where there is none.
     tissue : Image
         int8 on the grid of the image: 0 outside, 1 + index into the names inside.
     intracranial : Image or None
@@ -39,7 +40,7 @@ class Anatomy(NamedTuple):
         Of the tissues.
     """
 
-    image: Image
+    image: Image | None
     tissue: Image
     intracranial: Image | None
     names: tuple[str, ...] = BRAIN
@@ -103,7 +104,7 @@ def brainweb(
 
 
 def from_files(
-    image_path: str | Path,
+    image_path: str | Path | None,
     labels_path: str | Path,
     label_table: LabelTable,
     intracranial_path: str | Path | None = None,
@@ -112,7 +113,7 @@ def from_files(
 
     Parameters
     ----------
-    image_path : path
+    image_path : path, optional
         The fixed image.
     labels_path : path
         Tissue labels on its grid.
@@ -126,13 +127,14 @@ def from_files(
     InputError
         If a file is missing or unreadable, the table names labels that are absent, or the grids differ.
     """
-    image = load_image(image_path)
-    tissue = load_labels(labels_path, label_table)
-    check_same_grid(image, tissue, ("fixed", "label"))
+    tissue, image = load_labels(labels_path, label_table), None
+    if image_path is not None:
+        image = load_image(image_path)
+        check_same_grid(image, tissue, ("fixed", "label"))
     if intracranial_path is None:
         return Anatomy(image, tissue, None, tuple(label_table))
     mask = load_image(intracranial_path)
-    check_same_grid(image, mask, ("fixed", "intracranial"))
+    check_same_grid(tissue, mask, ("label", "intracranial"))
     return Anatomy(image, tissue, mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)), tuple(label_table))
 
 

@@ -48,13 +48,13 @@ class PriorConfig(BaseModel):
         return self
 
 
-class TemperaturePrior(BaseModel):
-    """Log-normal prior of a Boltzmann temperature.
+class ScalePrior(BaseModel):
+    """Log-normal prior of a positive number, such as the standard deviation of an error.
 
     Attributes
     ----------
     median : float
-        In the unit of the temperature, positive.
+        In the unit of the number, positive.
     log_sd : float
         Standard deviation of its natural logarithm, positive; 1 spans a factor of 50 with 95 %.
     """
@@ -63,6 +63,10 @@ class TemperaturePrior(BaseModel):
 
     median: Positive
     log_sd: Positive = 1.0
+
+
+class TemperaturePrior(ScalePrior):
+    """Log-normal prior of a Boltzmann temperature."""
 
 
 class FieldConfig(BaseModel):

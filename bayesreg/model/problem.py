@@ -61,7 +61,7 @@ def problem_of(
     sampled, held = sampled_nodes(mesh, model)
     require_proper(mesh, model)
     field = stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None
-    blocks = _blocks(mesh, model, sampled, field, reference)
+    blocks = {**_blocks(mesh, model, sampled, field, reference), **observation_blocks(observations)}
     body = _body(mesh, model, sampled, held, field, blocks)
     # The observations first: what is wrong with them is told before anything that takes long.
     terms = {**observation_terms(mesh, observations, model), **_priors(mesh, model, sampled, held, skull)}
@@ -118,6 +118,17 @@ def _body(
     )
 
 
+def observation_blocks(observations: Sequence[Any]) -> Blocks:
+    """The unknowns that observations bring, by name; InputError if a name is taken."""
+    found: Blocks = {}
+    for observation in observations:
+        for name, block in getattr(observation, "blocks", {}).items():
+            if name in found or name in TAKEN:
+                raise InputError(f"the name {name!r} of an unknown of {observation.name!r} is taken; rename the latter")
+            found[name] = block
+    return found
+
+
 def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelConfig) -> Terms:
     """The terms of observations by name.
 
@@ -140,7 +151,7 @@ def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelCo
                 f"an observation needs a name and a function log(state); got {type(observation).__name__}: use "
                 "ImagePair, Landmarks, or an object of your own with both"
             )
-        if term.name in terms or term.name in TAKEN:
+        if term.name in terms or term.name in TAKEN or term.name in observation_blocks(observations):
             raise InputError(f"the name {term.name!r} of an observation is taken; give another one")
         terms[term.name] = term
     return terms

@@ -61,6 +61,19 @@ def covered_voxels(grid: Image, mesh: TetMesh) -> Covered:
     return Covered(index[inside], cell[inside], barycentric[inside])
 
 
+def tissue_on_grid(mesh: TetMesh, voxels: int = 100) -> Image:
+    """The tissue map of a mesh: 0 outside, 1 + tissue inside, int8, cubic voxels, so many along the longest side."""
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    size = float((high - low).max()) / voxels
+    affine = np.diag([size, size, size, 1.0])
+    affine[:3, 3] = low - size
+    grid = Image(np.zeros(np.ceil((high - low) / size).astype(int) + 3, np.int8), affine)
+    labels = np.zeros(grid.shape, np.int8)
+    index, cells, _ = covered_voxels(grid, mesh)
+    labels[tuple(index.T)] = 1 + mesh.tissue[cells]
+    return grid.with_voxels(labels)
+
+
 def warp_image(
     moving: Image, displacement: Float[np.ndarray, "X Y Z 3"], grid: Image, method: Interpolation = "linear"
 ) -> Image:

@@ -11,7 +11,7 @@ from matplotlib.colors import Normalize
 from scipy import stats
 
 from bayesreg.inference.draws.predictive import predictive_p
-from bayesreg.io.store import Predicted
+from bayesreg.io.records import Fit, Predicted
 from bayesreg.report import panels, style
 from bayesreg.report.panels import View
 from bayesreg.report.slices import Plane, sample
@@ -32,16 +32,19 @@ BINS = 60
 LEAST_POINTS = 50
 
 
-def check_table(predicted: Predicted) -> Table:
-    """Realised against replicated discrepancies, with posterior predictive p-values."""
+def check_table(predicted: Predicted) -> Table | None:
+    """Realised against replicated discrepancies, with posterior predictive p-values; None without images."""
+    fit = predicted.fit
+    if fit is None:
+        return None
     rows = []
-    for k, name in enumerate(predicted.discrepancies):
-        observed, replicated = predicted.observed[..., k], predicted.replicated[..., k]
+    for k, name in enumerate(fit.discrepancies):
+        observed, replicated = fit.observed[..., k], fit.replicated[..., k]
         p = predictive_p(observed, replicated)
         title = NAMES.get(str(name), str(name))
         rows.append([title, _interval(observed), _interval(replicated), _p_text(p, observed.size), _said(p)])
     caption = (
-        f"Residuals in units of the noise sd that T_s implies, over {_count(predicted):,} draws: those of "
+        f"Residuals in units of the noise sd that T_s implies, over {_count(fit):,} draws: those of "
         "the images, and those of noise that follows the model (median and 90 % interval). p is how often the noise of "
         "the model shows at least as much as the images do: near 0 there is more in the residual than the model "
         "allows, near 1 less. Neighbouring cells share a face."
@@ -51,8 +54,8 @@ def check_table(predicted: Predicted) -> Table:
     )
 
 
-def _count(predicted: Predicted) -> int:
-    return int(np.prod(predicted.observed.shape[:2]))
+def _count(fit: Fit) -> int:
+    return int(np.prod(fit.observed.shape[:2]))
 
 
 def _p_text(p: float, draws: int) -> str:
@@ -70,9 +73,10 @@ def _said(p: float) -> str:
 
 
 def residual(view: View) -> Drawing | None:
-    """The residual at the posterior mean on three planes, its histogram, and the discrepancies; None for old runs."""
+    """The residual at the posterior mean on three planes, its histogram, and the discrepancies; None without images."""
     run, sd = view.run, part(view.run.manifest, "implied_noise_sd")
-    if run.predicted is None or not sd:
+    fit = run.predicted.fit if run.predicted else None
+    if fit is None or not sd:
         return None
     planes = view.planes[::-1]
     widths = [float(np.ptp(plane.horizontal)) for plane in planes]
@@ -90,14 +94,14 @@ def residual(view: View) -> Drawing | None:
             panel.set_title(plane.title)
         label = f"(f − m(x + ū)) / {number(float(sd))}, the implied noise sd"
         panels.colourbar(upper, drawn, list(axes), label, extend="both")
-        count = len(run.predicted.discrepancies)
+        count = len(fit.discrepancies)
         below = np.ravel(lower.subplots(1, 1 + count, width_ratios=[1.6] + [1.0] * count))
-        _histogram(below[0], view)
+        _histogram(below[0], view, fit)
         for k, panel in enumerate(below[1:]):
-            _discrepancy(panel, run.predicted, k)
+            _discrepancy(panel, fit, k)
         below[1].legend(loc="upper left", bbox_to_anchor=(0, 1.04), ncols=2, handlelength=1.0, columnspacing=1.0)
         uri = style.data_uri(figure)
-    z, expected = run.predicted.residual, noise_of(run.manifest)
+    z, expected = np.asarray(fit.residual), noise_of(run.manifest)
     beyond = f"{float((np.abs(z) > 3).mean()):.2%}".replace("%", " %")
     caption = (
         "Top: residual at the posterior mean, in units of the noise sd that T_s stands for at a quadrature point of "
@@ -128,19 +132,19 @@ def noise_of(manifest: Mapping[str, Any]) -> ExpectedNoise:
 
 def _picture(view: View, plane: Plane) -> np.ndarray:
     """f − m(x + ū) on a plane, NaN outside the mesh."""
-    points = plane.points()
-    difference = sample(view.run.fixed, points) - sample(view.run.warped, points)
+    points, fixed, warped = plane.points(), view.run.fixed, view.run.warped
+    assert fixed is not None
+    assert warped is not None
+    difference = sample(fixed, points) - sample(warped, points)
     return np.where(view.slice(plane).inside, difference, np.nan)
 
 
-def _histogram(axes: Axes, view: View) -> None:
-    predicted, names = view.run.predicted, view.run.mesh.names
-    assert predicted is not None
-    z = np.asarray(predicted.residual, float)
+def _histogram(axes: Axes, view: View, fit: Fit) -> None:
+    names, z = view.run.mesh.names, np.asarray(fit.residual, float)
     reach = float(np.clip(np.quantile(np.abs(z), 0.995) * 1.15, 4.5, None))
     edges = np.linspace(-reach, reach, BINS + 1)
     for index, (name, colour) in enumerate(zip(names, colours_of(names), strict=True)):
-        inside = z[predicted.residual_tissue == index]
+        inside = z[np.asarray(fit.residual_tissue) == index]
         if len(inside) >= LEAST_POINTS:
             density = np.histogram(inside, edges)[0] / len(inside) / np.diff(edges)
             axes.stairs(density, edges, color=colour, lw=1.3, label=f"{label_of(name)}, sd {number(inside.std(), 2)}")
@@ -152,15 +156,15 @@ def _histogram(axes: Axes, view: View) -> None:
     axes.legend(loc="upper left", handlelength=1.2)
 
 
-def _discrepancy(axes: Axes, predicted: Predicted, k: int) -> None:
-    observed, replicated = (np.ravel(values[..., k]) for values in (predicted.observed, predicted.replicated))
+def _discrepancy(axes: Axes, fit: Fit, k: int) -> None:
+    observed, replicated = (np.ravel(values[..., k]) for values in (fit.observed, fit.replicated))
     for values, colour, label in ((replicated, style.MUTED, "model"), (observed, style.ACCENT, "images")):
         low, high = values.min(), values.max()
         margin = max(0.02 * (high - low), 1e-3 * abs(high))
         edges = np.linspace(low - margin, high + margin, 25)
         density = np.histogram(values, edges)[0]
         axes.stairs(density / density.max(), edges, fill=True, color=colour, alpha=0.65, lw=0, label=label)
-    axes.set(yticks=[], ylim=(0, 1.3), xlabel=NAMES.get(str(predicted.discrepancies[k])))
+    axes.set(yticks=[], ylim=(0, 1.3), xlabel=NAMES.get(str(fit.discrepancies[k])))
     place: dict[str, Any] = {"fontsize": 8, "color": style.MUTED, "loc": "right"}
     axes.set_title(_p_text(predictive_p(observed, replicated), observed.size), **place)
     axes.spines["left"].set_visible(False)

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from bayesreg.image import Image
-from bayesreg.io.store import Predicted, Run
+from bayesreg.io.records import Predicted, Run
 from bayesreg.report import panels, style
 from bayesreg.report.estimands import elastic_draws
 from bayesreg.report.metrics import divergence
@@ -30,9 +30,11 @@ MAX_VOXELS = 200_000
 MEDIAN_DRAWS = 500
 
 
-def registration(view: View) -> Drawing:
-    """Fixed, moving and warped image, and the differences before and after, on three planes."""
+def registration(view: View) -> Drawing | None:
+    """Fixed, moving and warped image, and the differences before and after, on three planes; None without images."""
     run, limits = view.run, panels.grey_limits(view.run)
+    if run.fixed is None or run.moving is None or run.warped is None:
+        return None
     columns = {"fixed f": run.fixed, "moving m": run.moving, "warped m(x + ū)": run.warped}
     before, after = residual_sd(run, run.moving), residual_sd(run, run.warped)
     with style.look():
@@ -70,10 +72,13 @@ def data(view: View) -> Drawing:
     labels = "labels" if run.skull is None else "labels and skull"
     with style.look():
         figure, axes = _rows(plane, 2, legend=True)
-        panels.image_panel(axes[0, 0], run.fixed, plane, limits)
+        panels.image_panel(axes[0, 0], run.background, plane, limits)
         panels.label_panel(axes[0, 1], run, plane)
         panels.mesh_panel(axes[0, 2], run.mesh, plane)
-        panels.image_panel(axes[0, 3], run.moving, plane, limits)
+        if run.moving is None:
+            axes[0, 3].set_axis_off()
+        else:
+            panels.image_panel(axes[0, 3], run.moving, plane, limits)
         _divergence(figure, axes[1, 0], view, u)
         components = view.slice(plane).nodal(u)
         norm = panels.symmetric(components)
@@ -81,15 +86,17 @@ def data(view: View) -> Drawing:
             drawn = panels.field_panel(panel, components[..., k], plane, norm, style.SIGNED)
             panels.outline(panel, view, plane)
         panels.colourbar(figure, drawn, list(axes[1, 1:]), "mm", location="bottom")
-        titles = ("fixed f", labels, "mesh cut", "moving m", f"div {symbol}")
+        background = "tissue map" if run.fixed is None else "fixed f"
+        titles = (background, labels, "mesh cut", "moving m" if run.moving else "", f"div {symbol}")
         _letter(axes, [*titles, *(f"{symbol} along {axis}" for axis in ("x (R)", "y (A)", "z (S)"))])
         handles = panels.tissue_legend(run.mesh.names, run.skull is not None)
         figure.legend(handles=handles, loc="outside lower center", ncols=8)
         uri = style.data_uri(figure)
     caption = (
-        f"The paper’s Fig. 2 for this run, {plane.title}: fixed image, {labels}, exact cut through the "
+        f"The paper’s Fig. 2 for this run, {plane.title}: {background}, {labels}, exact cut through the "
         f"mesh ({len(run.mesh.points):,} nodes, {len(run.mesh.cells):,} tetrahedra, {len(run.mesh.boundary):,} "
-        f"boundary nodes), moving image; below, divergence and components of the {whose} displacement. Negative "
+        f"boundary nodes){'' if run.moving is None else ', moving image'}; below, divergence and components of the "
+        f"{whose} displacement. Negative "
         "divergence is loss of volume: ventricles that collapse show blue."
     )
     alt = f"Images, labels, mesh, divergence and displacement on the {plane.title} plane."
@@ -107,15 +114,20 @@ def result(view: View) -> Drawing:
         _magnitude(figure, axes[0, 0], view, plane, first, cmap)
         _magnitude(figure, axes[0, 1], view, plane, view.spread(plane), style.ERROR)
         _divergence(figure, axes[0, 2], view, np.asarray(run.u_mean), like=panels.reference_displacement(run))
-        drawn = panels.image_panel(axes[0, 3], run.warped, plane, panels.grey_limits(run))
-        panels.colourbar(figure, drawn, axes[0, 3], INTENSITY, location="bottom")
-        _letter(axes, ["|ū − u|" if known else "|ū|", "posterior sd of u", "div ū", "warped m(x + ū)"])
+        if run.warped is None:
+            axes[0, 3].set_axis_off()
+        else:
+            drawn = panels.image_panel(axes[0, 3], run.warped, plane, panels.grey_limits(run))
+            panels.colourbar(figure, drawn, axes[0, 3], INTENSITY, location="bottom")
+        _letter(
+            axes, ["|ū − u|" if known else "|ū|", "posterior sd of u", "div ū", "warped m(x + ū)" if run.warped else ""]
+        )
         uri = style.data_uri(figure)
     left = "norm of the error of the posterior mean" if known else "norm of the posterior mean (no truth is known)"
     caption = (
         f"The paper’s Fig. 3 for this run, {plane.title}: {left}; posterior standard deviation (root of the "
-        "summed variances of the three components); divergence of the mean, on the colour scale of the figure before; "
-        "the warped image."
+        "summed variances of the three components); divergence of the mean, on the colour scale of the figure before"
+        + ("." if run.warped is None else "; the warped image.")
     )
     return Drawing("result", "Error and uncertainty", caption, f"Four panels on the {plane.title} plane: {left}.", uri)
 
@@ -153,6 +165,7 @@ def displacement(view: View) -> Drawing:
 
 def residual_sd(run: Run, image: Image) -> float:
     """Root mean square of an image less the fixed one over labelled voxels (an even sample of the grid)."""
+    assert run.fixed is not None
     stride = max(1, int(np.prod(run.fixed.shape) // MAX_VOXELS))
     indices = np.stack(np.unravel_index(np.arange(0, np.prod(run.fixed.shape), stride), run.fixed.shape), axis=-1)
     points = np.asarray(run.fixed.voxel_to_world(indices.astype(float)))
@@ -193,7 +206,7 @@ def _note(axes: Axes, text: str) -> None:
 
 def _letter(axes: np.ndarray, titles: list[str]) -> None:
     for letter, panel, title in zip("abcdefgh", axes.ravel(), titles, strict=False):
-        panel.set_title(f"({letter}) {title}")
+        panel.set_title(f"({letter}) {title}" if title else "")
 
 
 def _rows(plane: Plane, rows: int, legend: bool = False) -> tuple[Figure, np.ndarray]:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.atomic import write_text
-from bayesreg.io.store import Run
+from bayesreg.io.records import Run
 from bayesreg.report import panels, style, tables
 from bayesreg.report.convergence import plain_log_axis
 from bayesreg.report.estimands import Diagnosed, Estimand, estimands, parameter_groups
@@ -130,6 +130,8 @@ def _notes(named: dict[str, Study]) -> list[str]:
 
 
 def _same(a: Any, b: Any) -> bool:
+    if a is None or b is None:
+        return a is b
     return bool(np.allclose(a.affine, b.affine) and np.array_equal(a.voxels, b.voxels))
 
 
@@ -199,7 +201,7 @@ def _fill_last(column: np.ndarray, views: list[View], known: bool) -> None:
     panels.outline(column[0], first, plane)
     panels.colourbar(column[0].figure, drawn, column[0], "mm")
     column[0].set_title("apart: |ū₂ − ū₁|")
-    panels.image_panel(column[1], first.run.fixed, plane, panels.grey_limits(first.run))
+    panels.image_panel(column[1], first.run.background, plane, panels.grey_limits(first.run))
     column[1].set_title("fixed f")
     if known:
         like = panels.reference_displacement(first.run)

@@ -120,7 +120,7 @@ class _Naming(NamedTuple):
     labels: np.ndarray | None
 
     def name(self, index: tuple[int, ...]) -> str:
-        symbol = SYMBOLS.get(self.variable, self.variable)
+        symbol = symbol_of(self.variable)
         if self.nodes is not None:
             return f"u_{AXES[index[1]]} of node {int(self.nodes[index[0]])}"
         if self._by_element:
@@ -160,9 +160,16 @@ def draws_of(posterior: xr.Dataset, entry: Estimand, max_draws: int) -> np.ndarr
     return np.asarray(chosen.transpose("chain", "draw").to_numpy(), float)
 
 
-def sampled_temperatures(posterior: xr.Dataset) -> list[str]:
-    """Names of the temperatures that vary over the draws."""
-    return [name for name in TEMPERATURES if name in posterior and np.ptp(posterior[name].to_numpy()) > 0]
+def sampled_scales(posterior: xr.Dataset) -> list[str]:
+    """Names of the temperatures, and of the sds of observations, that vary over the draws."""
+    scales = [str(name) for name in posterior if str(name).endswith("_sd") and name != "field_sd"]
+    names = (name for name in (*TEMPERATURES, *scales) if name in posterior)
+    return [name for name in names if np.ptp(posterior[name].to_numpy()) > 0]
+
+
+def symbol_of(name: str) -> str:
+    """What a variable is called in a report; the sd of an observation has its name."""
+    return SYMBOLS.get(name) or name.removesuffix("_sd") + " sd, mm"
 
 
 class Group(NamedTuple):

@@ -15,13 +15,14 @@ from markupsafe import Markup, escape
 from bayesreg import __version__
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.atomic import write_text
-from bayesreg.io.store import Run
+from bayesreg.io.records import Run
 from bayesreg.report import (
     adequacy,
     anatomy,
     bodies,
     convergence,
     identifiability,
+    landmarks,
     marginals,
     modes,
     tables,
@@ -45,6 +46,7 @@ from bayesreg.report.verdict import (
 SECTIONS = (
     ("accuracy", "Registration"),
     ("trust", "Uncertainty"),
+    ("landmarks", "Landmarks"),
     ("groups", "Chains that disagree"),
     ("stiffnesses", "Stiffness"),
     ("fit", "Fit"),
@@ -90,12 +92,15 @@ def write_report(
     nodes = posterior.sizes["node"]
     simulated = run.bodies or []
     allowed = bodies.allowing(run.mesh, posterior, simulated) if bodies.enough(simulated) else None
-    shown = {"groups": apart, "trust": predicted, "fit": predicted, "one-node": nodes}
+    fit = bool(predicted and predicted.discrepancies is not None)
+    pairs = bool(predicted and predicted.landmark_names is not None)
+    shown = {"groups": apart, "trust": predicted, "landmarks": pairs, "fit": fit, "one-node": nodes}
     left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
         *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
         uncertainty.maps(view, predicted) if predicted else None,
         uncertainty.places(view, predicted) if predicted else None,
+        landmarks.residuals(predicted) if predicted else None,
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
         bodies.scatter(allowed) if allowed else None,
@@ -118,6 +123,7 @@ def write_report(
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
         "error_tables": error_tables(metrics, run.mesh.names),
         "places": uncertainty.place_table(view, predicted) if predicted else None,
+        "landmarks": landmarks.landmark_table(run.mesh, predicted) if predicted else None,
         "groups": modes.explanation(groups) if apart else "",
         "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
         "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import stats
 
 from bayesreg.mesh import TetMesh
-from bayesreg.report.estimands import SYMBOLS, TEMPERATURES, Diagnosed, Group, parameter_groups, sampled_temperatures
+from bayesreg.report.estimands import SYMBOLS, Diagnosed, Group, parameter_groups, sampled_scales, symbol_of
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import NONE, number, part, rhat_text, threshold_of
 from bayesreg.tissues import label_of
@@ -97,11 +97,11 @@ def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> 
     model : mapping
         The section `model` of the manifest.
     name : str
-        "lam", "mu", "t_similarity" or "t_elastic".
+        "lam", "mu", or that of a temperature or of the sd of an observation.
     tissue : str, optional
         For λ and μ.
     """
-    if name in TEMPERATURES:
+    if name not in LAME:
         given = model.get(name)
         if not isinstance(given, Mapping):
             return None
@@ -136,15 +136,15 @@ def width_table(mesh: TetMesh, posterior: xr.Dataset, diagnosed: Diagnosed, mani
         groups.append((label_of(group.name), rows or [["λ, μ", NONE, "fixed", NONE, NONE]]))
     rows = [
         _width_row(
-            SYMBOLS[name],
+            symbol_of(name),
             posterior[name].to_numpy(),
             prior_of(model, name),
             _rhat(diagnosed, name, 0) >= threshold,
         )
-        for name in sampled_temperatures(posterior)
+        for name in sampled_scales(posterior)
     ]
     if rows:
-        groups.append(("Temperatures", rows))
+        groups.append(("Temperatures and sds", rows))
     caption = (
         "Central 95 % intervals and the ratio of their widths: near 1 the data say nothing that the prior did not. An "
         "improper prior, flat on [0, ∞), has no width. Of λ and μ alone the scale is a convention, set by the one that "

@@ -14,9 +14,9 @@ from scipy import stats
 
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
-from bayesreg.io.store import Run, Truth
+from bayesreg.io.records import Run, Truth
 from bayesreg.report import panels, style
-from bayesreg.report.estimands import SYMBOLS, Group, parameter_groups, sampled_temperatures
+from bayesreg.report.estimands import SYMBOLS, Group, parameter_groups, sampled_scales, symbol_of
 from bayesreg.report.slices import COORDINATES, IN_PLANE, Plane, sample
 from bayesreg.report.style import Drawing
 from bayesreg.report.verdict import number, part, place_text
@@ -151,7 +151,7 @@ def _true_ratios(run: Run, name: str) -> dict[str, float]:
 
 def temperatures(run: Run, posterior: xr.Dataset) -> Drawing | None:
     """Trace and marginal of every sampled temperature with its prior; None where none is sampled."""
-    sampled = sampled_temperatures(posterior)
+    sampled = sampled_scales(posterior)
     if not sampled:
         return None
     with style.look():
@@ -161,17 +161,22 @@ def temperatures(run: Run, posterior: xr.Dataset) -> Drawing | None:
             draws = np.asarray(posterior[name].transpose("chain", "draw").to_numpy(), float)
             for chain, colour in zip(draws, style.chain_colours(len(draws)), strict=True):
                 left.plot(chain, color=colour, lw=0.6, alpha=0.85)
-            left.set(xlim=(0, max(1, draws.shape[1] - 1)), xlabel="draw", ylabel=f"${SYMBOLS[name]}$")
+            left.set(xlim=(0, max(1, draws.shape[1] - 1)), xlabel="draw", ylabel=_math(name))
             histogram(right, draws, style.UNIFORM, [])
             _prior_line(right, part(run.manifest, "model", name))
-            right.set_xlabel(f"${SYMBOLS[name]}$")
+            right.set_xlabel(_math(name))
         uri = style.data_uri(figure)
     caption = (
-        "Temperatures that were sampled with the rest. Left: every chain over its kept draws. Right: all chains "
+        "Temperatures and sds that were sampled, too. Left: every chain over its kept draws. Right: all chains "
         "together (filled) and each by itself, with median and 95 % interval; dashed: the log-normal prior."
     )
-    alt = "Traces and histograms of " + " and ".join(SYMBOLS[name] for name in sampled) + "."
+    alt = "Traces and histograms of " + " and ".join(map(symbol_of, sampled)) + "."
     return Drawing("temperatures", "Temperatures", caption, alt, uri)
+
+
+def _math(name: str) -> str:
+    """A symbol as Matplotlib sets it."""
+    return f"${SYMBOLS[name]}$" if name in SYMBOLS else symbol_of(name)
 
 
 def _prior_line(axes: Axes, prior: Any) -> None:
@@ -299,7 +304,7 @@ def _neighbourhood(axes: Axes, run: Run, place: np.ndarray, u: np.ndarray) -> No
     centre = place + u.reshape(-1, 3).mean(axis=0)
     sides = [(float(centre[k] - ZOOM), float(centre[k] + ZOOM)) for k in (across, up)]
     plane = Plane(axis, float(centre[axis]), sides[0], sides[1], 2 * ZOOM / 200)
-    panels.image_panel(axes, run.fixed, plane, panels.grey_limits(run))
+    panels.image_panel(axes, run.background, plane, panels.grey_limits(run))
     if run.skull is not None:
         forbidden = sample(run.skull, plane.points(), order=0, outside=1.0) != 0
         shade = np.where(forbidden[..., None], (*_rgb(style.SKULL), 0.72), 0.0)

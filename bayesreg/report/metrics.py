@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float, Int
 
-from bayesreg.io.store import Truth
+from bayesreg.io.records import Truth
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 

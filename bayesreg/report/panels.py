@@ -18,7 +18,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.io.store import Run
+from bayesreg.io.records import Run
 from bayesreg.mesh import TetMesh
 from bayesreg.report import style
 from bayesreg.report.metrics import divergence
@@ -169,8 +169,8 @@ def _bound(values: np.ndarray, quantile: float) -> float:
 
 
 def grey_limits(run: Run) -> tuple[float, float]:
-    """One grey scale for the images of a run: the range of the fixed image, without its extremes."""
-    low, high = np.quantile(np.asarray(run.fixed.voxels, float), (0.005, 0.998))
+    """One grey scale for the images of a run: the range of the background, without its extremes."""
+    low, high = np.quantile(np.asarray(run.background.voxels, float), (0.005, 0.998))
     return float(low), float(max(high, low + 1e-9))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from rich.table import Table as TerminalTable
 
-from bayesreg.io.store import Run
+from bayesreg.io.records import Run
 from bayesreg.report.estimands import SYMBOLS, Diagnosed, Estimand, Group, parameter_groups, worst
 from bayesreg.report.metrics import WHOLE
 from bayesreg.report.verdict import NONE, fixed, number, percent, place_text, rhat_text

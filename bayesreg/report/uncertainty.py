@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.patches import Ellipse
 
-from bayesreg.io.store import Predicted
+from bayesreg.io.records import Predicted
 from bayesreg.report import panels, style
 from bayesreg.report.panels import View
 from bayesreg.report.places import regions
@@ -111,7 +111,7 @@ def places(view: View, predicted: Predicted) -> Drawing:
                 panel.remove()
         uri = style.data_uri(figure)
     caption = (
-        "Where each place of the fixed image is to be found in the moving image, magnified. Dots: one per draw, "
+        "Where each place of the fixed image is to be found, magnified. Dots: one per draw, "
         "coloured by chain; cross and ellipse: mean and outline of the ellipsoid that holds 95 % of the draws; dashed: "
         "the way from its place in the fixed image (ring, where it is near enough to be seen)."
     )
@@ -127,7 +127,7 @@ def _place(axes: Axes, view: View, predicted: Predicted, k: int, axis: int, limi
     half = max(ZOOM, 2 * float(found.semi_axes[0]))
     sides = [(float(goes[j] - half), float(goes[j] + half)) for j in (across, up)]
     plane = Plane(axis, float(goes[axis]), sides[0], sides[1], 2 * half / 160)
-    panels.image_panel(axes, view.run.moving, plane, limits)
+    panels.image_panel(axes, view.run.moving or view.run.background, plane, limits)
     stride = max(1, u.shape[0] * u.shape[1] // CLOUD)
     for chain, colour in zip(point + u, style.chain_colours(len(u)), strict=True):
         axes.plot(chain[::stride, across], chain[::stride, up], ".", ms=2.2, color=colour, alpha=0.9, mew=0)

@@ -10,25 +10,52 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.config import Config
+from bayesreg.config.observations import LandmarksSection
 from bayesreg.inference.chains.initialise import Start
 from bayesreg.io.displacements import read_displacement
-from bayesreg.io.store import Inputs
+from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
 from bayesreg.model.options import Lame, ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import cell_entries, lame_parameter
 from bayesreg.model.terms.images import ImagePair
+from bayesreg.model.terms.landmarks import Landmarks
+from bayesreg.types import InputError
 
 
 def posterior_of(config: Config, inputs: Inputs, observations: Sequence[Any] = ()) -> Posterior:
-    """The posterior of a run, with observations besides its images; solves preconditioned at the start parameters."""
+    """The posterior of a run, with observations besides those of its configuration.
+
+    Solves are preconditioned at the start parameters.
+    """
     reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
     model = _model(config.model, inputs)
-    observed = [ImagePair(inputs.fixed, inputs.moving), *observations]
+    observed = [*_configured(config, inputs), *observations]
     return build_posterior(
         mesh=inputs.mesh, observations=observed, model=model, skull=inputs.skull, reference=reference
     )
+
+
+def _configured(config: Config, inputs: Inputs) -> list[Any]:
+    """The observations of a configuration, in its order."""
+    found: list[Any] = []
+    if config.compares_images:
+        assert inputs.fixed is not None
+        assert inputs.moving is not None
+        found.append(ImagePair(inputs.fixed, inputs.moving))
+    for section in config.observations or []:
+        if isinstance(section, LandmarksSection):
+            pairs = inputs.points[section.name]
+            labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
+            sd = pairs.sd if section.sd is None else section.sd
+            if sd is None:
+                raise InputError(
+                    f"the observation {section.name!r} has no sd: give observations.{section.name}.sd in the "
+                    "configuration, mm, or a column sd in its file"
+                )
+            found.append(Landmarks(pairs.fixed, pairs.moving, sd, section.name, labels))
+    return found
 
 
 def _model(model: ModelConfig, inputs: Inputs) -> ModelConfig:

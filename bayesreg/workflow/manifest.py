@@ -22,10 +22,11 @@ from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.diagnostics import Convergence
 from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.inference.target import clearance
-from bayesreg.io.store import Inputs
+from bayesreg.io.records import Inputs
 from bayesreg.mesh import signed_volumes
 from bayesreg.model.coordinates import filled
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.single_node import images_of
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
 CONTACT = 0.5
@@ -66,7 +67,9 @@ def manifest(
         "versions": _versions(),
         "seed": config.seed,
         "mesh_digest": inputs.mesh.digest,
-        "image_digests": {name: getattr(inputs, name).digest for name in ("fixed", "moving")},
+        "image_digests": {
+            name: image.digest for name in ("fixed", "moving") if (image := getattr(inputs, name)) is not None
+        },
         "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
         "devices": [str(device) for device in jax.devices()],
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
@@ -77,7 +80,7 @@ def manifest(
         },
         "pair": provenance["pair"],
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
-        "model": config.model.model_dump(mode="json"),
+        "model": config.model.model_dump(mode="json") | _observation_priors(posterior),
         "observations": list(posterior.observations),
         "exact": samples.exact,
         "stopped": {
@@ -102,15 +105,35 @@ def manifest(
         "steps_per_chain": int(tally.steps[0]),
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
-        "residual_sd": float(np.std(posterior.images.residuals(jnp.asarray(samples.u_mean)))),
+        "residual_sd": _residual_sd(posterior, samples),
         "implied_noise_sd": implied_noise_sd(posterior, draws),
     }
 
 
-def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float:
-    """The noise that T_s stands for (see `ComparedImages.noise_sd`): the known one, or its posterior mean."""
+def _observation_priors(posterior: Posterior) -> dict[str, Any]:
+    """The priors of the scales that observations brought, as those of the temperatures are given."""
+    return {
+        name: {"median": float(block.median), "log_sd": float(block.log_sd)}
+        for observation in posterior.observations.values()
+        for name, block in getattr(observation, "blocks", {}).items()
+    }
+
+
+def _residual_sd(posterior: Posterior, samples: Samples) -> float | None:
+    images = images_of(posterior.data)
+    return None if images is None else float(np.std(images.residuals(jnp.asarray(samples.u_mean))))
+
+
+def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float | None:
+    """The noise that T_s stands for (see `ComparedImages.noise_sd`): the known one, or its posterior mean.
+
+    None without images.
+    """
+    images = images_of(posterior.data)
+    if images is None:
+        return None
     mean = {name: draws[name].mean().to_numpy() for name in ("t_similarity",) if name in draws}
-    return posterior.images.noise_sd(float(filled(posterior.data.blocks, mean)["t_similarity"]))
+    return images.noise_sd(float(filled(posterior.data.blocks, mean)["t_similarity"]))
 
 
 def _converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:

@@ -75,6 +75,8 @@ def _require_ratios(result: Result) -> None:
         )
     if run.boundary is not None or model.held or model.is_elastography:
         raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
+    if run.fixed is None:
+        raise InputError("bodies are registered by images: the run needs data.fixed and data.moving")
     if run.skull is None:
         raise InputError("bodies are pushed inside the skull: the run needs an intracranial mask (data.intracranial)")
     if run.manifest.get("inverted_elements"):
@@ -84,6 +86,7 @@ def _require_ratios(result: Result) -> None:
 def _subject(result: Result) -> Subject:
     run, draws = result.run, dataset(result.idata, "posterior")
     assert run.skull is not None
+    assert run.fixed is not None
     median = {name: draws[name].median(("chain", "draw")).to_numpy() for name in ("lam", "mu")}
     lam, mu = (dict(zip(run.mesh.names, median[name].tolist(), strict=True)) for name in ("lam", "mu"))
     return Subject(

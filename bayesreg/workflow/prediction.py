@@ -15,17 +15,25 @@ from scipy.spatial import cKDTree
 
 from bayesreg.fem.location import interpolation_at
 from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thinned
-from bayesreg.io.store import Predicted
+from bayesreg.inference.gaussian.whitened import MOST_UNKNOWNS
+from bayesreg.inference.layout import dimension
+from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
 from bayesreg.model.coordinates import filled
+from bayesreg.model.left_out import leave_out
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.single_node import images_of
+from bayesreg.model.state import state_of
+from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.tissues import label_of
 from bayesreg.types import AnyArray
 
 Places = Mapping[str, tuple[float, float, float]]
 
 MOST_DRAWS = 400
+# Landmarks that are left out in turn.
+MOST_LEFT_OUT = 60
 FAR = 2.0
 REACH = 0.95
 STIFFER = 1.5
@@ -58,7 +66,7 @@ def predict(
     InputError
         If a place lies outside the mesh.
     """
-    mesh = posterior.mesh
+    mesh, with_images = posterior.mesh, images_of(posterior.data) is not None
     places = places or default_places(mesh, u_mean, u_sd)
     nodes, weights = _interpolation(mesh, places)
     given = posterior.data, jnp.asarray(mesh.neighbours), jnp.asarray(u_mean), jnp.asarray(nodes), jnp.asarray(weights)
@@ -67,26 +75,26 @@ def predict(
     def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
         data, neighbours, u_mean, nodes, weights = given
         number, here = draw.pop("number"), replace(posterior, data=data)
-        cells = here.images.quadrature.cells
         u = here.evaluate(draw).u
-        values = here.filled(draw)
-        z = standardised_residual(here.images, u, values["t_similarity"])
-        noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
-        observed, replicated = (discrepancies(x, cells, neighbours, len(mesh.cells)) for x in (z, noise))
-        distance = jnp.linalg.norm(u - u_mean, axis=1)
-        marks = jnp.einsum("la,lai->li", weights, u[nodes])
-        stiffness = here.data.body.stiffness_factor(draw)
-        return {"u": u, "distance": distance, "far": (distance > FAR).astype(float), "places": marks,
-                "observed": observed, "replicated": replicated,
-                "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
+        distance, stiffness = jnp.linalg.norm(u - u_mean, axis=1), data.body.stiffness_factor(draw)
+        found = {"u": u, "distance": distance, "far": (distance > FAR).astype(float),
+                 "places": jnp.einsum("la,lai->li", weights, u[nodes]),
+                 "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
+        if with_images:
+            values, cells = here.filled(draw), here.images.quadrature.cells
+            z = standardised_residual(here.images, u, values["t_similarity"])
+            noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
+            for name, x in (("observed", z), ("replicated", noise)):
+                found[name] = discrepancies(x, cells, neighbours, len(mesh.cells))
+        return found
 
     some = thinned(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    aside: dict[str, list[np.ndarray]] = {"places": [], "observed": [], "replicated": []}
+    kept = ("places", "observed", "replicated") if with_images else ("places",)
+    aside: dict[str, list[np.ndarray]] = {name: [] for name in kept}
     found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
-    at_mean = standardised_residual(posterior.images, u_mean, _median_t_similarity(posterior, some))
     return Predicted(
         chain_mean=found.chain_mean["u"],
         far_mm=np.array(FAR),
@@ -94,14 +102,49 @@ def predict(
         reach=found.quantiles["distance"][0],
         place_names=np.array(list(places)),
         place_points=np.array(list(places.values()), float),
-        place_draws=whole["places"],
-        residual=np.asarray(at_mean, np.float32),
-        residual_tissue=mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
-        discrepancies=np.array(DISCREPANCIES),
-        observed=whole["observed"],
-        replicated=whole["replicated"],
+        place_draws=whole.pop("places"),
+        **whole,
+        **(_residual(posterior, u_mean, some) if with_images else {}),
+        **_landmarks(posterior, some),
         **(_stiffness(found) if posterior.data.body.field is not None else {}),
     )
+
+
+def _residual(
+    posterior: Posterior, u_mean: Float[np.ndarray, "nodes 3"], draws: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The residual of the images at the mean, in units of the noise."""
+    at_mean = standardised_residual(posterior.images, u_mean, _median_t_similarity(posterior, draws))
+    return {
+        "residual": np.asarray(at_mean, np.float32),
+        "residual_tissue": posterior.mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
+        "discrepancies": np.array(DISCREPANCIES),
+    }
+
+
+def _landmarks(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Residuals of all landmarks at the mean of the draws, and of each predicted by all else."""
+    given = {name: one for name, one in posterior.observations.items() if isinstance(one, Landmarks)}
+    if not given:
+        return {}
+    mean = {name: jnp.asarray(values.mean(axis=(0, 1))) for name, values in draws.items() if name != "number"}
+    estimands = posterior.estimands(mean)
+    state = state_of(posterior.data.body, posterior.data.blocks, posterior.filled(mean))
+    terms = [posterior.data.terms[name] for name in given]
+    labels = [f"{name} {label}" if len(given) > 1 else label for name, one in given.items() for label in one.labels]
+    found = {
+        "landmark_names": np.array(labels),
+        "landmark_points": np.concatenate([one.fixed_points for one in given.values()]),
+        "landmark_sd": np.concatenate([np.asarray(term.sd(state.values)) for term in terms]),
+        "landmark_residual": np.concatenate([np.asarray(term.shift - term.predicted(state)) for term in terms]),
+    }
+    if len(labels) > MOST_LEFT_OUT or not len(posterior.sampled) or dimension(posterior) > MOST_UNKNOWNS:
+        return found
+    left = [leave_out(posterior, term, estimands) for term in terms]
+    return found | {
+        "left_out_residual": np.concatenate([one.residual for one in left]),
+        "left_out_covariance": np.concatenate([one.covariance for one in left]),
+    }
 
 
 def _stiffness(found: Summary) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData
+from bayesreg.config.observations import LandmarksSection
 from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
@@ -20,9 +21,11 @@ from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files
 from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
-from bayesreg.io.store import Inputs, Truth
+from bayesreg.io.points import PointPairs, read_point_pairs
+from bayesreg.io.records import Inputs, Truth
 from bayesreg.io.volumes import load_image
 from bayesreg.mesh import TetMesh
+from bayesreg.model.warp import tissue_on_grid
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.types import InputError
 from bayesreg.workflow.prediction import require_inside
@@ -57,6 +60,16 @@ def prepare(config: Config) -> Prepared:
     """
     clock = _Clock()
     _require_start(config)
+    points = _points(config)
+    if isinstance(config.data, FilesData) and config.data.labels is None:
+        assert config.mesh.file is not None
+        mesh = load_mesh(config.mesh.file)
+        _require_start(config, mesh)
+        clock.lap("mesh")
+        boundary = _known_boundary(config, mesh, None)
+        tissue = _as_stored(tissue_on_grid(mesh))
+        inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, boundary=boundary, points=points)
+        return Prepared(inputs, clock.laps, {})
     anatomy, moving = _anatomy(config)
     if anatomy.intracranial is not None:
         anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
@@ -67,22 +80,41 @@ def prepare(config: Config) -> Prepared:
     clock.lap("mesh")
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
-    scale = robust_scale(anatomy.image, domain.voxels != 0)
-    fixed = scale(anatomy.image)
     if isinstance(config.data, FilesData):
-        assert moving is not None
-        own_scale = scale if config.data.same_contrast else robust_scale(moving, _within(domain, moving))
-        images = _as_stored(fixed), _as_stored(own_scale(moving))
+        images = _scaled(config.data, domain, anatomy.image, moving)
         boundary = _known_boundary(config, mesh, None)
-        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary)
+        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary, points=points)
         return Prepared(inputs, clock.laps, {})
+    assert anatomy.image is not None
+    fixed = robust_scale(anatomy.image, domain.voxels != 0)(anatomy.image)
     pair = _pair(config, fixed, anatomy, domain, skull, mesh)
     clock.lap("pair")
     u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
-    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, _known_boundary(config, mesh, truth))
+    boundary = _known_boundary(config, mesh, truth)
+    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
     return Prepared(inputs, clock.laps, _described(config, pair))
+
+
+def _points(config: Config) -> dict[str, PointPairs]:
+    """The landmarks of a configuration, read before anything takes long."""
+    return {
+        section.name: read_point_pairs(section.file, section.moving_file)
+        for section in config.observations or []
+        if isinstance(section, LandmarksSection)
+    }
+
+
+def _scaled(
+    data: FilesData, domain: Image, fixed: Image | None, moving: Image | None
+) -> tuple[Image | None, Image | None]:
+    """Both images on one scale of intensities, or each on its own."""
+    if fixed is None or moving is None:
+        return None, None
+    scale = robust_scale(fixed, domain.voxels != 0)
+    own_scale = scale if data.same_contrast else robust_scale(moving, _within(domain, moving))
+    return _as_stored(scale(fixed)), _as_stored(own_scale(moving))
 
 
 def prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
@@ -138,7 +170,11 @@ def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
     """The fixed side, and the moving image of a pair from files."""
     data = config.data
     if isinstance(data, FilesData):
+        assert data.labels is not None
+        assert data.label_table is not None
         anatomy = from_files(data.fixed, data.labels, data.label_table, data.intracranial)
+        if data.moving is None or anatomy.image is None:
+            return anatomy, None
         moving = load_image(data.moving)
         check_same_space(anatomy.image, moving, ("fixed", "moving"))
         return anatomy, moving

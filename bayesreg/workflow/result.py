@@ -13,7 +13,7 @@ import numpy as np
 from bayesreg.inference.draws.diagnostics import Convergence, convergence
 from bayesreg.inference.draws.inference_data import open_posterior
 from bayesreg.io import store
-from bayesreg.io.store import Run
+from bayesreg.io.records import Run
 from bayesreg.mesh import TetMesh
 from bayesreg.types import InputError
 
@@ -25,7 +25,7 @@ class Result:
     Attributes
     ----------
     folder : Path
-    run : bayesreg.io.store.Run
+    run : bayesreg.io.records.Run
         Mesh, images, posterior mean and sd of u at every node, manifest, metrics.
     """
 

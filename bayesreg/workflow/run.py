@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.image import Image
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.devices import is_first, require_joined, wait
 from bayesreg.inference.chains.run import (
@@ -26,10 +27,11 @@ from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.draws.inference_data import dataset, open_posterior, save_posterior, to_blocks
-from bayesreg.io import store
+from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
-from bayesreg.io.store import Inputs, Run
+from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.single_node import images_of
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
@@ -127,7 +129,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         _require_same_observations(out, provenance, observations)
         posterior = posterior_of(config, inputs, observations)
         if (out / "run.json").exists():
-            store.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
+            checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
         write_text(out / "config.yaml", inputs.config)
         reached = _reached(config, inputs, posterior, out, progress)
@@ -201,21 +203,21 @@ def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, prog
     found = first_checkpoint(
         posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
     )
-    return found, store.StoredBlocks(out, 0, writes=is_first())
+    return found, checkpoints.StoredBlocks(out, 0, writes=is_first())
 
 
 def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
     """The chains as the run that was cut off stored them last."""
-    state = store.load_state(out)
+    state = checkpoints.load_state(out)
     if state is None:
         return _first(config, inputs, posterior, out, progress)
-    blocks = store.StoredBlocks(out, int(state.pop("blocks")), writes=is_first())
+    blocks = checkpoints.StoredBlocks(out, int(state.pop("blocks")), writes=is_first())
     options = config.sampler
     return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
 
 
 def _save_state(out: Path, checkpoint: Checkpoint, blocks: Blocks) -> None:
-    store.save_state(out, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
+    checkpoints.save_state(out, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
 
 
 def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
@@ -232,7 +234,7 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or _block(len(posterior.images.quadrature.weights)),
+        block=options.block or _block(posterior),
         stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
         resume=reached,
@@ -241,12 +243,20 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
     )
 
 
-def _block(points: int) -> int:
+def _block(posterior: Posterior) -> int:
     """Fewer draws where a step costs more, or no look would come before a time limit is long over.
 
     By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
     """
+    images = images_of(posterior.data)
+    points = 0 if images is None else len(images.quadrature.weights)
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)
+
+
+def _warped(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
+    if inputs.moving is None or inputs.fixed is None:
+        return None
+    return warp_image(inputs.moving, mean_field, inputs.fixed)
 
 
 def _finish(
@@ -265,7 +275,9 @@ def _finish(
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)
     moments = np.concatenate([samples.u_mean, samples.u_sd], axis=1)
-    mean_field, sd_field = np.split(nodal_field_on_grid(inputs.mesh, moments, inputs.fixed), 2, axis=-1)
+    mean_field, sd_field = np.split(
+        nodal_field_on_grid(inputs.mesh, moments, inputs.fixed or inputs.tissue), 2, axis=-1
+    )
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
@@ -274,14 +286,14 @@ def _finish(
         manifest=manifest(config, inputs, posterior, samples, draws, judged, provenance, began),
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
-        warped=warp_image(inputs.moving, mean_field, inputs.fixed),
+        warped=_warped(inputs, mean_field),
         metrics=metrics,
         predicted=predicted,
         bodies=store.read_bodies(out),
         **inputs._asdict(),
     )
     store.write_results(out, finished, mean_field, sd_field)
-    store.remove_blocks(out)
+    checkpoints.remove_blocks(out)
     result = Result(out, finished)
     write_report(finished, idata, *judged, result.report)
     return result

@@ -42,7 +42,7 @@ from bayesreg.inference.target import estimands_of, logdensity
 from bayesreg.io.datasets import mni152
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh
-from bayesreg.io.store import Inputs
+from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
 from bayesreg.model.coordinates import completed

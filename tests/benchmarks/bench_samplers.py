@@ -22,7 +22,7 @@ from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.run import _first, checkpoint_from_arrays
 from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, choose_sampler
-from bayesreg.io import store
+from bayesreg.io import checkpoints, store
 from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
 
@@ -46,7 +46,7 @@ def finished() -> Finished:
         pytest.skip("BAYESREG_RUN names no run that has ended")
     config = br.load_config(Path(folder) / "config.yaml")
     posterior, options = posterior_of(config, store.read_inputs(folder)), config.sampler
-    arrays = store.load_state(folder)
+    arrays = checkpoints.load_state(folder)
     assert arrays is not None
     assert options.name == "hmc"
     arrays.pop("blocks")

@@ -30,7 +30,7 @@ from bayesreg.inference.gaussian.whitened import clearance_of, whitened_density,
 from bayesreg.inference.samplers.hamiltonian import _quarter_turn
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
-from bayesreg.io import store
+from bayesreg.io import checkpoints, store
 from bayesreg.model.coordinates import completed
 from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_sampling import _median
@@ -46,7 +46,7 @@ def main() -> None:
     given = parser.parse_args()
     config = br.load_config(given.run / "config.yaml")
     posterior, options = posterior_of(config, store.read_inputs(given.run)), config.sampler
-    arrays = store.load_state(given.run)
+    arrays = checkpoints.load_state(given.run)
     if (
         options.name != "hmc"
         or posterior.options.similarity != "ssd"

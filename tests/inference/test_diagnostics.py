@@ -17,7 +17,7 @@ from bayesreg.inference.draws.inference_data import (
     to_blocks,
     to_inference_data,
 )
-from bayesreg.io.store import StoredBlocks
+from bayesreg.io.checkpoints import StoredBlocks
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayesreg.image import Image
-from bayesreg.io import store
-from bayesreg.io.store import Inputs, Predicted, Run, Truth
+from bayesreg.io import checkpoints, store
+from bayesreg.io.records import Inputs, Predicted, Run, Truth
 from tests.phantoms import ball_mesh, rotated_affine
 
 
@@ -156,15 +156,15 @@ def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
 
 
 def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
-    assert list(store.StoredBlocks(tmp_path, 0)) == []
+    assert list(checkpoints.StoredBlocks(tmp_path, 0)) == []
     for k in range(12):
-        store.save_block(tmp_path, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
-    store.save_block(tmp_path, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
-    blocks = store.StoredBlocks(tmp_path, 12)
+        checkpoints.save_block(tmp_path, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
+    checkpoints.save_block(tmp_path, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
+    blocks = checkpoints.StoredBlocks(tmp_path, 12)
     assert [int(block["step"]) for block in blocks] == list(range(12))
     assert (blocks[11]["u"] == -1).all()
     assert len(blocks) == 12
-    fewer = store.StoredBlocks(tmp_path, 5)
+    fewer = checkpoints.StoredBlocks(tmp_path, 5)
     fewer.append({"step": np.array(50)})
     assert [int(block["step"]) for block in fewer] == [0, 1, 2, 3, 4, 50]
     with pytest.raises(IndexError, match="block 6 of 6"):
@@ -172,8 +172,8 @@ def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
 
 
 def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, monkeypatch):
-    store.save_block(tmp_path, 0, {"u": np.zeros(3)})
-    store.save_state(tmp_path, {"step": np.array(1)})
+    checkpoints.save_block(tmp_path, 0, {"u": np.zeros(3)})
+    checkpoints.save_state(tmp_path, {"step": np.array(1)})
 
     def killed(file, **_):
         file.write(b"PK half a file")
@@ -181,29 +181,29 @@ def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, 
 
     monkeypatch.setattr(np, "savez", killed)
     with pytest.raises(KeyboardInterrupt):
-        store.save_block(tmp_path, 1, {"u": np.ones(3)})
+        checkpoints.save_block(tmp_path, 1, {"u": np.ones(3)})
     with pytest.raises(KeyboardInterrupt):
-        store.save_state(tmp_path, {"step": np.array(2)})
+        checkpoints.save_state(tmp_path, {"step": np.array(2)})
     assert [path.name for path in (tmp_path / "draws").iterdir()] == ["block_00000.npz"]
-    assert int(store.load_state(tmp_path)["step"]) == 1
+    assert int(checkpoints.load_state(tmp_path)["step"]) == 1
 
 
 def test_a_gap_among_the_blocks_is_an_error(tmp_path):
     for k in (0, 2):
-        store.save_block(tmp_path, k, {"u": np.zeros(1)})
+        checkpoints.save_block(tmp_path, k, {"u": np.zeros(1)})
     with pytest.raises(ValueError, match=r"block_00001\.npz is missing"):
-        store.StoredBlocks(tmp_path, 3)
+        checkpoints.StoredBlocks(tmp_path, 3)
 
 
 @pytest.mark.parametrize("name", ["state.npz", "draws/block_00000.npz", "inputs/truth.npz"])
 def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
     write(tmp_path, run)
-    store.save_block(tmp_path, 0, {"u": np.zeros(3)})
-    store.save_state(tmp_path, {"step": np.array(1)})
+    checkpoints.save_block(tmp_path, 0, {"u": np.zeros(3)})
+    checkpoints.save_state(tmp_path, {"step": np.array(1)})
     (tmp_path / name).write_bytes(b"PK half a file")
     read = {
-        "state.npz": (store.load_state, r"delete it, and the run resumes from its first step"),
-        "draws/block_00000.npz": (lambda f: list(store.StoredBlocks(f, 1)), r"delete state\.npz"),
+        "state.npz": (checkpoints.load_state, r"delete it, and the run resumes from its first step"),
+        "draws/block_00000.npz": (lambda f: list(checkpoints.StoredBlocks(f, 1)), r"delete state\.npz"),
         "inputs/truth.npz": (store.read_inputs, r"run anew, into another folder"),
     }
     with pytest.raises(ValueError, match=f"{name} is damaged or no .npz file .*; {read[name][1]}"):
@@ -211,4 +211,4 @@ def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
 
 
 def test_without_a_checkpoint_there_is_no_state(tmp_path):
-    assert store.load_state(tmp_path) is None
+    assert checkpoints.load_state(tmp_path) is None

@@ -7,8 +7,10 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import bayesreg as br
+from bayesreg.model.left_out import leave_out
 from tests.oracles import paper
 from tests.phantoms import box_mesh, smooth_image
 
@@ -69,8 +71,8 @@ def barycentric(points):
 
 
 @cache
-def exact(with_region=False):
-    """Mean and covariance of the flat u_B, by dense matrices of its own."""
+def prior():
+    """Precision of the flat u_B, and what takes it to all nodes, by dense matrices."""
     K = np.asarray(paper.stiffness(MESH.points, MESH.cells, LAM[MESH.tissue], MU[MESH.tissue]).todense())
     boundary = (3 * MESH.boundary[:, None] + np.arange(3)).ravel()
     interior = np.setdiff1d(np.arange(len(K)), boundary)
@@ -78,9 +80,16 @@ def exact(with_region=False):
     whole[boundary] = np.eye(len(boundary))
     whole[interior] = -np.linalg.solve(K[np.ix_(interior, interior)], K[np.ix_(interior, boundary)])
     modes = np.linalg.qr(rigid(MESH.points[MESH.boundary]))[0]
-    precision = whole.T @ K @ whole / T_ELASTIC + modes @ modes.T / (len(MESH.boundary) * RIGID_SD**2)
-    force = np.zeros(len(boundary))
-    points, moved, sd = places()
+    return whole.T @ K @ whole / T_ELASTIC + modes @ modes.T / (len(MESH.boundary) * RIGID_SD**2), whole
+
+
+@cache
+def exact(with_region=False, without=None):
+    """Mean and covariance of the flat u_B, by dense matrices of its own; without one landmark."""
+    precision, whole = prior()
+    force = np.zeros(len(precision))
+    kept = np.delete(np.arange(9), [] if without is None else without)
+    points, moved, sd = (part[kept] for part in places())
     observed = [(np.kron(barycentric(points), np.eye(3)), (moved - points).ravel(), np.repeat(sd, 3))]
     if with_region:
         region, measured, error = REGION
@@ -135,6 +144,54 @@ def test_samplers_meet_mean_and_covariance(sampler, with_region):
         assert (z**2).mean() == pytest.approx(1.0, abs=0.6)
 
 
+def test_left_out_landmarks_are_predicted_as_by_a_posterior_without_them():
+    post = posterior(True)
+    mean = jnp.asarray(exact(True)[0].reshape(-1, 3))
+    found = leave_out(post, post.data.terms["landmarks"], {"u_boundary": mean})
+    points, moved, sd = places()
+    for k in range(len(points)):
+        at = np.kron(barycentric(points[k : k + 1]), np.eye(3)) @ prior()[1]
+        without, covariance = exact(True, k)
+        np.testing.assert_allclose(found.residual[k], moved[k] - points[k] - at @ without, rtol=1e-5, atol=1e-7)
+        expected = at @ covariance @ at.T + sd[k] ** 2 * np.eye(3)
+        np.testing.assert_allclose(found.covariance[k], expected, rtol=1e-5, atol=1e-8)
+
+
+def test_a_landmark_that_nothing_else_determines_is_told():
+    post = br.build_posterior(
+        mesh=MESH, observations=[br.Landmarks([[10.0, 9, 11]], [[11.0, 9, 11]], 0.1)], model=MODEL
+    )
+    tight = post.data.terms["landmarks"]._replace(known_sd=jnp.array([1e-7]))
+    found = leave_out(post, tight, {"u_boundary": post.reference()["u_boundary"]})
+    assert np.isnan(found.residual).all()
+
+
+def test_an_inferred_sd_has_the_posterior_of_its_evidence():
+    """The displacements are integrated out in closed form: the shifts are N(0, A Σ Aᵀ + sd² I) given sd."""
+    points, moved, _ = places()
+    sd = br.ScalePrior(median=0.3, log_sd=0.7)
+    observed = [br.Landmarks(points, moved, sd)]
+    post = br.build_posterior(mesh=MESH, observations=observed, model=MODEL)
+    precision, whole = prior()
+    A = np.kron(barycentric(points), np.eye(3)) @ whole
+    spread, shift = A @ np.linalg.solve(precision, A.T), (moved - points).ravel()
+    log_sd = np.linspace(np.log(0.3) - 3, np.log(0.3) + 3, 400)
+    height = [
+        stats.multivariate_normal.logpdf(shift, np.zeros(len(shift)), spread + np.exp(2 * s) * np.eye(len(shift)))
+        + stats.norm.logpdf(s, np.log(0.3), 0.7)
+        for s in log_sd
+    ]
+    weight = np.exp(np.array(height) - max(height))
+    weight /= weight.sum()
+    expected = weight @ log_sd
+    deviation = np.sqrt(weight @ (log_sd - expected) ** 2)
+    found = br.sample(post, "hmc", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
+    draws = np.log(found.idata.posterior["landmarks_sd"].values)[:, 20:]
+    error = draws.mean(axis=1).std(ddof=1) / np.sqrt(CHAINS)
+    assert abs(draws.mean() - expected) < 4 * error + 0.02 * deviation
+    assert draws.std() == pytest.approx(deviation, rel=0.12)
+
+
 def test_the_papers_kernel_runs_with_them():
     found = br.sample(posterior(True), "rwmh", chains=2, draws=40, thin=2, seed=1, progress=False, sigma_u=0.05)
     assert 0.05 < float(found.idata.sample_stats["acceptance_rate"].mean()) < 0.99
@@ -179,7 +236,10 @@ class Wrong:
         ([Wrong()], "must give one real number, got shape"),
         ([landmarks(), landmarks()], "'landmarks' of an observation is taken"),
         ([br.Landmarks([[1.0, 1, 1]], [[1.0, 1, 1]], 1.0, name="elastic")], "'elastic' of an observation is taken"),
-        ([br.Landmarks([[1.0, 1, 99]], [[1.0, 1, 1]], 1.0)], "outside the mesh"),
+        (
+            [br.Landmarks([[1.0, 1, 99]], [[1.0, 1, 1]], 1.0, labels=["tip"])],
+            "landmarks: point tip at .* outside the mesh",
+        ),
         ([MeanDisplacement(np.array([[0.0, 0.0, 99.0]]), np.zeros(3), 1.0)], "outside the mesh"),
     ],
 )
@@ -195,6 +255,7 @@ def test_wrong_observations_are_told(observations, message):
         ((np.zeros((2, 3)), np.zeros((2, 3)), [1.0, 2.0, 3.0]), "one for each point"),
         ((np.zeros((2, 3)), np.zeros((2, 3)), 0.0), "must be positive"),
         ((np.zeros((1, 3)), np.full((1, 3), np.nan), 1.0), "finite number"),
+        ((np.zeros((2, 3)), np.zeros((2, 3)), 1.0, "pairs", ["one"]), "pairs: there must be 2 labels"),
     ],
 )
 def test_wrong_landmarks_are_told(arguments, message):

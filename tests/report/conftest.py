@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.io.store import Predicted, Run, Truth
+from bayesreg.io.records import Predicted, Run, Truth
 from bayesreg.mesh import TetMesh
 from bayesreg.report.metrics import compute_metrics
 from tests.phantoms import ball_mesh, rotated_affine

@@ -151,7 +151,7 @@ def test_areas_on_a_logarithmic_axis_are_shares_of_the_draws():
     assert abs(np.log(peak) - 1.0) < 1.0
 
 
-def test_sampled_temperatures_are_drawn_with_their_prior(study):
+def test_sampled_scales_are_drawn_with_their_prior(study):
     posterior = study.idata.posterior
     assert marginals.temperatures(study.run, posterior) is None
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayesreg.io.store import Truth
+from bayesreg.io.records import Truth
 from bayesreg.mesh import TetMesh
 from bayesreg.report import metrics
 from tests.phantoms import ball_mesh, box_mesh

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -11,7 +12,8 @@ from jaxtyping import Float, Int
 
 from bayesreg.fem.location import interpolation_at
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import Values
+from bayesreg.model.blocks import Scale, Values
+from bayesreg.model.options import ScalePrior
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import Label, PointCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -20,7 +22,7 @@ from bayesreg.types import AnyArray, InputError, Scalar
 class Landmarks:
     """Pairs of points that show the same place of the organ, each with an isotropic Normal error.
 
-    log p = −Σ |q − p − u(p)|² / (2 sd²).
+    log p = −Σ |q − p − u(p)|² / (2 sd²), and −3k log(sd) where the sd is inferred.
 
     Parameters
     ----------
@@ -28,10 +30,13 @@ class Landmarks:
         p, world RAS mm, in the space of the fixed image and inside the mesh.
     moving_points : (k, 3) array
         q, world RAS mm, in the space of the moving image.
-    sd : float or (k,) array
-        Standard deviation of the error of each coordinate, mm, positive.
+    sd : float, (k,) array or ScalePrior
+        Standard deviation of the error of each coordinate, mm, positive; or the prior of one sd for all points, which
+        is then inferred as "<name>_sd".
     name : str, default "landmarks"
         Its name in tables and in the NumPyro program.
+    labels : sequence of str, optional
+        What to call each pair in the report; the default is its number.
 
     Raises
     ------
@@ -39,69 +44,103 @@ class Landmarks:
         If shapes differ, a number is not finite, or an sd is not positive.
     """
 
-    def __init__(self, fixed_points: Any, moving_points: Any, sd: Any, name: str = "landmarks") -> None:
+    def __init__(
+        self,
+        fixed_points: Any,
+        moving_points: Any,
+        sd: Any,
+        name: str = "landmarks",
+        labels: Sequence[str] | None = None,
+    ) -> None:
         self.fixed_points, self.moving_points = np.asarray(fixed_points, float), np.asarray(moving_points, float)
         shapes = self.fixed_points.shape, self.moving_points.shape
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3 or not shapes[0][0]:
             raise InputError(f"{name}: fixed_points and moving_points must both have shape (k, 3), got {shapes}")
-        if np.ndim(sd) and np.shape(sd) != shapes[0][:1]:
-            raise InputError(f"{name}: sd must be one number or {shapes[0][0]}, one for each point; got {np.shape(sd)}")
-        self.sd, self.name = np.broadcast_to(np.asarray(sd, float), shapes[0][:1]).copy(), name
+        count = shapes[0][0]
         if not all(np.isfinite(part).all() for part in (self.fixed_points, self.moving_points)):
             raise InputError(f"{name}: every coordinate must be a finite number")
-        if not (np.isfinite(self.sd) & (self.sd > 0)).all():
-            raise InputError(f"{name}: every sd must be positive, mm; got {self.sd.tolist()}")
+        if labels is not None and len(labels) != count:
+            raise InputError(f"{name}: there must be {count} labels, one for each point; got {len(labels)}")
+        self.name, self.labels = name, tuple(labels or map(str, range(1, count + 1)))
+        self.prior = ScalePrior(**sd) if isinstance(sd, Mapping) else sd if isinstance(sd, ScalePrior) else None
+        self.sd = _known_sd(self.prior.median if self.prior else sd, count, name)
 
-    def on(self, mesh: TetMesh) -> PointPairs:
+    @property
+    def blocks(self) -> dict[str, Scale]:
+        """The unknowns that it brings: its sd, where that is inferred."""
+        if self.prior is None:
+            return {}
+        return {f"{self.name}_sd": Scale(jnp.asarray(self.prior.median), jnp.asarray(self.prior.log_sd))}
+
+    def on(self, mesh: TetMesh) -> ComparedPoints:
         """The term on a mesh; InputError if a fixed point lies outside it."""
-        nodes, weights = interpolation_at(mesh, self.fixed_points)
-        return PointPairs(
+        labels = [f"{self.name}: point {label}" for label in self.labels]
+        nodes, weights = interpolation_at(mesh, self.fixed_points, labels)
+        return ComparedPoints(
             label=Label(self.name),
+            scale=None if self.prior is None else Label(f"{self.name}_sd"),
             nodes=jnp.asarray(nodes),
             weights=jnp.asarray(weights),
             shift=jnp.asarray(self.moving_points - self.fixed_points),
-            sd=jnp.asarray(self.sd),
+            known_sd=jnp.asarray(self.sd),
         )
 
 
-class PointPairs(NamedTuple):
+def _known_sd(sd: Any, count: int, name: str) -> Float[np.ndarray, "k"]:
+    if np.ndim(sd) and np.shape(sd) != (count,):
+        raise InputError(f"{name}: sd must be one number or {count}, one for each point; got {np.shape(sd)}")
+    found = np.broadcast_to(np.asarray(sd, float), (count,)).copy()
+    if not (np.isfinite(found) & (found > 0)).all():
+        raise InputError(f"{name}: every sd must be positive, mm; got {found.tolist()}")
+    return found
+
+
+class ComparedPoints(NamedTuple):
     """Landmarks on a mesh (a pytree).
 
     Attributes
     ----------
     label : Label
+    scale : Label or None
+        Name of the block with the sd of all points; None where it is known.
     nodes : (k, 4) int array
         Nodes of the cell that holds each point.
     weights : (k, 4) array
         Barycentric coordinates there.
     shift : (k, 3) array
         q − p, mm.
-    sd : (k,) array
-        mm.
+    known_sd : (k,) array
+        mm; the median of its prior where it is inferred.
     """
 
     label: Label
+    scale: Label | None
     nodes: Int[AnyArray, "k 4"]
     weights: Float[AnyArray, "k 4"]
     shift: Float[AnyArray, "k 3"]
-    sd: Float[AnyArray, "k"]
+    known_sd: Float[AnyArray, "k"]
 
     @property
     def name(self) -> str:
         """Its name."""
         return self.label.name
 
+    def sd(self, values: Values) -> Float[AnyArray, "k"]:
+        """The sd of every point, mm."""
+        return self.known_sd if self.scale is None else jnp.full(self.known_sd.shape, values[self.scale.name])
+
     def log(self, state: State) -> Scalar:
-        """−Σ |q − p − u(p)|² / (2 sd²)."""
-        return -0.5 * (self.standardised_residual(state) ** 2).sum()
+        """−Σ |q − p − u(p)|² / (2 sd²), and the part of the normaliser that is not known."""
+        return self.likelihood(state).log_prob(self.shift).sum()
 
     def observed(self) -> AnyArray:
         """q − p, mm."""
         return self.shift
 
     def likelihood(self, state: State) -> dist.Distribution:
-        """N(u(p), sd²), up to its normaliser, which is known."""
-        return UnnormalisedNormal(self.predicted(state), self.sd[:, None])
+        """N(u(p), sd²), up to the part of its normaliser that is known."""
+        sd = self.sd(state.values)
+        return PartlyNormalised(self.predicted(state), sd[:, None], self.known_sd[:, None])
 
     def predicted(self, state: State) -> Float[AnyArray, "k 3"]:
         """u(p), mm."""
@@ -109,17 +148,21 @@ class PointPairs(NamedTuple):
 
     def standardised_residual(self, state: State) -> Float[AnyArray, "k 3"]:
         """(q − p − u(p)) / sd: independent standard Normal numbers where the model holds."""
-        return (self.shift - self.predicted(state)) / self.sd[:, None]
+        return (self.shift - self.predicted(state)) / self.sd(state.values)[:, None]
 
     def curvature(self, u: Float[AnyArray, "nodes 3"], values: Values, second_order: bool) -> PointCurvature:
         """1 / sd² in every coordinate of every point; nothing of second order."""
-        first = jnp.eye(3) / self.sd[:, None, None] ** 2
+        first = jnp.eye(3) / self.sd(values)[:, None, None] ** 2
         return PointCurvature(self.nodes, self.weights, first, jnp.zeros_like(first))
 
 
-class UnnormalisedNormal(dist.Normal):
-    """A Normal distribution whose log density leaves its constant out."""
+class PartlyNormalised(dist.Normal):
+    """A Normal distribution whose log density leaves out the normaliser of a known scale."""
+
+    def __init__(self, loc: Any, scale: Any, known_scale: Any) -> None:
+        self.known_scale = known_scale
+        super().__init__(loc, scale)
 
     def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
-        """−(value − loc)² / (2 scale²)."""
-        return -0.5 * ((value - self.loc) / self.scale) ** 2
+        """−(value − loc)² / (2 scale²) − log(scale / known scale)."""
+        return -0.5 * ((value - self.loc) / self.scale) ** 2 - jnp.log(self.scale / self.known_scale)

@@ -1,0 +1,45 @@
+"""The sections of a configuration that say what was observed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from bayesreg.config.values import FoundFile, Positive, Section
+from bayesreg.model.options import ScalePrior
+
+
+class ImagesSection(Section):
+    """The pair of images of the section data, compared as the section model says."""
+
+    kind: Literal["images"]
+
+
+class LandmarksSection(Section):
+    """Pairs of points that show the same place of the organ."""
+
+    kind: Literal["landmarks"]
+    file: FoundFile
+    """Both points of each pair (.csv, or .tag of two volumes), or the points in the fixed image (.csv, .fcsv,
+    .mrk.json, .tag)."""
+    moving_file: FoundFile | None = None
+    """The points in the moving image, where they stand in a file of their own."""
+    sd: Positive | ScalePrior | None = None
+    """Sd of the error of each coordinate, mm, or its prior; null takes the column sd of the file."""
+    name: Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")] = "landmarks"
+    """Its name in tables; two observations need two."""
+
+
+Observation = Annotated[ImagesSection | LandmarksSection, Field(discriminator="kind")]
+
+
+def _of_different_names(given: list[Observation] | None) -> list[Observation] | None:
+    names = [one.name if isinstance(one, LandmarksSection) else "images" for one in given or []]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two observations are named {name}; give one of them another name")
+    return given
+
+
+Observations = Annotated[list[Observation] | None, AfterValidator(_of_different_names)]

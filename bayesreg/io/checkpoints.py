@@ -1,0 +1,102 @@
+"""Blocks of draws and the last state of a run, from which one that was cut off goes on."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from bayesreg.io.atomic import load_arrays, save_arrays
+from bayesreg.types import AnyArray, InputError
+
+RESUME_ANEW = "delete state.npz in that run's folder, and it resumes from its first step"
+
+
+def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:
+    """Write one block of draws in one step; a block of the same index is replaced."""
+    path = _block_path(folder, index)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_arrays(path, arrays)
+
+
+class StoredBlocks:
+    """The first blocks of draws in draws/ of a run folder, each read when it is asked for; see `save_block`.
+
+    Parameters
+    ----------
+    folder : path
+    count : int
+    writes : bool
+        False where another process writes what is appended.
+
+    Raises
+    ------
+    InputError
+        If one is missing or, when it is asked for, damaged.
+    """
+
+    def __init__(self, folder: str | Path, count: int, writes: bool = True) -> None:
+        self.folder, self.count, self.writes = Path(folder), count, writes
+        for index in range(count):
+            if not _block_path(self.folder, index).exists():
+                raise InputError(f"{_block_path(self.folder, index)} is missing; {RESUME_ANEW}")
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> dict[str, np.ndarray]:
+        if not 0 <= index < self.count:
+            raise IndexError(f"block {index} of {self.count}")
+        return load_arrays(_block_path(self.folder, index), RESUME_ANEW)
+
+    def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
+        return (self[index] for index in range(self.count))
+
+    def append(self, block: Mapping[str, AnyArray], /) -> None:
+        """Write one block more."""
+        if self.writes:
+            save_block(self.folder, self.count, block)
+        self.count += 1
+
+
+def _block_path(folder: str | Path, index: int) -> Path:
+    return Path(folder) / "draws" / f"block_{index:05d}.npz"
+
+
+def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
+    """Replace state.npz, what the next block starts from, in one step."""
+    save_arrays(Path(folder) / "state.npz", arrays)
+
+
+def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
+    """The content of state.npz; None where there is none."""
+    path = Path(folder) / "state.npz"
+    return load_arrays(path, "delete it, and the run resumes from its first step") if path.exists() else None
+
+
+def remove_blocks(folder: str | Path) -> None:
+    """Remove draws/ of a run whose results are complete; state.npz stays, from which it can be continued."""
+    shutil.rmtree(Path(folder) / "draws", ignore_errors=True)
+
+
+def reopen(folder: str | Path, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
+    """Make of a finished run one that was cut off after these blocks, which hold all its draws.
+
+    Killed between any two of its steps, it leaves a finished run, or what it is to leave.
+
+    Raises
+    ------
+    InputError
+        If the run's last state was not kept.
+    """
+    folder = Path(folder)
+    state = load_state(folder)
+    if state is None:
+        raise InputError(f"{folder} cannot be continued: state.npz, where its chains stood last, is missing")
+    kept = StoredBlocks(folder, 0)
+    for block in blocks:
+        kept.append(block)
+    save_state(folder, state | {"blocks": np.array(len(kept))})
+    (folder / "run.json").unlink()

@@ -1,0 +1,199 @@
+"""What a run starts from and what it leaves, in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.image import Image
+from bayesreg.io.points import PointPairs
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray
+
+
+class Truth(NamedTuple):
+    """What is known of a synthetic pair.
+
+    Attributes
+    ----------
+    u : (n, 3) array
+        True displacement of every node of the run's mesh, mm.
+    lam, mu : (T,) array
+        True Lamé parameters by tissue.
+    initial : (n, 3) array or None
+        Centre of the displacements that the chains started from, mm; None for the identity.
+    """
+
+    u: AnyArray
+    lam: AnyArray
+    mu: AnyArray
+    initial: AnyArray | None = None
+
+
+class Fit(NamedTuple):
+    """How the images fit, as in `Predicted`."""
+
+    residual: AnyArray
+    residual_tissue: AnyArray
+    discrepancies: np.ndarray
+    observed: AnyArray
+    replicated: AnyArray
+
+
+class Predicted(NamedTuple):
+    """What was computed of thinned draws at the end of a run, since it needs the posterior itself.
+
+    Attributes
+    ----------
+    chain_mean : (chains, n, 3) array
+        Mean displacement of every node, mm, chain by chain.
+    far_mm : scalar
+    far : (n,) array
+        P(|u − ū| > far_mm) at every node, ū the posterior mean.
+    reach : (n,) array
+        |u − ū|, mm, that 95 % of the draws do not exceed.
+    place_names : (L,) array of str
+    place_points : (L, 3) array
+        World mm, in the fixed image.
+    place_draws : (chains, draws, L, 3) array
+        Displacement of the places, mm.
+    residual : (q,) array or None
+        f − m(x + ū) at the quadrature points over the noise sd that T_s implies there. This and what follows up to
+        `replicated` is None without images.
+    residual_tissue : (q,) int array
+        Index into the mesh's tissue names.
+    discrepancies : (D,) array of str
+    observed, replicated : (chains, draws, D) arrays
+        Discrepancies of the standardised residuals of each draw, and of noise that follows the model.
+    landmark_names, landmark_points, landmark_sd, landmark_residual : (k,), (k, 3), (k,), (k, 3) arrays or None
+        Of all landmarks that were observed: names, places in the fixed image, sd and residual at the mean, mm.
+    left_out_residual, left_out_covariance : (k, 3), (k, 3, 3) arrays or None
+        Of each landmark, predicted by all observations but itself (`bayesreg.model.left_out`); where there are few.
+    stiffness_mean, stiffness_sd : (m,) array or None
+        Posterior mean and standard deviation of every element's stiffness over its tissue's; None without a field.
+    stiffer : scalar or None
+    stiffer_probability : (m,) array or None
+        P(stiffness over the tissue's > stiffer).
+    """
+
+    chain_mean: AnyArray
+    far_mm: AnyArray
+    far: AnyArray
+    reach: AnyArray
+    place_names: np.ndarray
+    place_points: AnyArray
+    place_draws: AnyArray
+    residual: AnyArray | None = None
+    residual_tissue: AnyArray | None = None
+    discrepancies: np.ndarray | None = None
+    observed: AnyArray | None = None
+    replicated: AnyArray | None = None
+    landmark_names: np.ndarray | None = None
+    landmark_points: AnyArray | None = None
+    landmark_sd: AnyArray | None = None
+    landmark_residual: AnyArray | None = None
+    left_out_residual: AnyArray | None = None
+    left_out_covariance: AnyArray | None = None
+    stiffness_mean: AnyArray | None = None
+    stiffness_sd: AnyArray | None = None
+    stiffer: AnyArray | None = None
+    stiffer_probability: AnyArray | None = None
+
+    @property
+    def fit(self) -> Fit | None:
+        """How the images fit; None without images."""
+        parts = {name: getattr(self, name) for name in Fit._fields}
+        return None if self.discrepancies is None else Fit(**parts)
+
+    @property
+    def known(self) -> dict[str, AnyArray]:
+        """Those of the entries that there are."""
+        return {name: value for name, value in self._asdict().items() if value is not None}
+
+    @property
+    def by_cell(self) -> dict[str, AnyArray]:
+        """Those that have one row per element."""
+        fields = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
+        return {name: value for name, value in self.known.items() if name in fields}
+
+
+class Inputs(NamedTuple):
+    """What a run starts from, and what a resumed run must find unchanged.
+
+    Attributes
+    ----------
+    config : str
+        The resolved configuration, YAML.
+    mesh : TetMesh
+    fixed, moving : Image or None
+        As the model saw them (one common intensity scale); None where no images were observed.
+    tissue : Image
+        Tissue labels on a grid of the fixed space, 0 outside, 1 + index into `mesh.names` inside.
+    skull : Image or None
+        Nonzero where no sampled node may go.
+    truth : Truth or None
+    boundary : (b, 3) array or None
+        Displacement of the boundary nodes, mm, where it is known and not sampled.
+    points : mapping
+        Pairs of points that were observed, by the name of the observation.
+    """
+
+    config: str
+    mesh: TetMesh
+    fixed: Image | None
+    moving: Image | None
+    tissue: Image
+    skull: Image | None = None
+    truth: Truth | None = None
+    boundary: AnyArray | None = None
+    points: Mapping[str, PointPairs] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished run in memory; its draws travel beside it.
+
+    Attributes
+    ----------
+    config, mesh, fixed, moving, tissue, skull, truth, boundary, points
+        As in `Inputs`.
+    manifest : dict
+        The content of run.json.
+    u_mean, u_sd : (n, 3) array
+        Posterior mean and standard deviation of the displacement of every node, mm.
+    warped : Image or None
+        Moving image resampled on the fixed grid by the posterior mean; None without images.
+    metrics : dict or None
+        The content of metrics.json, where the truth is known.
+    predicted : Predicted or None
+        The content of predicted.npz; None for runs of versions that wrote none.
+    bodies : list of dict or None
+        The content of bodies.json, simulated registrations on this mesh; None where there were none.
+    """
+
+    config: str
+    manifest: dict[str, Any]
+    mesh: TetMesh
+    u_mean: Float[AnyArray, "nodes 3"]
+    u_sd: Float[AnyArray, "nodes 3"]
+    fixed: Image | None
+    moving: Image | None
+    tissue: Image
+    warped: Image | None
+    skull: Image | None = None
+    truth: Truth | None = None
+    boundary: AnyArray | None = None
+    points: Mapping[str, PointPairs] = field(default_factory=dict)
+    metrics: dict[str, Any] | None = None
+    predicted: Predicted | None = None
+    bodies: list[dict[str, Any]] | None = None
+
+    @property
+    def background(self) -> Image:
+        """What maps are drawn on: the fixed image, or where there is none the tissue map."""
+        return self.tissue if self.fixed is None else self.fixed

@@ -1,0 +1,123 @@
+"""Observations in a configuration: landmarks with images, on labels and on a mesh alone, to the report."""
+
+import re
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+import bayesreg as br
+from bayesreg.io import store
+from tests.phantoms import ball_mesh
+from tests.test_tissues import CENTRE, anatomy
+
+NAMES = {"liver": 41, "vessels": 20}
+SHIFT = np.array([1.0, -0.5, 0.8])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("observed")
+    for name, image in zip(("fixed", "moving", "labels"), anatomy(NAMES), strict=True):
+        br.save_image(image, folder / f"{name}.nii.gz")
+    ball = ball_mesh(radius=38, spacing=24)
+    radius = np.linalg.norm(ball.points[ball.cells].mean(axis=1) - CENTRE, axis=1)
+    mesh = br.TetMesh.from_arrays(ball.points, ball.cells, (radius < 20).astype(int), tuple(NAMES))
+    br.save_mesh(mesh, folder / "mesh.vtu")
+    rng = np.random.default_rng(0)
+    fixed = CENTRE + rng.uniform(-18, 18, (8, 3))
+    moved = fixed + SHIFT + 0.2 * rng.normal(size=fixed.shape)
+    rows = [f"p{k},{','.join(map(str, [*p, *q]))},0.2" for k, (p, q) in enumerate(zip(fixed, moved, strict=True))]
+    header = "name,fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z,sd"
+    (folder / "pairs.csv").write_text("\n".join([header, *rows]))
+    (folder / "plain.csv").write_text(re.sub(r",[^,\n]*$", "", "\n".join([header, *rows]), flags=re.MULTILINE))
+    return folder
+
+
+def configuration(folder, observations, data=(), name="run.yaml", **sections):
+    content = {
+        "data": {"source": "files", **dict(data)},
+        "mesh": {"file": "mesh.vtu"},
+        "observations": observations,
+        "model": {"fixed": {"lam": 10.0, "mu": 1.0}, "t_elastic": 50.0, "rigid_sd": 5.0},
+        "sampler": {"name": "laplace"},
+        "stop": {"rhat": None, "ess": None, "max_steps": 40},
+        **sections,
+    }
+    YAML().dump({key: value for key, value in content.items() if value is not None}, folder / name)
+    return folder / name
+
+
+LABELS = {"labels": "labels.nii.gz", "label_table": {"liver": 3, "vessels": 5}}
+IMAGES = {"fixed": "fixed.nii.gz", "moving": "moving.nii.gz", **LABELS}
+PAIRS = {"kind": "landmarks", "file": "pairs.csv"}
+
+
+@pytest.mark.parametrize("data", [{}, LABELS], ids=["mesh alone", "labels"])
+def test_landmarks_without_any_image(folder, tmp_path, data):
+    result = br.run(configuration(folder, [PAIRS], data), tmp_path / "out", progress=False)
+    np.testing.assert_allclose(result.u_mean.mean(axis=0), SHIFT, atol=0.4)
+    assert result.run.fixed is None
+    assert result.run.warped is None
+    assert (tmp_path / "out" / "displacement_mean.nii.gz").exists()
+    assert not (tmp_path / "out" / "warped_mean.nii.gz").exists()
+    predicted = store.read_run(tmp_path / "out").predicted
+    assert list(predicted.landmark_names) == [f"p{k}" for k in range(8)]
+    np.testing.assert_allclose(predicted.landmark_sd, 0.2)
+    kept, alone = (np.linalg.norm(r, axis=1) for r in (predicted.landmark_residual, predicted.left_out_residual))
+    assert (alone > kept).all()
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert 'id="landmarks"' in page
+    assert 'id="fit"' not in page
+    assert "Before and after" not in page
+    assert result.run.manifest["observations"] == ["landmarks"]
+
+
+def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(folder, tmp_path):
+    observed = [{"kind": "images"}, {"kind": "landmarks", "file": "plain.csv", "sd": {"median": 0.5}, "name": "vessel"}]
+    sections = {"sampler": {"name": "hmc", "chains": 2, "warm_up": 10, "block": 5}}
+    stop = {"rhat": None, "ess": None}
+    short = configuration(folder, observed, IMAGES, "short.yaml", **sections, stop=stop | {"max_steps": 5})
+    longer = configuration(folder, observed, IMAGES, "longer.yaml", **sections, stop=stop | {"max_steps": 10})
+    br.run(short, tmp_path / "out", progress=False)
+    result = br.run(longer, tmp_path / "out", resume=True, progress=False)
+    assert result.idata.posterior["vessel_sd"].shape == (2, 10)
+    assert (result.idata.posterior["vessel_sd"] > 0).all()
+    assert result.run.manifest["observations"] == ["images", "vessel"]
+    assert result.run.manifest["model"]["vessel_sd"] == {"median": 0.5, "log_sd": 1.0}
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "vessel sd, mm" in page
+    assert 'id="fit"' in page
+    whole = br.run(longer, tmp_path / "whole", progress=False)
+    np.testing.assert_array_equal(whole.idata.posterior["vessel_sd"], result.idata.posterior["vessel_sd"])
+
+
+@pytest.mark.parametrize(
+    ("observations", "data", "sections", "message"),
+    [
+        ([{"kind": "images"}], LABELS, {}, "images are observed, and data has none"),
+        ([PAIRS, PAIRS], LABELS, {}, "two observations are named landmarks"),
+        ([PAIRS | {"name": "a b"}], LABELS, {}, "observations.0.name"),
+        ([PAIRS | {"file": "none.csv"}], LABELS, {}, "observations.0.file"),
+        ([PAIRS], LABELS | {"fixed": "fixed.nii.gz"}, {}, "a pair of images needs both"),
+        ([PAIRS], {"labels": "labels.nii.gz"}, {}, "labels and label_table belong together"),
+        ([PAIRS], {"fixed": "fixed.nii.gz", "moving": "moving.nii.gz"}, {}, "tissue labels of the fixed image"),
+        ([PAIRS], {}, {"mesh": None}, "mesh.file: missing"),
+        ([PAIRS], LABELS, {"report": {"landmarks": {"a": [0, 0, 0]}}}, "this key is called report.places now"),
+    ],
+)
+def test_what_does_not_fit_is_told(folder, observations, data, sections, message):
+    with pytest.raises(br.InputError, match=re.escape(message)):
+        br.load_config(configuration(folder, observations, data, "wrong.yaml", **sections))
+
+
+def test_landmarks_without_an_sd_are_refused_before_anything_is_written(folder, tmp_path):
+    path = configuration(folder, [PAIRS | {"file": "plain.csv"}], LABELS)
+    with pytest.raises(br.InputError, match="'landmarks' has no sd"):
+        br.run(path, tmp_path / "out", progress=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_observed_is_told(folder, tmp_path):
+    with pytest.raises(br.InputError, match="nothing observed"):
+        br.run(configuration(folder, None, LABELS), tmp_path / "out", progress=False)
