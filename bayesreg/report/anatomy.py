@@ -97,10 +97,10 @@ def data(view: View) -> Drawing:
         f"mesh ({len(run.mesh.points):,} nodes, {len(run.mesh.cells):,} tetrahedra, {len(run.mesh.boundary):,} "
         f"boundary nodes){'' if run.moving is None else ', moving image'}; below, divergence and components of the "
         f"{whose} displacement. Negative "
-        "divergence is loss of volume: ventricles that collapse show blue."
+        "divergence, blue, is loss of volume."
     )
     alt = f"Images, labels, mesh, divergence and displacement on the {plane.title} plane."
-    return Drawing("data", "The pair, the mesh and the displacement", caption, alt, uri)
+    return Drawing("data", "The data, the mesh and the displacement", caption, alt, uri)
 
 
 def result(view: View) -> Drawing:

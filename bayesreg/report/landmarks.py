@@ -48,7 +48,7 @@ def landmark_table(mesh: TetMesh, predicted: Predicted) -> Table | None:
         for k, (name, point) in enumerate(zip(predicted.landmark_names, points, strict=True))
     ]
     header = ["", "Place (x, y, z)", "Where", "Sd, mm", "Residual, mm", "Left out, mm", "Its region"]
-    return Table("Landmarks", _caption(predicted), header, [("", rows)])
+    return Table("Each landmark", _caption(predicted), header, [("", rows)])
 
 
 def _left_out_cells(predicted: Predicted, k: int) -> list[str]:
@@ -71,11 +71,11 @@ def _caption(predicted: Predicted) -> str:
     known = np.isfinite(np.asarray(predicted.left_out_residual)).all(axis=1)
     errors = np.linalg.norm(np.asarray(predicted.left_out_residual)[known], axis=1)
     found = surprise(predicted.left_out_residual, predicted.left_out_covariance)[known]
-    shares = " and ".join(f"{percent(float((found <= level).mean()))} in {percent(level)}" for level in LEVELS)
+    shares = " and ".join(f"{(found <= level).mean():.0%} of their {level:.0%}" for level in LEVELS).replace("%", " %")
     return (
         f"{text} Left out: the same distance where all other observations predict the landmark, at the mean stiffness; "
-        f"its mean is {number(float(errors.mean()))} mm. Its region: the share of the prediction that lies nearer; of "
-        f"the landmarks {shares} regions lie inside."
+        f"its mean is {number(float(errors.mean()))} mm. Its region: the share of the prediction that lies nearer; the "
+        f"landmarks lie in {shares} regions."
     )
 
 
@@ -104,4 +104,4 @@ def residuals(predicted: Predicted) -> Drawing | None:
         "predicted by all others (rings). Grey: what 95 % of landmarks with this error do not exceed."
     )
     alt = f"Distances of {len(names)} landmarks, with and without each among the data."
-    return Drawing("landmarks", "Landmarks", caption, alt, uri)
+    return Drawing("landmarks", "Distances of the landmarks", caption, alt, uri)
