@@ -4,27 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bayesreg.columns import with_chains_as_columns
 from bayesreg.fem import preconditioners
+from bayesreg.fem.conjugate_gradients import ElasticSystem, SolverInfo, conjugate_gradients
 from bayesreg.fem.elasticity import (
     force_between,
-    forces,
     lame_by_cell,
     rigid_modes,
     stiffness,
-    stiffness_diagonal,
     strain_products,
     unknowns_of,
 )
-from bayesreg.fem.elements import Elements, derivative_matrix, displacement_gradient, elements_of
+from bayesreg.fem.elements import derivative_matrix, displacement_gradient, elements_of
 from bayesreg.fem.multigrid import Multigrid, multigrid
 from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.fem.preconditioners import ReferenceInverse
@@ -32,48 +30,9 @@ from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
 
 TOLERANCE = 1e-8
-MAX_ITERATIONS = 2000
 
 
 LinearMap = Callable[[AnyArray], AnyArray]
-
-
-class ElasticSystem(NamedTuple):
-    """What the equilibrium of the free nodes needs (a pytree).
-
-    Attributes
-    ----------
-    elements : Elements
-    prescribed, free : (b,), (f,) int arrays
-        A partition of the nodes.
-    order : (n,) int array
-        Where each node stands among the prescribed and, after them, the free.
-    free_derivative, prescribed_derivative : SparseOperator
-        The columns of `elements.derivative` that belong to these nodes.
-    preconditioner : ReferenceInverse, Multigrid or None
-        None where no node is free.
-    tolerance, adjoint_tolerance : scalar
-        On the relative residual in the norm of the inverse diagonal of K, so that it also speaks for tissues a million
-        times softer than their neighbours; of the equilibrium, and of the solve behind its derivative.
-    """
-
-    elements: Elements
-    prescribed: Int[AnyArray, "prescribed"]
-    free: Int[AnyArray, "free"]
-    order: Int[AnyArray, "nodes"]
-    free_derivative: SparseOperator
-    prescribed_derivative: SparseOperator
-    preconditioner: ReferenceInverse | Multigrid | None
-    tolerance: Scalar
-    adjoint_tolerance: Scalar
-
-
-class SolverInfo(NamedTuple):
-    """Relative residual, iterations, and whether the one is below the tolerance, of each chain."""
-
-    residual: Float[AnyArray, "chains"]
-    iterations: Int[AnyArray, "chains"]
-    converged: Bool[AnyArray, "chains"]
 
 
 def elastic_system(
@@ -168,7 +127,7 @@ def _response(
     start = () if guess is None else (guess[system.free],)
 
     def solve(_: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
-        found = _conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
+        found = conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
         return jax.tree.map(lambda x: x[..., 0], found)
 
     apply = partial(_force, system, system.free_derivative, system.free_derivative, lam, mu)
@@ -219,57 +178,6 @@ def _sensitivity(
 
 
 _differentiable.defvjp(_forward, _backward)
-
-
-@with_chains_as_columns
-def _conjugate_gradients(
-    shared: tuple[ElasticSystem, Scalar],
-    lam: Float[AnyArray, "cells chains"],
-    mu: Float[AnyArray, "cells chains"],
-    load: Float[AnyArray, "free 3 chains"],
-    *start: Float[AnyArray, "free 3 chains"],
-) -> tuple[Float[AnyArray, "free 3 chains"], SolverInfo]:
-    """K_II⁻¹ times a load from `start`, else from zero, each chain with its own K.
-
-    A chain that has arrived, or in which something is not a number, stands still while others go on: no chain knows of
-    another.
-    """
-    system, tolerance = shared
-    precondition, volumes = system.preconditioner, system.elements.volumes
-    assert precondition is not None
-    apply = partial(forces, system.free_derivative, system.free_derivative, volumes, lam, mu)
-    inverse_diagonal = 1 / stiffness_diagonal(system.free_derivative, volumes, lam, mu)
-
-    def dot(a: AnyArray, b: AnyArray) -> AnyArray:
-        return (a * b).sum(axis=(0, 1))
-
-    def norm(r: AnyArray) -> AnyArray:
-        return jnp.sqrt(dot(inverse_diagonal * r, r))
-
-    target = tolerance * norm(load)
-
-    def unfinished(residual: AnyArray, iterations: AnyArray) -> AnyArray:
-        size = norm(residual)
-        return (size > target) & jnp.isfinite(size) & (iterations < MAX_ITERATIONS)
-
-    def iterate(state):  # type: ignore[no-untyped-def]
-        x, residual, direction, rho, iterations, going = state
-        image = apply(direction)
-        step = rho / dot(direction, image)
-        x = jnp.where(going, x + step * direction, x)
-        residual = jnp.where(going, residual - step * image, residual)
-        z = precondition(residual)
-        rho, previous = dot(residual, z), rho
-        direction = z + (rho / previous) * direction
-        iterations = iterations + going
-        return x, residual, direction, rho, iterations, going & unfinished(residual, iterations)
-
-    x, residual = (start[0], load - apply(start[0])) if start else (jnp.zeros_like(load), load)
-    z, none = precondition(residual), jnp.zeros(load.shape[-1:], int)
-    begun = x, residual, z, dot(residual, z), none, unfinished(residual, none)
-    x, residual, _, _, iterations, _ = jax.lax.while_loop(lambda state: state[-1].any(), iterate, begun)
-    relative = jnp.where(target > 0, norm(residual) / norm(load), norm(residual))
-    return x, SolverInfo(relative, iterations, relative <= tolerance)
 
 
 def linear_response(

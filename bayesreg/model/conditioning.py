@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from bayesreg.fem.equilibrium import ElasticSystem, elastic_system
+from bayesreg.fem.conjugate_gradients import ElasticSystem
+from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.multigrid import Multigrid
-from bayesreg.image import Interpolation
+from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.coordinates import completed
 from bayesreg.model.neighbourhood import neighbourhoods

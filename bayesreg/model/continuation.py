@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TypeVar
 
-from bayesreg.image import Interpolation
+from bayesreg.interpolation import Interpolation
 from bayesreg.model.program import Problem
 from bayesreg.model.terms.images import ImagePair
 

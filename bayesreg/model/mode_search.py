@@ -9,7 +9,7 @@ from typing import Any
 import jax
 from jaxtyping import Float
 
-from bayesreg.image import Interpolation
+from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import Values
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import completed

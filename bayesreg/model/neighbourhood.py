@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayesreg.fem.conjugate_gradients import ElasticSystem
 from bayesreg.fem.elasticity import stiffness, unknowns_of
 from bayesreg.fem.elements import Quadrature
-from bayesreg.fem.equilibrium import ElasticSystem, linear_response
+from bayesreg.fem.equilibrium import linear_response
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 

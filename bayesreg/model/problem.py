@@ -16,7 +16,8 @@ from bayesreg.fem.determinant import schur_determinant
 from bayesreg.fem.elasticity import rigid_modes
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.operators import sparse_operator
-from bayesreg.image import Image, Interpolator
+from bayesreg.image import Image
+from bayesreg.interpolation import Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import (
     LAME,

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from bayesreg.fem.conjugate_gradients import ElasticSystem
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.elements import Elements
-from bayesreg.fem.equilibrium import ElasticSystem, equilibrium
+from bayesreg.fem.equilibrium import equilibrium
 from bayesreg.fem.location import interpolation_at
 from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh

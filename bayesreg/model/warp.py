@@ -10,7 +10,8 @@ from jaxtyping import Float, Int
 
 from bayesreg.fem.elements import displacement_gradient, elements_of
 from bayesreg.fem.location import locate
-from bayesreg.image import Image, Interpolation
+from bayesreg.image import Image
+from bayesreg.interpolation import Interpolation
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray
 

@@ -8,7 +8,8 @@ from scipy import ndimage
 
 from bayesreg.fem.elements import gauss_quadrature
 from bayesreg.fem.location import nearest_on_surface
-from bayesreg.image import Image, Interpolation
+from bayesreg.image import Image
+from bayesreg.interpolation import Interpolation
 from bayesreg.mesh import TetMesh
 from bayesreg.model.warp import covered_voxels
 

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayesreg.fem import preconditioners
+from bayesreg.fem.conjugate_gradients import ElasticSystem
 from bayesreg.fem.elasticity import lame_by_cell
-from bayesreg.fem.equilibrium import ElasticSystem, elastic_system, equilibrium
+from bayesreg.fem.equilibrium import elastic_system, equilibrium
 from bayesreg.mesh import TetMesh
 from bayesreg.model.posterior import CHAIN_TOLERANCE
 from tests.benchmarks.bench_sampling import _median

@@ -22,8 +22,9 @@ import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Float
 
+from bayesreg.fem.conjugate_gradients import ElasticSystem
 from bayesreg.fem.elasticity import rigid_modes, stiffness, unknowns_of
-from bayesreg.fem.equilibrium import ElasticSystem, elastic_system, equilibrium
+from bayesreg.fem.equilibrium import elastic_system, equilibrium
 from bayesreg.mesh import TetMesh
 from tests.benchmarks.places import SPREAD
 from tests.benchmarks.stored import Solve, affine_sum, cholespy_solve, superlu_solve

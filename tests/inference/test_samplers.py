@@ -14,10 +14,11 @@ import bayesreg as br
 from bayesreg.config.samplers import sampler_section
 from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.chains.run import checkpoint_from_arrays
-from bayesreg.inference.gaussian import loose, whitened
+from bayesreg.inference.gaussian import loose
+from bayesreg.inference.gaussian.about_reference import about_reference
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.modes import distance, search_modes
-from bayesreg.inference.gaussian.whitened import Moved, about_reference, setup_about
+from bayesreg.inference.gaussian.whitened import Moved, setup_about
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import SAMPLERS, choose_sampler
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
@@ -262,7 +263,7 @@ def test_wrong_settings_are_told(name, wrong, message):
 
 
 def test_more_unknowns_than_memory_are_told(monkeypatch):
-    monkeypatch.setattr(whitened, "MOST_UNKNOWNS", 5)
+    monkeypatch.setattr("bayesreg.inference.gaussian.about_reference.MOST_UNKNOWNS", 5)
     with pytest.raises(br.InputError, match=r"6 unknowns.*up to 5.*coarser mesh"):
         br.sample(target(), "hmc", 2, 4, progress=False)
 

@@ -47,7 +47,7 @@ class Tuning(NamedTuple):
 
 @runtime_checkable
 class Walking(Protocol):
-    """What moves the chains, hashable (`bayesreg.inference.gaussian.whitened.Walk`)."""
+    """What moves the chains, hashable (`bayesreg.inference.gaussian.about_reference.Walk`)."""
 
     def init(self, data: Any, setup: Any, estimands: Estimands) -> Any:
         """See `Sampler`."""

@@ -1,49 +1,28 @@
-"""Samplers about a Gaussian reference: the coordinates in which Laplace's approximation is N(0, I).
-
-A transition there is all that such a sampler needs to bring; the search for the mode, the starts, the warm-up and the
-way back to the estimands are the same for all.
-"""
+"""The coordinates in which Laplace's approximation is N(0, I), and the density there."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from typing import Any, NamedTuple
 
-import blackjax
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from bayesreg.inference.gaussian.laplace import Reference, averaged, pulled, slope_at
-from bayesreg.inference.gaussian.loose import Loose, loose, moved_alone, searched, slowest
-from bayesreg.inference.gaussian.modes import search_modes
-from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delayed, log_normaliser_at, no_stand_in, stand_in
-from bayesreg.inference.gaussian.reflection import Clearance, Walls, rotated, walls
-from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, tuned
-from bayesreg.inference.kernel import Draw, Info, Sampler, Say
-from bayesreg.inference.layout import dimension, displacements, flat_position, node_count, unravel
+from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.loose import Loose, loose
+from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in
+from bayesreg.inference.gaussian.reflection import Clearance, Walls, walls
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP
+from bayesreg.inference.layout import displacements, node_count, unravel
 from bayesreg.inference.target import (
-    Estimands,
     Target,
     clearance,
-    estimands_of,
     has_costly_normaliser,
     logdensity,
     without_normaliser,
 )
-from bayesreg.types import AnyArray, InputError, Scalar
-
-# Chains start that much wider than Laplace's approximation.
-OVERDISPERSION = 1.5
-
-# A reference is averaged over the mode and the places of so many chains at most: each costs a curvature.
-AVERAGED = 16
-
-# Laplace's approximation and the reflections keep eight dense matrices of the square of this: 9 GB.
-MOST_UNKNOWNS = 12_000
+from bayesreg.types import AnyArray, Scalar
 
 
 class Setup(NamedTuple):
@@ -135,244 +114,3 @@ def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyAr
 def clearance_of(target: Target, data: Any, setup: Setup) -> Clearance:
     """Signed distances of the walls' nodes."""
     return lambda u: clearance(target, data, u, setup.walls.nodes)
-
-
-@dataclass(frozen=True)
-class Walk:
-    """Chains of whitened coordinates by a transition, as pure functions of (data, setup, …), see `Sampler`.
-
-    Two are equal if their targets are and their functions are the same: what is compiled for one serves the other.
-    """
-
-    target: Target
-    transition: Transition
-    begin: Callable[[AnyArray, Callable], Any]
-    density: Density
-
-    # Compiled by itself: the warm-up and the chains begin with the same program.
-    @partial(jax.jit, static_argnums=0)
-    def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
-        """The state of a chain there."""
-        flat = flat_position(self.target, data, estimands)
-        return self.begin(whitened(setup.reference, flat), self.density(self.target, data, setup))
-
-    def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
-        """The state after a transition."""
-        state, moved = self.transition(self.target, data, setup, key, state)
-        info = Info(
-            acceptance_rate=moved.acceptance_rate,
-            outside_support=jnp.asarray(moved.outside_support),
-            solver_failed=jnp.zeros((), bool),
-            solver_iterations=jnp.zeros((), int),
-            diverging=jnp.asarray(moved.diverging),
-            gradients=jnp.asarray(moved.gradients),
-            densities=jnp.asarray(moved.densities),
-        )
-        return state, info
-
-    def estimands(self, data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
-        """Where a chain is."""
-        return estimands_of(self.target, data, whitened_position(self.target, setup.reference, state.position))
-
-    def observe(self, data: Any, setup: Setup, state: Any) -> Draw:
-        """The same, with what the density is made of there."""
-        estimands = self.estimands(data, setup, state)
-        return Draw(estimands, self.target.evaluate_estimands(data, estimands))
-
-
-def about_reference(
-    target: Target,
-    transition: Transition,
-    tuning: Tuning | None = None,
-    begin: Callable[[AnyArray, Callable], Any] = blackjax.mcmc.hmc.init,
-    density: Density = whitened_density,
-    mode_search: str = "once",
-    exact: bool = True,
-    alone: int = 0,
-) -> Sampler:
-    """A sampler of the whitened coordinates.
-
-    Parameters
-    ----------
-    target : Target
-    transition : callable
-        (target, data, setup, key, state) → (state, Moved).
-    tuning : Tuning, optional
-        Of the step size; without it there is no warm-up.
-    begin : callable
-        (position, log density) → the state that the transition takes, with a field `position`, and with
-        `logdensity` where nodes are moved alone.
-    density : callable
-        (target, data, setup) → the log density of a whitened position that `begin` is given.
-    mode_search : str
-        "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
-    exact : bool
-    alone : int
-        Number of nodes, those that were the slowest in the warm-up, that are moved each alone after a transition. Their
-        moves are tested with `density`, which must then be the target's own.
-
-    Raises
-    ------
-    InputError
-        If the target has more than `MOST_UNKNOWNS` unknowns.
-    """
-    alone = 0 if target.single_nodes is None else min(alone, node_count(target))
-    unknowns = dimension(target)
-    if unknowns > MOST_UNKNOWNS:
-        raise InputError(
-            f"the posterior has {unknowns} unknowns; samplers about the mode keep dense matrices of their square and "
-            f"take up to {MOST_UNKNOWNS}: use a coarser mesh (mesh.edge_length), sample fewer nodes (model.sampled), "
-            "or sampler.name: rwmh"
-        )
-
-    walk = Walk(target, transition, begin, density)
-    # Made here and not while something is traced, where it would leave the target's own arrays in the program.
-    unravel(target)
-
-    def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
-        found = search_modes(target, points, mode_search == "per_chain", say)
-        key_start, key_tune = jax.random.split(key)
-        keys = jax.random.split(key_start, len(found.chains))
-        modes = [np.asarray(reference.centre) for reference in found.references]
-        about = [pulled(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
-        setups = [_about(target, reference, mode) for reference, mode in zip(about, modes, strict=True)]
-        starts = [_overdispersed(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
-        own = jnp.asarray(found.chains), jnp.arange(len(keys))
-        points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
-        if tuning is None:
-            return setups[0], points
-        return _warmed_up(walk, tuning, alone, modes[0], points, key_tune, say)
-
-    def blank() -> Setup:
-        nothing = jnp.zeros(unknowns)
-        return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
-
-    data = partial(_conditioned, target)
-    sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
-    # What is approximate anyway does without the normaliser's own value.
-    if has_costly_normaliser(target) and exact:
-        sampler = _with_normaliser(target, sampler)
-    return _with_loose_nodes(target, sampler, begin, density) if alone else sampler
-
-
-def _conditioned(target: Target, setup: Setup) -> Any:
-    """The target's data, prepared for chains about the middle."""
-    return target.conditioned(estimands_of(target, target.data, unravel(target)(setup.middle)), setup.loose.nodes)
-
-
-def _warmed_up(
-    walk: Walk, tuning: Tuning, alone: int, mode: AnyArray, points: Any, key: AnyArray, say: Say
-) -> tuple[Setup, Any]:
-    """The setup that the chains go on with, and where they then are.
-
-    Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already the
-    first is whitened by the curvature where they start: that at the mode alone can be so much less that no step is
-    short enough for a chain to leave.
-    """
-    target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
-    key_settle, key_tune, key_search = jax.random.split(key, 3)
-    begun = _averaged(target, mode, points, alone)
-    _, points, settling = tuned(_conditioned(target, begun), walk, begun, points, key_settle, stage, apart=True)
-    setup = _averaged(target, mode, points, alone)
-    setup, points, path = tuned(_conditioned(target, setup), walk, setup, points, key_tune, stage, say=say)
-    if settling is None or path is None:
-        return setup, points
-    # Of the second stage alone, where trajectories are whole from the first: before, they are short, and chains on
-    # their way.
-    nodes = slowest(np.asarray(path), alone)
-    say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.variables.coords['node'])[nodes]))}")
-    late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])
-    seen = np.moveaxis(late.reshape(-1, alone, 3), 1, 0)
-    setup = setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen))
-    beyond = searched(target, _conditioned(target, setup), setup.loose, points, key_search)
-    seen = np.concatenate([seen, beyond], axis=1)
-    return setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen)), points
-
-
-def _with_loose_nodes(target: Target, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
-    """A sampler that after each step moves some nodes alone.
-
-    The normaliser, the same wherever they are, has no part in that. Nor would the move have a place in the step that
-    the normaliser's test sees: one after the other, two reversible kernels are not.
-    """
-
-    def step(data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
-        key_step, key_move = jax.random.split(key)
-        state, info = sampler.step(data, setup, key_step, state)
-        if not len(setup.loose.nodes):
-            return state, info
-        kernel = state.kernel if isinstance(state, Delayed) else state
-
-        def beginning(xi: AnyArray) -> Any:
-            return begin(xi, density(target, data, setup))
-
-        kernel = moved_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
-        state = state._replace(kernel=kernel) if isinstance(state, Delayed) else kernel
-        return state, info._replace(gradients=info.gradients + 1)
-
-    return sampler._replace(step=step)
-
-
-def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
-    """A sampler of the density with the stand-in made one of the density with the normaliser."""
-
-    assert target.normaliser is not None
-    normaliser = target.normaliser
-
-    def init(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
-        return Delayed(sampler.init(data, setup, estimands), normaliser.log(data, estimands))
-
-    def observe(data: Any, setup: Setup, state: Delayed) -> Draw:
-        estimands, evaluation = sampler.observe(without_normaliser(target, data), setup, state.kernel)
-        return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
-
-    def flat_of(setup: Setup, state: Any) -> AnyArray:
-        return setup.reference.place(state.position)
-
-    step = delayed(sampler.step, flat_of, partial(log_normaliser_at, target))
-    return sampler._replace(init=init, step=step, observe=observe)
-
-
-def _about(target: Target, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
-    """A setup before its tuning, with the stand-in about the middle."""
-    setup = setup_about(target, reference, middle, alone)
-    return setup._replace(stand_in=stand_in(target, reference, jnp.asarray(middle)))
-
-
-def _averaged(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
-    """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there.
-
-    Which nodes are moved alone is not known yet: the first stands for so many.
-    """
-    flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
-    sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
-    places = [mode, *islice(sound, AVERAGED)]
-    return _about(target, averaged(target, places), np.mean(places, axis=0), np.zeros(alone, int))
-
-
-def _overdispersed(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
-    """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support.
-
-    Raises
-    ------
-    InputError
-        If a chain finds no place in the support.
-    """
-    width, begin = np.full(len(keys), OVERDISPERSION), whitened(setup.reference, jnp.asarray(mode))
-    for _ in range(10):
-        points, done = jax.vmap(partial(_start, target, target.data, setup, begin))(keys, jnp.asarray(width))
-        if done.all():
-            return points
-        # A flight that is caught in a corner of the skull does not end; a shorter one may.
-        width = np.where(done, width, width / 2)
-    raise InputError(f"{int((~done).sum())} of {len(keys)} chains find no start near the mode outside the skull")
-
-
-@partial(jax.jit, static_argnums=0)
-def _start(
-    target: Target, data: Any, setup: Setup, begin: AnyArray, key: AnyArray, width: AnyArray
-) -> tuple[Any, AnyArray]:
-    """Estimands, and whether the flight there was over in time."""
-    momentum = width * jax.random.normal(key, begin.shape)
-    xi, _ = rotated(setup.walls, clearance_of(target, data, setup), begin, momentum, jnp.pi / 2)
-    return estimands_of(target, data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()

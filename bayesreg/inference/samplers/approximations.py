@@ -12,17 +12,11 @@ import numpy as np
 from blackjax.optimizers.lbfgs import lbfgs_inverse_hessian_formula_1
 from blackjax.vi.pathfinder import approximate
 
+from bayesreg.inference.gaussian.about_reference import about_reference
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.mode_search import penalty
 from bayesreg.inference.gaussian.reflection import rotated
-from bayesreg.inference.gaussian.whitened import (
-    Moved,
-    Setup,
-    about_reference,
-    clearance_of,
-    setup_about,
-    whitened,
-)
+from bayesreg.inference.gaussian.whitened import Moved, Setup, clearance_of, setup_about, whitened
 from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.inference.samplers.settings import Laplace, Pathfinder

@@ -8,10 +8,11 @@ import blackjax
 import jax
 import jax.numpy as jnp
 
+from bayesreg.inference.gaussian.about_reference import about_reference
 from bayesreg.inference.gaussian.loose import LOOSE
 from bayesreg.inference.gaussian.reflection import reflective_microcanonical, reflective_rotation
 from bayesreg.inference.gaussian.warm_up import Tuning
-from bayesreg.inference.gaussian.whitened import Moved, Setup, about_reference, clearance_of, whitened_density
+from bayesreg.inference.gaussian.whitened import Moved, Setup, clearance_of, whitened_density
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.settings import Hmc, Mclmc, Nuts
 from bayesreg.inference.target import Target

@@ -11,17 +11,10 @@ import jax
 import jax.numpy as jnp
 from blackjax.mcmc import random_walk
 
+from bayesreg.inference.gaussian.about_reference import about_reference
 from bayesreg.inference.gaussian.reflection import reflective_leapfrog, rotated, shifted
 from bayesreg.inference.gaussian.warm_up import Tuning
-from bayesreg.inference.gaussian.whitened import (
-    Density,
-    Moved,
-    Setup,
-    Transition,
-    about_reference,
-    clearance_of,
-    whitened_density,
-)
+from bayesreg.inference.gaussian.whitened import Density, Moved, Setup, Transition, clearance_of, whitened_density
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.settings import Barker, Mala, Pcn, RwmhAdaptive
 from bayesreg.inference.target import Target

@@ -12,13 +12,7 @@ import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
 
 from bayesreg.inference.gaussian.reflection import reflective_rotation, rotated
-from bayesreg.inference.gaussian.whitened import (
-    Setup,
-    clearance_of,
-    whitened,
-    whitened_density,
-    whitened_position,
-)
+from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whitened, whitened_density, whitened_position
 from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.layout import flat_position
 from bayesreg.inference.samplers.hamiltonian import hmc

@@ -16,7 +16,8 @@ from numpyro.distributions import constraints
 
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
 from bayesreg.fem.location import locate
-from bayesreg.image import Image, Interpolation, Interpolator
+from bayesreg.image import Image
+from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.options import ModelConfig, TemperaturePrior

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.image import Interpolator
+from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
 from bayesreg.types import AnyArray, Scalar
