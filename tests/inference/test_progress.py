@@ -23,7 +23,8 @@ def test_time_left_tells_both():
     assert time_left(300.0, 72.0) == "about 1.2 min to convergence, 5.0 min to the budget"
     assert time_left(300.0, None) == "5.0 min to the budget"
     assert time_left(300.0, 900.0) == "5.0 min to the budget"
-    assert time_left(60.0, -1.0) == "about 0.0 min to convergence, 1.0 min to the budget"
+    # R̂ is low enough, and something else is not.
+    assert time_left(60.0, -1.0) == "1.0 min to the budget"
     assert time_left(-1.0, 5.0) == "0.0 min to the budget"
 
 

@@ -107,8 +107,12 @@ def draws_until(seen: Sequence[tuple[int, float]], threshold: float | None) -> f
 
 
 def time_left(budget: float, convergence: float | None) -> str:
-    """The seconds until convergence, where they are known and fewer, and those of the budget, in words."""
+    """The seconds until convergence, where they are known and fewer, and those of the budget, in words.
+
+    Where R̂ is low enough already and chains go on, it is the effective sample size that they are short of, about which
+    nothing is said.
+    """
     of_budget = f"{max(budget, 0) / 60:.1f} min to the budget"
-    if convergence is None or convergence > budget:
+    if convergence is None or not 0 < convergence <= budget:
         return of_budget
-    return f"about {max(convergence, 0) / 60:.1f} min to convergence, {of_budget}"
+    return f"about {convergence / 60:.1f} min to convergence, {of_budget}"
