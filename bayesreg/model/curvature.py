@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,9 @@ from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, State
 from bayesreg.model.terms.term import Curved, Outside, PointCurvature
 from bayesreg.types import AnyArray, Equilibrium
+
+# Random places at which a term from outside shows what it looks at, and the sd of their displacements, mm.
+NEARBY, NEARBY_SD = 3, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,67 +94,82 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
         found[modes:, modes:] += nodal[sampled][:, sampled].toarray()
         return (found + found.T) / 2
 
-    gauss_newton = reduced(_observed_curvature(problem, values, u, lam, mu))
+    curved = [term for term in problem.terms.values() if isinstance(term, Curved)]
+    seen = _Seen(problem, dict(values), jnp.asarray(lam), jnp.asarray(mu))
+    outside = [_outside_curvature(term, seen, u) for term in problem.terms.values() if isinstance(term, Outside)]
+    summed = partial(_summed, len(u))
+    gauss_newton = reduced(sum(outside, summed(term.gauss_newton(u, values) for term in curved)))
     if "elastic" in problem.terms:
         gauss_newton[modes:, modes:] += schur / float(values["t_elastic"])
     if "rigid" in problem.terms:
         gauss_newton[modes:, modes:] += np.asarray(problem.terms["rigid"].precision())
     gauss_newton[:modes, :modes] += np.eye(modes)
-    return Curvature(gauss_newton, lambda: reduced(_remaining_curvature(problem, values, u)))
+    return Curvature(gauss_newton, lambda: reduced(summed(term.remainder(u, values) for term in curved)))
 
 
-def _observed_curvature(
-    problem: Problem, values: Values, u: AnyArray, lam: AnyArray, mu: AnyArray
-) -> scipy.sparse.csr_matrix:
-    """Gauss and Newton's curvature of all observations in all nodes, row 3 · node + axis."""
-    nodes = len(problem.body.mesh.mesh.points)
-    total = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
-    for term in problem.terms.values():
-        if isinstance(term, Curved):
-            found = term.curvature(u, values, second_order=False)
-            total = total + _assembled(nodes, found, np.asarray(found.first_order))
-        elif isinstance(term, Outside):
-            total = total + _outside_curvature(problem, term, values, u, lam, mu)
-    return total
+def _summed(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
+    """Curvatures in the places of points as one in all nodes, row 3 · node + axis."""
+    empty = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
+    return sum((_assembled(nodes, part) for part in parts), empty)
 
 
-def _remaining_curvature(problem: Problem, values: Values, u: AnyArray) -> scipy.sparse.csr_matrix:
-    nodes = len(problem.body.mesh.mesh.points)
-    total = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
-    for term in problem.terms.values():
-        if isinstance(term, Curved):
-            found = term.curvature(u, values, second_order=True)
-            total = total + _assembled(nodes, found, np.asarray(found.second_order))
-    return total
+class _Seen(NamedTuple):
+    """Where a term from outside is looked at (a pytree): what a state is made of, but for the displacements."""
+
+    problem: Problem
+    values: dict[str, AnyArray]
+    lam: AnyArray
+    mu: AnyArray
 
 
-def _outside_curvature(
-    problem: Problem, term: Outside, values: Values, u: AnyArray, lam: AnyArray, mu: AnyArray
-) -> scipy.sparse.csr_matrix:
+def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
     """The convex part of the Hessian of −log in all nodes, for a term that knows nothing but its log."""
-    found = np.asarray(_hessian(term, problem, dict(values), jnp.asarray(u), jnp.asarray(lam), jnp.asarray(mu)))
-    touched = np.flatnonzero(np.abs(found).max(axis=0) > 0)
-    eigenvalues, vectors = np.linalg.eigh(found[np.ix_(touched, touched)])
+    touched = _touched(term, seen, u)
+    found = scipy.sparse.csr_matrix((u.size, u.size))
+    if not len(touched):
+        return found
+    eigenvalues, vectors = np.linalg.eigh(_hessian(term, seen, u, touched))
     convex = (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T
     rows, columns = np.repeat(touched, len(touched)), np.tile(touched, len(touched))
     return scipy.sparse.csr_matrix((convex.ravel(), (rows, columns)), shape=found.shape)
 
 
-@jax.jit
+def _touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
+    """The unknowns that a term looks at: its slope is not zero there at one of some random places near u."""
+    steps = NEARBY_SD * np.random.default_rng(0).normal(size=(NEARBY, *u.shape))
+    slopes = [np.asarray(_slope(term, seen, (u + step).ravel())) for step in steps]
+    return np.flatnonzero((np.stack(slopes) != 0).any(axis=0))
+
+
 def _hessian(
-    term: Outside, problem: Problem, values: dict[str, AnyArray], u: AnyArray, lam: AnyArray, mu: AnyArray
-) -> AnyArray:
-    elements, mesh = problem.body.system.elements, problem.body.mesh.mesh
+    term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"], touched: Int[np.ndarray, "touched"]
+) -> Float[np.ndarray, "touched touched"]:
+    """The Hessian of −log in some unknowns, a product with a direction for each of them."""
+    found = np.asarray(_products(term, seen, u.ravel(), jnp.asarray(touched)))[:, touched]
+    return (found + found.T) / 2
+
+
+@jax.jit
+def _products(
+    term: Outside, seen: _Seen, flat: Float[AnyArray, "unknowns"], directions: Int[AnyArray, "k"]
+) -> Float[AnyArray, "k unknowns"]:
+    def row(unknown: AnyArray) -> AnyArray:
+        direction = jnp.zeros_like(flat).at[unknown].set(1.0)
+        return jax.jvp(partial(_slope, term, seen), (flat,), (direction,))[1]
+
+    return jax.lax.map(row, directions, batch_size=64)
+
+
+@jax.jit
+def _slope(term: Outside, seen: _Seen, flat: Float[AnyArray, "unknowns"]) -> Float[AnyArray, "unknowns"]:
+    """∇(−log) in the displacements of all nodes."""
+    body = seen.problem.body
 
     def energy(flat: AnyArray) -> AnyArray:
-        solved = Equilibrium(flat.reshape(u.shape), jnp.zeros(()), jnp.zeros((), int), jnp.array(True))
-        return -term.log(State(values, lam, mu, solved, elements, mesh))
+        solved = Equilibrium(flat.reshape(-1, 3), jnp.zeros(()), jnp.zeros((), int), jnp.array(True))
+        return -term.log(State(seen.values, seen.lam, seen.mu, solved, body.system.elements, body.mesh.mesh))
 
-    def row(direction: AnyArray) -> AnyArray:
-        return jax.jvp(jax.grad(energy), (u.ravel(),), (direction,))[1]
-
-    found = jax.lax.map(row, jnp.eye(u.size), batch_size=64)
-    return (found + found.T) / 2
+    return jax.grad(energy)(flat)
 
 
 def _response(
@@ -191,10 +210,9 @@ def _element_forces(body: Body, lam: AnyArray, mu: AnyArray, u: AnyArray) -> sci
     return scipy.sparse.csr_matrix((np.asarray(forces).ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
-def _assembled(
-    nodes: int, points: PointCurvature, curvature: Float[np.ndarray, "points 3 3"]
-) -> scipy.sparse.csr_matrix:
+def _assembled(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
     """Σ_q C_q N_a N_b: a curvature in the places of points as one in all nodes."""
+    curvature = np.asarray(points.matrices)
     count = len(curvature)
     weights = np.broadcast_to(np.asarray(points.weights)[:, None], (count, 3, 4))
     columns = 3 * np.asarray(points.nodes)[:, None] + np.arange(3)[:, None]

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from functools import cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.model import curvature
+from bayesreg.model.curvature import _outside_curvature, _Seen
 from bayesreg.model.left_out import leave_out
+from bayesreg.model.state import State
+from bayesreg.model.terms.term import Outside
+from bayesreg.types import Equilibrium
 from tests.oracles import paper
 from tests.phantoms import box_mesh, smooth_image
 
@@ -36,6 +42,19 @@ class MeanDisplacement:
     def log(self, state):
         away = state.at(self.points).mean(axis=0) - self.measured
         return -0.5 * (away @ away) / self.sd**2
+
+
+class Distance:
+    """From outside the package, and not linear in the displacements: how far apart two places lie now."""
+
+    name = "distance"
+
+    def __init__(self, one, other, measured, sd):
+        self.points, self.measured, self.sd = np.stack([one, other]), measured, sd
+
+    def log(self, state):
+        one, other = self.points + state.at(self.points)
+        return -0.5 * ((jnp.linalg.norm(one - other) - self.measured) / self.sd) ** 2
 
 
 def places(count=9):
@@ -219,6 +238,55 @@ def test_images_and_landmarks_are_one_density():
     curvature = both.mode_search.curvature(both.data, both.estimands(values))
     alone = short.mode_search.curvature(short.data, short.estimands(values))
     assert np.linalg.eigvalsh(curvature.gauss_newton - alone.gauss_newton).min() > -1e-8
+
+
+def test_curvature_of_a_term_from_outside_is_the_dense_hessian():
+    """Its convex part, and in the unknowns that the term looks at alone: each costs a product."""
+    term = Distance(np.array([4.0, 5.0, 6.0]), np.array([13.0, 12.0, 15.0]), measured=15.0, sd=0.5)
+    mesh = box_mesh(4)
+    post = br.build_posterior(mesh=mesh, observations=[term], model=br.ModelConfig(sampled="all"))
+    u = 0.5 * np.random.default_rng(0).normal(size=mesh.points.shape)
+
+    def energy(flat):
+        solved = Equilibrium(flat.reshape(-1, 3), jnp.zeros(()), jnp.zeros((), int), jnp.array(True))
+        return -term.log(State({}, jnp.zeros(0), jnp.zeros(0), solved, post.data.body.system.elements, mesh))
+
+    dense = np.asarray(jax.hessian(energy)(u.ravel()))
+    eigenvalues, vectors = np.linalg.eigh(dense)
+    assert eigenvalues.min() < -0.1 < 0.1 < eigenvalues.max()
+    convex = (vectors * np.maximum(eigenvalues, 0)) @ vectors.T
+    seen = _Seen(post.data, {}, jnp.zeros(len(mesh.cells)), jnp.zeros(len(mesh.cells)))
+    found = _outside_curvature(Outside(term), seen, jnp.asarray(u)).toarray()
+    np.testing.assert_allclose(found, convex, atol=1e-10 * eigenvalues.max())
+
+
+@pytest.mark.parametrize("count", [0, 1, 10])
+def test_a_term_from_outside_costs_the_directions_it_looks_at(count, monkeypatch):
+    """Ten nodes are 30 unknowns, also at rest, where the slope of the term is zero."""
+
+    class OfNodes:
+        name, nodes = "nodes", np.arange(count) * 3
+
+        def log(self, state):
+            return -0.5 * (state.u[self.nodes] ** 2).sum() + 0.0 * state.u.sum()
+
+    mesh, asked = box_mesh(4), []
+    post = br.build_posterior(mesh=mesh, observations=[OfNodes()], model=br.ModelConfig(sampled="all"))
+    products = curvature._products
+
+    def counted(term, seen, flat, directions):
+        asked.append(np.asarray(directions))
+        return products(term, seen, flat, directions)
+
+    monkeypatch.setattr(curvature, "_products", counted)
+    without = post.data.without_term("nodes")
+    at_rest, u = post.data.blocks, jnp.zeros(mesh.points.shape)
+    values = {name: block.reference() for name, block in at_rest.items()}
+    whole, rest = (curvature.displacement_curvature(data, values, u).gauss_newton for data in (post.data, without))
+    expected = (3 * OfNodes.nodes[:, None] + np.arange(3)).ravel()
+    np.testing.assert_array_equal(np.concatenate([[], *asked]), expected)
+    np.testing.assert_allclose(np.diag(whole - rest), np.isin(np.arange(u.size), expected), atol=1e-9)
+    assert len(expected) == 3 * count < u.size
 
 
 class Wrong:

@@ -51,10 +51,9 @@ class ImagePair:
         InputError
             If the mesh does not overlap an image, or the quadrature has no points or fewer than are independent.
         """
-        require_overlap(mesh, self.fixed, f"fixed image of {self.name!r}" if self.name != "images" else "fixed image")
-        require_overlap(
-            mesh, self.moving, f"moving image of {self.name!r}" if self.name != "images" else "moving image"
-        )
+        of_pair = "" if self.name == "images" else f" of {self.name!r}"
+        require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
+        require_overlap(mesh, self.moving, f"moving image{of_pair}")
         quadrature = quadrature_of(mesh, self.fixed, model)
         positions = quadrature.positions(mesh)
         comparison = Comparison(
@@ -183,11 +182,13 @@ class ComparedImages(NamedTuple):
         variance = self.comparison.similarity.variance(noise) * t_similarity
         return float(np.sqrt(variance / (2 * np.mean(self.quadrature.weights))))
 
-    def curvature(self, u: Float[AnyArray, "nodes 3"], values: Values, second_order: bool) -> PointCurvature:
-        """Of E_s / T_s: Gauss and Newton's 2 w ∇m ∇mᵀ / T_s, and what the exact one has besides."""
-        first = _first_order(self, u, values["t_similarity"])
-        second = _second_order(self, u, values["t_similarity"]) if second_order else jnp.zeros_like(first)
-        return PointCurvature(self.nodes, self.quadrature.barycentric, first, second)
+    def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """Gauss and Newton's curvature of E_s / T_s, tempered: 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
+        return PointCurvature(self.nodes, self.quadrature.barycentric, _gauss_newton(self, u, values["t_similarity"]))
+
+    def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """What the exact curvature of E_s / T_s has besides, 1/mm²."""
+        return PointCurvature(self.nodes, self.quadrature.barycentric, _remainder(self, u, values["t_similarity"]))
 
 
 class ImageLikelihood(dist.Distribution):
@@ -213,10 +214,12 @@ class ImageLikelihood(dist.Distribution):
         return self.term.comparison.similarity.energy(value, self.predicted, weights, self.noise)
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
-        """Replicates of the fixed image, all points being independent."""
-        shape = (*sample_shape, *self.event_shape)
-        scale = jnp.sqrt(self.noise.temperature / (2 * self.term.quadrature.weights))
-        return self.predicted + scale * self.term.comparison.similarity.draw(key, shape, self.noise)
+        """Replicates of the fixed image, which the tempering by `independent_share` leaves as they are."""
+        keys = jax.random.split(key, sample_shape)
+        values = {"t_similarity": self.noise.temperature}
+        draw = partial(self.term.standardised_noise, values=values)
+        noise = jax.vmap(draw)(keys.ravel()).reshape(*sample_shape, *self.event_shape)
+        return self.predicted + jnp.sqrt(self.noise.temperature / (2 * self.term.quadrature.weights)) * noise
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
         """The tempered log density; its normaliser is part of it where T_s is inferred."""
@@ -227,17 +230,17 @@ class ImageLikelihood(dist.Distribution):
 
 
 @jax.jit
-def _first_order(
+def _gauss_newton(
     term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
 ) -> Float[AnyArray, "points 3 3"]:
-    """Gauss–Newton's curvature of E_s/T_s in every place x_q + u(x_q), tempered: 2 w ∇m ∇mᵀ/T_s, 1/mm²."""
+    """Gauss–Newton's curvature in every place x_q + u(x_q)."""
     gradient = _slope(term, term.places(u))
     weights = term.independent_share / t_similarity * 2 * term.quadrature.weights
     return weights[:, None, None] * gradient[:, :, None] * gradient[:, None]
 
 
 @jax.jit
-def _second_order(
+def _remainder(
     term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
 ) -> Float[AnyArray, "points 3 3"]:
     """What the exact curvature has besides. With e(m) the energy of a point it is e″ ∇m ∇mᵀ + e′ ∇²m."""

@@ -150,10 +150,13 @@ class ComparedPoints(NamedTuple):
         """(q − p − u(p)) / sd: independent standard Normal numbers where the model holds."""
         return (self.shift - self.predicted(state)) / self.sd(state.values)[:, None]
 
-    def curvature(self, u: Float[AnyArray, "nodes 3"], values: Values, second_order: bool) -> PointCurvature:
-        """1 / sd² in every coordinate of every point; nothing of second order."""
-        first = jnp.eye(3) / self.sd(values)[:, None, None] ** 2
-        return PointCurvature(self.nodes, self.weights, first, jnp.zeros_like(first))
+    def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """1 / sd² in every coordinate of every point, 1/mm²."""
+        return PointCurvature(self.nodes, self.weights, jnp.eye(3) / self.sd(values)[:, None, None] ** 2)
+
+    def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """Nothing: the density is Gaussian in the displacements."""
+        return PointCurvature(self.nodes, self.weights, jnp.zeros((len(self.known_sd), 3, 3)))
 
 
 class PartlyNormalised(dist.Normal):

@@ -58,24 +58,24 @@ class PointCurvature(NamedTuple):
         Nodes of the cell that holds each point.
     weights : (q, 4) array
         Barycentric coordinates there.
-    first_order : (q, 3, 3) array
-        Gauss and Newton's part, positive semidefinite, 1/mm².
-    second_order : (q, 3, 3) array
-        The rest: residuals times second derivatives.
+    matrices : (q, 3, 3) array
+        The curvature in the displacement of each point, 1/mm².
     """
 
     nodes: Int[AnyArray, "points 4"]
     weights: Float[AnyArray, "points 4"]
-    first_order: Float[AnyArray, "points 3 3"]
-    second_order: Float[AnyArray, "points 3 3"]
+    matrices: Float[AnyArray, "points 3 3"]
 
 
 @runtime_checkable
 class Curved(Protocol):
-    """A term that knows its curvature in the displacements of points."""
+    """A term that knows its curvature in the displacements of points, where the nodes are displaced by u, mm."""
 
-    def curvature(self, u: Float[AnyArray, "nodes 3"], values: Values, second_order: bool) -> PointCurvature:
-        """The curvature where the nodes are displaced by u, mm; without `second_order` that part is zero."""
+    def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """Gauss and Newton's part, positive semidefinite."""
+
+    def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """What the exact curvature has besides: residuals times second derivatives."""
 
 
 @jax.tree_util.register_static
