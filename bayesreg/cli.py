@@ -15,7 +15,7 @@ STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
 class _Commands(TyperGroup):
-    """What a user did wrong is one message and status 2, a failing disk status 1; anything else raised is a bug."""
+    """A mistake of the user gives one message and status 2, a failing disk status 1; any other exception is a bug."""
 
     def invoke(self, ctx: Any) -> Any:
         try:

@@ -59,7 +59,7 @@ def _remove_old(folder: Path) -> None:
 
 
 def _processor() -> str:
-    """What tells kinds of processors apart."""
+    """A text that tells kinds of processors apart."""
     information = Path("/proc/cpuinfo")
     if not information.exists():
         return platform.processor() or platform.machine()

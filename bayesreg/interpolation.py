@@ -49,16 +49,16 @@ class Interpolator:
         """Values at world points, mm."""
         along = [points[..., axis] for axis in range(3)]
         indices = [sum(self.to_voxel[i, j] * along[j] for j in range(3)) + self.to_voxel[i, 3] for i in range(3)]
-        return _interpolated(self.method, self.coefficients, *indices)
+        return _interpolate(self.method, self.coefficients, *indices)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _interpolated(method: Interpolation, coefficients: AnyArray, *indices: AnyArray) -> AnyArray:
+def _interpolate(method: Interpolation, coefficients: AnyArray, *indices: AnyArray) -> AnyArray:
     """Sum of B-splines at voxel indices, given by axis; its derivative is in these alone."""
     return _of_one_chain(_VALUES[method], coefficients, *indices)
 
 
-@_interpolated.defjvp
+@_interpolate.defjvp
 def _interpolated_jvp(
     method: Interpolation, primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]
 ) -> tuple[AnyArray, AnyArray]:
@@ -85,7 +85,7 @@ def _with_gradient_jvp(
 
 
 def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices: AnyArray) -> Any:
-    """What a function of indices (points, chains) by axis gives for those of one chain, of any shape."""
+    """Call a function of indices (points, chains) by axis with those of one chain, of any shape."""
     found = function(coefficients, *(index.reshape(-1, 1) for index in indices))
     return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
 
@@ -96,7 +96,7 @@ def _together() -> int:
 
 
 def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
-    """What a function gives at single points, at indices (points, chains) by axis."""
+    """Turn a function of single points into one of indices (points, chains) by axis."""
 
     def interpolation(coefficients: AnyArray, *indices: AnyArray) -> Any:
         # The taps of all points at once leave the cache, which costs three times as much. The batches are of one size,
@@ -123,7 +123,7 @@ def _value_at(spline: _Spline, coefficients: AnyArray, *index: AnyArray) -> AnyA
     """Value at one point: the sum over its taps, one axis after the other."""
     taps, weights, _ = _taps(spline, coefficients, index)
     for weight in weights:
-        taps = jax.lax.optimization_barrier(_summed(taps, weight))
+        taps = jax.lax.optimization_barrier(_sum_taps(taps, weight))
     return taps
 
 
@@ -132,9 +132,9 @@ def _value_and_gradient_at(
 ) -> tuple[AnyArray, tuple[AnyArray, ...]]:
     """Value and gradient at one point."""
     taps, (wx, wy, wz), (sx, sy, sz) = _taps(spline, coefficients, index)
-    x, dx = jax.lax.optimization_barrier((_summed(taps, wx), _summed(taps, sx)))
-    y, dy, y_dx = jax.lax.optimization_barrier((_summed(x, wy), _summed(x, sy), _summed(dx, wy)))
-    return _summed(y, wz), (_summed(y_dx, wz), _summed(dy, wz), _summed(y, sz))
+    x, dx = jax.lax.optimization_barrier((_sum_taps(taps, wx), _sum_taps(taps, sx)))
+    y, dy, y_dx = jax.lax.optimization_barrier((_sum_taps(x, wy), _sum_taps(x, sy), _sum_taps(dx, wy)))
+    return _sum_taps(y, wz), (_sum_taps(y_dx, wz), _sum_taps(dy, wz), _sum_taps(y, sz))
 
 
 def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) -> Any:
@@ -155,7 +155,7 @@ def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) 
     return jax.lax.optimization_barrier((taps, [spline.weights(place) for place in places], slopes))
 
 
-def _summed(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:
+def _sum_taps(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:
     """Over the first axis; what is left lies together, and is summed side by side."""
     return sum(taps[k] * weight for k, weight in enumerate(weights))
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Tissue(NamedTuple):
-    """What is known of a tissue.
+    """Facts about a tissue.
 
     Attributes
     ----------

@@ -83,7 +83,7 @@ def test_flags_are_set_only_where_they_are_known(monkeypatch, jaxlib, plugins, g
     monkeypatch.setenv("XLA_FLAGS", given or "")
     if given is None:
         monkeypatch.delenv("XLA_FLAGS")
-    monkeypatch.setattr(programs, "version", lambda _: jaxlib)
-    monkeypatch.setattr(programs, "find_spec", lambda _: plugins)
+    monkeypatch.setattr(compilation, "version", lambda _: jaxlib)
+    monkeypatch.setattr(compilation, "find_spec", lambda _: plugins)
     compilation.compile_quickly()
     assert os.environ.get("XLA_FLAGS") == expected

@@ -1,4 +1,4 @@
-"""What a run is to do: pydantic models of the configuration, and their YAML form.
+"""The configuration of a run: pydantic models and their YAML form.
 
 A configuration holds no arrays and builds nothing; `bayesreg.workflow.run` does that.
 """

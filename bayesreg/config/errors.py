@@ -55,7 +55,7 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
     for path, details in found:
         if not any(_explains(*other, path, details["type"]) for other in found):
             messages.setdefault(path, []).append(_message(details, model))
-    lines = [f"  {_head(path, data, origins)}: {_joined(some)}" for path, some in messages.items()]
+    lines = [f"  {_head(path, data, origins)}: {_join(some)}" for path, some in messages.items()]
     return "\n".join(lines)
 
 
@@ -69,7 +69,7 @@ def _explains(other: Keys, by: ErrorDetails, path: Keys, kind: str) -> bool:
     return len(other) > len(path) > 0 and other[: len(path)] == path and kind in (*_EXPECTED, "literal_error")
 
 
-def _joined(messages: list[str]) -> str:
+def _join(messages: list[str]) -> str:
     first, *others = dict.fromkeys(messages)
     return " or ".join((first, *(message.removeprefix("expected ") for message in others)))
 
@@ -146,7 +146,7 @@ def _models(field: FieldInfo) -> list[type[BaseModel]]:
 
 
 def _tags(model: type[BaseModel]) -> set[object]:
-    """What pydantic may call a member of a union: its class, or a value of its discriminator."""
+    """The names that pydantic may give a member of a union: its class, or a value of its discriminator."""
     return {model.__name__, *(leaf for field in model.model_fields.values() for leaf in _leaves(field.annotation))}
 
 

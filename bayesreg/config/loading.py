@@ -25,7 +25,7 @@ _KINDS = ("source", "kind", "name")
 
 @dataclass(frozen=True)
 class _Document:
-    """What YAML files say, where each key was written, and the folders that they lie in."""
+    """The content of YAML files, where each key was written, and the folders that they lie in."""
 
     data: dict[str, Any]
     origins: dict[Keys, str]

@@ -28,7 +28,7 @@ class LandmarksSection(Section):
     sd: Positive | ScalePrior | None = None
     """Sd of the error of each coordinate, mm, or its prior; null takes the column sd of the file."""
     name: Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")] = "landmarks"
-    """Its name in tables; two observations need two."""
+    """The name of the observation in tables; two observations need two."""
 
 
 Observation = Annotated[ImagesSection | LandmarksSection, Field(discriminator="kind")]

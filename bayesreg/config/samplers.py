@@ -11,7 +11,7 @@ from bayesreg.inference.samplers import settings
 
 
 class _Chains(BaseModel):
-    """What all samplers' sections share."""
+    """The options that all samplers' sections share."""
 
     chains: Count = 4
     thin: Count = 1
@@ -22,7 +22,7 @@ class _Chains(BaseModel):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What is the sampler's own."""
+        """The sampler's own settings."""
         return self.model_dump(exclude={"name", *_Chains.model_fields})
 
 

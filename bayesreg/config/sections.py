@@ -86,7 +86,7 @@ class DistributedConfig(Section):
 
 
 class ReportConfig(Section):
-    """What the report is to show."""
+    """The content of the report."""
 
     places: dict[str, Vector] = Field(default={})
     """Places (x, y, z) in the fixed image, world RAS mm, by name; empty lets the program choose some."""
@@ -122,7 +122,7 @@ class Config(Section):
     """Everything that a run needs to know."""
 
     description: str = ""
-    """What the run is for."""
+    """The purpose of the run, in words."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
     data: Annotated[Mni152Data | BrainWebData | FilesData, Field(discriminator="source")]
     mesh: Annotated[MeshConfig, Field(validate_default=True)] = MeshConfig()
@@ -134,7 +134,7 @@ class Config(Section):
     """Elastography: the displacement of the boundary is known, truth (of a synthetic pair) or a file (.vtu or .npz of
     this mesh, or a displacement field .nii, .nii.gz), and λ, μ alone are sampled; null samples both."""
     observations: Annotated[Observations, Field(validate_default=True)] = None
-    """What was observed; null is the pair of images alone."""
+    """The data of the run; null is the pair of images alone."""
     model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
     sampler: Annotated[
         SamplerConfig,

@@ -97,6 +97,6 @@ ByTissue = dict[str, Positive]
 
 
 class Section(BaseModel):
-    """What all parts of a configuration share: no unknown keys, no changes after the making."""
+    """A part of a configuration: no unknown keys, no changes after the making."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)

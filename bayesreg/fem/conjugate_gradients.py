@@ -21,7 +21,7 @@ MAX_ITERATIONS = 2000
 
 
 class ElasticSystem(NamedTuple):
-    """What the equilibrium of the free nodes needs (a pytree).
+    """The arrays that the equilibrium of the free nodes needs (a pytree).
 
     Attributes
     ----------

@@ -52,18 +52,18 @@ class BandLayout(NamedTuple):
 
 
 class SchurDeterminant(NamedTuple):
-    """What log pdet S needs besides λ and μ (a pytree).
+    """The arrays that log pdet S needs besides λ and μ (a pytree).
 
     Attributes
     ----------
     supported : BandLayout
-        Of K_{−J}: all nodes that are not held, without the isostatic unknowns J.
+        The pattern of K_{−J}: all nodes that are not held, without the isostatic unknowns J.
     free : BandLayout or None
-        Of K_II; None where every node is sampled or held.
+        The pattern of K_II; None where every node is sampled or held.
     log_null : scalar
         2 log |det N_J|.
     rank : scalar
-        Of S: 3b less the rigid motions that the held nodes leave (six where none is held).
+        The rank of S: 3b less the rigid motions that the held nodes leave (six where none is held).
     """
 
     supported: BandLayout
@@ -138,8 +138,8 @@ def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[n
 def _require_definite(mesh: TetMesh, determinant: SchurDeterminant) -> None:
     """A pivot that is nothing against the diagonal of K says that rigid motions are not all that costs nothing."""
     one = jnp.ones(len(mesh.cells))
-    band = _assembled(elements_of(mesh), one, one, determinant.supported)
-    pivots = jnp.diagonal(_factorised(band)[0], axis1=1, axis2=2) ** 2 / jnp.diagonal(band[:, 0], axis1=1, axis2=2)
+    band = _assemble(elements_of(mesh), one, one, determinant.supported)
+    pivots = jnp.diagonal(_factorise(band)[0], axis1=1, axis2=2) ** 2 / jnp.diagonal(band[:, 0], axis1=1, axis2=2)
     if not (pivots > 1e-12).all():
         raise InputError(
             "the elastic prior has no normaliser on this mesh: parts of it hang together by a node or an edge, "
@@ -160,10 +160,10 @@ def log_determinant(
     layout: BandLayout, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
 ) -> Scalar:
     """log det of the rows and columns of K(λ, μ) that are in a layout."""
-    return band_log_determinant(_assembled(elements, lam, mu, layout))
+    return band_log_determinant(_assemble(elements, lam, mu, layout))
 
 
-def _assembled(elements: Elements, lam: AnyArray, mu: AnyArray, layout: BandLayout) -> Band:
+def _assemble(elements: Elements, lam: AnyArray, mu: AnyArray, layout: BandLayout) -> Band:
     columns, width = layout.padding.shape
     entries = element_stiffness(elements, lam, mu).reshape(layout.places.shape)
     band = jnp.zeros(columns * (1 + BLOCKS_BELOW) * width**2).at[layout.places].add(entries, mode="drop")
@@ -180,13 +180,13 @@ def band_log_determinant(band: Band) -> Scalar:
     band : (columns, 1 + below, width, width) array
         Block columns: the diagonal block, which is symmetric, and those below it; zero past the last row.
     """
-    return _log_determinant_of(_factorised(band)[0])
+    return _log_determinant_of(_factorise(band)[0])
 
 
 @band_log_determinant.defjvp
 def _derivative(primals: tuple[Band], tangents: tuple[Band]) -> tuple[Scalar, Scalar]:
     """∂ log det K = tr(K⁻¹ ∂K): outside the band ∂K is zero, and what is below the diagonal blocks counts twice."""
-    factors, panels = _factorised(primals[0])
+    factors, panels = _factorise(primals[0])
     products = _inverse_in_band(factors, panels).reshape(tangents[0].shape) * tangents[0]
     return _log_determinant_of(factors), 2 * products.sum() - products[:, 0].sum()
 
@@ -195,7 +195,7 @@ def _log_determinant_of(factors: Float[AnyArray, "columns width width"]) -> Scal
     return 2 * jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)).sum()
 
 
-def _factorised(
+def _factorise(
     band: Band,
 ) -> tuple[Float[AnyArray, "columns width width"], Float[AnyArray, "columns height width"]]:
     """The Cholesky factor: its diagonal blocks L_kk, and the panels P_k below them.

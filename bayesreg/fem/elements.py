@@ -135,13 +135,13 @@ def gauss_quadrature(mesh: TetMesh, rule: str = "gauss4") -> Quadrature:
         behind the Boltzmann similarity gives a point of weight w_q the variance T_s / (2 w_q), which the
         negative weights of Gauss rules of higher order would not allow.
     """
-    barycentric = _subdivided(GAUSS_SUBDIVISIONS[rule])
+    barycentric = _subdivide(GAUSS_SUBDIVISIONS[rule])
     count, per_cell = len(mesh.cells), len(barycentric)
     cells, weights = np.repeat(np.arange(count), per_cell), np.repeat(mesh.volumes / per_cell, per_cell)
     return quadrature_at(mesh, cells, np.tile(barycentric, (count, 1)), weights)
 
 
-def _subdivided(levels: int) -> Float[np.ndarray, "points 4"]:
+def _subdivide(levels: int) -> Float[np.ndarray, "points 4"]:
     """Four-point rule on the children of the reference tetrahedron, in barycentric coordinates."""
     children = [np.eye(4)]
     for _ in range(levels):

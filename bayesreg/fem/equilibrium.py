@@ -92,10 +92,10 @@ def equilibrium(
     """
     if guess is None:
         return _differentiable(system, lam, mu, u_prescribed)
-    return _settled(system, lam, mu, u_prescribed, guess)
+    return _solve(system, lam, mu, u_prescribed, guess)
 
 
-def _settled(
+def _solve(
     system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray, guess: AnyArray | None = None
 ) -> Equilibrium:
     if len(system.free) == 0:
@@ -138,13 +138,13 @@ def _response(
 
 @jax.custom_vjp
 def _differentiable(system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray) -> Equilibrium:
-    return _settled(system, lam, mu, u_prescribed)
+    return _solve(system, lam, mu, u_prescribed)
 
 
 def _forward(
     system: ElasticSystem, lam: AnyArray, mu: AnyArray, u_prescribed: AnyArray
 ) -> tuple[Equilibrium, tuple[ElasticSystem, AnyArray, AnyArray, AnyArray]]:
-    state = _settled(system, lam, mu, u_prescribed)
+    state = _solve(system, lam, mu, u_prescribed)
     return state, (system, lam, mu, state.u)
 
 

@@ -53,7 +53,7 @@ def locate(
     Returns
     -------
     Location
-        Of the cells that hold a point (two or more where they meet), the one of lowest index.
+        Where two or more cells hold a point, the one of lowest index.
 
     Notes
     -----
@@ -212,7 +212,7 @@ def nearest_on_surface(
 def _in_threads(
     search: Callable[[np.ndarray], Location], query: Float[np.ndarray, "queries 3"], corners: int
 ) -> Location:
-    """What a search finds at points, some at a time. NumPy and SciPy let other threads run."""
+    """Search at points, some at a time, in threads: NumPy and SciPy let other threads run."""
     cell, barycentric = np.empty(len(query), int), np.empty((len(query), corners))
     parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
     with ThreadPoolExecutor(max_workers=_THREADS) as pool:

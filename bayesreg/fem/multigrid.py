@@ -94,7 +94,7 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
         raise InputError(SINGULAR)
     scale = 1 / np.sqrt(diagonal)
     hierarchy = pyamg.smoothed_aggregation_solver(
-        scipy.sparse.bsr_array(_scaled(matrix, scale, scale), blocksize=(3, 3)),
+        scipy.sparse.bsr_array(_scale(matrix, scale, scale), blocksize=(3, 3)),
         near_kernel / scale[:, None],
         strength=("symmetric", {"theta": STRENGTH}),
         # PyAMG draws at random for an estimate of the greatest eigenvalue, but not for this one.
@@ -108,14 +108,14 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
     kept = [np.flatnonzero(level.A.diagonal() > 1e-12) for level in hierarchy]
     inner = [scipy.sparse.csr_array(level.A)[own][:, own] for level, own in zip(hierarchy, kept, strict=True)]
     scales = [1 / np.sqrt(each.diagonal()) for each in inner]
-    matrices = [_scaled(each, own, own) for each, own in zip(inner, scales, strict=True)]
+    matrices = [_scale(each, own, own) for each, own in zip(inner, scales, strict=True)]
     values, vectors = np.linalg.eigh(matrices[-1].toarray())
     if not (np.isfinite(values).all() and values[0] > SINGULAR_BELOW):
         raise InputError(SINGULAR)
     levels = []
     for depth, fine in enumerate(matrices[:-1]):
         prolongation = scipy.sparse.csr_array(hierarchy[depth].P)[kept[depth]][:, kept[depth + 1]]
-        prolongation = _scaled(prolongation, 1 / scales[depth], scales[depth + 1])
+        prolongation = _scale(prolongation, 1 / scales[depth], scales[depth + 1])
         greatest = jnp.float32(_above_the_eigenvalues(fine))
         levels.append(
             Level(
@@ -125,7 +125,7 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
     return Multigrid(jnp.asarray(scale), tuple(levels), jnp.asarray((vectors / values) @ vectors.T))
 
 
-def _scaled(
+def _scale(
     matrix: scipy.sparse.sparray | scipy.sparse.spmatrix,
     rows: Float[np.ndarray, "rows"],
     columns: Float[np.ndarray, "columns"],
@@ -149,13 +149,13 @@ def _cycle(
     if not levels:
         return (coarsest @ load.astype(coarsest.dtype)).astype(load.dtype)
     level, *coarser = levels
-    x = _smoothed(level, jnp.zeros_like(load), load)
+    x = _smooth(level, jnp.zeros_like(load), load)
     residual = level.prolongation.transpose(load - level.matrix(x))
     x += level.prolongation(_cycle(tuple(coarser), coarsest, residual))
-    return _smoothed(level, x, load - level.matrix(x))
+    return _smooth(level, x, load - level.matrix(x))
 
 
-def _smoothed(
+def _smooth(
     level: Level, x: Float[AnyArray, "unknowns chains"], residual: Float[AnyArray, "unknowns chains"]
 ) -> Float[AnyArray, "unknowns chains"]:
     """x after `DEGREE` steps of Chebyshev's iteration (Saad 2003, algorithm 12.1), given its residual."""

@@ -87,7 +87,7 @@ _product = Primitive("sparse_product")
 
 @_product.def_impl
 def _implementation(*operands: AnyArray) -> AnyArray:
-    """Of the matrix, its transpose, and x, whose rows are padded to a multiple of `ALIGNED`."""
+    """The product of the matrix and x, whose rows are padded to a multiple of `ALIGNED`."""
     *matrix, _, _, from_rows, x = operands
     columns = x.shape[1]
     padded = jnp.pad(x, ((0, 0), (0, -columns % (ALIGNED // x.dtype.itemsize))))
@@ -101,7 +101,7 @@ def _shape(*operands: Any) -> jax.core.ShapedArray:
     return jax.core.ShapedArray((starts.shape[0] - 1, x.shape[1]), x.dtype)
 
 
-def _batched(operands: Sequence[AnyArray], axes: Sequence[int | None]) -> tuple[AnyArray, int]:
+def _multiply_in_batches(operands: Sequence[AnyArray], axes: Sequence[int | None]) -> tuple[AnyArray, int]:
     *matrices, x = operands
     *of_matrices, axis = axes
     if axis is None or any(each is not None for each in of_matrices):
@@ -111,7 +111,7 @@ def _batched(operands: Sequence[AnyArray], axes: Sequence[int | None]) -> tuple[
     return found.reshape(len(found), *moved.shape[1:]), 2
 
 
-def _transposed(cotangent: Any, *operands: Any) -> list[Any]:
+def _transpose(cotangent: Any, *operands: Any) -> list[Any]:
     *matrices, x = operands
     if isinstance(cotangent, ad.Zero):
         return [None] * 6 + [ad.Zero(x.aval)]
@@ -119,6 +119,6 @@ def _transposed(cotangent: Any, *operands: Any) -> list[Any]:
 
 
 mlir.register_lowering(_product, mlir.lower_fun(_implementation, multiple_results=False))
-batching.primitive_batchers[_product] = _batched
+batching.primitive_batchers[_product] = _multiply_in_batches
 ad.defjvp(_product, *[None] * 6, lambda change, *operands: _product.bind(*operands[:-1], change))
-ad.primitive_transposes[_product] = _transposed
+ad.primitive_transposes[_product] = _transpose

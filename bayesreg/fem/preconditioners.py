@@ -39,7 +39,7 @@ class ReferenceInverse(NamedTuple):
     scale : (3f,) array
         diag(K_II)^(−1/2).
     inverse : (3f, 3f) array, single precision
-        Of K_II scaled from both sides.
+        The inverse of K_II, scaled from both sides.
     """
 
     scale: Float[AnyArray, "unknowns"]
@@ -77,7 +77,7 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
     return ReferenceInverse(jnp.asarray(scale), jnp.asarray((inverse + inverse.T) / 2, jnp.float32))
 
 
-def solved(
+def solve(
     matrix: scipy.sparse.csr_matrix, right: Float[np.ndarray, "unknowns columns"]
 ) -> Float[np.ndarray, "unknowns columns"]:
     """K_II⁻¹ times many columns, to double precision.

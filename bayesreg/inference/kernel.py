@@ -1,4 +1,4 @@
-"""What a sampler is: a handful of pure functions behind one small adapter."""
+"""The definition of a sampler: a handful of pure functions behind one small adapter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Info(NamedTuple):
     acceptance_rate : scalar
     outside_support, diverging : scalar bool
     solver_failed, solver_iterations : scalar bool, scalar
-        Of the proposal's solve; zero where a transition has many (`Sampler.many_solves`).
+        Figures of the proposal's solve; zero where a transition has many (`Sampler.many_solves`).
     gradients, densities : scalar integer
         Evaluations of the density with its gradient, and without.
     """

@@ -1,4 +1,4 @@
-"""What the samplers know of a posterior: a small target, and objects that it may carry.
+"""The posterior as the samplers see it: a small target, and objects that it may carry.
 
 Functions of a target take its `data`, a pytree with all its arrays, as an argument: no array is baked into compiled
 code, and the data of an easier or a prepared problem serve as well. A *target* is hashable, by all but the values in
@@ -90,7 +90,7 @@ class Normaliser(Protocol):
         """Whether it costs much more than the rest of the density."""
 
     def log(self, data: Any, estimands: Estimands) -> Scalar:
-        """Its logarithm, as part of the log density."""
+        """The logarithm of this factor, as part of the log density."""
 
     def without(self, data: Any) -> Any:
         """The data of the same problem without this factor."""
@@ -126,7 +126,7 @@ class Curvature(Protocol):
 
 @runtime_checkable
 class ModeSearch(Protocol):
-    """What the search for a mode, and Laplace's approximation there, need."""
+    """The posterior as the search for a mode and Laplace's approximation there see it."""
 
     def continuation(self) -> Iterable[Any]:
         """Data of ever harder problems, in the displacements alone, that lead to the target's own."""
@@ -157,7 +157,7 @@ class Target(Hashable, Protocol):
     def supports(self, data: Any, estimands: Estimands) -> AnyArray:
         """Whether the density may be positive there; much cheaper than an evaluation."""
 
-    def conditioned(self, estimands: Estimands, alone: Any = (), quick: bool = False) -> Any:
+    def condition(self, estimands: Estimands, alone: Any = (), quick: bool = False) -> Any:
         """The data of the same problem, prepared for fast densities near these estimands.
 
         They serve `single_nodes` for the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
@@ -178,7 +178,7 @@ class Target(Hashable, Protocol):
 
     @property
     def mode_search(self) -> ModeSearch | None:
-        """What samplers about a mode need; None where it is not known."""
+        """The posterior as the search for a mode sees it; None where no mode can be searched for."""
 
 
 def logdensity(target: Target, data: Any, position: Estimands) -> Scalar:

@@ -35,7 +35,7 @@ def without_cavities(
     a, b, c = np.moveaxis(points[faces], 1, 0)
     volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
     for cavity in np.flatnonzero(volume < 0):
-        points, cells = _filled(points, cells, faces[part == cavity])
+        points, cells = _fill(points, cells, faces[part == cavity])
     return points, cells
 
 
@@ -55,7 +55,7 @@ def _surface_parts(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces"
     return connected_components(graph, directed=False)[1]
 
 
-def _filled(
+def _fill(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], walls: Int[np.ndarray, "walls 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with the hole between walls filled, their normals pointing into it."""

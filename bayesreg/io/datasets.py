@@ -37,7 +37,7 @@ class Anatomy(NamedTuple):
     intracranial : Image or None
         uint8 on the grid of the image, 1 inside the skull; None where it is not known.
     names : tuple of str
-        Of the tissues.
+        Names of the tissues.
     """
 
     image: Image | None

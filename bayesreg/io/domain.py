@@ -41,7 +41,7 @@ def mesh_domain(
     closing : float
         Radius of the ball, mm. Exact for affines whose axes are orthogonal.
     names : sequence of str
-        Of the tissues.
+        Names of the tissues.
 
     Returns
     -------
@@ -62,7 +62,7 @@ def mesh_domain(
     solid = np.isin(voxels, list(solid_names))
     if not solid.any():
         raise MeshError(f"there is no solid tissue to mesh among {', '.join(names)}")
-    hull = _filled(_closed(solid, tissue.voxel_sizes, closing) if len(solid_names) < len(names) else solid)
+    hull = _fill(_close(solid, tissue.voxel_sizes, closing) if len(solid_names) < len(names) else solid)
     if intracranial is not None:
         hull &= _intracranial_part(tissue, intracranial)
         if (hull & solid).sum() < 0.5 * solid.sum():
@@ -71,7 +71,7 @@ def mesh_domain(
                 "mask; do the two belong together?"
             )
     # The skull may cut the hull, and what it cuts off may leave holes.
-    return tissue.with_voxels(_filled(main_part(hull, "region to mesh")).astype(np.uint8))
+    return tissue.with_voxels(_fill(main_part(hull, "region to mesh")).astype(np.uint8))
 
 
 def domain_labels(tissue: Image, domain: Image, names: Sequence[str] = BRAIN) -> Image:
@@ -134,7 +134,7 @@ def _intracranial_part(tissue: Image, intracranial: Image) -> Bool[np.ndarray, "
     return main_part(np.asarray(intracranial.voxels) != 0, "intracranial mask")
 
 
-def _closed(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: float) -> Bool[np.ndarray, "X Y Z"]:
+def _close(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: float) -> Bool[np.ndarray, "X Y Z"]:
     """Dilated, then eroded by a ball (mm); the surroundings of the grid count as empty."""
     box = ndimage.find_objects(mask.astype(np.int8))[0]
     margin = [(n, n) for n in np.ceil(radius / voxel_sizes).astype(int) + 1]
@@ -146,7 +146,7 @@ def _closed(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: fl
     return result
 
 
-def _filled(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
+def _fill(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     """The mask and its holes: what cannot be reached from beyond the grid."""
     parts, _ = ndimage.label(~np.pad(mask, 1))
     return (parts != parts[0, 0, 0])[1:-1, 1:-1, 1:-1]

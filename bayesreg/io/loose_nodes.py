@@ -47,7 +47,7 @@ def without_loose_nodes(
         before = len(cells)
         holding = np.bincount(cells.ravel(), minlength=len(points))
         for node in np.argsort(holding, kind="stable")[: np.count_nonzero(holding < FEWEST)]:
-            cells = _contracted(points, cells, int(node))
+            cells = _contract(points, cells, int(node))
         if len(cells) == before:
             break
     if len(cells) == len(given):
@@ -56,7 +56,7 @@ def without_loose_nodes(
     return points[used], kept.reshape(-1, 4)
 
 
-def _contracted(
+def _contract(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], node: int
 ) -> Int[np.ndarray, "fewer_cells 4"]:
     """The cells without a node of the boundary, if it is loose and can be spared."""

@@ -63,7 +63,7 @@ class MeshOptions:
     stop_energy : float
         Quality at which fTetWild may stop (AMIPS energy, 3 at best); half as much takes several times as long.
     threads : int
-        Of fTetWild; 0 for all cores.
+        Threads of fTetWild; 0 for all cores.
     attempts : int
         fTetWild is not deterministic: how many meshes to try before giving up.
     quiet : bool
@@ -116,7 +116,7 @@ def build_mesh(
     domain : Image, optional
         Ω, where `mesh_domain` has made it already.
     names : sequence of str
-        Of the tissues; the default is those of the brains that the package ships.
+        Names of the tissues; the default is those of the brains that the package ships.
 
     Returns
     -------
@@ -217,7 +217,7 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
     ----------
     path : path
     names : sequence of str
-        Of the tissues, where the file does not say them; the default is those of the brains that the package ships.
+        Names of the tissues, where the file does not say them; the default is those of brains.
 
     Raises
     ------

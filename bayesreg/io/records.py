@@ -1,4 +1,4 @@
-"""What a run starts from and what it leaves, in memory."""
+"""The inputs and the results of a run, in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesreg.types import AnyArray
 
 
 class Truth(NamedTuple):
-    """What is known of a synthetic pair.
+    """The truth of a synthetic pair.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Fit(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """What was computed of thinned draws at the end of a run, since it needs the posterior itself.
+    """Predictions of thinned draws, computed at the end of a run, since they need the posterior itself.
 
     Attributes
     ----------
@@ -71,9 +71,9 @@ class Predicted(NamedTuple):
     observed, replicated : (chains, draws, D) arrays
         Discrepancies of the standardised residuals of each draw, and of noise that follows the model.
     landmark_names, landmark_points, landmark_sd, landmark_residual : (k,), (k, 3), (k,), (k, 3) arrays or None
-        Of all landmarks that were observed: names, places in the fixed image, sd and residual at the mean, mm.
+        All landmarks that were observed: names, places in the fixed image, sd and residual at the mean, mm.
     left_out_residual, left_out_covariance : (k, 3), (k, 3, 3) arrays or None
-        Of each landmark, predicted by all observations but itself (`bayesreg.model.left_out`); where there are few.
+        The residual of each landmark, predicted by all observations but itself, where there are few.
     stiffness_mean, stiffness_sd : (m,) array or None
         Posterior mean and standard deviation of every element's stiffness over its tissue's; None without a field.
     stiffer : scalar or None
@@ -112,18 +112,18 @@ class Predicted(NamedTuple):
 
     @property
     def known(self) -> dict[str, AnyArray]:
-        """Those of the entries that there are."""
+        """The entries that there are."""
         return {name: value for name, value in self._asdict().items() if value is not None}
 
     @property
     def by_cell(self) -> dict[str, AnyArray]:
-        """Those that have one row per element."""
+        """The entries that have one row per element."""
         fields = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
         return {name: value for name, value in self.known.items() if name in fields}
 
 
 class Inputs(NamedTuple):
-    """What a run starts from, and what a resumed run must find unchanged.
+    """The inputs of a run, which a resumed run must find unchanged.
 
     Attributes
     ----------
@@ -195,5 +195,5 @@ class Run:
 
     @property
     def background(self) -> Image:
-        """What maps are drawn on: the fixed image, or where there is none the tissue map."""
+        """The image that maps are drawn on: the fixed one, or where there is none the tissue map."""
         return self.tissue if self.fixed is None else self.fixed

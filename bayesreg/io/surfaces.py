@@ -83,7 +83,7 @@ def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BR
     edge_length : float
         mm.
     names : sequence of str
-        Of the tissues.
+        Names of the tissues.
 
     Returns
     -------
@@ -206,13 +206,13 @@ def _kuhn_cells(shape: tuple[int, ...], points: Float[np.ndarray, "n 3"]) -> Int
         corner = np.zeros((4, 3), int)
         for step, axis in enumerate(axes, start=1):
             corner[step:, axis] = 1
-        cells.append(np.stack([_shifted(node, offset) for offset in corner], axis=-1).reshape(-1, 4))
+        cells.append(np.stack([_shift_nodes(node, offset) for offset in corner], axis=-1).reshape(-1, 4))
     stacked = np.concatenate(cells)
     inverted = signed_volumes(points, stacked) < 0
     stacked[inverted] = stacked[inverted][:, (0, 2, 1, 3)]
     return stacked
 
 
-def _shifted(node: Int[np.ndarray, "A B C"], offset: Int[np.ndarray, "3"]) -> Int[np.ndarray, "a b c"]:
+def _shift_nodes(node: Int[np.ndarray, "A B C"], offset: Int[np.ndarray, "3"]) -> Int[np.ndarray, "a b c"]:
     """Nodes at an offset (0 or 1 per axis) from the first corner of every cube."""
     return node[tuple(slice(o, n - 1 + o) for o, n in zip(offset, node.shape, strict=True))]

@@ -25,7 +25,7 @@ def standardised_residual(
 def discrepancies(
     z: Float[AnyArray, "points"], cells: Int[AnyArray, "points"], neighbours: Int[AnyArray, "pairs 2"], count: int
 ) -> Float[AnyArray, "3"]:
-    """What would show in standardised residuals if the model were wrong, in the order of `DISCREPANCIES`.
+    """Compute figures of standardised residuals that would differ if the model were wrong (see `DISCREPANCIES`).
 
     Parameters
     ----------

@@ -35,10 +35,10 @@ class Block(Protocol):
         """Whether any of its entries is unknown."""
 
     def draw(self, name: str) -> AnyArray:
-        """Its value in a NumPyro program: a sample site of that name, or what is known."""
+        """Draw the value in a NumPyro program: a sample site of that name, or the known value."""
 
     def reference(self) -> AnyArray:
-        """Its value at rest, where chains may start."""
+        """The value at rest, where chains may start."""
 
     def complete(self, estimand: AnyArray) -> AnyArray:
         """The value of an estimand."""
@@ -60,7 +60,7 @@ class Block(Protocol):
 
 
 class _Arrays:
-    """What blocks share whose arrays are all data: they are sampled as a whole, and their position is themselves.
+    """A block whose arrays are all data: it is sampled as a whole, and its position is the value itself.
 
     A subclass names its arrays in `arrays`, in the order of its arguments.
     """
@@ -97,7 +97,7 @@ class _Arrays:
         return jnp.array(True)
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """Its arrays."""
+        """The arrays of the block."""
         return tuple(getattr(self, name) for name in self.arrays), None
 
     @classmethod
@@ -157,7 +157,7 @@ class LameParameter(NamedTuple):
     Attributes
     ----------
     alpha, beta, low, high : (entries,) arrays
-        Of the scaled Beta prior of each entry.
+        Parameters of the scaled Beta prior of each entry.
     log_beta : (entries,) array
         log B(α, β).
     free : FreeEntries
@@ -219,7 +219,7 @@ class LameParameter(NamedTuple):
         return self.transform.inv(estimand)
 
     def least_curvature(self, position: AnyArray) -> AnyArray:
-        """That of a Normal score, one.
+        """One, the curvature of a Normal score.
 
         Without an upper bound a score is scale · z²/2 far out, where its logarithm, which knows no scale, has one.
         """
@@ -234,7 +234,7 @@ class LameParameter(NamedTuple):
 
 
 class _Positive(_Arrays):
-    """What the positive scalars share: their position is the logarithm."""
+    """A positive scalar, whose position is its logarithm."""
 
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
         """The exponential."""
@@ -282,7 +282,7 @@ class Scale(_Positive):
         return jnp.asarray(self.median)
 
     def times(self, factor: float) -> Scale:
-        """The same scale, so many times as great."""
+        """A scale with the same spread and a median multiplied by a factor."""
         return Scale(factor * self.median, self.log_sd)
 
 

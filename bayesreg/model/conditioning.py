@@ -15,7 +15,7 @@ from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.multigrid import Multigrid
 from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import LAME, Values
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.neighbourhood import neighbourhoods
 from bayesreg.model.program import Problem
 from bayesreg.model.single_node import images_of
@@ -33,14 +33,14 @@ CHAIN_ADJOINT_TOLERANCE = 1e-3
 NEAR = 1e3
 
 
-def conditioned(problem: Problem, estimands: Values, alone: Int[np.ndarray, "k"]) -> Problem:
+def condition(problem: Problem, estimands: Values, alone: Int[np.ndarray, "k"]) -> Problem:
     """The problem with solves for chains, preconditioned at these λ, μ and field.
 
     (By a dense inverse, that is; a multigrid hierarchy stays that of the problem's own reference.) Solves end at
     `CHAIN_TOLERANCE`. The nodes in the rows `alone` of "u_boundary" may be moved alone, see
     `bayesreg.model.single_node`.
     """
-    body, values = problem.body, completed(problem.blocks, estimands)
+    body, values = problem.body, complete(problem.blocks, estimands)
     # A tissue that is next to nothing leaves K_II without a factor.
     reference = {name: np.asarray(problem.blocks[name].reference()) for name in LAME}
     near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
@@ -55,7 +55,7 @@ def conditioned(problem: Problem, estimands: Values, alone: Int[np.ndarray, "k"]
     return problem._replace(body=body._replace(system=system), neighbourhoods=around)
 
 
-def at_four_points(problem: Problem, observations: Mapping[str, Any], interpolation: Interpolation) -> Problem:
+def compare_at_four_points(problem: Problem, observations: Mapping[str, Any], interpolation: Interpolation) -> Problem:
     """The problem with its images compared at four points of each tetrahedron, whatever the model's quadrature."""
     for name, pair in observations.items():
         if isinstance(pair, ImagePair):

@@ -35,11 +35,11 @@ def continuation(
     if not len(problem.body.slots):
         return
     if pairs:
-        yield from _ahead([partial(_eased, problem, pairs, interpolation, *stage) for stage in SMOOTHING])
+        yield from _ahead([partial(_ease, problem, pairs, interpolation, *stage) for stage in SMOOTHING])
     yield problem
 
 
-def _eased(
+def _ease(
     problem: Problem,
     pairs: Mapping[str, ImagePair],
     interpolation: Interpolation,
@@ -55,7 +55,7 @@ def _eased(
 
 
 def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
-    """What each makes, the next one in the background while one is being used."""
+    """Yield the result of each maker, and let the next one work in the background meanwhile."""
     pool = ThreadPoolExecutor(max_workers=1)
     try:
         coming = pool.submit(makers[0])

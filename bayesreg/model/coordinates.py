@@ -32,11 +32,11 @@ class Coordinates:
 
     def constrain(self, data: Any, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
         """Estimands of a position, and the logarithm of the Jacobian."""
-        return constrained(data.blocks, position)
+        return constrain(data.blocks, position)
 
     def unconstrain(self, data: Any, estimands: Values) -> dict[str, AnyArray]:
         """Position of estimands; the inverse of `constrain`."""
-        return unconstrained(data.blocks, estimands)
+        return unconstrain(data.blocks, estimands)
 
     def least_curvature(self, data: Any, position: Values) -> dict[str, AnyArray]:
         """Curvature of −log density in every coordinate of which the data say next to nothing."""
@@ -54,12 +54,12 @@ def reference_values(blocks: Blocks) -> dict[str, AnyArray]:
     return {name: block.reference() for name, block in blocks.items()}
 
 
-def filled(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
+def fill(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
     """Values in which blocks without unknowns that were left out are filled in."""
     return {name: values[name] if name in values else block.reference() for name, block in blocks.items()}
 
 
-def completed(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
+def complete(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
     """The values of estimands: known entries and known blocks are filled in."""
     return {
         name: block.complete(estimands[name]) if block.is_sampled else block.reference()
@@ -72,18 +72,18 @@ def estimands_of(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
     return {name: block.estimand(values[name]) for name, block in sampled_blocks(blocks).items()}
 
 
-def constrained(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
+def constrain(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
     """The estimands of a position, and the logarithm of the Jacobian."""
     found = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
     return {name: estimand for name, (estimand, _) in found.items()}, sum(log for _, log in found.values())
 
 
-def unconstrained(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
+def unconstrain(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
     """The position of estimands."""
     return {name: block.unconstrain(estimands[name]) for name, block in sampled_blocks(blocks).items()}
 
 
-def allowed(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
+def is_in_range(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
     """Whether every value lies in the range of its prior."""
     found = jnp.array(True)
     for name, block in blocks.items():

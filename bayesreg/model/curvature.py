@@ -14,7 +14,7 @@ import scipy.sparse
 from jaxtyping import Float, Int
 
 from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
-from bayesreg.fem.preconditioners import DENSE_LIMIT, solved
+from bayesreg.fem.preconditioners import DENSE_LIMIT, solve
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.program import Problem
@@ -28,7 +28,7 @@ NEARBY, NEARBY_SD = 3, 0.1
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """Of minus a log density.
+    """The curvature of minus a log density.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Curvature:
 
     @cached_property
     def remainder(self) -> Float[np.ndarray, "rows rows"]:
-        """What the exact one has besides: residuals times second derivatives. Small where the images agree."""
+        """The rest of the exact curvature, residuals times second derivatives; it is small where the images agree."""
         return self.second_derivatives()
 
 
@@ -60,7 +60,7 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
     ----------
     problem : Problem
     values : mapping
-        Of all blocks.
+        Values of all blocks.
     u : (n, 3) array
         The equilibrium, mm.
 
@@ -97,7 +97,7 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
     curved = [term for term in problem.terms.values() if isinstance(term, Curved)]
     seen = _Seen(problem, dict(values), jnp.asarray(lam), jnp.asarray(mu))
     outside = [_outside_curvature(term, seen, u) for term in problem.terms.values() if isinstance(term, Outside)]
-    summed = partial(_summed, len(u))
+    summed = partial(_sum, len(u))
     gauss_newton = reduced(sum(outside, summed(term.gauss_newton(u, values) for term in curved)))
     if "elastic" in problem.terms:
         gauss_newton[modes:, modes:] += schur / float(values["t_elastic"])
@@ -107,10 +107,10 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
     return Curvature(gauss_newton, lambda: reduced(summed(term.remainder(u, values) for term in curved)))
 
 
-def _summed(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
+def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
     """Curvatures in the places of points as one in all nodes, row 3 · node + axis."""
     empty = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
-    return sum((_assembled(nodes, part) for part in parts), empty)
+    return sum((_assemble(nodes, part) for part in parts), empty)
 
 
 class _Seen(NamedTuple):
@@ -124,7 +124,7 @@ class _Seen(NamedTuple):
 
 def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
     """The convex part of the Hessian of −log in all nodes, for a term that knows nothing but its log."""
-    touched = _touched(term, seen, u)
+    touched = _find_touched(term, seen, u)
     found = scipy.sparse.csr_matrix((u.size, u.size))
     if not len(touched):
         return found
@@ -134,7 +134,7 @@ def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]
     return scipy.sparse.csr_matrix((convex.ravel(), (rows, columns)), shape=found.shape)
 
 
-def _touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
+def _find_touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
     """The unknowns that a term looks at: its slope is not zero there at one of some random places near u."""
     steps = NEARBY_SD * np.random.default_rng(0).normal(size=(NEARBY, *u.shape))
     slopes = [np.asarray(_slope(term, seen, (u + step).ravel())) for step in steps]
@@ -185,7 +185,7 @@ def _response(
     coupling = K[free][:, sampled]
     W = np.hstack([load, coupling.toarray()])
     if len(free):
-        W = -solved(K[free][:, free], W)
+        W = -solve(K[free][:, free], W)
     schur = np.asarray(K[sampled][:, sampled] + coupling.T @ W[:, load.shape[1] :])
     return W, (schur + schur.T) / 2
 
@@ -194,7 +194,7 @@ def _response(
 def _kept_response(
     mesh: TetMesh, sampled: tuple[int, ...], free: tuple[int, ...], lam: tuple[float, ...], mu: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "free sampled"], Float[np.ndarray, "sampled sampled"]]:
-    """The same without loads, which the stages of a search that leave λ and μ alone share."""
+    """`_response` without loads, kept for the stages of a search, which share λ and μ."""
     rows, others = np.array(sampled, int), np.array(free, int)
     return _response(mesh, rows, others, np.array(lam), np.array(mu), np.zeros((len(others), 0)))
 
@@ -210,7 +210,7 @@ def _element_forces(body: Body, lam: AnyArray, mu: AnyArray, u: AnyArray) -> sci
     return scipy.sparse.csr_matrix((np.asarray(forces).ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
-def _assembled(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
+def _assemble(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
     """Σ_q C_q N_a N_b: a curvature in the places of points as one in all nodes."""
     curvature = np.asarray(points.matrices)
     count = len(curvature)

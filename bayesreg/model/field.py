@@ -37,9 +37,9 @@ class StiffnessField(NamedTuple):
     basis : (m, k) array
         Leading principal components of the field with sd 1, times their standard deviations.
     sd_scale : scalar
-        Of the half-normal prior of sd.
+        The scale of the half-normal prior of sd.
     share : scalar
-        Of the field's variance, averaged over the volume, that the k components carry.
+        The share of the field's variance, averaged over the volume, that the k components carry.
     """
 
     basis: Float[AnyArray, "cells modes"]
@@ -64,7 +64,7 @@ def stiffness_field(mesh: TetMesh, options: FieldConfig) -> StiffnessField:
             f"model.elasticity field needs a mesh of at most {DENSE_LIMIT:,} elements, this one has {count:,}; "
             "give a longer mesh.edge_length"
         )
-    covariance = _conditioned(scipy.linalg.inv(precision(mesh, options.correlation).toarray()), _tissue_means(mesh))
+    covariance = _condition(scipy.linalg.inv(precision(mesh, options.correlation).toarray()), _tissue_means(mesh))
     # The best k components in the mean square over the volume.
     root = np.sqrt(mesh.volumes)
     weighted = root[:, None] * covariance * root
@@ -110,7 +110,7 @@ def _tissue_means(mesh: TetMesh) -> Float[np.ndarray, "tissues cells"]:
     return np.array([row / row.sum() for row in rows])
 
 
-def _conditioned(
+def _condition(
     covariance: Float[np.ndarray, "cells cells"], C: Float[np.ndarray, "tissues cells"]
 ) -> Float[np.ndarray, "cells cells"]:
     """Covariance given C s = 0."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
@@ -29,7 +29,7 @@ class LeftOut(NamedTuple):
     residual : (k, 3) array
         q − p − u(p), mm, u the mean given the others; NaN where these do not determine it.
     covariance : (k, 3, 3) array
-        Of that residual, mm²: of u(p) given the others, and of the landmark's own error.
+        Covariance of that residual, mm²: that of u(p) given the others, and the landmark's own error.
     """
 
     residual: Float[np.ndarray, "k 3"]
@@ -53,7 +53,7 @@ def leave_out(posterior: Posterior, term: ComparedPoints, estimands: dict[str, A
         Where the posterior is linearised: its mean.
     """
     data = posterior.data
-    values = completed(data.blocks, estimands)
+    values = complete(data.blocks, estimands)
     curvature = np.asarray(posterior.mode_search.curvature(data, estimands).gauss_newton)
     own = curvature[-3 * len(posterior.sampled) :, -3 * len(posterior.sampled) :]
     predicted, response = (np.asarray(found) for found in _predicted_with_response(data, term, values))

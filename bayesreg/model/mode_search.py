@@ -12,7 +12,7 @@ from jaxtyping import Float
 from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import Values
 from bayesreg.model.continuation import continuation
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.curvature import Curvature, displacement_curvature
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
@@ -21,7 +21,7 @@ from bayesreg.types import AnyArray
 
 @dataclass(frozen=True, eq=False)
 class ModeSearch:
-    """What the search for a mode needs (`bayesreg.inference.target.ModeSearch`).
+    """The posterior as the search for a mode sees it (`bayesreg.inference.target.ModeSearch`).
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class ModeSearch:
     observations : mapping
         By name, as they were given.
     interpolation : {"linear", "cubic"}
-        Of the moving images.
+        Interpolation of the moving images.
     """
 
     data: Problem
@@ -49,7 +49,7 @@ class ModeSearch:
             First the k components of the field, then row k + 3 · node + axis, 1/mm². The elastic energy counts by its
             curvature in the displacements alone.
         """
-        values = completed(data.blocks, estimands)
+        values = complete(data.blocks, estimands)
         return displacement_curvature(data, values, _equilibrium(data, values))
 
 

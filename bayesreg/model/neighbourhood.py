@@ -28,7 +28,7 @@ AT_A_TIME = 2**22
 
 
 class Neighbourhoods(NamedTuple):
-    """What lies near k sampled nodes (a pytree).
+    """The surroundings of k sampled nodes (a pytree).
 
     Attributes
     ----------

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 
 from bayesreg.model.blocks import Values
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.program import Problem
 from bayesreg.model.state import physical_lame_by_cell
 from bayesreg.types import AnyArray, Scalar
@@ -26,8 +26,8 @@ class Normaliser:
     is_costly: bool
 
     def log(self, data: Problem, estimands: Values) -> Scalar:
-        """Its logarithm; zero in data from which it was left out."""
-        return _log_normaliser(data, completed(data.blocks, estimands))
+        """The logarithm of this factor; zero in data from which it was left out."""
+        return _log_normaliser(data, complete(data.blocks, estimands))
 
     def without(self, data: Problem) -> Problem:
         """The data of the same problem without it, and without its cost."""

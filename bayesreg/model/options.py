@@ -1,4 +1,4 @@
-"""What a registration model is made of, as a validated, immutable record."""
+"""The options of a registration model, as a validated, immutable record."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class ModelConfig(BaseModel):
         False: the paper's density, without the normaliser of the elastic prior in λ, μ. True: with it; then
         every free λ, μ needs a prior with a finite `high`, and `fixed: {}` lets all be free if T_r is known.
     interpolation : {"linear", "cubic"}
-        Of the moving image; cubic where gradients are used.
+        Interpolation of the images; cubic where gradients are used.
     quadrature : {"gauss4", "gauss32", "gauss256", "voxels"}
         Points of the integral in eq. (1): 4, 32 or 256 for each tetrahedron, or the fixed image's voxel
         centres inside the mesh.

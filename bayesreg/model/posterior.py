@@ -16,7 +16,7 @@ from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.mesh import TetMesh
 from bayesreg.model import coordinates, evaluation, program
 from bayesreg.model.blocks import LAME, Values
-from bayesreg.model.conditioning import at_four_points, conditioned
+from bayesreg.model.conditioning import compare_at_four_points, condition
 from bayesreg.model.coordinates import Coordinates
 from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.mode_search import ModeSearch
@@ -87,7 +87,7 @@ class Posterior:
 
     def evaluate(self, values: Values) -> Evaluation:
         """`logdensity_constrained` with the energies, the full displacement and the state of the solve."""
-        return evaluation.evaluate(self.data, self.filled(values))
+        return evaluation.evaluate(self.data, self.fill(values))
 
     def logdensity(self, position: Values) -> Scalar:
         """Log density of the unconstrained position, the Jacobian of `constrain` included."""
@@ -104,11 +104,11 @@ class Posterior:
             the observations by their names ("images"), "elastic", "rigid", "skull" where there are such terms,
             "prior_lam", "prior_mu" and so on of the blocks that are sampled, "support" and "solved".
         """
-        return evaluation.terms(self.data, self.filled(values))
+        return evaluation.terms(self.data, self.fill(values))
 
     def constrain(self, position: Values) -> dict[str, AnyArray]:
         """Values (known entries included) of an unconstrained position."""
-        return coordinates.completed(self.data.blocks, self.coordinates.constrain(self.data, position)[0])
+        return coordinates.complete(self.data.blocks, self.coordinates.constrain(self.data, position)[0])
 
     def unconstrain(self, values: Values) -> dict[str, AnyArray]:
         """Unconstrained position of values; the inverse of `constrain`."""
@@ -116,7 +116,7 @@ class Posterior:
 
     def estimands(self, values: Values) -> dict[str, AnyArray]:
         """The sampled entries of values."""
-        return coordinates.estimands_of(self.data.blocks, self.filled(values))
+        return coordinates.estimands_of(self.data.blocks, self.fill(values))
 
     def reference(self) -> dict[str, AnyArray]:
         """Values at rest: no displacement, λ, μ at their known or reference values, temperatures at their medians.
@@ -134,7 +134,7 @@ class Posterior:
             for (name, value), subkey in zip(sorted(position.items()), keys, strict=True)
         }
 
-    def filled(self, values: Values) -> dict[str, AnyArray]:
+    def fill(self, values: Values) -> dict[str, AnyArray]:
         """Values in which known temperatures that were left out are filled in.
 
         Raises
@@ -148,7 +148,7 @@ class Posterior:
                 raise InputError(f"values lack {name!r}; expected {', '.join(expected)}")
             if name in values and np.shape(values[name]) != shape:
                 raise InputError(f"values[{name!r}] must have shape {shape}, got {np.shape(values[name])}")
-        return coordinates.filled(blocks, values)
+        return coordinates.fill(blocks, values)
 
     @property
     def images(self) -> ComparedImages:
@@ -179,20 +179,20 @@ class Posterior:
 
         With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
         """
-        return evaluation.evaluate(data, coordinates.completed(data.blocks, estimands), guess)
+        return evaluation.evaluate(data, coordinates.complete(data.blocks, estimands), guess)
 
     def supports(self, data: Problem, estimands: Values) -> Bool[AnyArray, ""]:
         """Whether estimands lie where the density may be positive; costs no elastic solve."""
-        return program.allowed(data, coordinates.completed(data.blocks, estimands))
+        return program.is_allowed(data, coordinates.complete(data.blocks, estimands))
 
-    def conditioned(self, estimands: Values, alone: Any = (), quick: bool = False) -> Problem:
+    def condition(self, estimands: Values, alone: Any = (), quick: bool = False) -> Problem:
         """The data for chains near these estimands, see `bayesreg.model.conditioning`.
 
         With `quick` the images are compared at four points of each tetrahedron, whatever the model's quadrature.
         """
         observations, interpolation = self.observations, self.options.interpolation
-        data = at_four_points(self.data, observations, interpolation) if quick else self.data
-        return conditioned(data, estimands, np.asarray(alone, int))
+        data = compare_at_four_points(self.data, observations, interpolation) if quick else self.data
+        return condition(data, estimands, np.asarray(alone, int))
 
     @cached_property
     def coordinates(self) -> Coordinates:
@@ -227,5 +227,5 @@ class Posterior:
 
     @property
     def mode_search(self) -> ModeSearch:
-        """What the search for a mode needs."""
+        """The posterior as the search for a mode sees it."""
         return ModeSearch(self.data, self.observations, self.options.interpolation)

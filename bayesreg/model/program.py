@@ -28,7 +28,7 @@ class Problem(NamedTuple):
     terms : dict
         The factors of the density by name.
     neighbourhoods : Neighbourhoods or None
-        Of some nodes that are moved alone, see `bayesreg.model.single_node`.
+        Surroundings of some nodes that are moved alone, see `bayesreg.model.single_node`.
     """
 
     body: Body
@@ -63,7 +63,7 @@ def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = No
             numpyro.sample(name, term.likelihood(state), obs=term.observed())
         else:
             numpyro.factor(name, term.log(state))
-    inside = allowed(problem, values)
+    inside = is_allowed(problem, values)
     numpyro.factor("support", jnp.where(inside, 0.0, -jnp.inf))
     numpyro.factor("solved", jnp.where(state.equilibrium.converged, 0.0, -jnp.inf))
 
@@ -74,9 +74,9 @@ def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = No
     numpyro.deterministic("outside_support", ~inside)
 
 
-def allowed(problem: Problem, values: Values) -> Bool[AnyArray, ""]:
+def is_allowed(problem: Problem, values: Values) -> Bool[AnyArray, ""]:
     """Whether the density may be positive: parameters physical and in range, every term that knows it; no solve."""
-    found = problem.body.is_physical(values) & coordinates.allowed(problem.blocks, values)
+    found = problem.body.is_physical(values) & coordinates.is_in_range(problem.blocks, values)
     for term in problem.terms.values():
         if isinstance(term, Support):
             found &= term.allows(values)

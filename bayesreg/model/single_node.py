@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from bayesreg.model.blocks import Values
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.program import Problem
 from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.terms.skull import is_allowed
@@ -26,7 +26,7 @@ class SingleNodes:
         self, data: Problem, estimands: Values, which: Int[AnyArray, ""]
     ) -> Callable[[Float[AnyArray, "3"]], Scalar]:
         """See `local_logdensity`."""
-        return local_logdensity(data, completed(data.blocks, estimands), which)
+        return local_logdensity(data, complete(data.blocks, estimands), which)
 
     def equilibrium(self, data: Problem, estimands: Values, which: Int[AnyArray, ""]) -> Float[AnyArray, "3"]:
         """See `local_equilibrium`."""
@@ -46,7 +46,7 @@ def local_logdensity(
         Where the other nodes are. Those that have neighbourhoods count as if they were in the middle of theirs, so that
         the sum over these is one function of them all.
     which : scalar integer
-        Of the neighbourhoods.
+        The number of one of the neighbourhoods.
     """
     near, body = problem.neighbourhoods, problem.body
     assert near is not None

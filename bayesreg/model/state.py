@@ -39,7 +39,7 @@ class StaticMesh:
 
 
 class Body(NamedTuple):
-    """What turns values into a state (a pytree).
+    """The elastic body, which turns values into a state (a pytree).
 
     Attributes
     ----------
@@ -95,12 +95,12 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What every term of the posterior sees; made anew in every evaluation.
+    """The state that every term of the posterior sees; each evaluation makes a new one.
 
     Attributes
     ----------
     values : mapping
-        Of every block by its name, known ones included: "u_boundary" (b, 3) in mm, "lam", "mu", "t_similarity", …
+        Values of every block by its name, known ones included: "u_boundary" (b, 3) in mm, "lam", "mu", …
     lam, mu : (m,) arrays
         Lamé parameters by cell.
     equilibrium : Equilibrium
@@ -141,7 +141,7 @@ class State:
             If a point lies outside the mesh.
         """
         points = np.asarray(points, float)
-        nodes, weights = _located(StaticMesh(self.mesh), points.tobytes(), len(points))
+        nodes, weights = _locate(StaticMesh(self.mesh), points.tobytes(), len(points))
         return jnp.einsum("ka,kai->ki", weights, self.u[nodes])
 
 
@@ -169,5 +169,5 @@ def physical_lame_by_cell(
 
 
 @lru_cache(maxsize=64)
-def _located(mesh: StaticMesh, points: bytes, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _locate(mesh: StaticMesh, points: bytes, count: int) -> tuple[np.ndarray, np.ndarray]:
     return interpolation_at(mesh.mesh, np.frombuffer(points).reshape(count, 3))

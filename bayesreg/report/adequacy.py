@@ -42,7 +42,7 @@ def check_table(predicted: Predicted) -> Table | None:
         observed, replicated = fit.observed[..., k], fit.replicated[..., k]
         p = predictive_p(observed, replicated)
         title = NAMES.get(str(name), str(name))
-        rows.append([title, _interval(observed), _interval(replicated), _p_text(p, observed.size), _said(p)])
+        rows.append([title, _interval(observed), _interval(replicated), _p_text(p, observed.size), _judge(p)])
     caption = (
         f"Residuals in units of the noise sd that T_s implies, over {_count(fit):,} draws: those of "
         "the images, and those of noise that follows the model (median and 90 % interval). p is how often the noise of "
@@ -68,7 +68,7 @@ def _interval(draws: np.ndarray) -> str:
     return f"{number(float(median))} ({number(float(low))} to {number(float(high))})"
 
 
-def _said(p: float) -> str:
+def _judge(p: float) -> str:
     return "too much" if p < EXTREME[0] else "too little" if p > EXTREME[1] else "as the model has it"
 
 

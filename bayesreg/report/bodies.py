@@ -17,7 +17,7 @@ from bayesreg.report.identifiability import RATIO_LEVELS
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import number
-from bayesreg.synthetic.recalibration import RANGE, Response, least_bodies, recalibrated, response
+from bayesreg.synthetic.recalibration import RANGE, Response, least_bodies, recalibrate, response
 from bayesreg.tissues import label_of
 
 
@@ -29,10 +29,10 @@ class Allowed(NamedTuple):
     names : list of str
         Solid tissues.
     true, found : (k, t) arrays
-        Of the simulated bodies whose search has not failed.
+        λ/μ of the simulated bodies whose search has not failed.
     response : Response
     draws : (n, t) array
-        Of the run's posterior.
+        Draws of the run's posterior.
     allowed : (m, t) array
         Draws of the body's own λ/μ.
     failed : int
@@ -49,7 +49,7 @@ class Allowed(NamedTuple):
 
 
 def sound(bodies: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Those whose registration counts."""
+    """The bodies whose registration counts."""
     return [body for body in bodies if not body["failed"]]
 
 
@@ -74,7 +74,7 @@ def allowing(mesh: TetMesh, posterior: xr.Dataset, bodies: Sequence[Mapping[str,
     draws = np.column_stack([groups[name] for name in names])
     draws = draws[np.isfinite(draws).all(axis=1) & (draws > 0).all(axis=1)]
     known = response(true, found)
-    return Allowed(names, true, found, known, draws, recalibrated(known, draws), len(bodies) - len(counted))
+    return Allowed(names, true, found, known, draws, recalibrate(known, draws), len(bodies) - len(counted))
 
 
 def mesh_table(it: Allowed) -> Table:

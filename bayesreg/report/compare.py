@@ -46,17 +46,17 @@ class Study(NamedTuple):
 
     @property
     def posterior(self) -> xr.Dataset:
-        """Its draws."""
+        """The draws of the run."""
         return dataset(self.idata, "posterior")
 
     @property
     def diagnosed(self) -> Diagnosed:
-        """Its convergence figures."""
+        """The convergence figures of the run."""
         return Diagnosed(self.rhat, self.ess_bulk, self.ess_tail)
 
     @property
     def entries(self) -> list[Estimand]:
-        """Its estimands."""
+        """The estimands of the run."""
         return estimands(self.run.mesh, self.diagnosed, self.posterior)
 
 
@@ -116,7 +116,7 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 
 def _notes(named: dict[str, Study]) -> list[str]:
-    """What makes the comparison unfair."""
+    """Sentences about what makes the comparison unfair."""
     runs = [study.run for study in named.values()]
     found = []
     if not all(_same(runs[0].fixed, run.fixed) and _same(runs[0].moving, run.moving) for run in runs):

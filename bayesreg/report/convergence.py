@@ -38,7 +38,7 @@ class Trace(NamedTuple):
 
 def traces(posterior: xr.Dataset, sample_stats: xr.Dataset, entries: Sequence[Estimand]) -> Drawing:
     """Trace and rank plots of every free parameter, the worst displacements, and the energies."""
-    shown = _chosen(posterior, sample_stats, entries)
+    shown = _choose(posterior, sample_stats, entries)
     rows = -(-len(shown) // 2)
     with style.look():
         figure, axes = _pairs(rows)
@@ -75,7 +75,7 @@ def _pairs(rows: int) -> tuple[Figure, np.ndarray]:
     return figure, axes.reshape(-1, 2)
 
 
-def _chosen(posterior: xr.Dataset, sample_stats: xr.Dataset, entries: Sequence[Estimand]) -> list[Trace]:
+def _choose(posterior: xr.Dataset, sample_stats: xr.Dataset, entries: Sequence[Estimand]) -> list[Trace]:
     parameters = [entry for entry in entries if entry.variable != DISPLACEMENT]
     displacements = [entry for entry in entries if entry.variable == DISPLACEMENT]
     if len(parameters) > MOST_PARAMETERS:

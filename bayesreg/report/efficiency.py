@@ -29,12 +29,12 @@ BARS = ("#2b5c8a", "#9bb8d3")
 
 
 class Setting(NamedTuple):
-    """What all samplers had in common.
+    """The conditions that all samplers had in common.
 
     Attributes
     ----------
     name : str
-        Of the posterior.
+        The name of the posterior.
     chains : int
     minutes : float
         Budget of each.
@@ -72,8 +72,8 @@ def write_efficiencies(found: Sequence[Efficiency], setting: Setting, folder: st
 
 def efficiency_table(found: Sequence[Efficiency], setting: Setting) -> Table:
     """A row for each sampler, exact ones first, the most effective draws per second first."""
-    exact = [_row(one) for one in _ranked(found) if one.exact is not False]
-    approximate = [_row(one) for one in _ranked(found) if one.exact is False]
+    exact = [_row(one) for one in _rank(found) if one.exact is not False]
+    approximate = [_row(one) for one in _rank(found) if one.exact is False]
     caption = (
         f"One posterior, {setting.chains} chains and {setting.minutes:g} minutes for each sampler, which stops earlier "
         f"where its rule is met ({setting.rule}). ESS and R̂ are the worst of all estimands, ESS per second and per "
@@ -86,7 +86,7 @@ def efficiency_table(found: Sequence[Efficiency], setting: Setting) -> Table:
 
 
 def terminal_table(table: Table) -> TerminalTable:
-    """What matters most of the same table, for a terminal."""
+    """The most important columns of the table, for a terminal."""
     columns = [HEADER.index(name) for name in IN_TERMINAL]
     groups = []
     for title, rows in table.groups:
@@ -95,7 +95,7 @@ def terminal_table(table: Table) -> TerminalTable:
     return in_terminal(Table(table.title, table.caption, [table.header[0], *IN_TERMINAL], groups))
 
 
-def _ranked(found: Sequence[Efficiency]) -> list[Efficiency]:
+def _rank(found: Sequence[Efficiency]) -> list[Efficiency]:
     return sorted(found, key=lambda one: -(one.ess_per_second or one.ess_per_second_in_all or 0.0))
 
 
@@ -113,7 +113,7 @@ def _row(one: Efficiency) -> list[str]:
 
 def bars(found: Sequence[Efficiency]) -> Drawing:
     """ESS per second, draws alone and all in, and ESS per evaluation, on logarithmic axes."""
-    ranked = _ranked(found)[::-1]
+    ranked = _rank(found)[::-1]
     with style.look():
         figure = style.new_figure(0.9 + 0.36 * len(ranked))
         left, right = figure.subplots(1, 2, sharey=True)

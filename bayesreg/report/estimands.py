@@ -168,7 +168,7 @@ def sampled_scales(posterior: xr.Dataset) -> list[str]:
 
 
 def symbol_of(name: str) -> str:
-    """What a variable is called in a report; the sd of an observation has its name."""
+    """The symbol of a variable in a report; the sd of an observation has its name."""
     return SYMBOLS.get(name) or name.removesuffix("_sd") + " sd, mm"
 
 

@@ -117,7 +117,7 @@ def write_report(
         "subtitle": _subtitle(run, posterior),
         "sections": [(key, name) for key, name in SECTIONS if key not in left_out],
         "approximation": approximation(run.manifest),
-        "verdict": _judged(run.manifest, entries, groups),
+        "verdict": _judge(run.manifest, entries, groups),
         "facts": key_facts(run.manifest, entries, posterior),
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
@@ -140,7 +140,7 @@ def write_report(
     write_text(path, render("template.html", content))
 
 
-def _judged(manifest: Mapping[str, Any], entries: Sequence[Estimand], groups: Grouping) -> Verdict:
+def _judge(manifest: Mapping[str, Any], entries: Sequence[Estimand], groups: Grouping) -> Verdict:
     """The verdict, with a word on chains that lie apart."""
     judged = verdict(manifest, entries)
     if groups.groups == 1:
@@ -154,12 +154,12 @@ def render(template: str, content: Mapping[str, Any]) -> str:
     environment = Environment(
         loader=PackageLoader("bayesreg", "report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    environment.filters["indexed"] = _indexed
+    environment.filters["indexed"] = _index
     style = Markup(files("bayesreg.report").joinpath("style.css").read_text(encoding="utf-8"))
     return environment.get_template(template).render(version=__version__, style=style, **content)
 
 
-def _indexed(text: str) -> Markup:
+def _index(text: str) -> Markup:
     """Escaped text in which u_x, T_s and the like get a subscript."""
     return Markup(re.sub(r"\b([uTE])_([xyzrs])\b", r"\1<sub>\2</sub>", str(escape(text))))
 
@@ -205,7 +205,7 @@ def _subtitle(run: Run, posterior: xr.Dataset) -> str:
 
 
 def provenance(manifest: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """What made this run, in named lists of key and value."""
+    """The provenance of a run, in named lists of key and value."""
     listed = []
     for key, title in PROVENANCE.items():
         flat = _flat(manifest.get(key) or {})

@@ -1,4 +1,4 @@
-"""What the data say of each parameter: prior against posterior width, ratios by quantiles, a sentence by tissue."""
+"""The data's word on each parameter: prior against posterior width, ratios by quantiles, a sentence by tissue."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class Interval(NamedTuple):
 
 
 def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
-    """What a posterior says of a parameter with a prior on [0, ∞) or part of it.
+    """Put in words how a posterior bounds a parameter with a prior on [0, ∞) or part of it.
 
     Parameters
     ----------
     draws : array
-        Of any shape.
+        Draws of any shape.
     prior : Interval, optional
         Central 95 % interval of its prior; None where it is improper.
 
@@ -66,7 +66,7 @@ def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
 
 
 def ratio_reading(draws: np.ndarray) -> str:
-    """What a posterior says of a ratio of parameters; what is not finite is left out.
+    """Put in words how a posterior bounds a ratio of parameters; draws that are not finite are left out.
 
     As `reading`, but alike for the ratio and its reciprocal: "only a lower bound" may be said too, and a tail of more
     than a factor of five on the side of the bound is none.

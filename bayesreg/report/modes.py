@@ -60,10 +60,10 @@ def grouping(posterior: xr.Dataset) -> Grouping:
         [[_distance(_separation(means, variances, i, j)) for j in range(len(means))] for i in range(len(means))]
     )
     _, label = connected_components(apart < APART, directed=False)
-    return Grouping(_renumbered(label), np.array([_drifts(chain) for chain in values]))
+    return Grouping(_renumber(label), np.array([_drifts(chain) for chain in values]))
 
 
-def _renumbered(label: np.ndarray) -> np.ndarray:
+def _renumber(label: np.ndarray) -> np.ndarray:
     _, first = np.unique(label, return_index=True)
     return np.argsort(np.argsort(first))[label]
 
@@ -108,7 +108,7 @@ def _drifts(chain: Float[np.ndarray, "draws estimands"]) -> bool:
 
 
 def explanation(found: Grouping) -> str:
-    """What the groups are, and what they may mean."""
+    """A paragraph that says which groups there are, and what they may mean."""
     listed = "; ".join(f"group {k + 1}: {_chain_list(found.chains(k))}" for k in range(found.groups))
     text = (
         f"The chains lie in {found.groups} groups ({listed}): chain means of different groups are {APART:g} or more "

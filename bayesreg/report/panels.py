@@ -53,7 +53,7 @@ class View:
         return cls(run, planes, main_plane(run.mesh, planes, u))
 
     def on(self, run: Run) -> View:
-        """The same planes, on another run."""
+        """A view of another run on these planes."""
         return View(run, self.planes, self.main)
 
     def slice(self, plane: Plane) -> MeshSlice:

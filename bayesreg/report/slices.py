@@ -82,24 +82,24 @@ class MeshSlice:
     plane: Plane
 
     @cached_property
-    def _located(self) -> tuple[np.ndarray, np.ndarray]:
+    def _location(self) -> tuple[np.ndarray, np.ndarray]:
         cell, barycentric = locate(self.mesh.points, self.mesh.cells, self.plane.points().reshape(-1, 3))
         return np.asarray(cell), np.asarray(barycentric)
 
     @cached_property
     def inside(self) -> Bool[np.ndarray, "rows columns"]:
         """Pixels inside the mesh."""
-        return (self._located[0] >= 0).reshape(self.plane.points().shape[:2])
+        return (self._location[0] >= 0).reshape(self.plane.points().shape[:2])
 
     def nodal(self, values: Float[AnyArray, "nodes components"]) -> Float[np.ndarray, "rows columns components"]:
         """A piecewise linear field; NaN outside the mesh."""
-        cell, barycentric = self._located
+        cell, barycentric = self._location
         corner = np.asarray(values)[self.mesh.cells[cell]]
         return self._picture(np.einsum("ki,kic->kc", barycentric, corner))
 
     def cellwise(self, values: Real[AnyArray, "cells"]) -> Float[np.ndarray, "rows columns"]:
         """A field that is constant in every tetrahedron; NaN outside the mesh."""
-        return self._picture(np.asarray(values, float)[self._located[0], None])[..., 0]
+        return self._picture(np.asarray(values, float)[self._location[0], None])[..., 0]
 
     def _picture(self, values: np.ndarray) -> np.ndarray:
         values = values.reshape(*self.inside.shape, -1)
@@ -192,7 +192,7 @@ def planes_through(mesh: TetMesh, point: Float[np.ndarray, "3"]) -> tuple[Plane,
 
 
 def main_plane(mesh: TetMesh, planes: Sequence[Plane], u: Float[AnyArray, "nodes 3"]) -> Plane:
-    """Of the given planes, the one that sees most of a displacement (the integral of |u|² over its section)."""
+    """The plane that sees most of a displacement (the integral of |u|² over its section)."""
 
     def seen(plane: Plane) -> float:
         section = cut(mesh, plane.axis, plane.position)

@@ -47,7 +47,7 @@ class Table(NamedTuple):
 
 
 def in_terminal(table: Table) -> TerminalTable:
-    """The same table for a terminal, without its caption."""
+    """A table for a terminal, without its caption."""
     shown = TerminalTable(title=table.title)
     for index, name in enumerate(table.header):
         shown.add_column(name, justify="right" if index else "left")

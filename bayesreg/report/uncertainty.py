@@ -179,7 +179,7 @@ def maps(view: View, predicted: Predicted) -> Drawing:
 
 
 def _numbers(predicted: Predicted) -> str:
-    """The same in a sentence."""
+    """The content of the maps in a sentence."""
     share = float((np.asarray(predicted.far) > 1 - LEVEL).mean())
     median, worst = (number(float(x)) for x in (np.median(predicted.reach), np.max(predicted.reach)))
     return (

@@ -110,8 +110,8 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
     named = f"{rhat_text(first.rhat)} ({first.name}{_at(first)})"
     if not failing and part(manifest, "stopped", "converged") is False:
         headline = (
-            f"Not converged by the rule of this run: {_missed(manifest, threshold)}, though the rank-normalised R̂ is "
-            f"below {threshold:g}; the greatest is {named}."
+            f"Not converged by the rule of this run: {_missed_rules(manifest, threshold)}, though the rank-normalised "
+            f"R̂ is below {threshold:g}; the greatest is {named}."
         )
         return Verdict(False, headline, stopped + UNCONVERGED)
     if not failing:
@@ -124,8 +124,8 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
     return Verdict(False, headline, stopped + UNCONVERGED)
 
 
-def _missed(manifest: Mapping[str, Any], threshold: float) -> str:
-    """What the stop rule asked for besides the rank-normalised R-hat, and what was found."""
+def _missed_rules(manifest: Mapping[str, Any], threshold: float) -> str:
+    """The figures that the stop rule asked for besides the rank-normalised R-hat, and those found."""
     wanted = part(manifest, "stopped", "ess_threshold")
     if wanted is None:
         return f"its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, asked for {threshold:g}"
@@ -171,7 +171,7 @@ def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterio
     greatest = worst(entries, 1)
     implied, sampling = part(manifest, "implied_noise_sd"), part(manifest, "timings", "sampling")
     return [
-        Fact("Greatest R̂", rhat_text(greatest[0].rhat) if greatest else NONE, _asked(manifest)),
+        Fact("Greatest R̂", rhat_text(greatest[0].rhat) if greatest else NONE, _threshold_text(manifest)),
         Fact(
             "Least ESS",
             f"{number(_least(entries, 'ess_bulk'), 2)} bulk",
@@ -195,7 +195,7 @@ def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterio
     ]
 
 
-def _asked(manifest: Mapping[str, Any]) -> str:
+def _threshold_text(manifest: Mapping[str, Any]) -> str:
     threshold = part(manifest, "stopped", "rhat_threshold")
     asked = f"asked for {threshold:g}" if threshold else "none asked for"
     unsplit = _unsplit(manifest)
@@ -207,7 +207,7 @@ def _count(value: float | int | None) -> str:
 
 
 def approximation(manifest: Mapping[str, Any]) -> str:
-    """What a reader of an approximate run must know first; empty where the sampler is exact."""
+    """A warning to the reader of an approximate run; empty where the sampler is exact."""
     if part(manifest, "exact") is not False:
         return ""
     sampler = part(manifest, "sampler", "name")
@@ -220,12 +220,12 @@ def approximation(manifest: Mapping[str, Any]) -> str:
 
 
 def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
-    """What to beware of, beyond convergence.
+    """Collect warnings beyond convergence.
 
     Parameters
     ----------
     manifest : mapping
-        Of which `solver`, `inverted_elements`, `residual_sd`, `implied_noise_sd` and `model` are looked at.
+        Its entries `solver`, `inverted_elements`, `residual_sd`, `implied_noise_sd` and `model` are read.
     mesh : TetMesh
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.

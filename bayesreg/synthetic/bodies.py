@@ -31,7 +31,7 @@ PATCH_SHARE = 0.045
 
 
 class Subject(NamedTuple):
-    """What the bodies of a mesh share.
+    """The part of a problem that all bodies of a mesh share.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Subject(NamedTuple):
     making, registering : TetMesh
         A finer mesh, and the one in question.
     model : ModelConfig
-        Of the registration.
+        Options of the registration.
     lam, mu : mapping
         Tissue name to the value of a fluid, or to one about which those of a solid tissue lie.
     displacement, noise_sd, smoothing_mm : float
@@ -79,7 +79,7 @@ class Body(NamedTuple):
     failed: str = ""
 
 
-def sought(model: ModelConfig, names: tuple[str, ...]) -> list[str]:
+def sought_tissues(model: ModelConfig, names: tuple[str, ...]) -> list[str]:
     """Solid tissues of which λ or μ is free."""
     known = [model.known(names).get(parameter) for parameter in ("lam", "mu")]
     return [name for name in names if not is_fluid(name) and not all(of_tissue(model, given, name) for given in known)]
@@ -100,10 +100,10 @@ def register_body(subject: Subject, seed: int) -> Body:
         if not is_fluid(name):
             mu[name] = mu_known or (lam_known / ratio if lam_known else mu[name] * factor)
             lam[name] = lam_known or ratio * mu[name]
-    tissues = sought(model, names)
+    tissues = sought_tissues(model, names)
     true = {name: lam[name] / mu[name] for name in tissues}
     try:
-        pair = _pushed(subject, rng, *(np.array([values[name] for name in names]) for values in (lam, mu)))
+        pair = _push(subject, rng, *(np.array([values[name] for name in names]) for values in (lam, mu)))
         values, inverted = _mode(build_posterior(pair.fixed, pair.moving, subject.registering, model))
     except InputError as error:
         return Body(seed, true, {}, str(error))
@@ -116,7 +116,7 @@ def register_body(subject: Subject, seed: int) -> Body:
     return Body(seed, true, found)
 
 
-def _pushed(
+def _push(
     subject: Subject,
     rng: np.random.Generator,
     lam: Float[np.ndarray, "tissues"],

@@ -89,7 +89,7 @@ def push_patch(
     lam, mu : (T,), (m,) or (1,) array
         Lamé parameters, mu positive.
     displacement : float, default 15.0
-        Of each node of the patch, mm.
+        The displacement of each node of the patch, mm.
     patch_nodes : int, default 20
         The boundary node farthest out along `direction`, and those nearest to it over the surface.
     direction : (x, y, z), optional
@@ -114,14 +114,14 @@ def push_patch(
     stiff = stiffness(mesh, lam, mu)
     for chosen in DIRECTIONS if direction is None else (direction,):
         patch = surface_patch(mesh, patch_nodes, np.asarray(chosen, float))
-        found = _pushed(mesh, stiff, obstacle, patch, displacement, margin)
+        found = _push(mesh, stiff, obstacle, patch, displacement, margin)
         if found.volume_ratio.min() > 0:
             return found
         _log.info("a push along %s inverts %d tetrahedra", chosen, (found.volume_ratio <= 0).sum())
     raise InputError(_inversion(mesh, found.volume_ratio, displacement))
 
 
-def _pushed(
+def _push(
     mesh: TetMesh,
     stiff: scipy.sparse.csr_matrix,
     obstacle: SmoothObstacle,

@@ -34,7 +34,7 @@ class SyntheticPair(NamedTuple):
         Standard deviation of f(x) − m(x + u(x)) at the four-point quadrature points, linear interpolation:
         noise and interpolation together.
     interpolation_sd : float
-        The same without the noise.
+        `residual_sd` without the noise.
     smoothing_mm, noise_sd : float
         As given.
     """
@@ -95,7 +95,7 @@ def make_pair(
     noise_sd : float, default 0.003
         Standard deviation of the independent Normal noise on each image.
     seed : int, default 0
-        Of the noise.
+        The seed of the noise.
 
     Raises
     ------

@@ -41,7 +41,7 @@ class Response(NamedTuple):
     scatter : (t, t) array
         Covariance of the logarithm between bodies, the average uncertainty of the curve included.
     degrees_of_freedom : int
-        Of Student's distribution of a further body's scatter.
+        Those of Student's distribution of a further body's scatter.
     """
 
     offset: Float[np.ndarray, "tissues"]
@@ -97,7 +97,7 @@ def _curve(
     return least_squares(lambda curve: np.log(design @ curve) - wanted, first, bounds=(least, np.inf)).x
 
 
-def recalibrated(
+def recalibrate(
     known: Response, found: Float[np.ndarray, "draws tissues"], seed: int = 0
 ) -> Float[np.ndarray, "candidates tissues"]:
     """Draws of the body's own λ/μ, given draws of what the registration found.

@@ -31,13 +31,13 @@ def posterior_of(config: Config, inputs: Inputs, observations: Sequence[Any] = (
     """
     reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
     model = _model(config.model, inputs)
-    observed = [*_configured(config, inputs), *observations]
+    observed = [*_observations(config, inputs), *observations]
     return build_posterior(
         mesh=inputs.mesh, observations=observed, model=model, skull=inputs.skull, reference=reference
     )
 
 
-def _configured(config: Config, inputs: Inputs) -> list[Any]:
+def _observations(config: Config, inputs: Inputs) -> list[Any]:
     """The observations of a configuration, in its order."""
     found: list[Any] = []
     if config.compares_images:

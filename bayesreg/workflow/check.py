@@ -48,7 +48,7 @@ def check(config: str | Path | Config) -> Check:
 
 @dataclass(frozen=True)
 class Check:
-    """What a configuration would cost; `text` says it."""
+    """The cost of a configuration; `text` puts it in words."""
 
     nodes: int
     cells: int

@@ -1,4 +1,4 @@
-"""What run.json says of a run."""
+"""The content of run.json."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.inference.target import clearance
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import signed_volumes
-from bayesreg.model.coordinates import filled
+from bayesreg.model.coordinates import fill
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
 
@@ -85,7 +85,7 @@ def manifest(
         "exact": samples.exact,
         "stopped": {
             "reason": samples.reason,
-            "converged": _converged(samples, config.stop, judged),
+            "converged": _has_converged(samples, config.stop, judged),
             "rhat_threshold": config.stop.rhat,
             "ess_threshold": config.stop.ess,
         },
@@ -133,10 +133,10 @@ def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float | None:
     if images is None:
         return None
     mean = {name: draws[name].mean().to_numpy() for name in ("t_similarity",) if name in draws}
-    return images.noise_sd(float(filled(posterior.data.blocks, mean)["t_similarity"]))
+    return images.noise_sd(float(fill(posterior.data.blocks, mean)["t_similarity"]))
 
 
-def _converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:
+def _has_converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:
     """The stop rule and the figures of the report, rank-normalised and split, must both agree."""
     if stop.rhat is None:
         return None

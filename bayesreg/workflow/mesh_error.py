@@ -1,4 +1,4 @@
-"""What the mesh of a run does to its λ/μ, by simulated bodies."""
+"""The error that the mesh of a run makes in its λ/μ, by simulated bodies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bayesreg.io.meshing import MeshOptions, build_mesh, load_mesh, save_mesh
 from bayesreg.mesh import TetMesh
 from bayesreg.report.bodies import allowing, enough, mesh_table, sound
 from bayesreg.report.tables import Table
-from bayesreg.synthetic.bodies import Subject, register_body, sought
+from bayesreg.synthetic.bodies import Subject, register_body, sought_tissues
 from bayesreg.synthetic.recalibration import least_bodies
 from bayesreg.types import InputError
 from bayesreg.workflow.result import Result, load_result, report
@@ -32,7 +32,7 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
     Parameters
     ----------
     folder : path
-        Of a finished run with elasticity by tissue, a boundary that is sampled, and an intracranial mask.
+        Folder of a finished run with elasticity by tissue, a boundary that is sampled, and an intracranial mask.
     bodies : int
         How many to simulate in all.
     progress : bool
@@ -50,7 +50,7 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
     """
     result = load_result(folder)
     _require_ratios(result)
-    least = least_bodies(len(sought(model_of(result.run.config), result.mesh.names)))
+    least = least_bodies(len(sought_tissues(model_of(result.run.config), result.mesh.names)))
     if bodies < least:
         raise InputError(f"bodies must be at least {least}, got {bodies}")
     found = list(result.run.bodies or [])
@@ -68,7 +68,7 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
 def _require_ratios(result: Result) -> None:
     """Raise InputError where a run has no λ/μ by tissue that could be the mesh's, or no body can be pushed."""
     run, model = result.run, model_of(result.run.config)
-    if model.elasticity != "tissue" or not sought(model, run.mesh.names):
+    if model.elasticity != "tissue" or not sought_tissues(model, run.mesh.names):
         raise InputError(
             "the mesh's share is that of λ/μ by tissue: the run needs elasticity: tissue, and a solid tissue of "
             "which λ or μ is free"

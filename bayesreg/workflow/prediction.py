@@ -1,4 +1,4 @@
-"""What only the posterior can tell after sampling, computed once and stored with the run: the report reads it back."""
+"""Predictions that need the posterior itself, computed once after sampling and stored for the report."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from bayesreg.fem.location import interpolation_at
-from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thinned
+from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thin
 from bayesreg.inference.gaussian.about_reference import MOST_UNKNOWNS
 from bayesreg.inference.layout import dimension
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
-from bayesreg.model.coordinates import filled
+from bayesreg.model.coordinates import fill
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
@@ -59,7 +59,7 @@ def predict(
     places : mapping
         Name to place (world mm, in the fixed image); where it is empty some are chosen.
     seed : int
-        Of the replicated noise.
+        The seed of the replicated noise.
 
     Raises
     ------
@@ -81,14 +81,14 @@ def predict(
                  "places": jnp.einsum("la,lai->li", weights, u[nodes]),
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         if with_images:
-            values, cells = here.filled(draw), here.images.quadrature.cells
+            values, cells = here.fill(draw), here.images.quadrature.cells
             z = standardised_residual(here.images, u, values["t_similarity"])
             noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
             for name, x in (("observed", z), ("replicated", noise)):
                 found[name] = discrepancies(x, cells, neighbours, len(mesh.cells))
         return found
 
-    some = thinned(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
+    some = thin(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
     kept = ("places", "observed", "replicated") if with_images else ("places",)
@@ -129,7 +129,7 @@ def _landmarks(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> dict[st
         return {}
     mean = {name: jnp.asarray(values.mean(axis=(0, 1))) for name, values in draws.items() if name != "number"}
     estimands = posterior.estimands(mean)
-    state = state_of(posterior.data.body, posterior.data.blocks, posterior.filled(mean))
+    state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(mean))
     terms = [posterior.data.terms[name] for name in given]
     labels = [f"{name} {label}" if len(given) > 1 else label for name, one in given.items() for label in one.labels]
     found = {
@@ -166,7 +166,7 @@ def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]
 
 def _median_t_similarity(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> float:
     median = {name: np.asarray(np.median(draws[name])) for name in ("t_similarity",) if name in draws}
-    return float(filled(posterior.data.blocks, median)["t_similarity"])
+    return float(fill(posterior.data.blocks, median)["t_similarity"])
 
 
 def require_inside(mesh: TetMesh, places: Places) -> None:

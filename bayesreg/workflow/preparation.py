@@ -81,7 +81,7 @@ def prepare(config: Config) -> Prepared:
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     if isinstance(config.data, FilesData):
-        images = _scaled(config.data, domain, anatomy.image, moving)
+        images = _scale(config.data, domain, anatomy.image, moving)
         boundary = _known_boundary(config, mesh, None)
         inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary, points=points)
         return Prepared(inputs, clock.laps, {})
@@ -94,7 +94,7 @@ def prepare(config: Config) -> Prepared:
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
     boundary = _known_boundary(config, mesh, truth)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
-    return Prepared(inputs, clock.laps, _described(config, pair))
+    return Prepared(inputs, clock.laps, _describe(config, pair))
 
 
 def _points(config: Config) -> dict[str, PointPairs]:
@@ -106,7 +106,7 @@ def _points(config: Config) -> dict[str, PointPairs]:
     }
 
 
-def _scaled(
+def _scale(
     data: FilesData, domain: Image, fixed: Image | None, moving: Image | None
 ) -> tuple[Image | None, Image | None]:
     """Both images on one scale of intensities, or each on its own."""
@@ -185,7 +185,7 @@ def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
 
 def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
     if settings.file is not None and edge_length is None:
-        return _loaded_mesh(settings.file, anatomy.names)
+        return _load_mesh(settings.file, anatomy.names)
     options = MeshOptions(
         edge_length=edge_length or settings.edge_length,
         envelope=None if edge_length else settings.envelope,
@@ -194,7 +194,7 @@ def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: fl
     return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain, anatomy.names)
 
 
-def _loaded_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
+def _load_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
     """A mesh from a file; InputError where its tissues are not those of the labels."""
     mesh = load_mesh(path, names)
     if mesh.names != names:
@@ -242,7 +242,7 @@ def _pair(
     )
 
 
-def _described(config: Config, pair: SyntheticPair) -> dict[str, object]:
+def _describe(config: Config, pair: SyntheticPair) -> dict[str, object]:
     assert config.simulate is not None
     same = "the mesh of the registration (the inverse crime)"
     return {

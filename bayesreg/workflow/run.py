@@ -108,7 +108,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
     if not (out / "run.json").exists():
         begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
         posterior = posterior_of(begun, inputs, observations)
-        _sample(begun, posterior, _reached(begun, inputs, posterior, out, progress=False), out, progress=False)
+        _sample(begun, posterior, _load_reached(begun, inputs, posterior, out, progress=False), out, progress=False)
         wait(SAMPLED)
     wait(ENDED)
     return load_result(out)
@@ -132,7 +132,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
             checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
         write_text(out / "config.yaml", inputs.config)
-        reached = _reached(config, inputs, posterior, out, progress)
+        reached = _load_reached(config, inputs, posterior, out, progress)
         sampled = float(reached[0].seconds)
         began -= provenance["unsampled"] + sampled
         store.write_json(out / PROVENANCE, with_unsampled(provenance, began + sampled))
@@ -149,7 +149,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         inputs = with_initial(inputs, config)
         store_inputs(out, inputs, with_unsampled(provenance, began))
     _save_state(out, *reached)
-    say(_described(inputs))
+    say(_describe_mesh(inputs))
     wait(BEGUN)
     samples = _sample(config, posterior, reached, out, progress)
     wait(SAMPLED)
@@ -189,7 +189,7 @@ def _narrator(progress: bool) -> Callable[[str], None]:
     return lambda text: console.print(text)
 
 
-def _described(inputs: Inputs) -> str:
+def _describe_mesh(inputs: Inputs) -> str:
     mesh = inputs.mesh
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
@@ -206,7 +206,7 @@ def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, prog
     return found, checkpoints.StoredBlocks(out, 0, writes=is_first())
 
 
-def _reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
+def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
     """The chains as the run that was cut off stored them last."""
     state = checkpoints.load_state(out)
     if state is None:
@@ -253,7 +253,7 @@ def _block(posterior: Posterior) -> int:
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)
 
 
-def _warped(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
+def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
     if inputs.moving is None or inputs.fixed is None:
         return None
     return warp_image(inputs.moving, mean_field, inputs.fixed)
@@ -286,7 +286,7 @@ def _finish(
         manifest=manifest(config, inputs, posterior, samples, draws, judged, provenance, began),
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
-        warped=_warped(inputs, mean_field),
+        warped=_warp(inputs, mean_field),
         metrics=metrics,
         predicted=predicted,
         bodies=store.read_bodies(out),

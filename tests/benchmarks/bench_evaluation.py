@@ -45,7 +45,7 @@ from bayesreg.io.meshing import MeshOptions, build_mesh
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem as Data
@@ -147,7 +147,7 @@ def _problem(mesh: str, interpolation: str) -> Problem:
     model = ModelConfig(interpolation=interpolation)
     posterior = _brain(mesh, model) if mesh in EDGES_OF_BRAINS else _ball(BALLS[mesh], model)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
-    return Problem(mesh, interpolation, posterior, posterior.conditioned(posterior.estimands(values)))
+    return Problem(mesh, interpolation, posterior, posterior.condition(posterior.estimands(values)))
 
 
 def _forget() -> None:
@@ -187,7 +187,7 @@ def _places(mesh: str, interpolation: str, chains: int) -> Places:
     positions = scattered(posterior, chains)
 
     def settled(data: Data, position: dict[str, jax.Array]) -> Any:
-        values = completed(data.blocks, estimands_of(posterior, data, position))
+        values = complete(data.blocks, estimands_of(posterior, data, position))
         lam, mu = data.body.lame_by_cell(values)
         given = data.body.prescribed(values["u_boundary"])
         found = equilibrium(data.body.system, lam, mu, given)

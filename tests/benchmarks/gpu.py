@@ -58,7 +58,7 @@ def throughput(posterior: br.Posterior, truth: Any, sizes: list[int]) -> None:
     at = posterior.reference()
     if truth is not None:
         at = at | {"u_boundary": jnp.asarray(truth.u[posterior.sampled])}
-    data = posterior.conditioned(posterior.estimands(at))
+    data = posterior.condition(posterior.estimands(at))
     middle = posterior.unconstrain(at)
     # Chains must not lie in the skull, where nothing is solved.
     density = jax.jit(jax.vmap(partial(logdensity, posterior), (None, 0)))

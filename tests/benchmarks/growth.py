@@ -79,7 +79,7 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     begun = time.perf_counter()
     posterior = phantom(nodes, voxels)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
-    data = posterior.conditioned(posterior.estimands(values))
+    data = posterior.condition(posterior.estimands(values))
     positions = scattered(posterior, chains)
     setup = time.perf_counter() - begun
     many = jax.jit(jax.vmap(partial(logdensity, posterior), in_axes=(None, 0)))

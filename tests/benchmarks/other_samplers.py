@@ -49,7 +49,7 @@ from bayesreg.inference.chains.run import first_checkpoint, sample
 from bayesreg.inference.draws.blocks import Block
 from bayesreg.inference.draws.diagnostics import worst
 from bayesreg.inference.gaussian.laplace import Reference
-from bayesreg.inference.gaussian.whitened import whitened
+from bayesreg.inference.gaussian.whitened import whiten
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
@@ -167,8 +167,8 @@ def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) 
 def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str, Problem]:
     """The density in unconstrained coordinates, and in those of `hmc` after its warm-up."""
     reference, middle = first.setup.reference, unravel(posterior)(first.setup.middle)
-    data = posterior.conditioned(estimands_of(posterior, posterior.data, middle))
-    xi = np.asarray(jax.vmap(partial(whitened, reference))(jnp.asarray(places)))
+    data = posterior.condition(estimands_of(posterior, posterior.data, middle))
+    xi = np.asarray(jax.vmap(partial(whiten, reference))(jnp.asarray(places)))
     return {
         "unconstrained": Problem(posterior, data, None, places, 0.008),
         "whitened": Problem(posterior, data, reference, xi, 2.4 / np.sqrt(xi.shape[1])),

@@ -24,14 +24,14 @@ import bayesreg as br
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.equilibrium import equilibrium
 from bayesreg.inference.chains.run import checkpoint_from_arrays
-from bayesreg.inference.gaussian.loose import moved_alone
-from bayesreg.inference.gaussian.reflection import rotated
+from bayesreg.inference.gaussian.loose import move_alone
+from bayesreg.inference.gaussian.reflection import rotate
 from bayesreg.inference.gaussian.whitened import clearance_of, whitened_density, whitened_position
 from bayesreg.inference.samplers.hamiltonian import _quarter_turn
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import checkpoints, store
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_sampling import _median
 
@@ -84,10 +84,10 @@ def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -
         return blackjax.mcmc.hmc.init(xi, whitened_density(posterior, data, setup))
 
     def alone(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
-        return moved_alone(posterior, partial(begin, data, setup), data, setup.reference, setup.loose, key, state)
+        return move_alone(posterior, partial(begin, data, setup), data, setup.reference, setup.loose, key, state)
 
     def turned(data: Any, setup: Any, xi: jax.Array, momentum: jax.Array) -> Any:
-        return rotated(setup.walls, clearance_of(posterior, data, setup), xi, momentum, setup.step_size)
+        return rotate(setup.walls, clearance_of(posterior, data, setup), xi, momentum, setup.step_size)
 
     def trajectory(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
         return _quarter_turn(posterior, data, setup, key, state)[0]
@@ -111,7 +111,7 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
 
     def values_of(xi: jax.Array) -> Any:
         estimands = estimands_of(posterior, data, whitened_position(posterior, setup.reference, xi))
-        values = completed(data.blocks, estimands)
+        values = complete(data.blocks, estimands)
         return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 
     lam, mu, given = jax.jit(jax.vmap(values_of))(places)

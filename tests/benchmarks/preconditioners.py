@@ -21,7 +21,7 @@ from bayesreg.fem.conjugate_gradients import ElasticSystem
 from bayesreg.fem.elasticity import lame_by_cell
 from bayesreg.fem.equilibrium import elastic_system, equilibrium
 from bayesreg.mesh import TetMesh
-from bayesreg.model.posterior import CHAIN_TOLERANCE
+from bayesreg.model.conditioning import CHAIN_TOLERANCE
 from tests.benchmarks.bench_sampling import _median
 from tests.benchmarks.places import SPREAD
 from tests.benchmarks.solves import mesh_of

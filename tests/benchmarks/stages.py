@@ -33,7 +33,7 @@ from bayesreg.fem import equilibrium
 from bayesreg.fem.elasticity import stiffness, unknowns_of
 from bayesreg.inference.samplers.random_walk import _normal_step
 from bayesreg.io import store
-from bayesreg.model.coordinates import completed
+from bayesreg.model.coordinates import complete
 from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
 from tests.benchmarks.bench_effective_draws import STEPS, estimands_of
@@ -51,7 +51,7 @@ def main() -> None:
     draws = estimands_of(posterior, br.load_result(given.run).idata.posterior.load())
     every = len(draws["u_boundary"]) // given.chains
     places = jax.tree.map(lambda x: x[::every][: given.chains], draws)
-    data = posterior.conditioned(jax.tree.map(lambda x: x.mean(axis=0), draws))
+    data = posterior.condition(jax.tree.map(lambda x: x.mean(axis=0), draws))
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled; {given.chains} chains")
     frozen(posterior, data, places)
     two_stages(posterior, data, places, given.proposals)
@@ -60,7 +60,7 @@ def main() -> None:
 def frozen(posterior: Posterior, data: Any, places: dict[str, jax.Array]) -> None:
     """A gradient in the displacements with a chain's own R and S, beside one with solve and adjoint."""
     chains = len(places["u_boundary"])
-    every = jax.vmap(lambda place: completed(posterior.data.blocks, place))(places)
+    every = jax.vmap(lambda place: complete(posterior.data.blocks, place))(places)
     parameters = [{name: np.asarray(every[name][i]) for name in ("lam", "mu")} for i in range(chains)]
     began = time.perf_counter()
     made = [matrices(posterior, **each) for each in parameters]

@@ -21,7 +21,7 @@ import numpy as np
 import bayesreg as br
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
-from bayesreg.model import posterior as posterior_module
+from bayesreg.model import conditioning
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.run import Result
 
@@ -42,7 +42,7 @@ def main() -> None:
 def tightened(folder: Path, out: Path) -> Result:
     """The run once more, its solves a hundred times as exact."""
     config = br.load_config(folder / "config.yaml", [f"mesh.file={(folder / 'mesh.vtu').absolute()}"])
-    with mock.patch.object(posterior_module, "CHAIN_TOLERANCE", posterior_module.CHAIN_TOLERANCE / 100):
+    with mock.patch.object(conditioning, "CHAIN_TOLERANCE", conditioning.CHAIN_TOLERANCE / 100):
         return br.run(config, out)
 
 
@@ -76,7 +76,7 @@ def at_draws(folder: Path) -> None:
     estimands = [posterior.estimands(known | values) for values in at]
     positions = [posterior.coordinates.unconstrain(posterior.data, e) for e in estimands]
     middle = jax.tree.map(lambda *x: jnp.stack(x).mean(axis=0), *positions)
-    data = posterior.conditioned(estimands_of(posterior, posterior.data, middle))
+    data = posterior.condition(estimands_of(posterior, posterior.data, middle))
     evaluate = jax.jit(posterior.evaluate_estimands)
 
     def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,8 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.inference.gaussian.laplace import Reference, laplace
-from bayesreg.inference.gaussian.loose import loose
-from bayesreg.inference.gaussian.normaliser import stand_in
+from bayesreg.inference.gaussian.loose import place_loose_nodes
+from bayesreg.inference.gaussian.normaliser import make_stand_in
 from bayesreg.inference.gaussian.whitened import Setup, setup_about
 from bayesreg.inference.layout import displacements
 from bayesreg.model.blocks import LAME
@@ -85,16 +85,16 @@ def setups_about(
     """The setups of all replications, stacked; the nodes `ALONE` have been seen at (replication, node, place, axis)."""
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
-    found = [stand_in(posterior, *each) for each in zip(references, middles, strict=True)]
+    found = [make_stand_in(posterior, *each) for each in zip(references, middles, strict=True)]
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
     def about(reference: Reference, middle: Any, seen: Any) -> Setup:
-        alone = loose(reference, displacements(posterior).start, ALONE, seen)
+        alone = place_loose_nodes(reference, displacements(posterior).start, ALONE, seen)
         return setup_about(posterior, reference, middle)._replace(loose=alone, **size)
 
     return jax.vmap(about)(stacked, jnp.asarray(middles), jnp.asarray(seen))._replace(stand_in=normalisers)
 
 
-def conditioned(posterior: br.Posterior) -> Any:
+def condition(posterior: br.Posterior) -> Any:
     """The data for chains: for all of them about rest."""
-    return posterior.conditioned(posterior.estimands(posterior.reference()), ALONE)
+    return posterior.condition(posterior.estimands(posterior.reference()), ALONE)

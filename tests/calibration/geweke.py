@@ -23,7 +23,7 @@ from bayesreg.inference.samplers.registry import choose_sampler
 from tests.calibration.chains import (
     ALONE,
     BATCH,
-    conditioned,
+    condition,
     of_posterior,
     prior_reference,
     quantities,
@@ -80,7 +80,7 @@ def compare(
     posterior = simulator.posterior if posterior is None else posterior
     first = of_posterior(posterior, simulator.draw_prior(np.random.default_rng(seed), chains))
     kernel = choose_sampler(sampler, posterior, **(RANDOM_WALK if sampler == "rwmh" else {})).sampler
-    setup, data = None, conditioned(posterior)
+    setup, data = None, condition(posterior)
     if sampler != "rwmh":
         reference = prior_reference(simulator, posterior)
         centre = np.asarray(reference.centre)[None]

@@ -32,11 +32,11 @@ from bayesreg.io.datasets import mni152
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain, save_mesh
 from bayesreg.report.bodies import sound
+from bayesreg.synthetic.bodies import PATCH_SHARE, Subject, register_body
 from bayesreg.synthetic.deformation import Direction
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
-from bayesreg.synthetic.recalibration import Response, recalibrated, response
+from bayesreg.synthetic.recalibration import Response, recalibrate, response
 from bayesreg.types import InputError
-from bayesreg.workflow.mesh_error import PATCH_SHARE, Subject, register_body
 from tests.calibration import figures
 
 COUNT, ENOUGH = 20, 17
@@ -147,7 +147,7 @@ def allowing_for(known: Response, pair: dict[str, Any], seed: int) -> dict[str, 
     found = [
         np.interp(level, QUANTILES, np.log(pair["ratio"][name])) for level, name in zip(levels.T, TISSUES, strict=True)
     ]
-    own = recalibrated(known, np.exp(np.column_stack(found)), seed)
+    own = recalibrate(known, np.exp(np.column_stack(found)), seed)
     return dict(zip(TISSUES, np.quantile(own, QUANTILES, axis=0).T.tolist(), strict=True))
 
 

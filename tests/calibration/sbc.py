@@ -22,10 +22,10 @@ from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import averaged
-from bayesreg.inference.gaussian.mode_search import settled
-from bayesreg.inference.gaussian.reflection import rotated
-from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whitened, whitened_position
+from bayesreg.inference.gaussian.laplace import average_reference
+from bayesreg.inference.gaussian.mode_search import settle
+from bayesreg.inference.gaussian.reflection import rotate
+from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whiten, whitened_position
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
@@ -33,7 +33,7 @@ from tests.calibration.chains import (
     ALONE,
     BATCH,
     Estimands,
-    conditioned,
+    condition,
     of_posterior,
     quantities,
     quantities_at,
@@ -182,7 +182,7 @@ def _chains(
     for stage in range(settings.stages + 1):
         say(f"a reference for each replication, {stage + 1} of {settings.stages + 1}")
         about = visited[:, [0, -1]]
-        references = [averaged(*each) for each in zip(problems, about, strict=True)]
+        references = [average_reference(*each) for each in zip(problems, about, strict=True)]
         u = visited[:, :, -3 * len(posterior.sampled) :].reshape(*visited.shape[:2], -1, 3)
         seen = np.moveaxis(u[:, :, ALONE], 2, 1)
         setup = setups_about(posterior, references, about.mean(axis=1), seen, settings.step_size, settings.steps)
@@ -201,7 +201,7 @@ def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
     found = []
     for k, problem in enumerate(problems):
         start = problem.coordinates.unconstrain(problem.data, {name: x[k] for name, x in starts.items()})
-        found.append(settled(problem, np.asarray(ravel_pytree(start)[0])))
+        found.append(settle(problem, np.asarray(ravel_pytree(start)[0])))
     return np.stack(found)
 
 
@@ -215,8 +215,8 @@ def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, mode
     def one(given: Any) -> Estimands:
         setup, observed, mode, key = given
         here = observing(data, observed)
-        begin = whitened(setup.reference, mode)
-        xi, _ = rotated(
+        begin = whiten(setup.reference, mode)
+        xi, _ = rotate(
             setup.walls, clearance_of(posterior, here, setup), begin, jax.random.normal(key, begin.shape), jnp.pi / 2
         )
         place = whitened_position(posterior, setup.reference, jnp.where(jnp.isfinite(xi).all(), xi, begin))
@@ -265,7 +265,7 @@ def _run(
     Each chain's step is tuned on its own, by dual averaging as in production: where one step served all replications,
     some chains stood still.
     """
-    data = conditioned(posterior)
+    data = condition(posterior)
     tuned, steps = (settings.warm_up, settings.warm_up + settings.draws) if last else (settings.approach,) * 2
     begin, update, final = dual_averaging_adaptation(settings.target_acceptance)
     averaging = jax.vmap(begin)(setup.step_size)

@@ -140,8 +140,8 @@ def test_a_posterior_of_a_large_mesh_is_compiled_once(monkeypatch):
     post = br.build_posterior(*images, mesh, model=br.ModelConfig(interpolation="cubic"))
     assert post.single_nodes is None
     values = post.reference()
-    here = post.conditioned(post.estimands(values))
-    there = post.conditioned(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))
+    here = post.condition(post.estimands(values))
+    there = post.condition(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))
     density = jax.jit(partial(logdensity, post))
     first, second = (float(density(data, post.initial(jax.random.key(0)))) for data in (here, there))
     assert density._cache_size() == 1

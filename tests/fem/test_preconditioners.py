@@ -7,7 +7,7 @@ import scipy.sparse.linalg
 import bayesreg as br
 from bayesreg.fem import preconditioners
 from bayesreg.fem.elasticity import stiffness, unknowns_of
-from bayesreg.fem.preconditioners import solved
+from bayesreg.fem.preconditioners import solve
 from tests.phantoms import box_mesh
 
 MESH = box_mesh(4)
@@ -26,7 +26,7 @@ def test_columns_are_those_of_a_sparse_factor(stretch, limit, monkeypatch):
     matrix = interior(stretch)
     right = np.random.default_rng(1).standard_normal((matrix.shape[0], 7))
     expected = scipy.sparse.linalg.splu(matrix.tocsc()).solve(right)
-    np.testing.assert_allclose(solved(matrix, right), expected, rtol=1e-8 if stretch < 10 else 1e-3)
+    np.testing.assert_allclose(solve(matrix, right), expected, rtol=1e-8 if stretch < 10 else 1e-3)
 
 
 @pytest.mark.parametrize("broken", ["empty", "nan"])
@@ -36,4 +36,4 @@ def test_what_has_no_solution_is_said(broken, limit, monkeypatch):
     matrix = interior(0.0).tolil()
     matrix[4] = matrix[:, 4] = 0.0 if broken == "empty" else np.nan
     with pytest.raises(br.InputError, match="the interior stiffness is singular"):
-        solved(matrix.tocsr(), np.ones((matrix.shape[0], 1)))
+        solve(matrix.tocsr(), np.ones((matrix.shape[0], 1)))

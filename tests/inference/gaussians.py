@@ -122,7 +122,7 @@ class GaussianTarget:
     def supports(self, data, estimands):
         return (self.walls.clearance(data, estimands["u_boundary"], jnp.arange(NODES)) >= 0).all()
 
-    def conditioned(self, estimands, alone=(), quick=False):
+    def condition(self, estimands, alone=(), quick=False):
         return self.data
 
     def allowed(self, u):

@@ -25,7 +25,7 @@ def found(sampler):
     target = GaussianTarget() if sampler == "hmc" else posterior()
     settings = {} if sampler == "rwmh" else {"warm_up": 5}
     chosen, begun = (
-        choose_sampler(sampler, target, settings),
+        choose_sampler(sampler, target, **settings),
         first_checkpoint(target, sampler, CHAINS, 0, **settings),
     )
     data = chosen.sampler.data(begun.setup)

@@ -11,13 +11,13 @@ import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from bayesreg.inference.gaussian.hierarchy import balanced, is_scale, tempered
+from bayesreg.inference.gaussian.hierarchy import balance_field, balance_temperature, is_scale
 
 COUNT, NOISE = 100, 0.5
 
 
 class Field:
-    """What `balanced` asks of a target; flat positions are field, field_sd, lam."""
+    """What `balance_field` asks of a target; flat positions are field, field_sd, lam."""
 
     def __init__(self, **position):
         self.position = position
@@ -61,7 +61,7 @@ def test_fixed_point_is_the_maximum_of_the_evidence(truth, first):
     sd = first
     for _ in range(60):
         flat, factor = given_scale(y, sd)
-        moved = balanced(TARGET, flat, lambda factor=factor: factor)
+        moved = balance_field(TARGET, flat, lambda factor=factor: factor)
         # The field stays, and so does what has nothing to do with it.
         np.testing.assert_allclose(np.exp(moved[COUNT]) * moved[:COUNT], sd * flat[:COUNT], rtol=1e-10)
         np.testing.assert_array_equal(moved[COUNT + 1 :], [1.0, 2.0])
@@ -77,7 +77,7 @@ def test_without_a_field_nothing_is_asked_for():
     def never():
         raise AssertionError("no factor is needed")
 
-    np.testing.assert_array_equal(balanced(target, flat, never), flat)
+    np.testing.assert_array_equal(balance_field(target, flat, never), flat)
     assert not is_scale(target).any()
     np.testing.assert_array_equal(np.flatnonzero(is_scale(TARGET)), [COUNT])
 
@@ -95,7 +95,7 @@ def test_a_temperature_comes_to_the_maximum_of_its_evidence(truth, first):
         prior = precision / np.exp(log_t)
         mode = y / (1 + NOISE**2 * prior)
         energy, shares = 0.5 * (prior * mode**2).sum(), np.diag(prior / (prior + NOISE**-2))
-        moved = tempered(target, np.array([1.0, 2.0, log_t]), energy - COUNT / 2, energy, shares)
+        moved = balance_temperature(target, np.array([1.0, 2.0, log_t]), energy - COUNT / 2, energy, shares)
         np.testing.assert_array_equal(moved[:2], [1.0, 2.0])
         log_t = moved[2]
 

@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import _convex, hessian_rows, laplace, precision_at, pulled
+from bayesreg.inference.gaussian.laplace import _add_convexly, hessian_rows, laplace, precision_at, recentre
 from bayesreg.inference.gaussian.mode_search import GAP, find_mode
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import logdensity
@@ -93,7 +93,7 @@ def test_a_gaussian_behind_a_wall_is_found_from_the_wall():
     """The wall holds the mode 3 mm off, where the force is not zero; Newton's step without the wall gives the mean."""
     exact = problem().exact
     place = exact.mean + np.tile([3.0, 0, 0], len(exact.mean) // 3)
-    centre = np.asarray(pulled(walled(), laplace(walled(), place), [place]).centre)
+    centre = np.asarray(recentre(walled(), laplace(walled(), place), [place]).centre)
     sd = np.sqrt(np.diag(np.linalg.inv(exact.precision)))
     assert (abs(centre - exact.mean) / sd).max() < 0.02 < (abs(place - exact.mean) / sd).max()
 
@@ -124,7 +124,7 @@ def test_a_curvature_with_its_remainder_is_made_convex():
     for size, expected in ((0.5, 1.5), (-0.5, 0.5), (-0.9, 0.25), (-3.0, 2.0), (6.0, 7.0)):
         lower = np.linalg.cholesky(convex)
         first = np.outer(lower[:, 0], lower[:, 0])
-        np.testing.assert_allclose(_convex(convex, size * first), convex + (expected - 1) * first, atol=1e-12)
+        np.testing.assert_allclose(_add_convexly(convex, size * first), convex + (expected - 1) * first, atol=1e-12)
 
 
 def test_parameters_that_nothing_is_known_of_have_the_prior_s_width():

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 import bayesreg as br
 from bayesreg.inference.gaussian import mode_search, pockets
 from bayesreg.inference.gaussian.mode_search import find_mode
-from bayesreg.inference.gaussian.pockets import out_of_pockets
+from bayesreg.inference.gaussian.pockets import leave_pockets
 from bayesreg.inference.layout import unravel
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 from tests.model.test_neighbourhood import MESH, posterior, state
@@ -88,7 +88,7 @@ def test_a_gain_that_the_density_itself_does_not_confirm_moves_nothing():
     class Wrong(Pocket):
         single_nodes = Misled()
 
-    flat, nodes = out_of_pockets(Wrong(depth=8.0), start(0.0))
+    flat, nodes = leave_pockets(Wrong(depth=8.0), start(0.0))
     assert not len(nodes)
     np.testing.assert_array_equal(flat, start(0.0))
 
@@ -98,12 +98,12 @@ def test_without_sampled_nodes_or_neighbourhoods_nothing_is_looked_at():
     model = br.ModelConfig(t_similarity=1.0, sampled=[], held=held, priors={"lam": {"high": 10}, "mu": {"high": 10}})
     post = br.build_posterior(smooth_image(MESH.points), smooth_image(MESH.points, seed=2), MESH, model=model)
     flat = np.asarray(ravel_pytree(post.unconstrain(post.reference()))[0])
-    assert not len(out_of_pockets(post, flat)[1])
+    assert not len(leave_pockets(post, flat)[1])
 
     class Unknown(Pocket):
         single_nodes = None
 
-    assert not len(out_of_pockets(Unknown(depth=8.0), start())[1])
+    assert not len(leave_pockets(Unknown(depth=8.0), start())[1])
 
 
 @pytest.mark.parametrize("options", [{}, {"sampled": "all"}, {"quadrature": "voxels"}])
@@ -120,7 +120,7 @@ def test_a_node_astray_between_two_equal_images_comes_back(options):
     post = br.build_posterior(image, image, MESH, model=model)
     nowhere = jnp.zeros((len(post.sampled), 3))
     astray = post.unconstrain(post.reference() | {"u_boundary": nowhere.at[row].set(jnp.array([-6.0, 5.0, 4.0]))})
-    found, nodes = out_of_pockets(post, np.asarray(ravel_pytree(astray)[0]))
+    found, nodes = leave_pockets(post, np.asarray(ravel_pytree(astray)[0]))
     back = unravel(post)(found)
     assert nodes.tolist() == [row]
     assert float(post.logdensity(back)) > float(post.logdensity(astray)) + pockets.GAIN
@@ -132,7 +132,7 @@ def test_at_rest_no_elastic_force_acts_on_a_node():
     """By differences of the strain energy, at the λ, μ that the rest follows by."""
     post = posterior()
     values, row = state(post), 11
-    data = post.conditioned(post.estimands(values), np.array([3, row]))
+    data = post.condition(post.estimands(values), np.array([3, row]))
     rest = np.asarray(post.single_nodes.equilibrium(data, post.estimands(values), jnp.asarray(1)))
 
     def energy(place):

@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from bayesreg.inference.draws import predictive
-from bayesreg.inference.draws.predictive import predictive_p, push_forward, summarise, thinned
+from bayesreg.inference.draws.predictive import predictive_p, push_forward, summarise, thin
 
 DRAWS = {"u": np.random.default_rng(0).gamma(2.0, size=(3, 50, 4)), "scale": np.linspace(1, 2, 150).reshape(3, 50)}
 
@@ -46,11 +46,11 @@ def test_memory_is_bounded_and_quantiles_still_come_from_evenly_spaced_draws(mon
 
 def test_thinned_draws_are_evenly_spaced_and_at_most_so_many():
     posterior = xr.Dataset({"a": (("draw", "chain", "k"), np.arange(300.0).reshape(50, 3, 2))})
-    some = thinned(posterior, ["a"], 16)["a"]
+    some = thin(posterior, ["a"], 16)["a"]
     assert some.shape == (3, 5, 2)
     np.testing.assert_array_equal(some[1, :, 0], posterior["a"].isel(chain=1, k=0, draw=[5, 15, 25, 35, 45]))
-    assert thinned(posterior, ["a"], 10_000)["a"].shape == (3, 50, 2)
-    assert thinned(posterior, ["a"], 1)["a"].shape == (3, 1, 2)
+    assert thin(posterior, ["a"], 10_000)["a"].shape == (3, 50, 2)
+    assert thin(posterior, ["a"], 1)["a"].shape == (3, 1, 2)
 
 
 def test_nothing_to_summarise_is_refused():

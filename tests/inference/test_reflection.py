@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesreg.inference.gaussian import reflection
-from bayesreg.inference.gaussian.reflection import rotated, shifted, walls
+from bayesreg.inference.gaussian.reflection import rotate, shift, walls
 
 DIMENSION, NODES = 9, 3
 CENTRE = np.array([[0.3, 0.0, 0.0], [0.0, 0.5, 0.0], [0.1, 0.1, 0.1]])
@@ -24,10 +24,10 @@ def made():
     return walls(jnp.asarray(CENTRE), jnp.asarray(rows), jnp.arange(NODES))
 
 
-turn = jax.jit(lambda made, position, momentum, time: rotated(made, ball, position, momentum, time))
+turn = jax.jit(lambda made, position, momentum, time: rotate(made, ball, position, momentum, time))
 
 
-fly = jax.jit(lambda made, position, momentum, time: shifted(made, ball, position, momentum, time))
+fly = jax.jit(lambda made, position, momentum, time: shift(made, ball, position, momentum, time))
 
 
 def clearance(made, position):
@@ -98,14 +98,14 @@ def test_volume_is_kept(made):
 def test_where_no_wall_is_near_it_is_a_rotation(made):
     """As where there is no skull: the clearance is infinite."""
     start, momentum = np.random.default_rng(5).normal(size=(2, DIMENSION))
-    found = rotated(made, lambda u: jnp.full(u.shape[:-1], jnp.inf), start, momentum, jnp.pi / 2)
+    found = rotate(made, lambda u: jnp.full(u.shape[:-1], jnp.inf), start, momentum, jnp.pi / 2)
     np.testing.assert_allclose(found[0], momentum, atol=1e-12)
     np.testing.assert_allclose(found[1], -start, atol=1e-12)
 
 
 def test_a_flight_that_does_not_end_is_no_place(made, monkeypatch):
     monkeypatch.setattr(reflection, "_MOST", 1)
-    position, _ = rotated(made, ball, jnp.zeros(DIMENSION), 30 * jnp.ones(DIMENSION), 1.5)
+    position, _ = rotate(made, ball, jnp.zeros(DIMENSION), 30 * jnp.ones(DIMENSION), 1.5)
     assert np.isnan(np.asarray(position)).all()
 
 
@@ -117,7 +117,7 @@ def test_quarter_turns_draw_the_truncated_gaussian(made):
     @jax.jit
     def chain(key):
         def one(position, key):
-            turned, _ = rotated(made, ball, position, jax.random.normal(key, position.shape), jnp.pi / 2)
+            turned, _ = rotate(made, ball, position, jax.random.normal(key, position.shape), jnp.pi / 2)
             # A flight that creeps along the wall is refused, as by the samplers.
             position = jnp.where(jnp.isfinite(turned).all(), turned, position)
             return position, position

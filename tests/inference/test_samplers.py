@@ -66,7 +66,7 @@ def after_steps(name: str, alone: Any = ()) -> np.ndarray:
     else:
         setup = setup_about(target(), poor_reference(), poor_reference().centre)
         seen = np.moveaxis(exact()[CHAINS:][:300, alone], 1, 0)
-        nodes = loose.loose(poor_reference(), 0, np.asarray(alone, int), seen)
+        nodes = loose.place_loose_nodes(poor_reference(), 0, np.asarray(alone, int), seen)
         setup = setup._replace(step_size=jnp.asarray(size), steps=jnp.asarray(steps), loose=nodes)
         kernel = nodes_alone() if name == "nodes alone" else choose_sampler(name, target()).sampler
 
@@ -276,9 +276,9 @@ def test_the_nodes_that_hardly_move_are_found():
     path[:, :, 10] = 0.2
     # What alternates about its mean comes far, and nowhere in two transitions.
     path[:, :, 5] = np.linspace(0, 1, 30)[:, None, None] + 2.0 * (-1.0) ** np.arange(30)[:, None, None]
-    np.testing.assert_array_equal(loose.slowest(path, 4), [3, 5, 7, 10])
-    assert len(loose.slowest(path[:1], 4)) == 4
-    assert len(loose.slowest(path, 0)) == 0
+    np.testing.assert_array_equal(loose.find_slowest(path, 4), [3, 5, 7, 10])
+    assert len(loose.find_slowest(path[:1], 4)) == 4
+    assert len(loose.find_slowest(path, 0)) == 0
 
 
 def test_places_have_the_density_that_is_said():

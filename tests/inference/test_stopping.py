@@ -5,7 +5,7 @@ import pytest
 
 from bayesreg.inference.chains import stopping
 from bayesreg.inference.chains.checkpoint import Checkpoint, no_steps
-from bayesreg.inference.chains.stopping import StopRule, judged, reason
+from bayesreg.inference.chains.stopping import StopRule, judge, reason
 from bayesreg.inference.draws.diagnostics import worst
 from bayesreg.inference.draws.moments import Moments, greatest_rhat
 
@@ -42,7 +42,7 @@ def asked(monkeypatch):
 
 def test_the_rule_holds_of_all_estimands(asked):
     checkpoint, blocks = drawn()
-    verdict = judged(RULE, checkpoint, blocks)
+    verdict = judge(RULE, checkpoint, blocks)
     assert verdict.holds
     assert asked == [5, 63]
     assert verdict.found == worst(blocks)
@@ -53,7 +53,7 @@ def test_the_rule_holds_of_all_estimands(asked):
 @pytest.mark.parametrize("node", [0, 17])
 def test_the_suspect_is_judged_alone(asked, node):
     checkpoint, blocks = drawn(shift=0.35, node=node)
-    verdict = judged(RULE, checkpoint, blocks)
+    verdict = judge(RULE, checkpoint, blocks)
     assert asked == [5]
     assert (verdict.holds, verdict.found) == (False, None)
     # Sorted by name: the three of lam stand before it.
@@ -67,7 +67,7 @@ def test_what_no_suspect_shows_is_seen_with_all(asked):
     for block in blocks:
         block["u_boundary"][1, :, 17, 1] *= 1.5
     assert worst(blocks, np.array([3 + 3 * 17 + 1])).rhat == worst(blocks).rhat > RULE.rhat
-    verdict = judged(RULE, checkpoint, blocks)
+    verdict = judge(RULE, checkpoint, blocks)
     assert asked == [5, 63]
     assert not verdict.holds
     assert verdict.found == worst(blocks)
@@ -82,7 +82,7 @@ def test_nothing_is_said_of_one_chain_or_of_no_estimand():
 
 def test_what_is_far_off_is_not_judged(asked):
     checkpoint, blocks = drawn(shift=3.0)
-    assert not judged(RULE, checkpoint, blocks).holds
-    assert not judged(RULE, checkpoint._replace(draws=np.array(50)), blocks).holds
-    assert not judged(StopRule(), checkpoint, blocks).holds
+    assert not judge(RULE, checkpoint, blocks).holds
+    assert not judge(RULE, checkpoint._replace(draws=np.array(50)), blocks).holds
+    assert not judge(StopRule(), checkpoint, blocks).holds
     assert asked == []

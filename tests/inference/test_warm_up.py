@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayesreg.inference.gaussian import about_reference
-from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _sized, tuned
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _with_step_size, tune
 from bayesreg.inference.gaussian.whitened import Moved
 from tests.inference.gaussians import DIMENSION, GaussianTarget
 
@@ -42,7 +42,7 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
     tuning = Tuning(60, 0.75, watched=True, quarter_turns=True)
     found = {}
     for apart in (True, False):
-        setup, points, path = tuned(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
+        setup, points, path = tune(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
         assert path.shape == (60, 4, 3)
         np.testing.assert_array_equal(path[-1], points["u_boundary"])
         found[apart] = float(setup.step_size), float(points["u_boundary"][3, 0])
@@ -54,11 +54,11 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
 
 @pytest.mark.parametrize("size", [0.011, 0.3, 0.46, 0.53, 0.79, 1.2, 1.5, 1.6, 4.0])
 def test_steps_make_a_quarter_turn_and_none_is_too_long(size):
-    setup = _sized(Tuning(60, 0.75, quarter_turns=True), Steps(), jnp.asarray(size))
+    setup = _with_step_size(Tuning(60, 0.75, quarter_turns=True), Steps(), jnp.asarray(size))
     assert float(setup.step_size * setup.steps) == pytest.approx(np.pi / 2)
     assert setup.step_size <= size
     assert (setup.steps - 1) * size < np.pi / 2
-    alone = _sized(Tuning(60, 0.75), Steps(), jnp.asarray(size))
+    alone = _with_step_size(Tuning(60, 0.75), Steps(), jnp.asarray(size))
     assert (float(alone.step_size), int(alone.steps)) == (min(size, np.pi / 2), int(Steps().steps))
 
 
@@ -70,8 +70,8 @@ def test_a_place_without_a_slope_has_no_part_in_the_reference():
     target, mode = Broken(), np.zeros(DIMENSION)
     sound = jnp.asarray(target.exact_draws(np.random.default_rng(0), 3))
     lost = sound.at[1].set(jnp.array([-1.0, 60.0, 0.0]))
-    found = about_reference._averaged(target, mode, {"u_boundary": lost})
-    expected = about_reference._averaged(target, mode, {"u_boundary": sound[jnp.array([0, 2])]})
+    found = about_reference._setup_on_average(target, mode, {"u_boundary": lost})
+    expected = about_reference._setup_on_average(target, mode, {"u_boundary": sound[jnp.array([0, 2])]})
     np.testing.assert_array_equal(found.reference.centre, expected.reference.centre)
     np.testing.assert_array_equal(found.middle, expected.middle)
     assert np.isfinite(found.middle).all()

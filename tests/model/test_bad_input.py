@@ -133,10 +133,10 @@ def test_options_are_validated(options, where):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, r"finite high \(r2\).* lam of csf has none"),
+        ({}, r"finite high \(r2\).* lam of the tissue has none"),
         ({"priors": {"lam": {"high": 9.0}}}, "mu of csf has none"),
         ({"priors": {"lam": {"high": 9.0}, "mu": {"gm": {"high": 9.0}}}, "fixed": {}}, "mu of csf has none"),
-        ({"elasticity": "uniform"}, "lam of csf has none"),
+        ({"elasticity": "uniform"}, "lam of the tissue has none"),
         ({"priors": {"lam": {"high": 9.0}}, "fixed": {"mu": 1.0}, "held": {3: (0.0, 0.0, 1.0)}}, "held where it is"),
     ],
 )

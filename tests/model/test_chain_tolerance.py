@@ -28,7 +28,7 @@ def posterior():
 
 def test_the_density_of_chains_is_the_density_to_a_hundredth():
     post = posterior()
-    conditioned = post.conditioned(post.estimands(post.reference()))
+    conditioned = post.condition(post.estimands(post.reference()))
     for seed in range(5):
         rng = np.random.default_rng(seed)
         values = post.reference() | {"u_boundary": jnp.asarray(0.3 * rng.normal(size=(len(MESH.boundary), 3)))}
@@ -56,7 +56,7 @@ def chains():
         states = jax.vmap(lambda _: kernel.init(data, setup, estimands))(jnp.arange(count))
         return jax.lax.scan(step, states, jax.random.split(jax.random.key(0), (60, count)))[1]
 
-    return post.conditioned(estimands), draws
+    return post.condition(estimands), draws
 
 
 def with_tolerances(data, solve, slope):

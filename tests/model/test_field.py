@@ -112,7 +112,7 @@ def test_density_is_that_of_parameters_by_element():
     options = {"normalised": True, "priors": {"lam": br.PriorConfig(high=100.0), "mu": br.PriorConfig(high=100.0)}}
     ours, known = posterior(**options), values()
     factor = np.exp(0.6 * np.asarray(ours.data.body.field.basis) @ np.asarray(known["field"]))
-    np.testing.assert_allclose(ours.stiffness(known), factor, rtol=1e-12)
+    np.testing.assert_allclose(ours.data.body.stiffness_factor(known), factor, rtol=1e-12)
     lam, mu = (jnp.asarray(entries[MESH.tissue] * factor) for entries in (LAM, MU))
     element = posterior("element", **options | {"fixed": {"mu": by_tissue(MU)}})
     element = element.energies({"u_boundary": known["u_boundary"], "lam": lam, "mu": mu})

@@ -60,7 +60,7 @@ def changes(post: br.Posterior, moved_from: float = 0.0) -> tuple[np.ndarray, np
     """Of the density where one of the nodes moves, approximately and exactly; λ, μ away from where the rest follows."""
     rows, values, step = loose(post), state(post), 3.0 * np.random.default_rng(1).normal(size=(3, 12, 3))
     away = values | {name: values[name] * np.exp(moved_from) for name in ("lam", "mu")}
-    data = post.conditioned(post.estimands(values), rows)
+    data = post.condition(post.estimands(values), rows)
     u = values["u_boundary"][rows][:, None] + jnp.asarray(step).at[:, 0].set(0.0)
     found = np.asarray(local(post, data, post.estimands(away), u))
     at = values["u_boundary"]
@@ -95,7 +95,7 @@ def test_the_sum_over_the_nodes_is_one_function_of_them():
     """Where one of them is changes nothing in what is said of another."""
     post = posterior()
     rows, values = loose(post), state(post)
-    data = post.conditioned(post.estimands(values), rows)
+    data = post.condition(post.estimands(values), rows)
     u = values["u_boundary"][rows][:, None] + jnp.linspace(0, 1, 12)[None, :, None]
     elsewhere = values | {"u_boundary": values["u_boundary"].at[rows[0]].add(3.0)}
     here, there = (local(post, data, post.estimands(v), u) for v in (values, elsewhere))
@@ -104,4 +104,4 @@ def test_the_sum_over_the_nodes_is_one_function_of_them():
 
 def test_without_nodes_there_are_no_neighbourhoods():
     post = posterior()
-    assert post.conditioned(post.estimands(state(post))).neighbourhoods is None
+    assert post.condition(post.estimands(state(post))).neighbourhoods is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesreg.synthetic.recalibration import RANGE, Response, least_bodies, recalibrated, response
+from bayesreg.synthetic.recalibration import RANGE, Response, least_bodies, recalibrate, response
 from bayesreg.types import InputError
 
 MESH = Response(np.array([0.02, 0.05]), np.array([[0.7, 0.1], [0.0, 0.9]]), np.diag([0.2, 0.3]) ** 2, 100)
@@ -30,7 +30,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     for seed in range(count):
         true, found = bodies(25, seed=1000 + seed)
         known = response(true[1:], found[1:])
-        low, high = np.quantile(recalibrated(known, found[:1], seed), (0.05, 0.95), axis=0)
+        low, high = np.quantile(recalibrate(known, found[:1], seed), (0.05, 0.95), axis=0)
         inside += (low <= true[0]) & (true[0] <= high)
     for covered in inside:
         assert stats.binomtest(int(covered), count, 0.9).pvalue > 0.01, inside
@@ -39,7 +39,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 def test_a_better_mesh_gives_as_good_an_interval():
     """However narrow: the candidates follow."""
     sharp = MESH._replace(scatter=np.diag([0.02, 0.02]) ** 2, degrees_of_freedom=10_000)
-    ends = [np.quantile(recalibrated(sharp, np.array([[8.0, 9.0]]), seed), (0.05, 0.95), axis=0) for seed in range(4)]
+    ends = [np.quantile(recalibrate(sharp, np.array([[8.0, 9.0]]), seed), (0.05, 0.95), axis=0) for seed in range(4)]
     np.testing.assert_allclose(ends, np.broadcast_to(np.mean(ends, axis=0), (4, 2, 2)), rtol=0.01)
     grid = np.exp(np.linspace(*np.log(RANGE), 2000))
     high = 1 / grid
@@ -54,13 +54,13 @@ def test_a_mesh_without_error_leaves_the_posterior_as_it_is():
     draws = np.exp(np.log([10.0, 30.0]) + 0.2 * np.random.default_rng(5).normal(size=(2000, 2)))
     levels = (0.1, 0.5, 0.9)
     np.testing.assert_allclose(
-        np.quantile(recalibrated(exact, draws), levels, axis=0), np.quantile(draws, levels, axis=0), rtol=0.05
+        np.quantile(recalibrate(exact, draws), levels, axis=0), np.quantile(draws, levels, axis=0), rtol=0.05
     )
 
 
 def test_what_a_mesh_hides_is_left_to_the_prior():
     stiff = MESH._replace(offset=np.array([0.02, 0.5]))
-    own = recalibrated(stiff, np.tile([20.0, 2.0], (100, 1)))
+    own = recalibrate(stiff, np.tile([20.0, 2.0], (100, 1)))
     low, high = np.quantile(own[:, 1], (0.05, 0.95))
     assert low > RANGE[0]
     assert high > 0.4 * RANGE[1]
@@ -68,8 +68,8 @@ def test_what_a_mesh_hides_is_left_to_the_prior():
 
 def test_the_same_seed_gives_the_same_draws():
     draws = np.full((10, 2), 12.0)
-    assert np.array_equal(recalibrated(MESH, draws, seed=1), recalibrated(MESH, draws, seed=1))
-    assert not np.array_equal(recalibrated(MESH, draws, seed=1), recalibrated(MESH, draws, seed=2))
+    assert np.array_equal(recalibrate(MESH, draws, seed=1), recalibrate(MESH, draws, seed=1))
+    assert not np.array_equal(recalibrate(MESH, draws, seed=1), recalibrate(MESH, draws, seed=2))
 
 
 def test_too_few_bodies_and_broken_ones_are_refused():
@@ -81,13 +81,13 @@ def test_too_few_bodies_and_broken_ones_are_refused():
     with pytest.raises(InputError, match="positive and finite"):
         response(true, found)
     with pytest.raises(InputError, match="no draw"):
-        recalibrated(MESH, np.zeros((0, 2)))
+        recalibrate(MESH, np.zeros((0, 2)))
 
 
 def test_bodies_that_are_all_found_alike_tell_nothing():
     """The scatter that they lack is not taken for certainty of what is true."""
     true, _ = bodies(24, seed=7)
-    own = recalibrated(response(true, np.full_like(true, 10.0)), np.full((5, 2), 10.0))
+    own = recalibrate(response(true, np.full_like(true, 10.0)), np.full((5, 2), 10.0))
     low, high = np.quantile(own, (0.05, 0.95), axis=0)
     assert (low < 2).all()
     assert (high > 100).all()

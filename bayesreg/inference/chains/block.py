@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from bayesreg.inference.chains.checkpoint import Tally, counted, no_steps, with_passed_over, with_solve
+from bayesreg.inference.chains.checkpoint import Tally, count_step, no_steps, with_passed_over, with_solve
 from bayesreg.inference.chains.devices import side_by_side
-from bayesreg.inference.draws.moments import Moments, updated
+from bayesreg.inference.draws.moments import Moments, update
 from bayesreg.inference.kernel import Draw, Info
 from bayesreg.inference.samplers.registry import Chosen
 from bayesreg.types import AnyArray
@@ -25,7 +25,7 @@ Outside = Callable[[AnyArray, Any], AnyArray]
 
 
 class _Drawn(NamedTuple):
-    """What a block leaves of one chain.
+    """The results of a block for one chain.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class _Drawn(NamedTuple):
     places : dict of (draw, ...) arrays
         Where the chain stood, as `_place` has it.
     windows : Tally of (draw,) arrays
-        Of the steps since the draw before each.
+        Tallies of the steps since the draw before each.
     """
 
     state: Any
@@ -110,8 +110,8 @@ def run_block(
     return side_by_side(chain, devices)(numbers, state, moments, tally)
 
 
-def watched(draw: Draw) -> dict[str, Any]:
-    """That of which moments are kept."""
+def watched_values(draw: Draw) -> dict[str, Any]:
+    """The values of which moments are kept."""
     return {"estimands": draw.estimands, "u": draw.evaluation.u}
 
 
@@ -129,14 +129,14 @@ def _in_step(
     def one_draw(carry: tuple[Any, Moments], draw: AnyArray) -> tuple[tuple[Any, Moments], tuple[Any, Tally]]:
         def one_step(i: AnyArray | int, found: tuple[Any, Tally]) -> tuple[Any, Tally]:
             state, info = step(draw * thin + i, found[0])
-            return state, counted(found[1], info)
+            return state, count_step(found[1], info)
 
         state, moments = carry
         state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
         drawn = observe(state)
         if many_solves:
             window = with_solve(window, drawn.evaluation, thin)
-        return (state, updated(moments, watched(drawn))), (_place(drawn), window)
+        return (state, update(moments, watched_values(drawn))), (_place(drawn), window)
 
     (state, moments), (places, windows) = jax.lax.scan(one_draw, (state, moments), jnp.arange(length))
     return _Drawn(state, moments, places, windows)
@@ -165,16 +165,16 @@ def _at_own_pace(
         state, info = step(i, state)
         following = next_taken(i + 1, state)
         drawn, draw = observe(state), i // thin
-        moments = updated(moments, watched(drawn), following // thin - draw)
+        moments = update(moments, watched_values(drawn), following // thin - draw)
         places = jax.tree.map(lambda rows, x: rows.at[draw + 1].set(x), places, _place(drawn))
-        windows = jax.tree.map(lambda rows, x: rows.at[draw].add(x), windows, counted(no_steps(), info))
+        windows = jax.tree.map(lambda rows, x: rows.at[draw].add(x), windows, count_step(no_steps(), info))
         return following, _Drawn(state, moments, places, windows)
 
     begun = observe(state)
     # Row 0 is where the block begins, row d + 1 where the last step taken for draw d has led.
     places = jax.tree.map(lambda x: jnp.zeros((length + 1, *jnp.shape(x)), x.dtype).at[0].set(x), _place(begun))
     first = next_taken(jnp.zeros((), int), state)
-    moments = updated(moments, watched(begun), first // thin)
+    moments = update(moments, watched_values(begun), first // thin)
     carry = first, _Drawn(state, moments, places, no_steps((length,)))
     _, (state, moments, places, windows) = jax.lax.while_loop(lambda carry: carry[0] < length * thin, one_step, carry)
     latest = jax.lax.cummax(jnp.where(windows.steps > 0, jnp.arange(1, length + 1), 0))

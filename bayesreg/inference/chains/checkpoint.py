@@ -1,4 +1,4 @@
-"""What a run knows between two blocks of draws."""
+"""The state of a run between two blocks of draws."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Checkpoint(NamedTuple):
         What the sampler found before its first step.
     state : pytree
     moments : Moments
-        Of the estimands and of u at every node.
+        Moments of the estimands and of u at every node.
     tally : Tally
         Summed over all steps so far.
     seconds : float
@@ -58,7 +58,7 @@ def no_steps(shape: tuple[int, ...] = ()) -> Tally:
     return Tally(*(jnp.zeros(shape),) * len(Tally._fields))
 
 
-def counted(tally: Tally, info: Info) -> Tally:
+def count_step(tally: Tally, info: Info) -> Tally:
     """The tally with one step more."""
     return jax.tree.map(jnp.add, tally, Tally(jnp.ones(()), *info))
 

@@ -78,7 +78,7 @@ def on_host(tree: Any) -> Any:
     return jax.tree.map(np.asarray, tree) if jax.process_count() > 1 else tree
 
 
-def gathered(tree: Any) -> Any:
+def gather(tree: Any) -> Any:
     """Arrays that are spread over the devices of several processes, whole on each."""
     return multihost_utils.process_allgather(tree, tiled=True) if jax.process_count() > 1 else tree
 
@@ -102,7 +102,7 @@ def devices_for(chains: int) -> Mesh | None:
     return Mesh(np.array(chosen), (_AXIS,)) if len(chosen) > 1 else None
 
 
-def shared(tree: Any, devices: Mesh | None) -> Any:
+def share(tree: Any, devices: Mesh | None) -> Any:
     """Arrays whose leading axis is that of the chains, on these devices, as a block of draws leaves them.
 
     The first block would otherwise be compiled for other places than all after it.

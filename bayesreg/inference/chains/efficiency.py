@@ -1,4 +1,4 @@
-"""What a sampler's draws cost: effective draws per second and per evaluation, and how far a budget led."""
+"""The cost of a sampler's draws: effective draws per second and per evaluation, and how far a budget led."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Efficiency(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """What every sampler may spend.
+    """The budget of every sampler.
 
     Attributes
     ----------
@@ -116,10 +116,10 @@ def efficiency(
         )  # fmt: skip
     except InputError as error:
         return Efficiency(sampler, note=str(error))
-    return _reckoned(sampler, samples, float(first.seconds), ends)
+    return _reckon(sampler, samples, float(first.seconds), ends)
 
 
-def _reckoned(sampler: str, samples: Samples, preparing: float, ends: list[tuple[int, float]]) -> Efficiency:
+def _reckon(sampler: str, samples: Samples, preparing: float, ends: list[tuple[int, float]]) -> Efficiency:
     judged = convergence(samples.idata)
     bulk, tail = (_extreme(ess, np.nanmin) for ess in (judged.ess_bulk, judged.ess_tail))
     least = None if bulk is None or tail is None else min(bulk, tail)

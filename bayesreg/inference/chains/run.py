@@ -12,15 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.chains.block import run_block, watched
+from bayesreg.inference.chains.block import run_block, watched_values
 from bayesreg.inference.chains.checkpoint import Checkpoint, Tally, no_steps
-from bayesreg.inference.chains.devices import devices_for, from_first, gathered, is_first, on_host, shared
+from bayesreg.inference.chains.devices import devices_for, from_first, gather, is_first, on_host, share
 from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress
-from bayesreg.inference.chains.stopping import StopRule, Verdict, judged, out_of_time, reason
+from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, out_of_time, reason
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_inference_data
-from bayesreg.inference.draws.moments import pooled, scale_reduction, zero_moments
+from bayesreg.inference.draws.moments import pool, scale_reduction, zero_moments
 from bayesreg.inference.kernel import Draw
 from bayesreg.inference.samplers.registry import Chosen, choose_sampler
 from bayesreg.inference.target import Target
@@ -29,7 +29,7 @@ from bayesreg.types import InputError
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What sampling found.
+    """The results of sampling.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def sample(
     on_block : callable, optional
         Called with the block's number, its draws and the checkpoint after it, when the block is kept.
     **settings
-        Of the sampler, see `bayesreg.inference.samplers.registry`.
+        Settings of the sampler, see `bayesreg.inference.samplers.settings`.
 
     Returns
     -------
@@ -137,14 +137,14 @@ def sample(
         _require_continuation(chosen, checkpoint, blocks)
     with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
-        verdict, ended = _judged(stop, checkpoint, blocks, bar)
+        verdict, ended = _judge(stop, checkpoint, blocks, bar)
         while not ended and (found := next(advance, None)) is not None:
             drawn, checkpoint = found
             blocks.append(drawn)
             if on_block is not None:
                 on_block(len(blocks) - 1, drawn, checkpoint)
-            verdict, ended = _judged(stop, checkpoint, blocks, bar)
-    return _samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
+            verdict, ended = _judge(stop, checkpoint, blocks, bar)
+    return _gather_samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
 
 
 def first_checkpoint(
@@ -173,7 +173,7 @@ def first_checkpoint(
     setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), say)
     data = chosen.sampler.data(setup)
     checkpoint = _first(chosen, data, setup, points)
-    require_density(_observed(chosen, data, setup, checkpoint.state).evaluation)
+    require_density(_observe(chosen, data, setup, checkpoint.state).evaluation)
     return checkpoint._replace(seconds=np.array(time.perf_counter() - began))
 
 
@@ -205,7 +205,7 @@ def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks
     if len(blocks) == 0:
         return
     last = blocks[len(blocks) - 1]
-    here = _observed(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
+    here = _observe(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
     if not all(np.allclose(here[name], last[name][:, -1], rtol=1e-3, atol=1e-4) for name in here):
         raise InputError(
             "the chains do not stand where their last draws were: another version of bayesreg began this run; begin it "
@@ -216,13 +216,13 @@ def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks
 def _first(chosen: Chosen, data: Any, setup: Any, points: Any) -> Checkpoint:
     state = jax.vmap(partial(chosen.sampler.init, data, setup))(points)
     chains = len(next(iter(points.values())))
-    shapes = jax.eval_shape(partial(_observed, chosen), data, setup, state)
-    moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), watched(shapes)))
+    shapes = jax.eval_shape(partial(_observe, chosen), data, setup, state)
+    moments = jax.vmap(zero_moments)(jax.tree.map(lambda x: jnp.zeros(x.shape), watched_values(shapes)))
     return Checkpoint(np.array(0), setup, state, moments, no_steps((chains,)), np.array(0.0))
 
 
 @partial(jax.jit, static_argnums=0)
-def _observed(chosen: Chosen, data: Any, setup: Any, state: Any) -> Draw:
+def _observe(chosen: Chosen, data: Any, setup: Any, state: Any) -> Draw:
     return jax.vmap(partial(chosen.sampler.observe, data, setup))(state)
 
 
@@ -242,7 +242,7 @@ def _advance(
     data = on_host(chosen.sampler.data(checkpoint.setup))
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
-        state, moments, tally, found = gathered(
+        state, moments, tally, found = gather(
             run_block(
                 chosen,
                 length,
@@ -253,7 +253,7 @@ def _advance(
                 np.arange(chains),
                 int(checkpoint.draws),
                 on_host(checkpoint.setup),
-                *shared(on_host(checkpoint[2:5]), devices),
+                *share(on_host(checkpoint[2:5]), devices),
             )
         )
         found = {name: np.asarray(value) for name, value in found.items()}
@@ -263,18 +263,18 @@ def _advance(
         yield found, checkpoint
 
 
-def _judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
+def _judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
     """The verdict on the draws so far, and whether they are enough or time is up; of several processes the first says.
 
     What is known without judging them is shown.
     """
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    verdict = judged(stop, checkpoint, blocks) if is_first() else Verdict(holds=False)
+    verdict = judge(stop, checkpoint, blocks) if is_first() else Verdict(holds=False)
     holds, late = from_first(np.array([verdict.holds, out_of_time(stop, checkpoint)]))
     return verdict._replace(holds=bool(holds)), bool(holds or late)
 
 
-def _samples(
+def _gather_samples(
     posterior: Target,
     exact: bool,
     blocks: Blocks,
@@ -283,7 +283,7 @@ def _samples(
     verdict: Verdict,
     draws: int,
 ) -> Samples:
-    mean, sd = pooled(checkpoint.moments)
+    mean, sd = pool(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
     return Samples(
         posterior=posterior,

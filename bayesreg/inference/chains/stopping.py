@@ -28,7 +28,7 @@ class StopRule(NamedTuple):
     ess : float, optional
         And when every estimand's bulk and tail effective sample sizes exceed this.
     max_seconds : float, optional
-        Of sampling, compilation, search for the mode and warm-up included.
+        Seconds of sampling, compilation, search for the mode and warm-up included.
     min_draws : int
         Kept draws per chain before R̂ is believed.
     """
@@ -46,7 +46,7 @@ class Verdict(NamedTuple):
     found: Worst | None = None
 
 
-def judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
+def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
     """The verdict on all draws so far."""
     if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
         return Verdict(holds=False)
@@ -63,7 +63,7 @@ def judged(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
 
 
 def _suspects(rhat: Mapping[str, AnyArray]) -> np.ndarray:
-    """Those of the greatest running R̂, by their place among all estimands, which are sorted by name."""
+    """The estimands of the greatest running R̂, by their place among all, which are sorted by name."""
     return np.argsort(-np.concatenate([rhat[name].ravel() for name in sorted(rhat)]), kind="stable")[:SUSPECTS]
 
 

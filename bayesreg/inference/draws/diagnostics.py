@@ -39,11 +39,11 @@ def convergence(idata: Any) -> Convergence:
     Draws that lie in a file are read in parts.
     """
     draws = dataset(idata, "posterior")
-    judged = [_judged(values) for name, values in draws.items() if name not in DERIVED]
+    judged = [_judge(values) for name, values in draws.items() if name not in DERIVED]
     return Convergence(*(xr.merge([found[k] for found in judged]) for k in range(len(Convergence._fields))))
 
 
-def _judged(draws: xr.DataArray) -> list[xr.DataArray]:
+def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
     """R̂, bulk and tail ESS of one variable."""
     others = [dim for dim in draws.dims if dim not in ("chain", "draw")]
     if draws.sizes["draw"] < 4 or draws.size == 0:
@@ -62,7 +62,7 @@ def _judged(draws: xr.DataArray) -> list[xr.DataArray]:
 def _figures(draws: xr.DataArray) -> list[xr.DataArray]:
     draws = draws.compute()
     constant = draws.min(("chain", "draw")) == draws.max(("chain", "draw"))
-    return [found[draws.name].where(~constant) for found in _diagnosed(draws.to_dataset())]
+    return [found[draws.name].where(~constant) for found in _diagnose(draws.to_dataset())]
 
 
 class Worst(NamedTuple):
@@ -110,12 +110,12 @@ def _worst(draws: np.ndarray) -> Worst:
     if draws.shape[1] < 4:
         return Worst(np.inf, 0.0, 0.0)
     data = xr.Dataset({"draws": (["chain", "draw", "estimand"], draws)})
-    rhat, bulk, tail = (found["draws"] for found in _diagnosed(data))
+    rhat, bulk, tail = (found["draws"] for found in _diagnose(data))
     least = (float(ess.where(rhat.notnull(), 0.0).min()) for ess in (bulk, tail))
     return Worst(float(rhat.fillna(np.inf).max()), *least)
 
 
-def _diagnosed(draws: xr.Dataset) -> list[xr.Dataset]:
+def _diagnose(draws: xr.Dataset) -> list[xr.Dataset]:
     """R̂, bulk and tail ESS of every variable."""
     # It takes a second to import, for which the first draws need not wait.
     az = arviz()

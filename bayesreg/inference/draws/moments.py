@@ -26,7 +26,7 @@ def zero_moments(like: Any) -> Moments:
     return Moments(jnp.zeros(()), zeros, zeros)
 
 
-def updated(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
+def update(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
     """Moments with one draw more, or with so many that are all the same (West 1979)."""
     count = moments.count + times
     share = times / jnp.maximum(count, 1)
@@ -37,7 +37,7 @@ def updated(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
     return Moments(count, mean, squares)
 
 
-def extended(moments: Moments, block: Any) -> Moments:
+def extend(moments: Moments, block: Any) -> Moments:
     """Moments of several chains with a block of draws more (Chan et al.), on the host.
 
     Parameters
@@ -66,7 +66,7 @@ def extended(moments: Moments, block: Any) -> Moments:
     )
 
 
-def pooled(moments: Moments) -> tuple[Any, Any]:
+def pool(moments: Moments) -> tuple[Any, Any]:
     """Mean and standard deviation over all draws of all chains (leading axis), each chain of equal length."""
     count = np.asarray(moments.count)[0]
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from bayesreg.inference.draws.moments import Moments, extended, pooled, zero_moments
+from bayesreg.inference.draws.moments import Moments, extend, pool, zero_moments
 from bayesreg.types import AnyArray
 
 Draws = Mapping[str, AnyArray]
@@ -24,7 +24,7 @@ MOST_KEPT = 1024
 
 
 class Summary(NamedTuple):
-    """What is known of a function of the draws; pytrees of the function's own structure.
+    """Moments and quantiles of a function of the draws; pytrees of the function's own structure.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Summary(NamedTuple):
     quantiles: Any
 
 
-def thinned(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np.ndarray]:
+def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np.ndarray]:
     """Evenly spaced draws of the named variables.
 
     Parameters
@@ -75,7 +75,7 @@ def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, 
     draws : mapping
         Arrays (chain, draw, …).
     given : pytree
-        The same for all draws.
+        A further argument, the same for all draws.
     block : int
         Draws evaluated side by side.
 
@@ -99,7 +99,7 @@ def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.
     """Mean, sd and quantiles of what `push_forward` yields; one block and `MOST_KEPT` draws in memory at a time."""
     moments, kept, stride, seen = None, None, 1, 0
     for block in blocks:
-        moments = extended(_nothing(block) if moments is None else moments, block)
+        moments = extend(_nothing(block) if moments is None else moments, block)
         every = slice(-seen % stride, None, stride)
         some = jax.tree.map(lambda leaf, every=every: leaf[:, every], block)
         kept = some if kept is None else jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), kept, some)
@@ -108,7 +108,7 @@ def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.
             kept, stride = jax.tree.map(lambda leaf: leaf[:, ::2], kept), 2 * stride
     if moments is None:
         raise ValueError("there is no draw to summarise")
-    mean, sd = pooled(moments)
+    mean, sd = pool(moments)
     return Summary(mean, sd, moments.mean, jax.tree.map(lambda leaf: np.quantile(leaf, probabilities, (0, 1)), kept))
 
 

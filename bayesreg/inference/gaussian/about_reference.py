@@ -17,19 +17,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.gaussian.laplace import Reference, averaged, pulled, slope_at
-from bayesreg.inference.gaussian.loose import loose, moved_alone, searched, slowest
+from bayesreg.inference.gaussian.laplace import Reference, average_reference, recentre, slope_at
+from bayesreg.inference.gaussian.loose import find_slowest, move_alone, place_loose_nodes, search_places
 from bayesreg.inference.gaussian.modes import search_modes
-from bayesreg.inference.gaussian.normaliser import Delayed, delayed, log_normaliser_at, stand_in
-from bayesreg.inference.gaussian.reflection import rotated
-from bayesreg.inference.gaussian.warm_up import Tuning, tuned
+from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, log_normaliser_at, make_stand_in
+from bayesreg.inference.gaussian.reflection import rotate
+from bayesreg.inference.gaussian.warm_up import Tuning, tune
 from bayesreg.inference.gaussian.whitened import (
     Density,
     Setup,
     Transition,
     clearance_of,
     setup_about,
-    whitened,
+    whiten,
     whitened_density,
     whitened_position,
 )
@@ -71,7 +71,7 @@ class Walk:
     def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
         """The state of a chain there."""
         flat = flat_position(self.target, data, estimands)
-        return self.begin(whitened(setup.reference, flat), self.density(self.target, data, setup))
+        return self.begin(whiten(setup.reference, flat), self.density(self.target, data, setup))
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
         """The state after a transition."""
@@ -92,7 +92,7 @@ class Walk:
         return estimands_of(self.target, data, whitened_position(self.target, setup.reference, state.position))
 
     def observe(self, data: Any, setup: Setup, state: Any) -> Draw:
-        """The same, with what the density is made of there."""
+        """Where a chain is, and the evaluation of the density there."""
         estimands = self.estimands(data, setup, state)
         return Draw(estimands, self.target.evaluate_estimands(data, estimands))
 
@@ -115,7 +115,7 @@ def about_reference(
     transition : callable
         (target, data, setup, key, state) → (state, Moved).
     tuning : Tuning, optional
-        Of the step size; without it there is no warm-up.
+        How the step size is tuned; without it there is no warm-up.
     begin : callable
         (position, log density) → the state that the transition takes, with a field `position`, and with
         `logdensity` where nodes are moved alone.
@@ -151,20 +151,20 @@ def about_reference(
         key_start, key_tune = jax.random.split(key)
         keys = jax.random.split(key_start, len(found.chains))
         modes = [np.asarray(reference.centre) for reference in found.references]
-        about = [pulled(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
+        about = [recentre(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
         setups = [_about(target, reference, mode) for reference, mode in zip(about, modes, strict=True)]
-        starts = [_overdispersed(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
+        starts = [_scatter(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
             return setups[0], points
-        return _warmed_up(walk, tuning, alone, modes[0], points, key_tune, say)
+        return _warm_up(walk, tuning, alone, modes[0], points, key_tune, say)
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
         return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
 
-    data = partial(_conditioned, target)
+    data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
     # What is approximate anyway does without the normaliser's own value.
     if has_costly_normaliser(target) and exact:
@@ -172,12 +172,12 @@ def about_reference(
     return _with_loose_nodes(target, sampler, begin, density) if alone else sampler
 
 
-def _conditioned(target: Target, setup: Setup) -> Any:
+def _condition(target: Target, setup: Setup) -> Any:
     """The target's data, prepared for chains about the middle."""
-    return target.conditioned(estimands_of(target, target.data, unravel(target)(setup.middle)), setup.loose.nodes)
+    return target.condition(estimands_of(target, target.data, unravel(target)(setup.middle)), setup.loose.nodes)
 
 
-def _warmed_up(
+def _warm_up(
     walk: Walk, tuning: Tuning, alone: int, mode: AnyArray, points: Any, key: AnyArray, say: Say
 ) -> tuple[Setup, Any]:
     """The setup that the chains go on with, and where they then are.
@@ -188,22 +188,22 @@ def _warmed_up(
     """
     target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
     key_settle, key_tune, key_search = jax.random.split(key, 3)
-    begun = _averaged(target, mode, points, alone)
-    _, points, settling = tuned(_conditioned(target, begun), walk, begun, points, key_settle, stage, apart=True)
-    setup = _averaged(target, mode, points, alone)
-    setup, points, path = tuned(_conditioned(target, setup), walk, setup, points, key_tune, stage, say=say)
+    begun = _setup_on_average(target, mode, points, alone)
+    _, points, settling = tune(_condition(target, begun), walk, begun, points, key_settle, stage, apart=True)
+    setup = _setup_on_average(target, mode, points, alone)
+    setup, points, path = tune(_condition(target, setup), walk, setup, points, key_tune, stage, say=say)
     if settling is None or path is None:
         return setup, points
     # Of the second stage alone, where trajectories are whole from the first: before, they are short, and chains on
     # their way.
-    nodes = slowest(np.asarray(path), alone)
+    nodes = find_slowest(np.asarray(path), alone)
     say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.variables.coords['node'])[nodes]))}")
     late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])
     seen = np.moveaxis(late.reshape(-1, alone, 3), 1, 0)
-    setup = setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen))
-    beyond = searched(target, _conditioned(target, setup), setup.loose, points, key_search)
+    setup = setup._replace(loose=place_loose_nodes(setup.reference, displacements(target).start, nodes, seen))
+    beyond = search_places(target, _condition(target, setup), setup.loose, points, key_search)
     seen = np.concatenate([seen, beyond], axis=1)
-    return setup._replace(loose=loose(setup.reference, displacements(target).start, nodes, seen)), points
+    return setup._replace(loose=place_loose_nodes(setup.reference, displacements(target).start, nodes, seen)), points
 
 
 def _with_loose_nodes(target: Target, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
@@ -223,7 +223,7 @@ def _with_loose_nodes(target: Target, sampler: Sampler, begin: Callable, density
         def beginning(xi: AnyArray) -> Any:
             return begin(xi, density(target, data, setup))
 
-        kernel = moved_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
+        kernel = move_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
         state = state._replace(kernel=kernel) if isinstance(state, Delayed) else kernel
         return state, info._replace(gradients=info.gradients + 1)
 
@@ -246,17 +246,17 @@ def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
     def flat_of(setup: Setup, state: Any) -> AnyArray:
         return setup.reference.place(state.position)
 
-    step = delayed(sampler.step, flat_of, partial(log_normaliser_at, target))
+    step = delay_acceptance(sampler.step, flat_of, partial(log_normaliser_at, target))
     return sampler._replace(init=init, step=step, observe=observe)
 
 
 def _about(target: Target, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
     """A setup before its tuning, with the stand-in about the middle."""
     setup = setup_about(target, reference, middle, alone)
-    return setup._replace(stand_in=stand_in(target, reference, jnp.asarray(middle)))
+    return setup._replace(stand_in=make_stand_in(target, reference, jnp.asarray(middle)))
 
 
-def _averaged(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
+def _setup_on_average(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there.
 
     Which nodes are moved alone is not known yet: the first stands for so many.
@@ -264,10 +264,10 @@ def _averaged(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Se
     flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
-    return _about(target, averaged(target, places), np.mean(places, axis=0), np.zeros(alone, int))
+    return _about(target, average_reference(target, places), np.mean(places, axis=0), np.zeros(alone, int))
 
 
-def _overdispersed(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
+def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
     """A quarter turn from the mode with too much momentum: a draw of a wider Gaussian, reflected into the support.
 
     Raises
@@ -275,7 +275,7 @@ def _overdispersed(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray)
     InputError
         If a chain finds no place in the support.
     """
-    width, begin = np.full(len(keys), OVERDISPERSION), whitened(setup.reference, jnp.asarray(mode))
+    width, begin = np.full(len(keys), OVERDISPERSION), whiten(setup.reference, jnp.asarray(mode))
     for _ in range(10):
         points, done = jax.vmap(partial(_start, target, target.data, setup, begin))(keys, jnp.asarray(width))
         if done.all():
@@ -291,5 +291,5 @@ def _start(
 ) -> tuple[Any, AnyArray]:
     """Estimands, and whether the flight there was over in time."""
     momentum = width * jax.random.normal(key, begin.shape)
-    xi, _ = rotated(setup.walls, clearance_of(target, data, setup), begin, momentum, jnp.pi / 2)
+    xi, _ = rotate(setup.walls, clearance_of(target, data, setup), begin, momentum, jnp.pi / 2)
     return estimands_of(target, data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()

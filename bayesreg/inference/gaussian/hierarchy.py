@@ -33,7 +33,7 @@ def is_temperature(target: Placed) -> Float[np.ndarray, "dimension"]:
     return marked(target, TEMPERATURE).astype(float)
 
 
-def balanced(
+def balance_field(
     target: Placed,
     flat: Float[np.ndarray, "dimension"],
     factor: Callable[[], Float[np.ndarray, "dimension dimension"]],
@@ -65,7 +65,7 @@ def balanced(
     return moved
 
 
-def tempered(
+def balance_temperature(
     target: Placed,
     flat: Float[np.ndarray, "dimension"],
     slope: float,
@@ -80,16 +80,16 @@ def tempered(
     flat : (d,) array
         A mode given T_r.
     slope, curvature : float
-        Of the log density and of minus it in log T_r, there.
+        Slope of the log density and curvature of minus it in log T_r, there.
     shares : (r, r) array
         C P: in its eigenvectors, how much of what holds a component of u_B is the prior's.
     """
     moved = np.array(flat)
-    change = (slope + np.trace(shares) / 2) / (curvature + gained(shares))
+    change = (slope + np.trace(shares) / 2) / (curvature + evidence_curvature(shares))
     moved[is_temperature(target) > 0] += np.clip(change, -_MOST, _MOST)
     return moved
 
 
-def gained(shares: Float[np.ndarray, "rows rows"]) -> float:
+def evidence_curvature(shares: Float[np.ndarray, "rows rows"]) -> float:
     """By how much the evidence of log T_r is more curved than the log density: ½ tr(C P − (C P)²)."""
     return float(np.trace(shares) - (shares * shares.T).sum()) / 2

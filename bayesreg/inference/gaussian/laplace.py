@@ -13,7 +13,7 @@ import scipy.linalg
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.inference.gaussian.hierarchy import gained, is_scale, is_temperature
+from bayesreg.inference.gaussian.hierarchy import evidence_curvature, is_scale, is_temperature
 from bayesreg.inference.layout import marked, unravel
 from bayesreg.inference.target import Curvature, Target, estimands_of, logdensity, without_walls
 from bayesreg.types import AnyArray, InputError
@@ -58,8 +58,8 @@ def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = No
     return gaussian(flat, precision_at(target, flat, data, joint))
 
 
-def averaged(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
-    """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `pulled` by all.
+def average_reference(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+    """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `recentre` by all.
 
     Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
     wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
@@ -71,12 +71,12 @@ def averaged(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) ->
     curvatures = (_curvature(target, target.data, flat) for flat in flats)
     pairs = [(found.gauss_newton, found.remainder) for found in curvatures]
     approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
-    curvature = _convex(_regular(approximate), remainder)
+    curvature = _add_convexly(_regular(approximate), remainder)
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
-    return pulled(target, gaussian(flats[0], precision), flats)
+    return recentre(target, gaussian(flats[0], precision), flats)
 
 
-def pulled(target: Target, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+def recentre(target: Target, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
     """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
 
     Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
@@ -116,7 +116,7 @@ def _height_and_slope(target: Target, data: Any, flat: AnyArray) -> tuple[AnyArr
     return jax.value_and_grad(lambda x: logdensity(target, data, unravel(target)(x)))(flat)
 
 
-def _convex(
+def _add_convexly(
     approximate: Float[np.ndarray, "rows rows"], remainder: Float[np.ndarray, "rows rows"]
 ) -> Float[np.ndarray, "rows rows"]:
     """The sum of a positive definite curvature and another, made positive definite.
@@ -150,7 +150,7 @@ def precision_at(
     target : Target
     flat : (d,) array
     data : pytree, optional
-        Of a problem other than the target's own.
+        Data of a problem other than the target's own.
     joint : bool
         Whether the other coordinates are given curvature; else they are left uncorrelated.
 
@@ -202,7 +202,7 @@ def _jointly(
 
     In log T_r it is that of its evidence, or that at draws of the displacements (see `hierarchy`).
     """
-    curved = _curved(target, joint)
+    curved = _mark_curved(target, joint)
     count = int((~curved).sum())
     # The coordinates whose curvature counts come last. Where not jointly, the field's share of the given is left out.
     order = np.argsort(curved, kind="stable")
@@ -215,7 +215,7 @@ def _jointly(
         temperature = np.flatnonzero(is_temperature(target)[order[:count]])
         if len(temperature):
             shares = prior_shares(target, data, flat)
-            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else gained(shares)
+            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else evidence_curvature(shares)
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]
@@ -233,7 +233,7 @@ def _jointly(
     return precision
 
 
-def _curved(target: Target, joint: bool) -> Bool[np.ndarray, "dimension"]:
+def _mark_curved(target: Target, joint: bool) -> Bool[np.ndarray, "dimension"]:
     """Entries of a flat position whose curvature the target knows: "u_boundary" and, jointly, "field"."""
     return marked(target, "u_boundary", "field") if joint else marked(target, "u_boundary")
 

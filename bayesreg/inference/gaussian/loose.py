@@ -47,7 +47,7 @@ class Kernels(NamedTuple):
     scale : (3, 3) array
         Lower triangular.
     degrees : int
-        Of freedom: not an array, for so many numbers are drawn.
+        Degrees of freedom: not an array, for so many numbers are drawn.
     """
 
     middles: Float[AnyArray, "kernels 3"]
@@ -92,7 +92,7 @@ class Loose(NamedTuple):
     spread: Float[AnyArray, "k 3 3"]
 
 
-def slowest(path: Float[AnyArray, "draw chain node 3"], count: int) -> Int[np.ndarray, "k"]:
+def find_slowest(path: Float[AnyArray, "draw chain node 3"], count: int) -> Int[np.ndarray, "k"]:
     """The nodes that come the least far beside their spread: squared steps over the variance.
 
     Steps are those of two transitions: a quarter turn often leads to the other side of the mean, and the next one back.
@@ -103,7 +103,9 @@ def slowest(path: Float[AnyArray, "draw chain node 3"], count: int) -> Int[np.nd
     return np.sort(np.argsort(mobility)[:count])
 
 
-def loose(reference: Reference, first: int, nodes: Int[AnyArray, "k"], seen: Float[AnyArray, "k seen 3"]) -> Loose:
+def place_loose_nodes(
+    reference: Reference, first: int, nodes: Int[AnyArray, "k"], seen: Float[AnyArray, "k seen 3"]
+) -> Loose:
     """How the nodes stand in the whitened coordinates, and where places are drawn for them.
 
     Parameters
@@ -129,14 +131,14 @@ def loose(reference: Reference, first: int, nodes: Int[AnyArray, "k"], seen: Flo
     return Loose(jnp.asarray(nodes, int), columns, seen, jnp.linalg.cholesky(covariance + own))
 
 
-def searched(target: Target, data: Any, nodes: Loose, points: Any, key: AnyArray) -> Float[np.ndarray, "k seen 3"]:
+def search_places(target: Target, data: Any, nodes: Loose, points: Any, key: AnyArray) -> Float[np.ndarray, "k seen 3"]:
     """Where the nodes come from the chains' estimands, each while all others stay, by moves from wide places."""
     keys = jax.random.split(key, len(next(iter(points.values()))))
-    return np.concatenate(np.asarray(_searched(target, data, nodes, points, keys)), axis=1)
+    return np.concatenate(np.asarray(_search_places(target, data, nodes, points, keys)), axis=1)
 
 
 @partial(jax.jit, static_argnums=0)
-def _searched(target: Target, data: Any, nodes: Loose, points: Any, keys: AnyArray) -> AnyArray:
+def _search_places(target: Target, data: Any, nodes: Loose, points: Any, keys: AnyArray) -> AnyArray:
     assert target.single_nodes is not None
     single_nodes = target.single_nodes
 
@@ -146,7 +148,7 @@ def _searched(target: Target, data: Any, nodes: Loose, points: Any, keys: AnyArr
         height = single_nodes.log_density(data, estimands, which)
 
         def one(here: AnyArray, key: AnyArray) -> tuple[AnyArray, AnyArray]:
-            there = _resampled(places, WIDE_PLACES, height, here, key)[0]
+            there = _resample(places, WIDE_PLACES, height, here, key)[0]
             return there, there
 
         here = estimands["u_boundary"][nodes.nodes[which]]
@@ -159,7 +161,7 @@ def _searched(target: Target, data: Any, nodes: Loose, points: Any, keys: AnyArr
     return jax.vmap(of_chain)(points, keys)
 
 
-def _resampled(
+def _resample(
     places: Kernels,
     count: int,
     height: Callable[[AnyArray], AnyArray],
@@ -176,7 +178,7 @@ def _resampled(
     return drawn[chosen], heights[chosen] - heights[0]
 
 
-def moved_alone(
+def move_alone(
     target: Target,
     begin: Callable[[AnyArray], Any],
     data: Any,
@@ -193,7 +195,7 @@ def moved_alone(
     begin : callable
         Whitened position → state, with fields `position` and `logdensity`.
     data : pytree
-        Of the target, for moves of these nodes.
+        The target's data, conditioned for moves of these nodes.
     reference : Reference
     nodes : Loose
     key : PRNG key
@@ -208,7 +210,7 @@ def moved_alone(
         """The way of one node, and what it gained in its own density."""
         here = estimands["u_boundary"][nodes.nodes[which]]
         places = Kernels(nodes.seen[which], NARROW[1] * nodes.spread[which], NARROW[0])
-        there, gain = _resampled(places, PLACES, single_nodes.log_density(data, estimands, which), here, key)
+        there, gain = _resample(places, PLACES, single_nodes.log_density(data, estimands, which), here, key)
         return there - here, gain
 
     count = len(nodes.nodes)

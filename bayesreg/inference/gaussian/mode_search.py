@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from bayesreg.inference.gaussian.hierarchy import balanced, is_scale, is_temperature, tempered
+from bayesreg.inference.gaussian.hierarchy import balance_field, balance_temperature, is_scale, is_temperature
 from bayesreg.inference.gaussian.laplace import (
     Reference,
     gaussian,
@@ -23,7 +23,7 @@ from bayesreg.inference.gaussian.laplace import (
     prior_shares,
     slope_at,
 )
-from bayesreg.inference.gaussian.pockets import out_of_pockets
+from bayesreg.inference.gaussian.pockets import leave_pockets
 from bayesreg.inference.layout import displacements, node_count, others, unravel
 from bayesreg.inference.target import Target, clearance, without_normaliser
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -47,7 +47,7 @@ def find_mode(
 ) -> Float[np.ndarray, "dimension"]:
     """A mode of the log density of the position, in its support, by L-BFGS along the target's continuation.
 
-    Single nodes that are then far more probable elsewhere are moved there, and the search goes on (`out_of_pockets`).
+    Single nodes that are then far more probable elsewhere are moved there, and the search goes on (`leave_pockets`).
 
     Parameters
     ----------
@@ -72,21 +72,21 @@ def find_mode(
     assert target.mode_search is not None
     flat = np.asarray(start)
     for data in target.mode_search.continuation():
-        flat = _improved(target, data, flat, False, iterations, say, gain=ROUGH)
-    flat = settled(target, flat, say, iterations)
+        flat = _improve(target, data, flat, False, iterations, say, gain=ROUGH)
+    flat = settle(target, flat, say, iterations)
     for _ in range(RESCUES):
-        elsewhere, nodes = out_of_pockets(target, flat)
+        elsewhere, nodes = leave_pockets(target, flat)
         if not len(nodes):
             break
         named = ", ".join(map(str, np.asarray(target.variables.coords["node"])[nodes]))
         say(f"mode: moved to where they are more probable: nodes {named}")
-        flat = settled(target, elsewhere, say, iterations)
+        flat = settle(target, elsewhere, say, iterations)
     else:
         say("mode: single nodes may be more probable elsewhere")
     return flat
 
 
-def settled(
+def settle(
     target: Target,
     flat: Float[np.ndarray, "dimension"],
     say: Callable[[str], None] = lambda text: None,
@@ -99,8 +99,8 @@ def settled(
     shift = np.zeros(node_count(target))
     for _ in range(REPEATS):
         before, pressed = flat, shift
-        flat = _improved(target, target.data, flat, True, iterations, say, shift)
-        flat = _tempered(target, balanced(target, flat, partial(_factor, target, flat)))
+        flat = _improve(target, target.data, flat, True, iterations, say, shift)
+        flat = _improve_temperature(target, balance_field(target, flat, partial(_factor, target, flat)))
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
             break
@@ -109,14 +109,16 @@ def settled(
     return _admissible(target, flat)
 
 
-def _tempered(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+def _improve_temperature(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
     """The flat position with T_r, if it is inferred, nearer to the maximum of its evidence."""
     entry = np.flatnonzero(is_temperature(target))
     if not len(entry):
         return flat
     slope = slope_at(target, flat)[entry]
     curvature = -hessian_rows(target, target.data, flat, entry)[0, entry]
-    return tempered(target, flat, float(slope[0]), float(curvature[0]), prior_shares(target, target.data, flat))
+    return balance_temperature(
+        target, flat, float(slope[0]), float(curvature[0]), prior_shares(target, target.data, flat)
+    )
 
 
 def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
@@ -129,7 +131,7 @@ def _factor(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.nd
     return np.asarray(laplace(target, flat).factor)
 
 
-def _improved(
+def _improve(
     target: Target,
     data: Any,
     flat: Float[np.ndarray, "dimension"],
@@ -141,7 +143,7 @@ def _improved(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
     shift = np.zeros(node_count(target)) if shift is None else shift
-    reference = gaussian(flat, _apart(precision_at(target, flat, data, moves), is_scale(target) > 0))
+    reference = gaussian(flat, _decouple(precision_at(target, flat, data, moves), is_scale(target) > 0))
     if not moves:
         # The same for all displacements.
         data = without_normaliser(target, data)
@@ -156,7 +158,7 @@ def _improved(
         pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[own].reshape(-1, 3)), shift)
         value, slope = float(pressed) - height, -slope
         slope[own] += np.asarray(push).ravel()
-        gradient = moving * np.asarray(_pulled_back(reference, slope))
+        gradient = moving * np.asarray(_pull_back(reference, slope))
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
@@ -176,10 +178,10 @@ def _improved(
 
 # On the device: the threads of NumPy's products stay awake for a while and are in the way of what comes next.
 _place = jax.jit(Reference.place)
-_pulled_back = jax.jit(lambda reference, slope: reference.factor.T @ slope)
+_pull_back = jax.jit(lambda reference, slope: reference.factor.T @ slope)
 
 
-def _apart(
+def _decouple(
     precision: Float[np.ndarray, "dimension dimension"], held: Bool[np.ndarray, "dimension"]
 ) -> Float[np.ndarray, "dimension dimension"]:
     """Without what couples the held entries to the others: no move of the whitened others moves the held then."""
@@ -190,7 +192,7 @@ def _apart(
 
 
 def penalty(target: Target, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
-    """What minus the log density gains in place of the hard skull, moved inwards by `shift`, mm."""
+    """The penalty on minus the log density in place of the hard skull, moved inwards by `shift`, mm."""
     gap = clearance(target, data, u, jnp.arange(node_count(target)))
     return 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
 

@@ -47,10 +47,10 @@ def search_modes(target: Target, points: Any, each: bool, say: Say) -> Modes:
     for chain in range(chains):
         say(f"chain {chain}:")
         found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points)), say))
-    return report_modes(target, distinct(target, np.stack(found)), say)
+    return report_modes(target, tell_apart(target, np.stack(found)), say)
 
 
-def distinct(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
+def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
     """The modes among those of every chain that differ, by their distance in standard deviations (see `SAME`)."""
     heights = [_height(target, mode) for mode in found]
     references: list[Reference] = []

@@ -32,7 +32,7 @@ class StandIn(NamedTuple):
     Attributes
     ----------
     entries : (k,) int array
-        Of a flat position, that are no displacements.
+        The entries of a flat position that are no displacements.
     slope : (k,) array
     curvature : (k, k) array
     """
@@ -42,7 +42,7 @@ class StandIn(NamedTuple):
     curvature: Float[AnyArray, "parameters parameters"]
 
     def __call__(self, away: Float[AnyArray, "dimension"]) -> Scalar:
-        """Its value at a flat position, given less the middle."""
+        """The value at a flat position, given less the middle."""
         x = away[self.entries]
         return self.slope @ x + 0.5 * (x @ self.curvature @ x)
 
@@ -62,12 +62,12 @@ class Delayed(NamedTuple):
 
 
 def no_stand_in(target: Target) -> StandIn:
-    """That of a density without a normaliser, or before it is found."""
+    """The stand-in of a density without a normaliser, or before it is found."""
     entries = others(target)
     return StandIn(jnp.asarray(entries), jnp.zeros(len(entries)), jnp.zeros((len(entries), len(entries))))
 
 
-def stand_in(target: Target, reference: Reference, middle: AnyArray) -> StandIn:
+def make_stand_in(target: Target, reference: Reference, middle: AnyArray) -> StandIn:
     """The normaliser's slope at a flat position, and its curvature by differences over one sd of the reference."""
     found, entries = no_stand_in(target), others(target)
     count = len(entries)
@@ -95,7 +95,7 @@ def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
 _slope = jax.jit(jax.grad(log_normaliser_at, argnums=2), static_argnums=0)
 
 
-def delayed(
+def delay_acceptance(
     step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Any]],
     flat_of: Callable[[Any, Any], AnyArray],
     log_normaliser: Callable[[Any, AnyArray], Scalar],
@@ -105,7 +105,7 @@ def delayed(
     Parameters
     ----------
     step : callable
-        (data, setup, key, state) → (state, info); reversible, and setup with fields `middle` and `stand_in`.
+        (data, setup, key, state) → (state, info); reversible, and setup with fields `middle` and `make_stand_in`.
     flat_of : callable
         (setup, state) → flat position.
     log_normaliser : callable

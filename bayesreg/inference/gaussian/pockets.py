@@ -30,7 +30,7 @@ GAIN = 5.0
 AT_A_TIME = 512
 
 
-def out_of_pockets(
+def leave_pockets(
     target: Target, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[Float[np.ndarray, "dimension"], Int[np.ndarray, "moved"]]:
     """Move single nodes to where the density is far higher.
@@ -55,8 +55,8 @@ def out_of_pockets(
     estimands = estimands_of(target, data, unravel(target)(jnp.asarray(flat)))
     for first in range(0, 0 if target.single_nodes is None else count, AT_A_TIME):
         rows = np.arange(first, min(first + AT_A_TIME, count))
-        near = target.conditioned(estimands, rows, quick=True)
-        gains, places = (np.asarray(found) for found in _looked(target, near, estimands, jnp.asarray(rows)))
+        near = target.condition(estimands, rows, quick=True)
+        gains, places = (np.asarray(found) for found in _look(target, near, estimands, jnp.asarray(rows)))
         # Approximate, and said of a node while all others stay: the density itself decides, one node after the other.
         for which in (candidate for candidate in np.argsort(-gains) if gains[candidate] > GAIN):
             there, at = flat.copy(), displacements(target).start + 3 * rows[which]
@@ -68,8 +68,8 @@ def out_of_pockets(
 
 
 @partial(jax.jit, static_argnums=0)
-def _looked(target: Target, data: Any, estimands: Estimands, rows: Int[AnyArray, "k"]) -> tuple[Any, Any]:
-    """Of every node the highest place that was seen, and by how much it is higher, approximately."""
+def _look(target: Target, data: Any, estimands: Estimands, rows: Int[AnyArray, "k"]) -> tuple[Any, Any]:
+    """The highest place that was seen for every node, and by how much it is higher, approximately."""
 
     assert target.single_nodes is not None
     single_nodes = target.single_nodes

@@ -79,7 +79,7 @@ def reflective_rotation(walls: Walls, clearance: Clearance, precision: AnyArray 
 
         def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
             momentum = state.momentum + step_size / 2 * (state.logdensity_grad + precision * state.position)
-            position, velocity = rotated(walls, clearance, state.position, momentum / precision, step_size)
+            position, velocity = rotate(walls, clearance, state.position, momentum / precision, step_size)
             logdensity, gradient = density(position)
             momentum = precision * velocity + step_size / 2 * (gradient + precision * position)
             return IntegratorState(position, momentum, logdensity, gradient)
@@ -97,7 +97,7 @@ def reflective_leapfrog(walls: Walls, clearance: Clearance) -> Callable:
 
         def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
             momentum = state.momentum + step_size / 2 * state.logdensity_grad
-            position, momentum = shifted(walls, clearance, state.position, momentum, step_size)
+            position, momentum = shift(walls, clearance, state.position, momentum, step_size)
             logdensity, gradient = density(position)
             return IntegratorState(position, momentum + step_size / 2 * gradient, logdensity, gradient)
 
@@ -122,7 +122,7 @@ def reflective_microcanonical(walls: Walls, clearance: Clearance) -> Callable:
             change = None
             for push, flight in zip(way[::2], way[1::2], strict=True):
                 momentum, _, change = kick(momentum, gradient, step_size, push, change)
-                position, momentum = shifted(walls, clearance, position, momentum, flight * step_size)
+                position, momentum = shift(walls, clearance, position, momentum, flight * step_size)
                 logdensity, gradient = density(position)
             momentum, _, change = kick(momentum, gradient, step_size, last, change)
             return IntegratorState(position, momentum, logdensity, gradient), change
@@ -141,24 +141,24 @@ class _Flight(NamedTuple):
     reflections: AnyArray
 
 
-def rotated(
+def rotate(
     walls: Walls, clearance: Clearance, position: AnyArray, momentum: AnyArray, time: AnyArray | float
 ) -> tuple[AnyArray, AnyArray]:
     """Position and momentum after the reference's own motion for some time (either sign), reflected at the walls.
 
     A flight that is not over after many reflections ends outside the support of any density: at NaN.
     """
-    return _reflected(_turn, walls, clearance, position, momentum, time)
+    return _reflect(_turn, walls, clearance, position, momentum, time)
 
 
-def shifted(
+def shift(
     walls: Walls, clearance: Clearance, position: AnyArray, momentum: AnyArray, time: AnyArray | float
 ) -> tuple[AnyArray, AnyArray]:
-    """As `rotated`, in a straight line."""
-    return _reflected(_shift, walls, clearance, position, momentum, time)
+    """As `rotate`, in a straight line."""
+    return _reflect(_shift, walls, clearance, position, momentum, time)
 
 
-def _reflected(
+def _reflect(
     motion: Motion,
     walls: Walls,
     clearance: Clearance,

@@ -47,7 +47,7 @@ class Tuning(NamedTuple):
 
 @runtime_checkable
 class Walking(Protocol):
-    """What moves the chains, hashable (`bayesreg.inference.gaussian.about_reference.Walk`)."""
+    """A hashable object that moves the chains (`bayesreg.inference.gaussian.about_reference.Walk`)."""
 
     def init(self, data: Any, setup: Any, estimands: Estimands) -> Any:
         """See `Sampler`."""
@@ -59,7 +59,7 @@ class Walking(Protocol):
         """Where a chain is."""
 
 
-def tuned(
+def tune(
     data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False,
     say: Say = lambda text: None,
 ) -> tuple[Any, Any, AnyArray | None]:  # fmt: skip
@@ -84,7 +84,7 @@ def tuned(
     keys = jax.random.split(key, tuning.warm_up)
     first = jax.vmap(partial(walk.init, data, setup))(starts)
     points, sizes, rates, path = _run(walk, tuning, data, setup, first, keys, jnp.asarray(apart))
-    setup, late = _sized(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
+    setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     say(f"warm-up: step {float(setup.step_size):.2g}{trajectory}, acceptance {late:.0%}")
     return setup, points, path
@@ -105,7 +105,7 @@ def _run(
     chains = len(jax.tree.leaves(first)[0])
 
     def moved(state: Any, size: AnyArray, key: AnyArray) -> Any:
-        now = _sized(tuning, setup, size)
+        now = _with_step_size(tuning, setup, size)
         few = jnp.minimum(now.steps, FEW_STEPS)
         return walk.step(data, now._replace(steps=jnp.where(apart, few, now.steps)), key, state)
 
@@ -122,7 +122,7 @@ def _run(
     return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates, path
 
 
-def _sized(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
+def _with_step_size(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
     size = jnp.clip(size, tuning.least, tuning.greatest)
     if not tuning.quarter_turns:
         return setup._replace(step_size=size)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from bayesreg.inference.gaussian.laplace import Reference
-from bayesreg.inference.gaussian.loose import Loose, loose
+from bayesreg.inference.gaussian.loose import Loose, place_loose_nodes
 from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in
 from bayesreg.inference.gaussian.reflection import Clearance, Walls, walls
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP
@@ -26,7 +26,7 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Setup(NamedTuple):
-    """What the samplers about a Gaussian reference find once (a pytree).
+    """The setup of a sampler about a Gaussian reference, found once (a pytree).
 
     Attributes
     ----------
@@ -35,13 +35,13 @@ class Setup(NamedTuple):
         Flat position that the chains are about: the mode, or the mean of where they are. Not the reference's centre,
         which may lie behind a wall. Solves are preconditioned there.
     walls : Walls
-        Of every sampled node.
+        The walls of every sampled node.
     step_size : scalar
         In whitened coordinates; π/2 is a quarter turn of the reference's motion.
     steps : scalar integer
         Steps of a trajectory of fixed length: as many as make a quarter turn.
     stand_in : StandIn
-        Of the density's normaliser, where it has one.
+        The stand-in of the density's normaliser, where it has one.
     loose : Loose
         Nodes that are moved alone, too.
     """
@@ -56,7 +56,7 @@ class Setup(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """What a transition tells: see `Info`."""
+    """The report of a transition: see `Info`."""
 
     acceptance_rate: AnyArray
     diverging: AnyArray | bool = False
@@ -82,12 +82,12 @@ def setup_about(
     nothing = no_stand_in(target)
     held = walls(centre, rows, jnp.arange(nodes))
     at = middle[own].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
-    nodes_alone = loose(reference, own.start, jnp.asarray(alone, int), at)
+    nodes_alone = place_loose_nodes(reference, own.start, jnp.asarray(alone, int), at)
     step_size, steps = jnp.asarray(FIRST_STEP), jnp.asarray(1, int)
     return Setup(reference, jnp.asarray(middle), held, step_size, steps, nothing, nodes_alone)
 
 
-def whitened(reference: Reference, flat: AnyArray) -> AnyArray:
+def whiten(reference: Reference, flat: AnyArray) -> AnyArray:
     """The whitened coordinates ξ of a flat position."""
     return jax.scipy.linalg.solve_triangular(reference.factor, flat - reference.centre, lower=False)
 

@@ -15,8 +15,8 @@ from blackjax.vi.pathfinder import approximate
 from bayesreg.inference.gaussian.about_reference import about_reference
 from bayesreg.inference.gaussian.laplace import Reference
 from bayesreg.inference.gaussian.mode_search import penalty
-from bayesreg.inference.gaussian.reflection import rotated
-from bayesreg.inference.gaussian.whitened import Moved, Setup, clearance_of, setup_about, whitened
+from bayesreg.inference.gaussian.reflection import rotate
+from bayesreg.inference.gaussian.whitened import Moved, Setup, clearance_of, setup_about, whiten
 from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.inference.samplers.settings import Laplace, Pathfinder
@@ -44,7 +44,7 @@ def _begin(position: AnyArray, _density: Callable[[AnyArray], AnyArray]) -> _Pla
 
 def _turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: _Place) -> tuple[_Place, Moved]:
     momentum = jax.random.normal(key, state.position.shape)
-    position, _ = rotated(setup.walls, clearance_of(target, data, setup), state.position, momentum, jnp.pi / 2)
+    position, _ = rotate(setup.walls, clearance_of(target, data, setup), state.position, momentum, jnp.pi / 2)
     # A turn that was not over in time is refused, as everywhere.
     done = jnp.isfinite(position).all()
     return _Place(jnp.where(done, position, state.position)), Moved(done.astype(float), diverging=~done)
@@ -62,13 +62,13 @@ def pathfinder(target: Target, settings: Pathfinder) -> Sampler:
         setup, starts = about_mode.prepare(points, key, say)
         flat = flat_position(target, target.data, jax.tree.map(lambda x: x[0], starts))
         path = _path(
-            target, about_mode.data(setup), setup.reference, whitened(setup.reference, flat), jax.random.fold_in(key, 0)
+            target, about_mode.data(setup), setup.reference, whiten(setup.reference, flat), jax.random.fold_in(key, 0)
         )
         elbo, mean, covariance = (np.asarray(found) for found in path)
         if not np.isfinite(elbo):
             raise InputError("pathfinder found no Gaussian with a finite evidence bound; use the sampler laplace")
         say(f"pathfinder: evidence bound {elbo:.1f}, mean {np.sqrt((mean**2).mean()):.2f} sd from the mode")
-        reference = _pushed(setup.reference, mean, covariance)
+        reference = _push_forward(setup.reference, mean, covariance)
         return setup_about(target, reference, reference.centre), starts
 
     return about_mode._replace(prepare=prepare)
@@ -89,7 +89,7 @@ def _path(target: Target, data: Any, reference: Reference, start: AnyArray, key:
     return best.elbo, best.position - covariance @ best.grad_position, covariance
 
 
-def _pushed(reference: Reference, mean: np.ndarray, covariance: np.ndarray) -> Reference:
+def _push_forward(reference: Reference, mean: np.ndarray, covariance: np.ndarray) -> Reference:
     """The Gaussian of the whitened coordinates as one of flat positions."""
     factor = np.asarray(reference.factor)
     spread = factor @ covariance @ factor.T

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from blackjax.mcmc import random_walk
 
 from bayesreg.inference.gaussian.about_reference import about_reference
-from bayesreg.inference.gaussian.reflection import reflective_leapfrog, rotated, shifted
+from bayesreg.inference.gaussian.reflection import reflective_leapfrog, rotate, shift
 from bayesreg.inference.gaussian.warm_up import Tuning
 from bayesreg.inference.gaussian.whitened import Density, Moved, Setup, Transition, clearance_of, whitened_density
 from bayesreg.inference.kernel import Sampler
@@ -64,7 +64,7 @@ def rwmh_adaptive(target: Target, settings: RwmhAdaptive) -> Sampler:
     takes the same way, so that the proposal is symmetric.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
-    transition = _symmetric(shifted, whitened_density)
+    transition = _symmetric(shift, whitened_density)
     return about_reference(target, transition, tuning, random_walk.init, whitened_density, settings.mode_search)
 
 
@@ -75,7 +75,7 @@ def pcn(target: Target, settings: Pcn) -> Sampler:
     unchanged and is reversible, so that the test sees only the ratio of the posterior to the reference.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
-    transition = _symmetric(rotated, against_reference)
+    transition = _symmetric(rotate, against_reference)
     return about_reference(target, transition, tuning, random_walk.init, against_reference, settings.mode_search)
 
 

@@ -84,11 +84,11 @@ def choose_sampler(name: str, target: Target, **given: Any) -> Chosen:
     try:
         return Chosen(name, target, record(**plain))
     except ValidationError as error:
-        wrong = "; ".join(_said(details, record) for details in error.errors(include_url=False))
+        wrong = "; ".join(_explain(details, record) for details in error.errors(include_url=False))
         raise InputError(f"sampler {name}: {wrong}") from None
 
 
-def _said(details: Any, record: type[Settings]) -> str:
+def _explain(details: Any, record: type[Settings]) -> str:
     """One of pydantic's errors as a message."""
     key = ".".join(map(str, details["loc"]))
     if details["type"] == "extra_forbidden":

@@ -15,7 +15,7 @@ Share = Annotated[float, Field(strict=True, gt=0, lt=1)]
 
 
 class Settings(BaseModel):
-    """What all records share: no unknown keys, no changes after the making."""
+    """The base of all records: no unknown keys, no changes after the making."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -32,7 +32,7 @@ class RandomWalk(Settings):
 
 
 class AboutMode(Settings):
-    """What the samplers about a mode share; see docs/samplers.md."""
+    """Settings of all samplers about a mode; see docs/samplers.md."""
 
     mode_search: Literal["once", "per_chain"] = "once"
     """once: one mode, from the mean of the chains' starts; per_chain: one from the start of each, at as many times the
@@ -48,7 +48,7 @@ class Pathfinder(AboutMode):
 
 
 class Tuned(AboutMode):
-    """What the samplers share whose step size is tuned."""
+    """Settings of all samplers whose step size is tuned."""
 
     warm_up: Count = 80
     """Transitions that tune the step size and are not kept."""
@@ -81,7 +81,7 @@ class Smc(Tuned):
 
 
 class SingleStep(Tuned):
-    """What the samplers of one evaluation a transition share."""
+    """Settings of all samplers with one evaluation a transition."""
 
     warm_up: Count = 500
     """Transitions that tune the step size and are not kept."""

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
 
-from bayesreg.inference.gaussian.reflection import reflective_rotation, rotated
-from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whitened, whitened_density, whitened_position
+from bayesreg.inference.gaussian.reflection import reflective_rotation, rotate
+from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whiten, whitened_density, whitened_position
 from bayesreg.inference.kernel import Sampler, Say
 from bayesreg.inference.layout import flat_position
 from bayesreg.inference.samplers.hamiltonian import hmc
@@ -44,9 +44,9 @@ def smc(target: Target, settings: Smc) -> Sampler:
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         one = jax.tree.map(lambda x: x[0], starts)
-        begin = whitened(setup.reference, flat_position(target, data, one))
+        begin = whiten(setup.reference, flat_position(target, data, one))
         first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
-        found, weights = _tempered(target, data, setup, spread, first, target_acceptance, key_temper, say)
+        found, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
         return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
@@ -64,7 +64,7 @@ def _broad(
     def draw(key: AnyArray) -> AnyArray:
         def turn(position: AnyArray, key: AnyArray) -> tuple[AnyArray, None]:
             momentum = spread * jax.random.normal(key, position.shape)
-            turned, _ = rotated(setup.walls, clearance, position, momentum, jnp.pi / 2)
+            turned, _ = rotate(setup.walls, clearance, position, momentum, jnp.pi / 2)
             return jnp.where(jnp.isfinite(turned).all(), turned, position), None
 
         return jax.lax.scan(turn, begin, jax.random.split(key, _TURNS))[0]
@@ -72,7 +72,7 @@ def _broad(
     return jax.lax.map(draw, keys, batch_size=_BATCH)
 
 
-def _tempered(
+def _temper(
     target: Target,
     data: Any,
     setup: Setup,

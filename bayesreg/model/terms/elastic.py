@@ -26,7 +26,7 @@ class ElasticPrior(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the term."""
         return "elastic"
 
     def log(self, state: State) -> Scalar:

@@ -74,7 +74,7 @@ class ImagePair:
         """The term with both images smoothed, sd in mm."""
         # SciPy's filters let other threads run.
         with ThreadPoolExecutor() as pool:
-            fixed, moving = pool.map(partial(_smoothed, sd, interpolation), (self.fixed, self.moving))
+            fixed, moving = pool.map(partial(_smooth, sd, interpolation), (self.fixed, self.moving))
         return term._replace(moving=moving, fixed_values=fixed(term.positions))
 
     def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
@@ -265,7 +265,7 @@ def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
     return jax.grad(lambda x: term.moving(x).sum())(places)
 
 
-def _smoothed(sd: float, interpolation: Interpolation, image: Image) -> Interpolator:
+def _smooth(sd: float, interpolation: Interpolation, image: Image) -> Interpolator:
     return image.smoothed(sd).interpolator(interpolation)
 
 

@@ -122,7 +122,7 @@ class ComparedPoints(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the term."""
         return self.label.name
 
     def sd(self, values: Values) -> Float[AnyArray, "k"]:

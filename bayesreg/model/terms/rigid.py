@@ -26,7 +26,7 @@ class RigidPrior(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the term."""
         return "rigid"
 
     def log(self, state: State) -> Scalar:
@@ -39,5 +39,5 @@ class RigidPrior(NamedTuple):
         return -0.5 * (mean_square / self.sd**2).sum()
 
     def precision(self) -> Float[AnyArray, "rows rows"]:
-        """Its curvature in the displacements of the sampled nodes, 1/mm²."""
+        """The curvature in the displacements of the sampled nodes, 1/mm²."""
         return self.modes @ self.modes.T / ((len(self.modes) // 3) * self.sd**2)

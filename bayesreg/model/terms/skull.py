@@ -29,7 +29,7 @@ class Skull(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the term."""
         return "skull"
 
     def log(self, state: State) -> Scalar:

@@ -1,4 +1,4 @@
-"""What a term is, and what it may know besides.
+"""The protocols of a term.
 
 A term is one factor of the joint density. It has a `name` and `log(state)`. The other classes here are what a term may
 know besides, each asked for by `isinstance`.
@@ -24,10 +24,10 @@ class Term(Protocol):
 
     @property
     def name(self) -> str:
-        """Its name in tables and in the NumPyro program."""
+        """The name of the term in tables and in the NumPyro program."""
 
     def log(self, state: State) -> Scalar:
-        """Its logarithm, up to a constant; traceable by JAX."""
+        """The logarithm of the factor, up to a constant; JAX can trace it."""
 
 
 @runtime_checkable
@@ -35,10 +35,10 @@ class Likelihood(Protocol):
     """A term that is the density of something observed."""
 
     def observed(self) -> AnyArray:
-        """What was observed."""
+        """The observed values."""
 
     def likelihood(self, state: State) -> dist.Distribution:
-        """Its distribution, of which replicates can be drawn."""
+        """The distribution of the observed values, of which replicates can be drawn."""
 
 
 @runtime_checkable
@@ -75,7 +75,7 @@ class Curved(Protocol):
         """Gauss and Newton's part, positive semidefinite."""
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """What the exact curvature has besides: residuals times second derivatives."""
+        """The rest of the exact curvature: residuals times second derivatives."""
 
 
 @jax.tree_util.register_static
