@@ -29,6 +29,7 @@ from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.check import check
 from bayesreg.workflow.simulate import simulate
 from tests.phantoms import ball_mesh
+from tests.reportless import without_reports
 
 ROOT = Path(__file__).parent.parent
 BAYESREG = (sys.executable, "-c", "from bayesreg.cli import main; main()")
@@ -80,8 +81,7 @@ def folder(anatomy, tmp_path_factory):
 @pytest.fixture
 def no_report(finished):
     """Runs without their reports, whose pictures take longer than these runs; those of `finished` are looked at."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesreg.report.html.write_report", lambda *arguments: None)
+    with without_reports():
         yield
 
 
@@ -394,7 +394,8 @@ def test_an_observation_from_outside_goes_through_run_resume_and_report(folder, 
         return br.load_config(folder / "run.yaml", [*settings, "model.interpolation=cubic"])
 
     out, observed = tmp_path / "out", [MeanDisplacement()]
-    br.run(config(10), out, progress=False, observations=observed)
+    with without_reports():
+        br.run(config(10), out, progress=False, observations=observed)
     with pytest.raises(br.InputError, match="began with the observations \\['region'\\] besides its images"):
         br.run(config(30), out, resume=True, progress=False)
     found = br.run(config(30), out, resume=True, progress=False, observations=observed)
