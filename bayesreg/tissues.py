@@ -22,20 +22,20 @@ class Tissue(NamedTuple):
     is_fluid : bool
         Whether it hardly resists: it starts at λ = μ = 0.01, fills the space that others leave, and its stiffness is
         not worth looking for.
-    is_reference : bool
+    has_unit_mu : bool
         Whether its μ is the one that is fixed at 1 where nothing else is said.
     """
 
     label: str
     colour: str
     is_fluid: bool = False
-    is_reference: bool = False
+    has_unit_mu: bool = False
 
 
 # By name in small letters. Colours are distinct in hue and in lightness, also for colour-blind eyes and in grey.
 PRESETS: Mapping[str, Tissue] = {
     "csf": Tissue("CSF", "#3a6ea5", is_fluid=True),
-    "gm": Tissue("GM", "#c26a6f", is_reference=True),
+    "gm": Tissue("GM", "#c26a6f", has_unit_mu=True),
     "wm": Tissue("WM", "#e3b95a"),
     "fluid": Tissue("fluid", "#6f9fc8", is_fluid=True),
 }
@@ -68,9 +68,9 @@ def colours_of(names: Sequence[str]) -> list[str]:
     return [PRESETS[name.lower()].colour if name.lower() in PRESETS else next(others) for name in names]
 
 
-def reference_tissue(names: Sequence[str]) -> str:
+def tissue_of_unit_mu(names: Sequence[str]) -> str:
     """The tissue whose μ is 1 where nothing else is said: the preset's, else the first that is no fluid."""
-    preset = (name for name in names if name.lower() in PRESETS and PRESETS[name.lower()].is_reference)
+    preset = (name for name in names if name.lower() in PRESETS and PRESETS[name.lower()].has_unit_mu)
     return next(preset, next((name for name in names if not is_fluid(name)), names[0]))
 
 

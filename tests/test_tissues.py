@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.io.domain import domain_labels, mesh_domain
 from bayesreg.io.surfaces import tissue_surfaces
-from bayesreg.tissues import BRAIN, colours_of, is_fluid, label_of, reference_tissue, usual_value
+from bayesreg.tissues import BRAIN, colours_of, is_fluid, label_of, tissue_of_unit_mu, usual_value
 from tests.phantoms import ball_mesh
 
 PACKAGE = Path(br.__file__).parent
@@ -35,9 +35,9 @@ def test_no_other_place_names_the_tissues_of_a_brain():
 def test_what_names_tell():
     assert [is_fluid(name) for name in ("csf", "CSF", "fluid", "liver")] == [True, True, True, False]
     assert [label_of(name) for name in ("gm", "GM", "liver")] == ["GM", "GM", "liver"]
-    assert reference_tissue(BRAIN) == "gm"
-    assert reference_tissue(("fluid", "liver", "vessels")) == "liver"
-    assert reference_tissue(("fluid",)) == "fluid"
+    assert tissue_of_unit_mu(BRAIN) == "gm"
+    assert tissue_of_unit_mu(("fluid", "liver", "vessels")) == "liver"
+    assert tissue_of_unit_mu(("fluid",)) == "fluid"
     assert (usual_value("lam", "vessels"), usual_value("mu", "vessels"), usual_value("mu", "csf")) == (10.0, 1.0, 0.01)
     assert len(set(colours_of((*BRAIN, "a", "b", "c", "d", "e", "f")))) == 9
 
@@ -97,7 +97,7 @@ def test_the_draws_have_the_names_of_the_table(case):
     posterior = xr.open_dataset(result.folder / "posterior.nc", group="posterior")
     assert tuple(posterior.tissue.values) == names == result.mesh.names
     assert set(result.mesh.tissue) == set(range(len(names)))
-    reference = names.index(reference_tissue(names))
+    reference = names.index(tissue_of_unit_mu(names))
     assert (posterior.mu[..., reference] == 1).all()
     lam = posterior.lam.mean(("chain", "draw")).values
     usual = [usual_value("lam", name) for name in names[:-1]]

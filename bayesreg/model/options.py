@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 from pydantic_core import PydanticCustomError
 
-from bayesreg.tissues import reference_tissue
+from bayesreg.tissues import tissue_of_unit_mu
 
 Lame = Literal["lam", "mu"]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -102,7 +102,7 @@ class ModelConfig(BaseModel):
     fixed : mapping, optional
         Parameters that are known: ``{"mu": {"liver": 1.0}}`` by tissue name (by element it fixes every
         element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of one tissue
-        (`bayesreg.tissues.reference_tissue`) at 1, uniform: μ at 1; the scale of λ, μ is not identified otherwise.
+        (`bayesreg.tissues.tissue_of_unit_mu`) at 1, uniform: μ at 1; the scale of λ, μ is not identified otherwise.
     priors : mapping
         A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"liver": PriorConfig(high=60)}}``;
         what is not named has the flat prior on [0, ∞).
@@ -217,7 +217,7 @@ class ModelConfig(BaseModel):
         """`fixed`, or its default for these tissues."""
         if self.fixed is not None:
             return self.fixed
-        return {"mu": 1.0 if self.elasticity == "uniform" else {reference_tissue(tissues): 1.0}}
+        return {"mu": 1.0 if self.elasticity == "uniform" else {tissue_of_unit_mu(tissues): 1.0}}
 
     @property
     def _named_tissues(self) -> list[str]:

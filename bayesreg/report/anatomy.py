@@ -67,7 +67,7 @@ def registration(view: View) -> Drawing | None:
 def data(view: View) -> Drawing:
     """The paper's Fig. 2: images, labels, mesh cut, divergence and components of the (true) displacement."""
     run, plane, limits = view.run, view.main, panels.grey_limits(view.run)
-    u, whose = panels.reference_displacement(run), "posterior mean" if run.truth is None else "true"
+    u, whose = panels.true_or_mean_displacement(run), "posterior mean" if run.truth is None else "true"
     symbol = "ū" if run.truth is None else "u"
     labels = "labels" if run.skull is None else "labels and skull"
     with style.look():
@@ -113,7 +113,7 @@ def result(view: View) -> Drawing:
         cmap = style.ERROR if known else style.MAGNITUDE
         _magnitude(figure, axes[0, 0], view, plane, first, cmap)
         _magnitude(figure, axes[0, 1], view, plane, view.spread(plane), style.ERROR)
-        _divergence(figure, axes[0, 2], view, np.asarray(run.u_mean), like=panels.reference_displacement(run))
+        _divergence(figure, axes[0, 2], view, np.asarray(run.u_mean), like=panels.true_or_mean_displacement(run))
         if run.warped is None:
             axes[0, 3].set_axis_off()
         else:

@@ -183,7 +183,7 @@ def _fill(row: np.ndarray, views: list[View], pictures: list[np.ndarray], label:
 
 
 def _fill_divergence(row: np.ndarray, views: list[View]) -> None:
-    like = panels.reference_displacement(views[0].run)
+    like = panels.true_or_mean_displacement(views[0].run)
     norm = panels.symmetric(divergence(views[0].run.mesh, like), quantile=0.98)
     for panel, view in zip(row, views, strict=False):
         picture = view.divergence(view.main, np.asarray(view.run.u_mean))
@@ -204,7 +204,7 @@ def _fill_last(column: np.ndarray, views: list[View], known: bool) -> None:
     panels.image_panel(column[1], first.run.background, plane, panels.grey_limits(first.run))
     column[1].set_title("fixed f")
     if known:
-        like = panels.reference_displacement(first.run)
+        like = panels.true_or_mean_displacement(first.run)
         norm = panels.symmetric(divergence(first.run.mesh, like), quantile=0.98)
         panels.field_panel(column[2], first.divergence(plane, like), plane, norm, style.SIGNED)
         panels.outline(column[2], first, plane)

@@ -48,7 +48,7 @@ class View:
     @classmethod
     def of(cls, run: Run) -> View:
         """Planes through the node of greatest displacement (true where known)."""
-        u = reference_displacement(run)
+        u = true_or_mean_displacement(run)
         planes = planes_through(run.mesh, run.mesh.points[(u**2).sum(axis=1).argmax()])
         return cls(run, planes, main_plane(run.mesh, planes, u))
 
@@ -82,7 +82,7 @@ class View:
         return self.slice(plane).cellwise(divergence(self.run.mesh, u))
 
 
-def reference_displacement(run: Run) -> np.ndarray:
+def true_or_mean_displacement(run: Run) -> np.ndarray:
     """The true displacement where it is known, else the posterior mean; (n, 3), mm."""
     return np.asarray(run.u_mean if run.truth is None else run.truth.u, float)
 

@@ -48,7 +48,7 @@ from bayesreg.inference.chains.initialise import Start
 from bayesreg.inference.chains.run import first_checkpoint, sample
 from bayesreg.inference.draws.blocks import Block
 from bayesreg.inference.draws.diagnostics import worst
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.whitened import whiten
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import estimands_of
@@ -65,11 +65,11 @@ COLUMNS = (
 
 
 class Problem(NamedTuple):
-    """A log density of flat coordinates, whitened if there is a reference, where chains start, and the first step."""
+    """A log density of flat coordinates, whitened if there is a Gaussian, where chains start, and the first step."""
 
     posterior: Any
     data: Any
-    reference: Reference | None
+    gaussian: Gaussian | None
     starts: np.ndarray
     step: float
 
@@ -150,7 +150,7 @@ def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.n
         heard.append(now() if text.startswith("mode") else heard[-1])
 
     first = first_checkpoint(posterior, "hmc", chains, seed, start, say)
-    return np.asarray(jax.vmap(about_mode.setup.reference.place)(about_mode.state.position)), first, heard[-1]
+    return np.asarray(jax.vmap(about_mode.setup.gaussian.place)(about_mode.state.position)), first, heard[-1]
 
 
 def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) -> Drawn:
@@ -166,23 +166,23 @@ def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) 
 
 def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str, Problem]:
     """The density in unconstrained coordinates, and in those of `hmc` after its warm-up."""
-    reference, middle = first.setup.reference, unravel(posterior)(first.setup.middle)
+    gaussian, middle = first.setup.gaussian, unravel(posterior)(first.setup.middle)
     data = posterior.condition(estimands_of(posterior, posterior.data, middle))
-    xi = np.asarray(jax.vmap(partial(whiten, reference))(jnp.asarray(places)))
+    xi = np.asarray(jax.vmap(partial(whiten, gaussian))(jnp.asarray(places)))
     return {
         "unconstrained": Problem(posterior, data, None, places, 0.008),
-        "whitened": Problem(posterior, data, reference, xi, 2.4 / np.sqrt(xi.shape[1])),
+        "whitened": Problem(posterior, data, gaussian, xi, 2.4 / np.sqrt(xi.shape[1])),
     }
 
 
-def position(posterior: Any, reference: Reference | None, x: jax.Array) -> dict[str, jax.Array]:
+def position(posterior: Any, gaussian: Gaussian | None, x: jax.Array) -> dict[str, jax.Array]:
     """The position at flat coordinates."""
-    return unravel(posterior)(x if reference is None else reference.place(x))
+    return unravel(posterior)(x if gaussian is None else gaussian.place(x))
 
 
-def logdensity(posterior: Any, data: Any, reference: Reference | None, x: jax.Array) -> jax.Array:
+def logdensity(posterior: Any, data: Any, gaussian: Gaussian | None, x: jax.Array) -> jax.Array:
     """Of flat coordinates; whitening is linear, and leaves out a constant."""
-    return logdensity(posterior, data, position(posterior, reference, x))
+    return logdensity(posterior, data, position(posterior, gaussian, x))
 
 
 value = jax.jit(logdensity, static_argnums=0)
@@ -191,8 +191,8 @@ value_and_slope = jax.jit(jax.value_and_grad(logdensity, argnums=3), static_argn
 
 def estimands(problem: Problem, draws: np.ndarray) -> list[Block]:
     """Flat coordinates (chain, draw, …) as a block of draws, if there are any."""
-    posterior, data, reference = problem[:3]
-    every = jax.jit(jax.vmap(jax.vmap(lambda x: estimands_of(posterior, data, position(posterior, reference, x)))))
+    posterior, data, gaussian = problem[:3]
+    every = jax.jit(jax.vmap(jax.vmap(lambda x: estimands_of(posterior, data, position(posterior, gaussian, x)))))
     return [jax.tree.map(np.asarray, every(draws))] if draws.size else []
 
 

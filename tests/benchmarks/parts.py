@@ -84,7 +84,7 @@ def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -
         return blackjax.mcmc.hmc.init(xi, whitened_density(posterior, data, setup))
 
     def alone(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
-        return move_alone(posterior, partial(begin, data, setup), data, setup.reference, setup.loose, key, state)
+        return move_alone(posterior, partial(begin, data, setup), data, setup.gaussian, setup.loose, key, state)
 
     def turned(data: Any, setup: Any, xi: jax.Array, momentum: jax.Array) -> Any:
         return rotate(setup.walls, clearance_of(posterior, data, setup), xi, momentum, setup.step_size)
@@ -110,7 +110,7 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
         return whitened_density(posterior, data, setup)(xi)
 
     def values_of(xi: jax.Array) -> Any:
-        estimands = estimands_of(posterior, data, whitened_position(posterior, setup.reference, xi))
+        estimands = estimands_of(posterior, data, whitened_position(posterior, setup.gaussian, xi))
         values = complete(data.blocks, estimands)
         return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import Reference, laplace
+from bayesreg.inference.gaussian.laplace import Gaussian, laplace
 from bayesreg.inference.gaussian.loose import place_loose_nodes
 from bayesreg.inference.gaussian.normaliser import make_stand_in
 from bayesreg.inference.gaussian.whitened import Setup, setup_about
@@ -66,8 +66,8 @@ def simulated(posterior: br.Posterior, data: Any, truths: Estimands, key: Any) -
     return jax.vmap(partial(draw_data, posterior, data))(keys, truths)
 
 
-def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Reference:
-    """At rest, with data of its own: any reference is exact."""
+def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Gaussian:
+    """At rest, with data of its own: any gaussian is exact."""
     truth = simulator.draw_prior(np.random.default_rng(1000), 1)
     observed = simulated(simulator.posterior, simulator.posterior.data, truth, jax.random.key(1000))[0]
     at_rest = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
@@ -76,7 +76,7 @@ def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Reference:
 
 def setups_about(
     posterior: br.Posterior,
-    references: list[Reference],
+    references: list[Gaussian],
     middles: np.ndarray,
     seen: np.ndarray,
     step_size: float,
@@ -88,9 +88,9 @@ def setups_about(
     found = [make_stand_in(posterior, *each) for each in zip(references, middles, strict=True)]
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
-    def about(reference: Reference, middle: Any, seen: Any) -> Setup:
-        alone = place_loose_nodes(reference, displacements(posterior).start, ALONE, seen)
-        return setup_about(posterior, reference, middle)._replace(loose=alone, **size)
+    def about(gaussian: Gaussian, middle: Any, seen: Any) -> Setup:
+        alone = place_loose_nodes(gaussian, displacements(posterior).start, ALONE, seen)
+        return setup_about(posterior, gaussian, middle)._replace(loose=alone, **size)
 
     return jax.vmap(about)(stacked, jnp.asarray(middles), jnp.asarray(seen))._replace(stand_in=normalisers)
 

@@ -3,7 +3,7 @@
 Talts et al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018; test quantities that
 look at the data too, here E_s and log p, after Modrák et al., Bayesian Analysis 2023. All replications share one mesh,
 one moving image and what is compiled, and run side by side; f at the quadrature points differs, and the
-Gaussian reference about which the sampler moves.
+Gaussian about which the sampler moves.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import average_reference
+from bayesreg.inference.gaussian.laplace import average_gaussian
 from bayesreg.inference.gaussian.mode_search import settle
 from bayesreg.inference.gaussian.reflection import rotate
 from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whiten, whitened_position
@@ -57,7 +57,7 @@ class Settings(NamedTuple):
     ----------
     replications : int
     stages, approach : int
-        How often a chain makes so many transitions to come to where the posterior is, about a reference taken at its
+        How often a chain makes so many transitions to come to where the posterior is, about a Gaussian taken at its
         mode and, from the second time on, where it came to the time before.
     warm_up, draws : int
         Transitions about that, not kept and kept.
@@ -180,9 +180,9 @@ def _chains(
     visited = modes[:, None]
     key, key_flight = jax.random.split(key)
     for stage in range(settings.stages + 1):
-        say(f"a reference for each replication, {stage + 1} of {settings.stages + 1}")
+        say(f"a Gaussian for each replication, {stage + 1} of {settings.stages + 1}")
         about = visited[:, [0, -1]]
-        references = [average_reference(*each) for each in zip(problems, about, strict=True)]
+        references = [average_gaussian(*each) for each in zip(problems, about, strict=True)]
         u = visited[:, :, -3 * len(posterior.sampled) :].reshape(*visited.shape[:2], -1, 3)
         seen = np.moveaxis(u[:, :, ALONE], 2, 1)
         setup = setups_about(posterior, references, about.mean(axis=1), seen, settings.step_size, settings.steps)
@@ -215,11 +215,11 @@ def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, mode
     def one(given: Any) -> Estimands:
         setup, observed, mode, key = given
         here = observing(data, observed)
-        begin = whiten(setup.reference, mode)
+        begin = whiten(setup.gaussian, mode)
         xi, _ = rotate(
             setup.walls, clearance_of(posterior, here, setup), begin, jax.random.normal(key, begin.shape), jnp.pi / 2
         )
-        place = whitened_position(posterior, setup.reference, jnp.where(jnp.isfinite(xi).all(), xi, begin))
+        place = whitened_position(posterior, setup.gaussian, jnp.where(jnp.isfinite(xi).all(), xi, begin))
         return estimands_of(posterior, here, place)
 
     return jax.lax.map(one, (setup, observed, modes, keys), batch_size=BATCH)

@@ -16,7 +16,7 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.samplers.registry import choose_sampler
 from tests.oracles import paper
@@ -199,19 +199,19 @@ class TestTruncatedPosterior:
 
     LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
 
-    def scores(self, draws, reference):
-        """z of the means, and of the probabilities below the reference's quantiles, for every coordinate."""
-        below = np.stack([(draws < q).mean(axis=1) for q in np.quantile(reference, self.LEVELS, axis=0)], axis=-1)
-        spread = (self.LEVELS * (1 - self.LEVELS)) / len(reference)
-        mean = z_scores(draws.mean(axis=1), reference.mean(axis=0), reference.var(axis=0) / len(reference))
+    def scores(self, draws, gaussian):
+        """z of the means, and of the probabilities below the Gaussian's quantiles, for every coordinate."""
+        below = np.stack([(draws < q).mean(axis=1) for q in np.quantile(gaussian, self.LEVELS, axis=0)], axis=-1)
+        spread = (self.LEVELS * (1 - self.LEVELS)) / len(gaussian)
+        mean = z_scores(draws.mean(axis=1), gaussian.mean(axis=0), gaussian.var(axis=0) / len(gaussian))
         return mean, z_scores(below, self.LEVELS, spread)
 
     def test_no_draw_is_in_the_skull(self, draws):
         deepest = (MESH.points[MESH.boundary, 0] + draws[..., ::3]).max()
         assert WALL - 0.05 < deepest < WALL
 
-    def test_marginals(self, draws, reference):
-        mean, quantiles = self.scores(draws, reference)
+    def test_marginals(self, draws, gaussian):
+        mean, quantiles = self.scores(draws, gaussian)
         assert abs(mean).max() < 5
         assert (mean**2).mean() == pytest.approx(1.0, abs=0.6)
         assert abs(quantiles).max() < 6
@@ -229,7 +229,7 @@ STEPS = {"mclmc": (0.8, 1), "mala": (0.7, 1), "barker": (0.6, 1), "rwmh_adaptive
 
 
 class TestEverySamplerFromExactDraws:
-    """The samplers that the long runs above leave out, about a reference that is neither centred nor of the right size.
+    """The samplers that the long runs above leave out, about a Gaussian that is neither centred nor of the right size.
 
     Many chains start from exact draws of the truncated posterior; a few transitions later they still are such draws.
     """
@@ -238,11 +238,11 @@ class TestEverySamplerFromExactDraws:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("name", STEPS)
-    def test_exact_draws_stay_exact(self, name, reference):
+    def test_exact_draws_stay_exact(self, name, gaussian):
         posterior, exact = walled(), problem().exact
         spread = 1.2 * np.linalg.inv(exact.precision)[::-1, ::-1]
         factor = np.linalg.cholesky(spread)[::-1, ::-1]
-        about = Reference(jnp.asarray(exact.mean + 0.1 * factor.sum(axis=1)), jnp.asarray(factor))
+        about = Gaussian(jnp.asarray(exact.mean + 0.1 * factor.sum(axis=1)), jnp.asarray(factor))
         size, steps = STEPS[name]
         setup = setup_about(posterior, about, about.centre)._replace(
             step_size=jnp.asarray(size), steps=jnp.asarray(steps)
@@ -262,14 +262,14 @@ class TestEverySamplerFromExactDraws:
 
             return jax.vmap(chain)(points, keys)
 
-        started = reference[: self.CHAINS]
+        started = gaussian[: self.CHAINS]
         keys = jax.random.split(jax.random.key(0), self.CHAINS)
         moved, rates = run(posterior.data, setup, jnp.asarray(started.reshape(self.CHAINS, -1, 3)), keys)
         moved = np.asarray(moved).reshape(self.CHAINS, -1)
         assert 0.02 < float(rates.mean()) < 0.98
         assert (MESH.points[MESH.boundary, 0] + moved[:, ::3]).max() < WALL
         energies = (
-            np.einsum("ni,ij,nj->n", x - exact.mean, exact.precision, x - exact.mean) for x in (moved, reference)
+            np.einsum("ni,ij,nj->n", x - exact.mean, exact.precision, x - exact.mean) for x in (moved, gaussian)
         )
-        pairs = [*zip(moved.T, reference[self.CHAINS :].T, strict=True), tuple(energies)]
+        pairs = [*zip(moved.T, gaussian[self.CHAINS :].T, strict=True), tuple(energies)]
         assert len(pairs) * min(stats.ks_2samp(*pair).pvalue for pair in pairs) > 1e-3

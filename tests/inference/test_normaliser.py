@@ -13,7 +13,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.inference.chains.initialise import starting_points
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.normaliser import Delayed, StandIn, delay_acceptance, make_stand_in
 from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.kernel import Info
@@ -49,7 +49,7 @@ def test_the_stand_in_is_the_normaliser_to_second_order():
     post = posterior()
     position = post.unconstrain(post.reference())
     flat = jax.flatten_util.ravel_pytree(position)[0]
-    found = make_stand_in(post, Reference(flat, 0.02 * jnp.eye(len(flat))), flat)
+    found = make_stand_in(post, Gaussian(flat, 0.02 * jnp.eye(len(flat))), flat)
     count = len(flat) - 3 * len(post.sampled)
     assert found.slope.shape == (count,)
 
@@ -116,9 +116,9 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     sampler = hmc(post, Hmc())
     estimands = post.estimands(post.reference())
     flat = jax.flatten_util.ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0]
-    reference = Reference(flat, 0.05 * jnp.eye(len(flat)))
-    setup = setup_about(post, reference, flat, np.array([0, 5]))
-    setup = setup._replace(stand_in=make_stand_in(post, reference, flat), step_size=jnp.asarray(0.3))
+    gaussian = Gaussian(flat, 0.05 * jnp.eye(len(flat)))
+    setup = setup_about(post, gaussian, flat, np.array([0, 5]))
+    setup = setup._replace(stand_in=make_stand_in(post, gaussian, flat), step_size=jnp.asarray(0.3))
 
     @jax.jit
     def moved(data, setup, key):
@@ -143,6 +143,6 @@ def test_the_stand_in_is_about_the_centre_that_the_warm_up_ends_with():
     post = posterior()
     points = starting_points(post, br.Start(), 2, jax.random.key(0))
     setup, _ = hmc(post, Hmc(warm_up=2)).prepare(points, jax.random.key(1), lambda text: None)
-    expected = make_stand_in(post, setup.reference, setup.middle)
+    expected = make_stand_in(post, setup.gaussian, setup.middle)
     np.testing.assert_allclose(setup.stand_in.slope, expected.slope, rtol=1e-9)
     np.testing.assert_allclose(setup.stand_in.curvature, expected.curvature, rtol=1e-6, atol=1e-9)

@@ -15,8 +15,8 @@ from bayesreg.config.samplers import sampler_section
 from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.chains.run import checkpoint_from_arrays
 from bayesreg.inference.gaussian import loose
-from bayesreg.inference.gaussian.about_reference import about_reference
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.about_gaussian import about_gaussian
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.modes import distance, search_modes
 from bayesreg.inference.gaussian.whitened import Moved, setup_about
 from bayesreg.inference.kernel import Sampler
@@ -41,12 +41,12 @@ def exact() -> np.ndarray:
     return target().exact_draws(np.random.default_rng(0), 5 * CHAINS)
 
 
-def poor_reference() -> Reference:
+def poor_reference() -> Gaussian:
     """Neither the mean nor the covariance of the target."""
     covariance = target().covariance
     factor = np.linalg.cholesky(covariance[::-1, ::-1])[::-1, ::-1]
     stretch = 1.2 * np.eye(DIMENSION) + np.triu(0.25 * np.cos(np.arange(DIMENSION**2)).reshape(DIMENSION, -1), 1)
-    return Reference(jnp.full(DIMENSION, -0.2), jnp.asarray(factor @ stretch))
+    return Gaussian(jnp.full(DIMENSION, -0.2), jnp.asarray(factor @ stretch))
 
 
 def nodes_alone() -> Sampler:
@@ -55,7 +55,7 @@ def nodes_alone() -> Sampler:
     def stay(target, data, setup, key, state):
         return state, Moved(jnp.ones(()))
 
-    return about_reference(target(), stay, alone=NODES)
+    return about_gaussian(target(), stay, alone=NODES)
 
 
 def after_steps(name: str, alone: Any = ()) -> np.ndarray:
@@ -210,19 +210,19 @@ def starts_at(*y: float) -> dict[str, np.ndarray]:
 def test_every_chain_finds_its_own_mode():
     said = []
     found = search_modes(two_modes(), starts_at(-3.0, 4.0, 2.0, -4.0), True, said.append)
-    assert len(found.references) == 2
+    assert len(found.gaussians) == 2
     assert found.chains[0] == found.chains[3] != found.chains[1] == found.chains[2]
-    centres = np.array([np.asarray(reference.centre)[1] for reference in found.references])
+    centres = np.array([np.asarray(gaussian.centre)[1] for gaussian in found.gaussians])
     assert sorted(centres) == pytest.approx([-4.5, 4.5], abs=0.1)
     sd = np.sqrt(two_modes().covariance[1, 1])
-    assert distance(found.references[0], np.asarray(found.references[1].centre)) == pytest.approx(9 / sd, rel=0.02)
+    assert distance(found.gaussians[0], np.asarray(found.gaussians[1].centre)) == pytest.approx(9 / sd, rel=0.02)
     assert any("2, about which" in text for text in said)
     assert any("chains 0, 3" in text for text in said)
 
 
 def test_searches_that_end_in_one_place_are_one_mode():
     found = search_modes(two_modes(), starts_at(3.0, 4.0), True, lambda text: None)
-    assert (len(found.references), found.chains) == (1, [0, 0])
+    assert (len(found.gaussians), found.chains) == (1, [0, 0])
 
 
 @pytest.mark.slow
@@ -263,7 +263,7 @@ def test_wrong_settings_are_told(name, wrong, message):
 
 
 def test_more_unknowns_than_memory_are_told(monkeypatch):
-    monkeypatch.setattr("bayesreg.inference.gaussian.about_reference.MOST_UNKNOWNS", 5)
+    monkeypatch.setattr("bayesreg.inference.gaussian.about_gaussian.MOST_UNKNOWNS", 5)
     with pytest.raises(br.InputError, match=r"6 unknowns.*up to 5.*coarser mesh"):
         br.sample(target(), "hmc", 2, 4, progress=False)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bayesreg.inference.gaussian import about_reference
+from bayesreg.inference.gaussian import about_gaussian
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _with_step_size, tune
 from bayesreg.inference.gaussian.whitened import Moved
 from tests.inference.gaussians import DIMENSION, GaussianTarget
@@ -70,8 +70,8 @@ def test_a_place_without_a_slope_has_no_part_in_the_reference():
     target, mode = Broken(), np.zeros(DIMENSION)
     sound = jnp.asarray(target.exact_draws(np.random.default_rng(0), 3))
     lost = sound.at[1].set(jnp.array([-1.0, 60.0, 0.0]))
-    found = about_reference._setup_on_average(target, mode, {"u_boundary": lost})
-    expected = about_reference._setup_on_average(target, mode, {"u_boundary": sound[jnp.array([0, 2])]})
-    np.testing.assert_array_equal(found.reference.centre, expected.reference.centre)
+    found = about_gaussian._setup_on_average(target, mode, {"u_boundary": lost})
+    expected = about_gaussian._setup_on_average(target, mode, {"u_boundary": sound[jnp.array([0, 2])]})
+    np.testing.assert_array_equal(found.gaussian.centre, expected.gaussian.centre)
     np.testing.assert_array_equal(found.middle, expected.middle)
     assert np.isfinite(found.middle).all()

@@ -25,7 +25,7 @@ class Start(NamedTuple):
         Chains start at fractions of the field spread evenly over this range: 0 identity, 1 the field. A node
         that this would put into the skull starts at the nearest fraction that does not.
     lam, mu : mapping of entry name to float, optional
-        Centre of the start parameters, where it is not the posterior's reference.
+        Centre of the start parameters, where it is not the posterior's own reference.
     spread : float
         Standard deviation of the log of the start parameters between chains.
     """

@@ -1,7 +1,7 @@
 """Scales of what has many components, where a mode would mislead.
 
 With a field s = sd · B z, z ~ N(0, I), the joint mode of (z, log sd) lies at a great sd and small z: it ignores how
-much less room z has the greater sd is. The reference is better placed where the evidence of sd has its maximum, by
+much less room z has the greater sd is. The Gaussian is better placed where the evidence of sd has its maximum, by
 MacKay's fixed point (1992): |z|² = γ, the number of components that the data determine.
 
 T_r is such a scale of u_B, whose prior's curvature P falls as 1 / T_r: the joint mode lies next to T_r = 0, where

@@ -1,4 +1,4 @@
-"""The Gaussian reference that the curvature of a posterior defines at its mode (Laplace's approximation)."""
+"""The Gaussian that the curvature of a posterior defines at its mode (Laplace's approximation)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEP = 1e-4
 LEAST_RATIO = 0.25
 
 
-class Reference(NamedTuple):
+class Gaussian(NamedTuple):
     """The Gaussian N(centre, factor · factorᵀ) of a flat position (a pytree).
 
     Attributes
@@ -53,15 +53,15 @@ def prior_shares(target: Target, data: Any, flat: Float[np.ndarray, "dimension"]
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
 
 
-def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Reference:
-    """The Gaussian reference about a flat position, with the curvature there (see `precision_at`)."""
-    return gaussian(flat, precision_at(target, flat, data, joint))
+def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Gaussian:
+    """The Gaussian about a flat position, with the curvature there (see `precision_at`)."""
+    return gaussian_of(flat, precision_at(target, flat, data, joint))
 
 
-def average_reference(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
     """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `recentre` by all.
 
-    Where the images say little at the mode and much beside it, the curvature at the mode alone makes a reference too
+    Where the images say little at the mode and much beside it, the curvature at the mode alone makes a Gaussian too
     wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
     large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with its argument,
     and its mean over places would be that of the largest. In log T_r it is that at draws about the mode, which
@@ -73,10 +73,10 @@ def average_reference(target: Target, flats: Sequence[Float[np.ndarray, "dimensi
     approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
     curvature = _add_convexly(_regular(approximate), remainder)
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
-    return recentre(target, gaussian(flats[0], precision), flats)
+    return recentre(target, gaussian_of(flats[0], precision), flats)
 
 
-def recentre(target: Target, reference: Reference, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Reference:
+def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
     """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
 
     Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
@@ -84,9 +84,9 @@ def recentre(target: Target, reference: Reference, flats: Sequence[Float[np.ndar
     where it is: its force at the mode of what it scales is no hint (see `hierarchy`).
     """
     slopes = np.mean([slope_at(target, flat) for flat in flats], axis=0)
-    factor, moving = np.asarray(reference.factor), 1 - is_scale(target)
+    factor, moving = np.asarray(gaussian.factor), 1 - is_scale(target)
     shift = moving * (factor @ (factor.T @ (moving * slopes)))
-    return reference._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
+    return gaussian._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
 
 
 def slope_at(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
@@ -130,11 +130,13 @@ def _add_convexly(
     return (vectors * np.maximum(np.abs(1 + values), LEAST_RATIO)) @ vectors.T
 
 
-def gaussian(centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]) -> Reference:
-    """The reference of that centre and precision."""
+def gaussian_of(
+    centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]
+) -> Gaussian:
+    """The Gaussian of a centre and a precision."""
     lower = np.linalg.cholesky(precision)
     factor = scipy.linalg.solve_triangular(lower, np.eye(len(centre)), lower=True).T
-    return Reference(jnp.asarray(centre), jnp.asarray(factor))
+    return Gaussian(jnp.asarray(centre), jnp.asarray(factor))
 
 
 def precision_at(

@@ -1,4 +1,4 @@
-"""Moves of single nodes that little holds: what trajectories about a Gaussian reference mix worst.
+"""Moves of single nodes that little holds: what trajectories about a Gaussian mix worst.
 
 A node that few elements of little contrast hold has a wide and bent density of its own, now and then with a second mode
 millimetres off, which no Gaussian follows; all others of a mesh often converge many times sooner. How the density
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import Estimands, Target, estimands_of
 from bayesreg.types import AnyArray
@@ -104,25 +104,25 @@ def find_slowest(path: Float[AnyArray, "draw chain node 3"], count: int) -> Int[
 
 
 def place_loose_nodes(
-    reference: Reference, first: int, nodes: Int[AnyArray, "k"], seen: Float[AnyArray, "k seen 3"]
+    gaussian: Gaussian, first: int, nodes: Int[AnyArray, "k"], seen: Float[AnyArray, "k seen 3"]
 ) -> Loose:
     """How the nodes stand in the whitened coordinates, and where places are drawn for them.
 
     Parameters
     ----------
-    reference : Reference
+    gaussian : Gaussian
     first : int
         Where "u_boundary" begins in a flat position.
     nodes : (k,) int array
         Some of these rows.
     seen : (k, s, 3) array
-        Where the nodes were seen, mm, of which `KERNELS` are taken. To their covariance there that of the reference is
+        Where the nodes were seen, mm, of which `KERNELS` are taken. To their covariance there that of the Gaussian is
         added where the others stay.
     """
-    dimension = len(reference.centre)
+    dimension = len(gaussian.centre)
     rows = first + 3 * jnp.asarray(nodes, int)[:, None] + jnp.arange(3)
     unit = jnp.zeros((dimension, rows.size)).at[rows.ravel(), jnp.arange(rows.size)].set(1.0)
-    columns = jax.scipy.linalg.solve_triangular(reference.factor, unit, lower=False)
+    columns = jax.scipy.linalg.solve_triangular(gaussian.factor, unit, lower=False)
     columns = jnp.moveaxis(columns.reshape(dimension, len(nodes), 3), 1, 0)
     own = jnp.linalg.inv(jnp.einsum("kdi,kdj->kij", columns, columns))
     seen = jnp.asarray(seen)[:, np.linspace(0, seen.shape[1] - 1, KERNELS).round().astype(int)]
@@ -182,7 +182,7 @@ def move_alone(
     target: Target,
     begin: Callable[[AnyArray], Any],
     data: Any,
-    reference: Reference,
+    gaussian: Gaussian,
     nodes: Loose,
     key: AnyArray,
     state: Any,
@@ -196,7 +196,7 @@ def move_alone(
         Whitened position → state, with fields `position` and `logdensity`.
     data : pytree
         The target's data, conditioned for moves of these nodes.
-    reference : Reference
+    gaussian : Gaussian
     nodes : Loose
     key : PRNG key
     state : state of the kernel
@@ -204,7 +204,7 @@ def move_alone(
     assert target.single_nodes is not None
     single_nodes = target.single_nodes
     key_move, key_test = jax.random.split(key)
-    estimands = estimands_of(target, data, unravel(target)(reference.place(state.position)))
+    estimands = estimands_of(target, data, unravel(target)(gaussian.place(state.position)))
 
     def move(key: AnyArray, which: AnyArray) -> tuple[AnyArray, AnyArray]:
         """The way of one node, and what it gained in its own density."""

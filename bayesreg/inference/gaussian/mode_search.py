@@ -14,8 +14,8 @@ from scipy.optimize import minimize
 
 from bayesreg.inference.gaussian.hierarchy import balance_field, balance_temperature, is_scale, is_temperature
 from bayesreg.inference.gaussian.laplace import (
-    Reference,
-    gaussian,
+    Gaussian,
+    gaussian_of,
     height_and_slope,
     hessian_rows,
     laplace,
@@ -143,7 +143,7 @@ def _improve(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
     shift = np.zeros(node_count(target)) if shift is None else shift
-    reference = gaussian(flat, _decouple(precision_at(target, flat, data, moves), is_scale(target) > 0))
+    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves), is_scale(target) > 0))
     if not moves:
         # The same for all displacements.
         data = without_normaliser(target, data)
@@ -153,12 +153,12 @@ def _improve(
     best: list[tuple[Any, float, Any, float]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        there = np.asarray(_place(reference, moving * xi))
+        there = np.asarray(_place(gaussian, moving * xi))
         height, slope = height_and_slope(target, data, there)
         pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[own].reshape(-1, 3)), shift)
         value, slope = float(pressed) - height, -slope
         slope[own] += np.asarray(push).ravel()
-        gradient = moving * np.asarray(_pull_back(reference, slope))
+        gradient = moving * np.asarray(_pull_back(gaussian, slope))
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
@@ -173,12 +173,12 @@ def _improve(
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
     place, least, _, pressed = best[-1]
     say(f"mode: log density {pressed - least:.1f}")
-    return np.asarray(_place(reference, moving * place))
+    return np.asarray(_place(gaussian, moving * place))
 
 
 # On the device: the threads of NumPy's products stay awake for a while and are in the way of what comes next.
-_place = jax.jit(Reference.place)
-_pull_back = jax.jit(lambda reference, slope: reference.factor.T @ slope)
+_place = jax.jit(Gaussian.place)
+_pull_back = jax.jit(lambda gaussian, slope: gaussian.factor.T @ slope)
 
 
 def _decouple(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.inference.gaussian.laplace import Reference, laplace
+from bayesreg.inference.gaussian.laplace import Gaussian, laplace
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.kernel import Say
 from bayesreg.inference.layout import flat_position, unravel
@@ -24,13 +24,13 @@ class Modes(NamedTuple):
 
     Attributes
     ----------
-    references : list of Reference
+    gaussians : list of Gaussian
         Laplace's approximation about each, the mode of the highest density first.
     chains : (chains,) list of int
         Whose mode each chain's is.
     """
 
-    references: list[Reference]
+    gaussians: list[Gaussian]
     chains: list[int]
 
 
@@ -53,33 +53,33 @@ def search_modes(target: Target, points: Any, each: bool, say: Say) -> Modes:
 def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
     """The modes among those of every chain that differ, by their distance in standard deviations (see `SAME`)."""
     heights = [_height(target, mode) for mode in found]
-    references: list[Reference] = []
+    gaussians: list[Gaussian] = []
     chains = [0] * len(found)
     for chain in np.argsort(heights)[::-1]:
-        apart = [distance(reference, found[chain]) for reference in references]
+        apart = [distance(gaussian, found[chain]) for gaussian in gaussians]
         if not apart or min(apart) > SAME:
             apart = [*apart, 0.0]
-            references.append(laplace(target, found[chain]))
+            gaussians.append(laplace(target, found[chain]))
         chains[chain] = int(np.argmin(apart))
-    return Modes(references, chains)
+    return Modes(gaussians, chains)
 
 
-def distance(reference: Reference, flat: Float[np.ndarray, "dimension"]) -> float:
+def distance(gaussian: Gaussian, flat: Float[np.ndarray, "dimension"]) -> float:
     """How far a flat position is from the centre, in standard deviations of the coordinate in which it is furthest."""
-    sd = np.linalg.norm(np.asarray(reference.factor), axis=1)
-    return float(np.abs((flat - np.asarray(reference.centre)) / sd).max())
+    sd = np.linalg.norm(np.asarray(gaussian.factor), axis=1)
+    return float(np.abs((flat - np.asarray(gaussian.centre)) / sd).max())
 
 
 def report_modes(target: Target, modes: Modes, say: Say) -> Modes:
     """Report the modes and return them."""
-    if len(modes.references) == 1:
+    if len(modes.gaussians) == 1:
         say("modes: every chain's search ended at one and the same")
         return modes
-    say(f"modes: {len(modes.references)}, about which the chains start; all are whitened at the first")
-    for number, reference in enumerate(modes.references):
-        centre = np.asarray(reference.centre)
+    say(f"modes: {len(modes.gaussians)}, about which the chains start; all are whitened at the first")
+    for number, gaussian in enumerate(modes.gaussians):
+        centre = np.asarray(gaussian.centre)
         chains = ", ".join(str(chain) for chain, mode in enumerate(modes.chains) if mode == number)
-        apart = distance(modes.references[0], centre)
+        apart = distance(modes.gaussians[0], centre)
         say(f"  log density {_height(target, centre):.1f}, {apart:.1f} sd from the first: chains {chains}")
     return modes
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.layout import others, unravel
 from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
@@ -67,8 +67,8 @@ def no_stand_in(target: Target) -> StandIn:
     return StandIn(jnp.asarray(entries), jnp.zeros(len(entries)), jnp.zeros((len(entries), len(entries))))
 
 
-def make_stand_in(target: Target, reference: Reference, middle: AnyArray) -> StandIn:
-    """The normaliser's slope at a flat position, and its curvature by differences over one sd of the reference."""
+def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
+    """The normaliser's slope at a flat position, and its curvature by differences over one sd of the Gaussian."""
     found, entries = no_stand_in(target), others(target)
     count = len(entries)
     if not has_costly_normaliser(target) or not count:
@@ -77,7 +77,7 @@ def make_stand_in(target: Target, reference: Reference, middle: AnyArray) -> Sta
     found = found._replace(slope=slope_at(middle)[entries])
     if count > MOST_CURVED:
         return found
-    sd = np.minimum(np.linalg.norm(np.asarray(reference.factor)[entries], axis=1), 1.0)
+    sd = np.minimum(np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), 1.0)
     rows = []
     for index, h in zip(entries, sd, strict=True):
         step = jnp.zeros_like(middle).at[index].set(h)

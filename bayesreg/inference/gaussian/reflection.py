@@ -1,7 +1,7 @@
-"""Hamiltonian dynamics about a Gaussian reference, reflected where a sampled node meets the skull.
+"""Hamiltonian dynamics about a Gaussian, reflected where a sampled node meets the skull.
 
-In coordinates ξ in which the reference (Laplace's approximation) is N(0, I), the Hamiltonian splits into that of the
-reference, ½|ξ|² + ½|p|², whose flow is a rotation of (ξ, p), and what the posterior adds to it, −log π(ξ) − ½|ξ|²,
+In coordinates ξ in which the Gaussian (Laplace's approximation) is N(0, I), the Hamiltonian splits into that of the
+Gaussian, ½|ξ|² + ½|p|², whose flow is a rotation of (ξ, p), and what the posterior adds to it, −log π(ξ) − ½|ξ|²,
 whose flow is a kick. Their Strang composition is exact where the posterior is Gaussian, in any dimension (Beskos et al.
 2011), and so takes long steps where it is nearly so.
 
@@ -9,10 +9,10 @@ The support has hard walls: the signed distance d of every sampled node to the f
 rotation that meets a wall is reflected there: with n the gradient of that node's distance in ξ, the momentum p becomes
 p − 2 (p·n) n / |n|². This keeps volume, energy and reversibility (Pakman and Paninski 2014; Mohasel Afshar and Domke
 2015), so that the Metropolis test of Hamiltonian Monte Carlo stays what it is. A reflection inside a leapfrog step
-would cost an error of first order in the step times the force at the wall; here only the force beyond the reference's
+would cost an error of first order in the step times the force at the wall; here only the force beyond the Gaussian's
 counts.
 
-Samplers that know no reference move in straight lines instead, reflected in the same way.
+Samplers that know no Gaussian move in straight lines instead, reflected in the same way.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def walls(centre: Float[AnyArray, "nodes 3"], rows: Float[AnyArray, "nodes 3 dim
 def reflective_rotation(walls: Walls, clearance: Clearance, precision: AnyArray | float = 1.0) -> Callable:
     """An integrator for BlackJAX: half a kick, a rotation reflected at the walls, half a kick.
 
-    The reference is N(0, I / precision) and the mass the precision, of which BlackJAX takes the inverse.
+    The Gaussian is N(0, I / precision) and the mass the precision, of which BlackJAX takes the inverse.
     """
 
     def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
@@ -144,7 +144,7 @@ class _Flight(NamedTuple):
 def rotate(
     walls: Walls, clearance: Clearance, position: AnyArray, momentum: AnyArray, time: AnyArray | float
 ) -> tuple[AnyArray, AnyArray]:
-    """Position and momentum after the reference's own motion for some time (either sign), reflected at the walls.
+    """Position and momentum after the Gaussian's own motion for some time (either sign), reflected at the walls.
 
     A flight that is not over after many reflections ends outside the support of any density: at NaN.
     """

@@ -33,7 +33,7 @@ class Tuning(NamedTuple):
     watched : bool
         Whether displacements of all transitions are wanted.
     quarter_turns : bool
-        Whether a transition has as many steps as make a quarter turn of the reference, of one size no greater than what
+        Whether a transition has as many steps as make a quarter turn of the Gaussian, of one size no greater than what
         the acceptance allows.
     """
 
@@ -47,7 +47,7 @@ class Tuning(NamedTuple):
 
 @runtime_checkable
 class Walking(Protocol):
-    """A hashable object that moves the chains (`bayesreg.inference.gaussian.about_reference.Walk`)."""
+    """A hashable object that moves the chains (`bayesreg.inference.gaussian.about_gaussian.Walk`)."""
 
     def init(self, data: Any, setup: Any, estimands: Estimands) -> Any:
         """See `Sampler`."""

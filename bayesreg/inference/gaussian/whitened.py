@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.loose import Loose, place_loose_nodes
 from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in
 from bayesreg.inference.gaussian.reflection import Clearance, Walls, walls
@@ -26,18 +26,18 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Setup(NamedTuple):
-    """The setup of a sampler about a Gaussian reference, found once (a pytree).
+    """The setup of a sampler about a Gaussian, found once (a pytree).
 
     Attributes
     ----------
-    reference : Reference
+    gaussian : Gaussian
     middle : (d,) array
-        Flat position that the chains are about: the mode, or the mean of where they are. Not the reference's centre,
+        Flat position that the chains are about: the mode, or the mean of where they are. Not the Gaussian's centre,
         which may lie behind a wall. Solves are preconditioned there.
     walls : Walls
         The walls of every sampled node.
     step_size : scalar
-        In whitened coordinates; π/2 is a quarter turn of the reference's motion.
+        In whitened coordinates; π/2 is a quarter turn of the Gaussian's motion.
     steps : scalar integer
         Steps of a trajectory of fixed length: as many as make a quarter turn.
     stand_in : StandIn
@@ -46,7 +46,7 @@ class Setup(NamedTuple):
         Nodes that are moved alone, too.
     """
 
-    reference: Reference
+    gaussian: Gaussian
     middle: AnyArray
     walls: Walls
     step_size: Scalar
@@ -72,40 +72,38 @@ Density = Callable[[Target, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
 @partial(jax.jit, static_argnums=0)
-def setup_about(
-    target: Target, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()
-) -> Setup:
+def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
     """A setup before its tuning; the nodes in the rows `alone` of "u_boundary" are moved alone."""
     nodes, own = node_count(target), displacements(target)
-    centre = reference.centre[own].reshape(nodes, 3)
-    rows = reference.factor[own].reshape(nodes, 3, len(reference.centre))
+    centre = gaussian.centre[own].reshape(nodes, 3)
+    rows = gaussian.factor[own].reshape(nodes, 3, len(gaussian.centre))
     nothing = no_stand_in(target)
     held = walls(centre, rows, jnp.arange(nodes))
     at = middle[own].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
-    nodes_alone = place_loose_nodes(reference, own.start, jnp.asarray(alone, int), at)
+    nodes_alone = place_loose_nodes(gaussian, own.start, jnp.asarray(alone, int), at)
     step_size, steps = jnp.asarray(FIRST_STEP), jnp.asarray(1, int)
-    return Setup(reference, jnp.asarray(middle), held, step_size, steps, nothing, nodes_alone)
+    return Setup(gaussian, jnp.asarray(middle), held, step_size, steps, nothing, nodes_alone)
 
 
-def whiten(reference: Reference, flat: AnyArray) -> AnyArray:
+def whiten(gaussian: Gaussian, flat: AnyArray) -> AnyArray:
     """The whitened coordinates ξ of a flat position."""
-    return jax.scipy.linalg.solve_triangular(reference.factor, flat - reference.centre, lower=False)
+    return jax.scipy.linalg.solve_triangular(gaussian.factor, flat - gaussian.centre, lower=False)
 
 
-def whitened_position(target: Target, reference: Reference, xi: AnyArray) -> dict[str, AnyArray]:
+def whitened_position(target: Target, gaussian: Gaussian, xi: AnyArray) -> dict[str, AnyArray]:
     """The position at ξ."""
-    return unravel(target)(reference.place(xi))
+    return unravel(target)(gaussian.place(xi))
 
 
 def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ), up to a constant, with the stand-in for its normaliser."""
-    reference = setup.reference
+    gaussian = setup.gaussian
     if not has_costly_normaliser(target):
-        return lambda xi: logdensity(target, data, whitened_position(target, reference, xi))
+        return lambda xi: logdensity(target, data, whitened_position(target, gaussian, xi))
     plain = without_normaliser(target, data)
 
     def density(xi: AnyArray) -> AnyArray:
-        flat = reference.place(xi)
+        flat = gaussian.place(xi)
         return logdensity(target, plain, unravel(target)(flat)) + setup.stand_in(flat - setup.middle)
 
     return density

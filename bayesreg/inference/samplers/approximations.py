@@ -12,8 +12,8 @@ import numpy as np
 from blackjax.optimizers.lbfgs import lbfgs_inverse_hessian_formula_1
 from blackjax.vi.pathfinder import approximate
 
-from bayesreg.inference.gaussian.about_reference import about_reference
-from bayesreg.inference.gaussian.laplace import Reference
+from bayesreg.inference.gaussian.about_gaussian import about_gaussian
+from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.mode_search import penalty
 from bayesreg.inference.gaussian.reflection import rotate
 from bayesreg.inference.gaussian.whitened import Moved, Setup, clearance_of, setup_about, whiten
@@ -29,7 +29,7 @@ ITERATIONS, JUDGES = 30, 8
 
 def laplace(target: Target, settings: Laplace) -> Sampler:
     """Independent draws from Laplace's approximation, cut off by the skull: a quick look, not the posterior."""
-    return about_reference(target, _turn, begin=_begin, mode_search=settings.mode_search, exact=False)
+    return about_gaussian(target, _turn, begin=_begin, mode_search=settings.mode_search, exact=False)
 
 
 class _Place(NamedTuple):
@@ -62,24 +62,24 @@ def pathfinder(target: Target, settings: Pathfinder) -> Sampler:
         setup, starts = about_mode.prepare(points, key, say)
         flat = flat_position(target, target.data, jax.tree.map(lambda x: x[0], starts))
         path = _path(
-            target, about_mode.data(setup), setup.reference, whiten(setup.reference, flat), jax.random.fold_in(key, 0)
+            target, about_mode.data(setup), setup.gaussian, whiten(setup.gaussian, flat), jax.random.fold_in(key, 0)
         )
         elbo, mean, covariance = (np.asarray(found) for found in path)
         if not np.isfinite(elbo):
             raise InputError("pathfinder found no Gaussian with a finite evidence bound; use the sampler laplace")
         say(f"pathfinder: evidence bound {elbo:.1f}, mean {np.sqrt((mean**2).mean()):.2f} sd from the mode")
-        reference = _push_forward(setup.reference, mean, covariance)
-        return setup_about(target, reference, reference.centre), starts
+        gaussian = _push_forward(setup.gaussian, mean, covariance)
+        return setup_about(target, gaussian, gaussian.centre), starts
 
     return about_mode._replace(prepare=prepare)
 
 
 @partial(jax.jit, static_argnums=0)
-def _path(target: Target, data: Any, reference: Reference, start: AnyArray, key: AnyArray) -> Any:
+def _path(target: Target, data: Any, gaussian: Gaussian, start: AnyArray, key: AnyArray) -> Any:
     """Evidence bound, mean and covariance in whitened coordinates."""
 
     def density(xi: AnyArray) -> AnyArray:
-        position = unravel(target)(reference.place(xi))
+        position = unravel(target)(gaussian.place(xi))
         height = logdensity(target, without_walls(target, data), position)
         return height - penalty(target, data, position["u_boundary"])
 
@@ -89,10 +89,10 @@ def _path(target: Target, data: Any, reference: Reference, start: AnyArray, key:
     return best.elbo, best.position - covariance @ best.grad_position, covariance
 
 
-def _push_forward(reference: Reference, mean: np.ndarray, covariance: np.ndarray) -> Reference:
+def _push_forward(gaussian: Gaussian, mean: np.ndarray, covariance: np.ndarray) -> Gaussian:
     """The Gaussian of the whitened coordinates as one of flat positions."""
-    factor = np.asarray(reference.factor)
+    factor = np.asarray(gaussian.factor)
     spread = factor @ covariance @ factor.T
     # Cholesky's factor from the last row up is the upper triangular one.
     upper = np.linalg.cholesky(spread[::-1, ::-1])[::-1, ::-1]
-    return Reference(reference.centre + reference.factor @ mean, jnp.asarray(upper))
+    return Gaussian(gaussian.centre + gaussian.factor @ mean, jnp.asarray(upper))

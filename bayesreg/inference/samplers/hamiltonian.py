@@ -8,7 +8,7 @@ import blackjax
 import jax
 import jax.numpy as jnp
 
-from bayesreg.inference.gaussian.about_reference import about_reference
+from bayesreg.inference.gaussian.about_gaussian import about_gaussian
 from bayesreg.inference.gaussian.loose import LOOSE
 from bayesreg.inference.gaussian.reflection import reflective_microcanonical, reflective_rotation
 from bayesreg.inference.gaussian.warm_up import Tuning
@@ -20,12 +20,12 @@ from bayesreg.types import AnyArray
 
 
 def hmc(target: Target, settings: Hmc) -> Sampler:
-    """Hamiltonian Monte Carlo: a quarter turn about the Gaussian reference, in as many steps as acceptance asks for.
+    """Hamiltonian Monte Carlo: a quarter turn about the Gaussian, in as many steps as acceptance asks for.
 
     All steps of a trajectory are longer or shorter by up to a fifth, at random.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, quarter_turns=True)
-    return about_reference(target, _quarter_turn, tuning, mode_search=settings.mode_search, alone=LOOSE)
+    return about_gaussian(target, _quarter_turn, tuning, mode_search=settings.mode_search, alone=LOOSE)
 
 
 def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -38,9 +38,9 @@ def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state:
 
 
 def nuts(target: Target, settings: Nuts) -> Sampler:
-    """The No-U-Turn sampler about the Gaussian reference."""
+    """The No-U-Turn sampler about the Gaussian."""
     tuning = Tuning(settings.warm_up, settings.target_acceptance)
-    return about_reference(target, _no_u_turn, tuning, mode_search=settings.mode_search)
+    return about_gaussian(target, _no_u_turn, tuning, mode_search=settings.mode_search)
 
 
 def _no_u_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -57,7 +57,7 @@ def mclmc(target: Target, settings: Mclmc) -> Sampler:
     The speed is one whatever the density, so that a time of √d does what a time of one does in `hmc`.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, quarter_turns=True)
-    return about_reference(target, _microcanonical, tuning, mode_search=settings.mode_search)
+    return about_gaussian(target, _microcanonical, tuning, mode_search=settings.mode_search)
 
 
 def _microcanonical(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:

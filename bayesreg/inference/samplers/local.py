@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from blackjax.mcmc import random_walk
 
-from bayesreg.inference.gaussian.about_reference import about_reference
+from bayesreg.inference.gaussian.about_gaussian import about_gaussian
 from bayesreg.inference.gaussian.reflection import reflective_leapfrog, rotate, shift
 from bayesreg.inference.gaussian.warm_up import Tuning
 from bayesreg.inference.gaussian.whitened import Density, Moved, Setup, Transition, clearance_of, whitened_density
@@ -30,7 +30,7 @@ def mala(target: Target, settings: Mala) -> Sampler:
     Written so, it has a momentum that the skull can reflect.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
-    return about_reference(target, _leapfrog, tuning, mode_search=settings.mode_search)
+    return about_gaussian(target, _leapfrog, tuning, mode_search=settings.mode_search)
 
 
 def _leapfrog(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -46,7 +46,7 @@ def barker(target: Target, settings: Barker) -> Sampler:
     It has no momentum: a proposal in the skull is refused.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
-    return about_reference(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=settings.mode_search)
+    return about_gaussian(target, _barker, tuning, blackjax.mcmc.barker.init, mode_search=settings.mode_search)
 
 
 def _barker(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
@@ -65,18 +65,18 @@ def rwmh_adaptive(target: Target, settings: RwmhAdaptive) -> Sampler:
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
     transition = _symmetric(shift, whitened_density)
-    return about_reference(target, transition, tuning, random_walk.init, whitened_density, settings.mode_search)
+    return about_gaussian(target, transition, tuning, random_walk.init, whitened_density, settings.mode_search)
 
 
 def pcn(target: Target, settings: Pcn) -> Sampler:
-    """Preconditioned Crank–Nicolson on the Gaussian reference (Cotter et al. 2013).
+    """Preconditioned Crank–Nicolson on the Gaussian (Cotter et al. 2013).
 
-    ξ′ = cos β ξ + sin β p with p Normal is a rotation, reflected by the skull. It leaves the reference, cut off there,
-    unchanged and is reversible, so that the test sees only the ratio of the posterior to the reference.
+    ξ′ = cos β ξ + sin β p with p Normal is a rotation, reflected by the skull. It leaves the Gaussian, cut off there,
+    unchanged and is reversible, so that the test sees only the ratio of the posterior to the Gaussian.
     """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, LEAST)
-    transition = _symmetric(rotate, against_reference)
-    return about_reference(target, transition, tuning, random_walk.init, against_reference, settings.mode_search)
+    transition = _symmetric(rotate, against_gaussian)
+    return about_gaussian(target, transition, tuning, random_walk.init, against_gaussian, settings.mode_search)
 
 
 @cache
@@ -94,7 +94,7 @@ def _symmetric(motion: Callable, density: Density) -> Transition:
     return transition
 
 
-def against_reference(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
+def against_gaussian(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
     """log π(ξ) − log N(ξ; 0, I), up to a constant."""
     density = whitened_density(target, data, setup)
     return lambda xi: density(xi) + 0.5 * (xi @ xi)

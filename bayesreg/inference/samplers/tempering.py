@@ -44,11 +44,11 @@ def smc(target: Target, settings: Smc) -> Sampler:
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         one = jax.tree.map(lambda x: x[0], starts)
-        begin = whiten(setup.reference, flat_position(target, data, one))
+        begin = whiten(setup.gaussian, flat_position(target, data, one))
         first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
         found, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
-        positions = jax.vmap(lambda xi: whitened_position(target, setup.reference, xi))(found[chosen])
+        positions = jax.vmap(lambda xi: whitened_position(target, setup.gaussian, xi))(found[chosen])
         return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
 
     return chains_of._replace(prepare=prepare)
@@ -114,7 +114,7 @@ def _rise(
     def broad(xi: AnyArray) -> AnyArray:
         return -0.5 * (xi @ xi) / spread**2
 
-    # That of the tempered reference, about which trajectories rotate.
+    # That of the tempered gaussian, about which trajectories rotate.
     precision = (1 - state.tempering_param) / spread**2 + state.tempering_param
     kernel = adaptive_tempered.build_kernel(
         broad,
@@ -128,7 +128,7 @@ def _rise(
     steps = jnp.maximum(jnp.ceil(jnp.pi / 2 / size), 1).astype(int)
     settings = {
         "step_size": jnp.pi / 2 / steps,
-        "inverse_mass_matrix": jnp.ones_like(setup.reference.centre) / precision,
+        "inverse_mass_matrix": jnp.ones_like(setup.gaussian.centre) / precision,
         "num_integration_steps": steps,
     }
     state, info = kernel(key, state, _MOVES, jax.tree.map(lambda x: x[None], settings))

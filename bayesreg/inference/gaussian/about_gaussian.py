@@ -1,4 +1,4 @@
-"""Samplers about a Gaussian reference, in the coordinates in which it is N(0, I).
+"""Samplers about a Gaussian, in the coordinates in which it is N(0, I).
 
 A transition there is all that such a sampler needs to bring; the search for the mode, the starts, the warm-up and the
 way back to the estimands are the same for all.
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.gaussian.laplace import Reference, average_reference, recentre, slope_at
+from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, recentre, slope_at
 from bayesreg.inference.gaussian.loose import find_slowest, move_alone, place_loose_nodes, search_places
 from bayesreg.inference.gaussian.modes import search_modes
 from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, log_normaliser_at, make_stand_in
@@ -47,7 +47,7 @@ from bayesreg.types import AnyArray, InputError
 # Chains start that much wider than Laplace's approximation.
 OVERDISPERSION = 1.5
 
-# A reference is averaged over the mode and the places of so many chains at most: each costs a curvature.
+# A Gaussian is averaged over the mode and the places of so many chains at most: each costs a curvature.
 AVERAGED = 16
 
 # Laplace's approximation and the reflections keep eight dense matrices of the square of this: 9 GB.
@@ -71,7 +71,7 @@ class Walk:
     def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
         """The state of a chain there."""
         flat = flat_position(self.target, data, estimands)
-        return self.begin(whiten(setup.reference, flat), self.density(self.target, data, setup))
+        return self.begin(whiten(setup.gaussian, flat), self.density(self.target, data, setup))
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
         """The state after a transition."""
@@ -89,7 +89,7 @@ class Walk:
 
     def estimands(self, data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
         """Where a chain is."""
-        return estimands_of(self.target, data, whitened_position(self.target, setup.reference, state.position))
+        return estimands_of(self.target, data, whitened_position(self.target, setup.gaussian, state.position))
 
     def observe(self, data: Any, setup: Setup, state: Any) -> Draw:
         """Where a chain is, and the evaluation of the density there."""
@@ -97,7 +97,7 @@ class Walk:
         return Draw(estimands, self.target.evaluate_estimands(data, estimands))
 
 
-def about_reference(
+def about_gaussian(
     target: Target,
     transition: Transition,
     tuning: Tuning | None = None,
@@ -150,9 +150,9 @@ def about_reference(
         found = search_modes(target, points, mode_search == "per_chain", say)
         key_start, key_tune = jax.random.split(key)
         keys = jax.random.split(key_start, len(found.chains))
-        modes = [np.asarray(reference.centre) for reference in found.references]
-        about = [recentre(target, reference, [mode]) for reference, mode in zip(found.references, modes, strict=True)]
-        setups = [_about(target, reference, mode) for reference, mode in zip(about, modes, strict=True)]
+        modes = [np.asarray(gaussian.centre) for gaussian in found.gaussians]
+        about = [recentre(target, gaussian, [mode]) for gaussian, mode in zip(found.gaussians, modes, strict=True)]
+        setups = [_about(target, gaussian, mode) for gaussian, mode in zip(about, modes, strict=True)]
         starts = [_scatter(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
@@ -162,7 +162,7 @@ def about_reference(
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
-        return setup_about(target, Reference(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
+        return setup_about(target, Gaussian(nothing, jnp.eye(unknowns)), nothing, np.zeros(alone, int))
 
     data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
@@ -200,10 +200,10 @@ def _warm_up(
     say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.variables.coords['node'])[nodes]))}")
     late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])
     seen = np.moveaxis(late.reshape(-1, alone, 3), 1, 0)
-    setup = setup._replace(loose=place_loose_nodes(setup.reference, displacements(target).start, nodes, seen))
+    setup = setup._replace(loose=place_loose_nodes(setup.gaussian, displacements(target).start, nodes, seen))
     beyond = search_places(target, _condition(target, setup), setup.loose, points, key_search)
     seen = np.concatenate([seen, beyond], axis=1)
-    return setup._replace(loose=place_loose_nodes(setup.reference, displacements(target).start, nodes, seen)), points
+    return setup._replace(loose=place_loose_nodes(setup.gaussian, displacements(target).start, nodes, seen)), points
 
 
 def _with_loose_nodes(target: Target, sampler: Sampler, begin: Callable, density: Density) -> Sampler:
@@ -223,7 +223,7 @@ def _with_loose_nodes(target: Target, sampler: Sampler, begin: Callable, density
         def beginning(xi: AnyArray) -> Any:
             return begin(xi, density(target, data, setup))
 
-        kernel = move_alone(target, beginning, data, setup.reference, setup.loose, key_move, kernel)
+        kernel = move_alone(target, beginning, data, setup.gaussian, setup.loose, key_move, kernel)
         state = state._replace(kernel=kernel) if isinstance(state, Delayed) else kernel
         return state, info._replace(gradients=info.gradients + 1)
 
@@ -244,16 +244,16 @@ def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
         return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
 
     def flat_of(setup: Setup, state: Any) -> AnyArray:
-        return setup.reference.place(state.position)
+        return setup.gaussian.place(state.position)
 
     step = delay_acceptance(sampler.step, flat_of, partial(log_normaliser_at, target))
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _about(target: Target, reference: Reference, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
+def _about(target: Target, gaussian: Gaussian, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
     """A setup before its tuning, with the stand-in about the middle."""
-    setup = setup_about(target, reference, middle, alone)
-    return setup._replace(stand_in=make_stand_in(target, reference, jnp.asarray(middle)))
+    setup = setup_about(target, gaussian, middle, alone)
+    return setup._replace(stand_in=make_stand_in(target, gaussian, jnp.asarray(middle)))
 
 
 def _setup_on_average(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
@@ -264,7 +264,7 @@ def _setup_on_average(target: Target, mode: AnyArray, points: Any, alone: int = 
     flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
-    return _about(target, average_reference(target, places), np.mean(places, axis=0), np.zeros(alone, int))
+    return _about(target, average_gaussian(target, places), np.mean(places, axis=0), np.zeros(alone, int))
 
 
 def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
@@ -275,7 +275,7 @@ def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> An
     InputError
         If a chain finds no place in the support.
     """
-    width, begin = np.full(len(keys), OVERDISPERSION), whiten(setup.reference, jnp.asarray(mode))
+    width, begin = np.full(len(keys), OVERDISPERSION), whiten(setup.gaussian, jnp.asarray(mode))
     for _ in range(10):
         points, done = jax.vmap(partial(_start, target, target.data, setup, begin))(keys, jnp.asarray(width))
         if done.all():
@@ -292,4 +292,4 @@ def _start(
     """Estimands, and whether the flight there was over in time."""
     momentum = width * jax.random.normal(key, begin.shape)
     xi, _ = rotate(setup.walls, clearance_of(target, data, setup), begin, momentum, jnp.pi / 2)
-    return estimands_of(target, data, whitened_position(target, setup.reference, xi)), jnp.isfinite(xi).all()
+    return estimands_of(target, data, whitened_position(target, setup.gaussian, xi)), jnp.isfinite(xi).all()
