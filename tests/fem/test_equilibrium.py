@@ -69,7 +69,7 @@ def test_a_tighter_tolerance_is_met(traced, u_boundary):
 
 
 def test_too_few_iterations_are_confessed(mesh, u_boundary, monkeypatch):
-    monkeypatch.setattr(fem_equilibrium, "MAX_ITERATIONS", 3)
+    monkeypatch.setattr("bayesreg.fem.conjugate_gradients.MAX_ITERATIONS", 3)
     found = jax.jit(partial(br.solve_interior, mesh))(PAPER_LAM, PAPER_MU, u_boundary)
     assert not bool(found.converged)
     assert int(found.iterations) == 3

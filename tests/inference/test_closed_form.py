@@ -177,7 +177,7 @@ class TestGaussianPosterior:
 
 
 @pytest.fixture(scope="module")
-def reference():
+def gaussian():
     """Brute force: draw from the Gaussian, drop what has a node in the skull."""
     exact, rng = problem().exact, np.random.default_rng(1)
     height = MESH.points[MESH.boundary, 0]

@@ -67,7 +67,7 @@ def test_the_stand_in_is_the_normaliser_to_second_order():
 
 class Setup(NamedTuple):
     middle: jax.Array
-    make_stand_in: StandIn
+    stand_in: StandIn
 
 
 def log_normaliser(data, flat):

@@ -97,13 +97,13 @@ def test_widths_of_all_that_is_free(posterior):
     table = width_table(MESH, posterior, diagnosed([1.0] * 3, [np.nan, np.nan, 1.5], t_similarity=1.0), manifest)
     found = {(group, row[0]): row[1:] for group, rows in table.groups for row in rows}
     assert list(found) == [(g, s) for g, s in [("CSF", "λ"), ("CSF", "μ"), ("GM", "λ"), ("WM", "λ"), ("WM", "μ")]] + [
-        ("Temperatures", "T_s")
+        ("Temperatures and sds", "T_s")
     ]
     assert found["CSF", "λ"][0] == "improper"
     assert found["CSF", "λ"][2:] == ["–", "only an upper bound"]
     assert float(found["GM", "λ"][2]) == pytest.approx(2 * 1.96 * 0.5 / 19, abs=0.012)
     assert found["WM", "μ"][3] == "the chains disagree"
-    assert found["Temperatures", "T_s"][3] == "identified"
+    assert found["Temperatures and sds", "T_s"][3] == "identified"
 
 
 def test_ratios_by_quantiles_with_their_correlation(posterior):
