@@ -1,113 +1,75 @@
-"""Image similarity energies E_s at quadrature points; the likelihood is exp(−E_s / T_s) / Z_s, eq. (11)."""
+"""Similarities of two images at quadrature points; the likelihood is exp(−E_s / T_s) / Z_s, eq. (11)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Protocol
 
-import jax
-import jax.numpy as jnp
-from jax.scipy.special import gammaln
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, Int
 
+from bayesreg.interpolation import Interpolator
+from bayesreg.model.options import ModelConfig
+from bayesreg.model.pointwise import POINTWISE
 from bayesreg.types import AnyArray, Scalar
 
 
-class Noise(NamedTuple):
-    """What a likelihood knows of the noise (a pytree).
+class Similarity(Protocol):
+    """How the likelihood compares f and the warped m (a pytree).
 
-    Attributes
-    ----------
-    temperature : scalar
-        T_s, mm³ times squared intensity: at a point of weight w_q the residual has the squared scale T_s / (2 w_q).
-    degrees_of_freedom : scalar
-        ν of Student's t.
+    `fixed` stands for f(x_q), `moving` for m(x_q + u(x_q)), `weights` for the quadrature weights w_q in mm³, each of
+    shape (q,), and `temperature` for T_s in mm³ times squared intensity. A point of weight w_q has noise of the squared
+    scale T_s / (2 w_q).
     """
 
-    temperature: Scalar
-    degrees_of_freedom: Scalar
+    @classmethod
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> Similarity:
+        """The similarity at these points, mm, for an image m, with the settings that the options hold."""
+
+    def energy(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Scalar:
+        """E_s, mm³ times squared intensity."""
+
+    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+        """−log Z_s, with which exp(−E_s / T_s) is a density of the residuals."""
+
+    def residuals(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """The part of f that noise explains."""
+
+    def convexity(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """Gauss and Newton's curvature of E_s in each m_q, mm³; not negative."""
+
+    def curvature(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Float[AnyArray, "points"]:
+        """The curvature of E_s in each m_q by itself, mm³."""
+
+    def variance(self) -> Scalar:
+        """The mean of the residuals' variances in units of their squared scales."""
+
+    def draw(
+        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """Residuals that follow the model, in units of their scales."""
+
+    def at(self, positions: Float[np.ndarray, "others 3"]) -> Similarity:
+        """The same similarity at other points, mm."""
+
+    def among(self, points: Int[AnyArray, "some"]) -> Similarity:
+        """The same similarity of some of the points alone, given by their indices; traceable."""
 
 
-class Similarity(NamedTuple):
-    """One family of noise.
-
-    Attributes
-    ----------
-    energy : callable
-        (fixed values, moving values, weights, noise) → E_s, mm³ times squared intensity.
-    log_normaliser : callable
-        (weights, noise) → −log Z_s, with which exp(−E_s / T_s) is a density of the residuals.
-    variance : callable
-        (noise) → variance of the residual in units of its squared scale.
-    draw : callable
-        (key, shape, noise) → independent residuals in units of their scale √(T_s / 2w).
-    """
-
-    energy: Callable[[AnyArray, AnyArray, AnyArray, Noise], Scalar]
-    log_normaliser: Callable[[AnyArray, Noise], Scalar]
-    variance: Callable[[Noise], Scalar]
-    draw: Callable[[AnyArray, tuple[int, ...], Noise], AnyArray]
-
-
-def sum_of_squared_differences(
-    fixed: Float[AnyArray, "points"],
-    moving: Float[AnyArray, "points"],
-    weights: Float[AnyArray, "points"],
-    noise: Noise | None = None,
-) -> Scalar:
-    """∫ (f − m(x + u))² dx, eq. (1); the same for any noise.
-
-    Parameters
-    ----------
-    fixed, moving : (q,) array
-        f(x_q) and m(x_q + u(x_q)).
-    weights : (q,) array
-        Quadrature weights, mm³.
-    """
-    # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
-    # and then redo the index arithmetic for each of its taps.
-    return weights @ (fixed - moving) ** 2
-
-
-def gaussian_log_normaliser(weights: Float[AnyArray, "points"], noise: Noise) -> Scalar:
-    """Σ_q −½ log(2π σ_q²) with σ_q² = T_s / (2 w_q)."""
-    return 0.5 * jnp.log(weights / (jnp.pi * noise.temperature)).sum()
-
-
-def student_t_energy(
-    fixed: Float[AnyArray, "points"],
-    moving: Float[AnyArray, "points"],
-    weights: Float[AnyArray, "points"],
-    noise: Noise,
-) -> Scalar:
-    """T_s (ν + 1)/2 Σ_q log(1 + 2 w_q (f − m)² / (ν T_s)): −T_s times the log of Student's t without its normaliser.
-
-    For small residuals, and for many degrees of freedom, eq. (1); a large residual adds its logarithm alone.
-    """
-    temperature, nu = noise
-    surprise = jnp.log1p(2 * weights * (fixed - moving) ** 2 / (nu * temperature))
-    # A product of vectors, as in eq. (1).
-    return temperature * (nu + 1) / 2 * (jnp.ones_like(weights) @ surprise)
-
-
-def student_t_log_normaliser(weights: Float[AnyArray, "points"], noise: Noise) -> Scalar:
-    """Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²) with s_q² = T_s / (2 w_q)."""
-    temperature, nu = noise
-    shape = gammaln((nu + 1) / 2) - gammaln(nu / 2)
-    return (shape + 0.5 * jnp.log(2 * weights / (jnp.pi * nu * temperature))).sum()
-
-
-SIMILARITIES: dict[str, Similarity] = {
-    "ssd": Similarity(
-        sum_of_squared_differences,
-        gaussian_log_normaliser,
-        lambda _: jnp.ones(()),
-        lambda key, shape, _: jax.random.normal(key, shape),
-    ),
-    "student_t": Similarity(
-        student_t_energy,
-        student_t_log_normaliser,
-        lambda noise: noise.degrees_of_freedom / (noise.degrees_of_freedom - 2),
-        lambda key, shape, noise: jax.random.t(key, noise.degrees_of_freedom, shape),
-    ),
-}
+SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE}

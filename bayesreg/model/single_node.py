@@ -52,7 +52,7 @@ def local_logdensity(
     assert near is not None
     images, rigid, skull = images_of(problem), problem.terms.get("rigid"), problem.terms.get("skull")
     assert images is not None
-    noise, likelihood, quadrature = images.noise(values), images.comparison.similarity, images.quadrature
+    temperature, quadrature = values["t_similarity"], images.quadrature
     u_boundary = values["u_boundary"].at[near.rows].set(near.at)
     u_prescribed = body.prescribed(u_boundary)
     around = jnp.tensordot(near.response, u_prescribed, 2)
@@ -60,6 +60,7 @@ def local_logdensity(
     row, points, follows, at = near.rows[which], near.points[which], near.follows[which], near.at[which]
     base = (quadrature.barycentric[points][:, :, None] * around[near.corners[which]]).sum(axis=1)
     places, fixed, weights = images.positions[points] + base, images.fixed_values[points], quadrature.weights[points]
+    similarity = images.similarity.among(points)
     force = jnp.tensordot(near.force[which], u_prescribed, 2)
     stiffness = near.force[which][:, body.slots[row]]
     if rigid is not None:
@@ -69,9 +70,9 @@ def local_logdensity(
     def log(u: Float[AnyArray, "3"]) -> Scalar:
         away = u - at
         moved = images.moving(places + follows @ away)
-        similarity_energy = likelihood.energy(fixed, moved, weights, noise)
+        similarity_energy = similarity.energy(fixed, moved, weights, temperature)
         strain_energy = away @ force + 0.5 * away @ stiffness @ away
-        total = -images.independent_share * similarity_energy / noise.temperature - strain_energy / values["t_elastic"]
+        total = -images.independent_share * similarity_energy / temperature - strain_energy / values["t_elastic"]
         if rigid is not None:
             total += rigid.log_of(motion + own_motion.T @ away)
         if skull is None:

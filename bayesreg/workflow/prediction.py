@@ -83,7 +83,7 @@ def predict(
         if with_images:
             values, cells = here.fill(draw), here.images.quadrature.cells
             z = standardised_residual(here.images, u, values["t_similarity"])
-            noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), values)
+            noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), u)
             for name, x in (("observed", z), ("replicated", noise)):
                 found[name] = discrepancies(x, cells, neighbours, len(mesh.cells))
         return found

@@ -21,7 +21,7 @@ from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.options import ModelConfig, TemperaturePrior
-from bayesreg.model.similarity import SIMILARITIES, Noise, Similarity
+from bayesreg.model.similarity import SIMILARITIES, Similarity
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import PointCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -56,17 +56,15 @@ class ImagePair:
         require_overlap(mesh, self.moving, f"moving image{of_pair}")
         quadrature = quadrature_of(mesh, self.fixed, model)
         positions = quadrature.positions(mesh)
-        comparison = Comparison(
-            self.name, SIMILARITIES[model.similarity], isinstance(model.t_similarity, TemperaturePrior)
-        )
+        moving = self.moving.interpolator(model.interpolation)
         return ComparedImages(
-            comparison=comparison,
+            comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior)),
+            similarity=SIMILARITIES[model.similarity].on(model, positions, moving),
             fixed_values=self.fixed.interpolate(positions, model.interpolation),
-            moving=self.moving.interpolator(model.interpolation),
+            moving=moving,
             quadrature=quadrature,
             nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
             positions=jnp.asarray(positions),
-            degrees_of_freedom=jnp.asarray(model.degrees_of_freedom),
             independent_share=jnp.asarray(independent_share(model, len(positions))),
         )
 
@@ -82,6 +80,7 @@ class ImagePair:
         quadrature = gauss_quadrature(mesh, "gauss4")
         positions = quadrature.positions(mesh)
         return term._replace(
+            similarity=term.similarity.at(positions),
             quadrature=quadrature,
             nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
             positions=jnp.asarray(positions),
@@ -97,13 +96,11 @@ class Comparison:
     Attributes
     ----------
     name : str
-    similarity : Similarity
     normalised : bool
         Whether the likelihood's normaliser is part of the density: where T_s is inferred.
     """
 
     name: str
-    similarity: Similarity
     normalised: bool
 
 
@@ -113,6 +110,7 @@ class ComparedImages(NamedTuple):
     Attributes
     ----------
     comparison : Comparison
+    similarity : Similarity
     fixed_values : (q,) array
         f(x_q).
     moving : Interpolator
@@ -122,19 +120,17 @@ class ComparedImages(NamedTuple):
         Nodes of the cell of every quadrature point.
     positions : (q, 3) array
         World positions x_q of the quadrature points, mm.
-    degrees_of_freedom : scalar
-        ν of Student's t noise.
     independent_share : scalar
         Effective number of independent quadrature points over that of all: tempers the likelihood.
     """
 
     comparison: Comparison
+    similarity: Similarity
     fixed_values: Float[AnyArray, "points"]
     moving: Interpolator
     quadrature: Quadrature
     nodes: Int[AnyArray, "points 4"]
     positions: Float[AnyArray, "points 3"]
-    degrees_of_freedom: Scalar
     independent_share: Scalar
 
     @property
@@ -154,11 +150,7 @@ class ComparedImages(NamedTuple):
         """The distribution of f(x_q), given m(x_q + u(x_q))."""
         # Without the barrier XLA interpolates twice, for the density and for the record.
         predicted = jax.lax.optimization_barrier(self.predicted(state.u))
-        return ImageLikelihood(self, predicted, self.noise(state.values))
-
-    def noise(self, values: Values) -> Noise:
-        """Temperature and degrees of freedom."""
-        return Noise(values["t_similarity"], self.degrees_of_freedom)
+        return ImageLikelihood(self, predicted, state.values["t_similarity"])
 
     def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
         """x_q + u(x_q), mm."""
@@ -169,21 +161,20 @@ class ComparedImages(NamedTuple):
         return self.moving(self.places(u))
 
     def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
-        """f(x_q) − m(x_q + u(x_q))."""
-        return self.fixed_values - self.predicted(u)
+        """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q))."""
+        return self.similarity.residuals(self.fixed_values, self.predicted(u), self.quadrature.weights)
 
-    def standardised_noise(self, key: AnyArray, values: Values) -> Float[AnyArray, "points"]:
-        """Noise of the model in units of its scale √(T_s / 2w), one number for each quadrature point."""
-        return self.comparison.similarity.draw(key, self.fixed_values.shape, self.noise(values))
+    def standardised_noise(self, key: AnyArray, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+        """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""
+        return self.similarity.draw(key, self.predicted(u), self.quadrature.weights)
 
     def noise_sd(self, t_similarity: float) -> float:
         """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
-        noise = Noise(jnp.asarray(t_similarity), self.degrees_of_freedom)
-        variance = self.comparison.similarity.variance(noise) * t_similarity
+        variance = self.similarity.variance() * t_similarity
         return float(np.sqrt(variance / (2 * np.mean(self.quadrature.weights))))
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Gauss and Newton's curvature of E_s / T_s, tempered: 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
+        """Gauss and Newton's curvature of E_s / T_s, tempered: with 2 w for a point ∫ 2 ∇m ∇mᵀ / T_s, 1/mm²."""
         return PointCurvature(self.nodes, self.quadrature.barycentric, _gauss_newton(self, u, values["t_similarity"]))
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
@@ -192,40 +183,41 @@ class ComparedImages(NamedTuple):
 
 
 class ImageLikelihood(dist.Distribution):
-    """Intensities of the fixed image at the quadrature points, independent given the moving image's there.
+    """Intensities of the fixed image at the quadrature points, given the moving image's there.
 
     Parameters
     ----------
     term : ComparedImages
     predicted : (q,) array
         m(x_q + u(x_q)).
-    noise : Noise
+    temperature : scalar
+        T_s, mm³ times squared intensity.
     """
 
     support = constraints.real_vector
 
-    def __init__(self, term: ComparedImages, predicted: Float[AnyArray, "points"], noise: Noise) -> None:
-        self.term, self.predicted, self.noise = term, predicted, noise
+    def __init__(self, term: ComparedImages, predicted: Float[AnyArray, "points"], temperature: Scalar) -> None:
+        self.term, self.predicted, self.temperature = term, predicted, temperature
         super().__init__(event_shape=jnp.shape(predicted), validate_args=False)
 
     def energy(self, value: Float[AnyArray, "points"]) -> Scalar:
         """E_s, mm³ times squared intensity."""
-        weights = self.term.quadrature.weights
-        return self.term.comparison.similarity.energy(value, self.predicted, weights, self.noise)
+        return self.term.similarity.energy(value, self.predicted, self.term.quadrature.weights, self.temperature)
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
         """Replicates of the fixed image, which the tempering by `independent_share` leaves as they are."""
-        keys = jax.random.split(key, sample_shape)
-        values = {"t_similarity": self.noise.temperature}
-        draw = partial(self.term.standardised_noise, values=values)
-        noise = jax.vmap(draw)(keys.ravel()).reshape(*sample_shape, *self.event_shape)
-        return self.predicted + jnp.sqrt(self.noise.temperature / (2 * self.term.quadrature.weights)) * noise
+        similarity, weights = self.term.similarity, self.term.quadrature.weights
+        explained = self.term.fixed_values - similarity.residuals(self.term.fixed_values, self.predicted, weights)
+        keys = jax.random.split(key, sample_shape).ravel()
+        noise = jax.vmap(lambda one: similarity.draw(one, self.predicted, weights))(keys)
+        scale = jnp.sqrt(self.temperature / (2 * weights))
+        return (explained + scale * noise).reshape(*sample_shape, *self.event_shape)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
         """The tempered log density; its normaliser is part of it where T_s is inferred."""
-        found = -self.energy(value) / self.noise.temperature
+        found = -self.energy(value) / self.temperature
         if self.term.comparison.normalised:
-            found += self.term.comparison.similarity.log_normaliser(self.term.quadrature.weights, self.noise)
+            found += self.term.similarity.log_normaliser(self.term.quadrature.weights, self.temperature)
         return self.term.independent_share * found
 
 
@@ -234,8 +226,10 @@ def _gauss_newton(
     term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
 ) -> Float[AnyArray, "points 3 3"]:
     """Gauss–Newton's curvature in every place x_q + u(x_q)."""
-    gradient = _slope(term, term.places(u))
-    weights = term.independent_share / t_similarity * 2 * term.quadrature.weights
+    moved = term.places(u)
+    gradient = _slope(term, moved)
+    convexity = term.similarity.convexity(term.fixed_values, term.moving(moved), term.quadrature.weights)
+    weights = term.independent_share / t_similarity * convexity
     return weights[:, None, None] * gradient[:, :, None] * gradient[:, None]
 
 
@@ -244,19 +238,14 @@ def _remainder(
     term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
 ) -> Float[AnyArray, "points 3 3"]:
     """What the exact curvature has besides. With e(m) the energy of a point it is e″ ∇m ∇mᵀ + e′ ∇²m."""
-    moved, weights = term.places(u), term.quadrature.weights
-    noise = Noise(t_similarity, term.degrees_of_freedom)
-
-    def energy_slope(values: AnyArray) -> AnyArray:
-        energy = term.comparison.similarity.energy
-        return jax.grad(lambda m: energy(term.fixed_values, m, weights, noise))(values)
-
+    moved, similarity = term.places(u), term.similarity
     slope = partial(_slope, term)
-    gradient, values = slope(moved), term.moving(moved)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    first, second = jax.jvp(energy_slope, (values,), (jnp.ones_like(values),))
+    gradient, compared = slope(moved), (term.fixed_values, term.moving(moved), term.quadrature.weights)
+    first = jax.grad(similarity.energy, argnums=1)(*compared, t_similarity)
+    second = similarity.curvature(*compared, t_similarity) - similarity.convexity(*compared)
     outer = gradient[:, :, None] * gradient[:, None]
-    remainder = (second - 2 * weights)[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
+    remainder = second[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
     return term.independent_share / t_similarity * remainder
 
 

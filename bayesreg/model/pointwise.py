@@ -1,0 +1,175 @@
+"""Similarities that compare the images point by point: every residual f(x_q) − m(x_q + u(x_q)) has its own noise."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaln
+from jaxtyping import Float, Int
+
+from bayesreg.interpolation import Interpolator
+from bayesreg.model.options import ModelConfig
+from bayesreg.types import AnyArray, Scalar
+
+Same = TypeVar("Same")
+
+
+class Pointwise:
+    """What all of them share; see `bayesreg.model.similarity.Similarity`.
+
+    A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `on`, `energy`,
+    `log_normaliser`, `variance` and `draw`.
+    """
+
+    arrays: ClassVar[tuple[str, ...]] = ()
+
+    def energy(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Scalar:
+        """E_s, a sum over the points, mm³ times squared intensity."""
+        raise NotImplementedError
+
+    def residuals(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """f − m."""
+        return fixed - moving
+
+    def convexity(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """That of eq. (1), 2 w."""
+        return 2 * weights
+
+    def curvature(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Float[AnyArray, "points"]:
+        """∂²E_s/∂m_q²: the Hessian is diagonal."""
+        slope = jax.grad(lambda values: self.energy(fixed, values, weights, temperature))
+        return jax.jvp(slope, (moving,), (jnp.ones_like(moving),))[1]
+
+    def at(self: Same, positions: Float[np.ndarray, "others 3"]) -> Same:
+        """Itself: it knows nothing of places."""
+        return self
+
+    def among(self: Same, points: Int[AnyArray, "some"]) -> Same:
+        """Itself: it knows nothing of other points."""
+        return self
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        """For JAX."""
+        return tuple(getattr(self, name) for name in self.arrays), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, arrays: tuple[Any, ...]) -> Any:
+        """For JAX."""
+        return cls(*arrays)
+
+
+@jax.tree_util.register_pytree_node_class
+class SumOfSquaredDifferences(Pointwise):
+    """∫ (f − m(x + u))² dx, eq. (1): Gaussian noise with the variance σ_q² = T_s / (2 w_q)."""
+
+    @classmethod
+    def on(
+        cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator
+    ) -> SumOfSquaredDifferences:
+        """It has no settings."""
+        return cls()
+
+    def energy(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Scalar:
+        """Σ_q w_q (f − m)², at any temperature."""
+        # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
+        # and then redo the index arithmetic for each of its taps.
+        return weights @ (fixed - moving) ** 2
+
+    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+        """Σ_q −½ log(2π σ_q²)."""
+        return 0.5 * jnp.log(weights / (jnp.pi * temperature)).sum()
+
+    def variance(self) -> Scalar:
+        """One."""
+        return jnp.ones(())
+
+    def draw(
+        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """Independent standard Normal numbers."""
+        return jax.random.normal(key, weights.shape)
+
+
+@jax.tree_util.register_pytree_node_class
+class StudentT(Pointwise):
+    """Student's t noise of the squared scale s_q² = T_s / (2 w_q), which forgives outliers.
+
+    Parameters
+    ----------
+    degrees_of_freedom : scalar
+        ν.
+    """
+
+    arrays = ("degrees_of_freedom",)
+
+    def __init__(self, degrees_of_freedom: Any) -> None:
+        self.degrees_of_freedom = degrees_of_freedom
+
+    @classmethod
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> StudentT:
+        """With the model's degrees of freedom."""
+        return cls(jnp.asarray(model.degrees_of_freedom))
+
+    def energy(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Scalar:
+        """T_s (ν + 1)/2 Σ_q log(1 + 2 w_q (f − m)² / (ν T_s)).
+
+        It is −T_s times the log of Student's t without its normaliser. For small residuals, and for many degrees of
+        freedom, it is eq. (1); a large residual adds its logarithm alone.
+        """
+        nu = self.degrees_of_freedom
+        surprise = jnp.log1p(2 * weights * (fixed - moving) ** 2 / (nu * temperature))
+        # A product of vectors, as in eq. (1).
+        return temperature * (nu + 1) / 2 * (jnp.ones_like(weights) @ surprise)
+
+    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+        """Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""
+        nu = self.degrees_of_freedom
+        shape = gammaln((nu + 1) / 2) - gammaln(nu / 2)
+        return (shape + 0.5 * jnp.log(2 * weights / (jnp.pi * nu * temperature))).sum()
+
+    def variance(self) -> Scalar:
+        """ν / (ν − 2)."""
+        return self.degrees_of_freedom / (self.degrees_of_freedom - 2)
+
+    def draw(
+        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """Independent numbers of Student's t."""
+        return jax.random.t(key, self.degrees_of_freedom, weights.shape)
+
+
+POINTWISE: dict[str, type[SumOfSquaredDifferences] | type[StudentT]] = {
+    "ssd": SumOfSquaredDifferences,
+    "student_t": StudentT,
+}
