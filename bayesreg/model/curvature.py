@@ -211,7 +211,7 @@ def _element_forces(body: Body, lam: AnyArray, mu: AnyArray, u: AnyArray) -> sci
 
 
 def _assemble(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
-    """Σ_q C_q N_a N_b: a curvature in the places of points as one in all nodes."""
+    """Σ_q C_q N_a N_b, and g gᵀ of groups: a curvature in the places of points as one in all nodes."""
     curvature = np.asarray(points.matrices)
     count = len(curvature)
     weights = np.broadcast_to(np.asarray(points.weights)[:, None], (count, 3, 4))
@@ -219,4 +219,10 @@ def _assemble(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
     shape, starts = (3 * count, 3 * nodes), np.arange(0, 12 * count + 1, 4)
     P = scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=shape)
     C = scipy.sparse.bsr_matrix((curvature, np.arange(count), np.arange(count + 1)))
-    return (P.T @ (C.tocsr() @ P)).tocsr()
+    found = P.T @ (C.tocsr() @ P)
+    if points.shared is not None:
+        groups, rows = np.repeat(np.asarray(points.shared.groups), 3), np.arange(3 * count)
+        for vectors, sign in zip(np.asarray(points.shared.vectors), np.asarray(points.shared.signs), strict=True):
+            forces = P.T @ scipy.sparse.csr_matrix((vectors.ravel(), (rows, groups)))
+            found = found + sign * (forces @ forces.T)
+    return found.tocsr()

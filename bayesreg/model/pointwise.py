@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,24 @@ from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
+from bayesreg.model.terms.term import SharedCurvature
 from bayesreg.types import AnyArray, Scalar
 
 Same = TypeVar("Same")
+
+
+class ValueCurvature(NamedTuple):
+    """Curvature of E_s in the values m_q, mm³.
+
+    Attributes
+    ----------
+    diagonal : (q,) array
+    shared : SharedCurvature or None
+        What is added for the values of groups of points, one unknown for each.
+    """
+
+    diagonal: Float[AnyArray, "points"]
+    shared: SharedCurvature | None = None
 
 
 class Pointwise:
@@ -44,9 +59,9 @@ class Pointwise:
 
     def convexity(
         self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    ) -> ValueCurvature:
         """That of eq. (1), 2 w."""
-        return 2 * weights
+        return ValueCurvature(2 * weights)
 
     def curvature(
         self,
@@ -54,10 +69,10 @@ class Pointwise:
         moving: Float[AnyArray, "points"],
         weights: Float[AnyArray, "points"],
         temperature: Scalar,
-    ) -> Float[AnyArray, "points"]:
+    ) -> ValueCurvature:
         """∂²E_s/∂m_q²: the Hessian is diagonal."""
         slope = jax.grad(lambda values: self.energy(fixed, values, weights, temperature))
-        return jax.jvp(slope, (moving,), (jnp.ones_like(moving),))[1]
+        return ValueCurvature(jax.jvp(slope, (moving,), (jnp.ones_like(moving),))[1])
 
     def at(self: Same, positions: Float[np.ndarray, "others 3"]) -> Same:
         """Itself: it knows nothing of places."""

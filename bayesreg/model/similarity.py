@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import POINTWISE
+from bayesreg.model.pointwise import POINTWISE, ValueCurvature
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -45,8 +45,8 @@ class Similarity(Protocol):
 
     def convexity(
         self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
-        """Gauss and Newton's curvature of E_s in each m_q, mm³; not negative."""
+    ) -> ValueCurvature:
+        """Gauss and Newton's curvature of E_s in the values m_q, positive semidefinite."""
 
     def curvature(
         self,
@@ -54,8 +54,8 @@ class Similarity(Protocol):
         moving: Float[AnyArray, "points"],
         weights: Float[AnyArray, "points"],
         temperature: Scalar,
-    ) -> Float[AnyArray, "points"]:
-        """The curvature of E_s in each m_q by itself, mm³."""
+    ) -> ValueCurvature:
+        """The curvature of E_s in the values m_q."""
 
     def variance(self) -> Scalar:
         """The mean of the residuals' variances in units of their squared scales."""

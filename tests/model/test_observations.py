@@ -11,11 +11,12 @@ import pytest
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.fem.location import interpolation_at
 from bayesreg.model import curvature
-from bayesreg.model.curvature import _outside_curvature, _Seen
+from bayesreg.model.curvature import _assembled, _outside_curvature, _Seen
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.state import State
-from bayesreg.model.terms.term import Outside
+from bayesreg.model.terms.term import Outside, PointCurvature, SharedCurvature
 from bayesreg.types import Equilibrium
 from tests.oracles import paper
 from tests.phantoms import box_mesh, smooth_image
@@ -287,6 +288,22 @@ def test_a_term_from_outside_costs_the_directions_it_looks_at(count, monkeypatch
     np.testing.assert_array_equal(np.concatenate([[], *asked]), expected)
     np.testing.assert_allclose(np.diag(whole - rest), np.isin(np.arange(u.size), expected), atol=1e-9)
     assert len(expected) == 3 * count < u.size
+
+
+def test_curvature_that_points_share_is_the_sum_of_products():
+    rng, points = np.random.default_rng(0), places()[0]
+    groups, vectors, matrices = rng.integers(0, 3, len(points)), rng.normal(size=(2, 9, 3)), rng.normal(size=(9, 3, 3))
+    nodes, weights = interpolation_at(MESH, points)
+    shared = SharedCurvature(jnp.asarray(groups), jnp.asarray(vectors), jnp.array([-1.0, 1.0]))
+    found = _assembled(len(MESH.points), PointCurvature(*map(jnp.asarray, (nodes, weights, matrices)), shared))
+    of_points = np.zeros((9, 3, 9, 3))
+    for one in range(9):
+        of_points[one, :, one] += matrices[one]
+        for other in np.flatnonzero(groups == groups[one]):
+            of_points[one, :, other] += np.outer(vectors[1, one], vectors[1, other])
+            of_points[one, :, other] -= np.outer(vectors[0, one], vectors[0, other])
+    rows = np.kron(barycentric(points), np.eye(3))
+    np.testing.assert_allclose(found.toarray(), rows.T @ of_points.reshape(27, 27) @ rows, atol=1e-12)
 
 
 class Wrong:

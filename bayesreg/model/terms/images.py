@@ -21,9 +21,10 @@ from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.options import ModelConfig, TemperaturePrior
+from bayesreg.model.pointwise import ValueCurvature
 from bayesreg.model.similarity import SIMILARITIES, Similarity
 from bayesreg.model.state import State
-from bayesreg.model.terms.term import PointCurvature
+from bayesreg.model.terms.term import PointCurvature, SharedCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
 
 
@@ -174,12 +175,12 @@ class ComparedImages(NamedTuple):
         return float(np.sqrt(variance / (2 * np.mean(self.quadrature.weights))))
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Gauss and Newton's curvature of E_s / T_s, tempered: with 2 w for a point ∫ 2 ∇m ∇mᵀ / T_s, 1/mm²."""
-        return PointCurvature(self.nodes, self.quadrature.barycentric, _gauss_newton(self, u, values["t_similarity"]))
+        """Gauss and Newton's curvature of E_s / T_s, tempered: that of eq. (1) is 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
+        return _gauss_newton(self, u, values["t_similarity"])
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """What the exact curvature of E_s / T_s has besides, 1/mm²."""
-        return PointCurvature(self.nodes, self.quadrature.barycentric, _remainder(self, u, values["t_similarity"]))
+        return _remainder(self, u, values["t_similarity"])
 
 
 class ImageLikelihood(dist.Distribution):
@@ -222,31 +223,47 @@ class ImageLikelihood(dist.Distribution):
 
 
 @jax.jit
-def _gauss_newton(
-    term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
-) -> Float[AnyArray, "points 3 3"]:
-    """Gauss–Newton's curvature in every place x_q + u(x_q)."""
+def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar) -> PointCurvature:
+    """Gauss and Newton's curvature in every place x_q + u(x_q)."""
     moved = term.places(u)
-    gradient = _slope(term, moved)
     convexity = term.similarity.convexity(term.fixed_values, term.moving(moved), term.quadrature.weights)
-    weights = term.independent_share / t_similarity * convexity
-    return weights[:, None, None] * gradient[:, :, None] * gradient[:, None]
+    return _chained(term, convexity, _slope(term, moved), t_similarity)
 
 
 @jax.jit
-def _remainder(
-    term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar
-) -> Float[AnyArray, "points 3 3"]:
-    """What the exact curvature has besides. With e(m) the energy of a point it is e″ ∇m ∇mᵀ + e′ ∇²m."""
+def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar) -> PointCurvature:
+    """What the exact curvature has besides: with E″ the curvature in the values m_q it is ∇m E″ ∇mᵀ + E′ ∇²m."""
     moved, similarity = term.places(u), term.similarity
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    gradient, compared = slope(moved), (term.fixed_values, term.moving(moved), term.quadrature.weights)
+    compared = term.fixed_values, term.moving(moved), term.quadrature.weights
     first = jax.grad(similarity.energy, argnums=1)(*compared, t_similarity)
-    second = similarity.curvature(*compared, t_similarity) - similarity.convexity(*compared)
-    outer = gradient[:, :, None] * gradient[:, None]
-    remainder = second[:, None, None] * outer + first[:, None, None] * jnp.stack(columns, axis=-1)
-    return term.independent_share / t_similarity * remainder
+    second = _difference(similarity.curvature(*compared, t_similarity), similarity.convexity(*compared))
+    found = _chained(term, second, slope(moved), t_similarity)
+    bent = first[:, None, None] * jnp.stack(columns, axis=-1)
+    return found._replace(matrices=found.matrices + term.independent_share / t_similarity * bent)
+
+
+def _chained(
+    term: ComparedImages, values: ValueCurvature, slope: Float[AnyArray, "points 3"], t_similarity: Scalar
+) -> PointCurvature:
+    """∇m E″ ∇mᵀ, tempered and over T_s."""
+    share = term.independent_share / t_similarity
+    matrices = (share * values.diagonal)[:, None, None] * slope[:, :, None] * slope[:, None]
+    shared = values.shared
+    if shared is not None:
+        shared = shared._replace(vectors=jnp.sqrt(share) * shared.vectors[:, :, None] * slope)
+    return PointCurvature(term.nodes, term.quadrature.barycentric, matrices, shared)
+
+
+def _difference(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
+    """What the one has more than the other; both share by the same groups, or neither shares."""
+    diagonal = one.diagonal - other.diagonal
+    if one.shared is None or other.shared is None:
+        return ValueCurvature(diagonal)
+    vectors = jnp.concatenate([one.shared.vectors, other.shared.vectors])
+    signs = jnp.concatenate([one.shared.signs, -other.shared.signs])
+    return ValueCurvature(diagonal, SharedCurvature(one.shared.groups, vectors, signs))
 
 
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:

@@ -49,6 +49,24 @@ class Support(Protocol):
         """Whether the density may be positive there."""
 
 
+class SharedCurvature(NamedTuple):
+    """Curvature that groups of points have together: Σ_r s_r Σ_k g_rk g_rkᵀ, where g_rk holds v_rq for q in group k.
+
+    Attributes
+    ----------
+    groups : (q,) int array
+        The group of each point.
+    vectors : (r, q, ...) array
+        v, with one number for each unknown of a point.
+    signs : (r,) array
+        s, 1 or −1.
+    """
+
+    groups: Int[AnyArray, "points"]
+    vectors: Float[AnyArray, "r points *unknowns"]
+    signs: Float[AnyArray, "r"]
+
+
 class PointCurvature(NamedTuple):
     """Curvature of −log in the displacements of some points of the mesh.
 
@@ -60,11 +78,14 @@ class PointCurvature(NamedTuple):
         Barycentric coordinates there.
     matrices : (q, 3, 3) array
         The curvature in the displacement of each point, 1/mm².
+    shared : SharedCurvature or None
+        What is added to it for points together, in 1/mm².
     """
 
     nodes: Int[AnyArray, "points 4"]
     weights: Float[AnyArray, "points 4"]
     matrices: Float[AnyArray, "points 3 3"]
+    shared: SharedCurvature | None = None
 
 
 @runtime_checkable
