@@ -106,10 +106,15 @@ class ModelConfig(BaseModel):
     priors : mapping
         A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"liver": PriorConfig(high=60)}}``;
         what is not named has the flat prior on [0, ∞).
-    similarity : {"ssd", "student_t"}
-        Sum of squared differences, eq. (1): Gaussian noise; or Student's t noise, which forgives outliers.
+    similarity : {"ssd", "student_t", "lncc"}
+        Sum of squared differences, eq. (1): Gaussian noise; Student's t noise, which forgives outliers; or, for images
+        of unlike contrast, squared differences after the best affine map of intensities in each of many windows
+        (`bayesreg.model.local_correlation`).
     degrees_of_freedom : float
         ν of "student_t", above 2: the fewer, the heavier the tails; many are Gaussian.
+    window_mm : float
+        Longest side of a window of "lncc", mm, within which one affine map should relate the contrasts. Where the
+        quadrature has few points, windows are as much larger as to hold 16.
     independent_points : float, optional
         Effective number of independent quadrature points (see `bayesreg.independent_points`): the log likelihood
         is tempered by its share of all of them. None: all are independent.
@@ -139,7 +144,8 @@ class ModelConfig(BaseModel):
     field: FieldConfig | None = None
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
     priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = {}
-    similarity: Literal["ssd", "student_t"] = "ssd"
+    similarity: Literal["ssd", "student_t", "lncc"] = "ssd"
+    window_mm: Positive = 10.0
     degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
     independent_points: Positive | None = None
     t_similarity: Positive | TemperaturePrior = 0.05

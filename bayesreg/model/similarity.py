@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
+from bayesreg.model.local_correlation import LocalCorrelation
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.pointwise import POINTWISE, ValueCurvature
 from bayesreg.types import AnyArray, Scalar
@@ -72,4 +73,4 @@ class Similarity(Protocol):
         """The same similarity of some of the points alone, given by their indices; traceable."""
 
 
-SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE}
+SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE, "lncc": LocalCorrelation}

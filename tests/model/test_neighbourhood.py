@@ -73,7 +73,7 @@ def changes(post: br.Posterior, moved_from: float = 0.0) -> tuple[np.ndarray, np
     return found - found[:, :1], exact - exact[:, :1]
 
 
-@pytest.mark.parametrize("options", [("ssd",), ("student_t",), ("ssd", "voxels"), ("ssd", "gauss4", "all")])
+@pytest.mark.parametrize("options", [("ssd",), ("student_t",), ("lncc",), ("ssd", "voxels"), ("ssd", "gauss4", "all")])
 def test_it_is_the_density_where_the_neighbourhood_is_everything(options, monkeypatch):
     monkeypatch.setattr(neighbourhood, "CELLS", len(MESH.cells))
     found, exact = changes(posterior(*options))

@@ -1,0 +1,262 @@
+"""Local normalised cross-correlation, for pairs of unlike contrast: squared differences that a local map may explain.
+
+Another sequence, or a bias field, changes intensities by a map that is nearly affine within some millimetres. The
+quadrature points are therefore parted into windows. In window k the model is f = a_k m + b_k + noise with a_k, b_k
+unknown and Gaussian noise of the variance T_s / (2 w_q), as in eq. (1). At the best a_k, b_k
+
+E_s = Σ_k min_{a, b} Σ_{q ∈ k} w_q (f_q − a m_q − b)² = Σ_k V_k var_k(f) (1 − ncc_k²),
+
+where V_k = Σ w_q, and the variances and the correlation ncc_k of f and the warped m within the window are weighted by
+w_q: the minimum lies at a = cov(f, m) / var(m) and b = mean(f) − a mean(m), and leaves var(f) − cov(f, m)² / var(m) of
+the mean square. Where a = 1 and b = 0 are best everywhere, this is eq. (1), so that T_s, the noise that it stands for
+and its prior keep their meaning. Each window takes two degrees of freedom from the noise: of N residuals in K windows
+N − 2K are independent, which the normaliser counts where T_s is inferred. The likelihood is a profile likelihood; with
+a_k and b_k integrated out under flat priors it would prefer a warped m without contrast.
+
+An m replaced by s m + c leaves E_s as it is, for a negative s, too. A window in which m hardly varies explains nothing:
+var(m) is increased by `RIDGE` times the variance of m over all points, which is a Normal prior of a_k about zero.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+
+from bayesreg.fem.operators import SparseOperator, sparse_operator
+from bayesreg.interpolation import Interpolator
+from bayesreg.model.options import ModelConfig
+from bayesreg.model.pointwise import ValueCurvature
+from bayesreg.model.terms.term import SharedCurvature
+from bayesreg.types import AnyArray, InputError, Scalar
+
+# Fewest points of a window: two of their degrees of freedom are lost.
+LEAST = 16
+# Over the variance of m: the square of a hundredth of its sd, which is less than the noise of most images.
+RIDGE = 1e-4
+
+
+class Windows(NamedTuple):
+    """A partition of all points (a pytree).
+
+    Attributes
+    ----------
+    label : (q,) int array
+        The window of each point.
+    members : SparseOperator
+        (k, q): one where a point lies in a window.
+    """
+
+    label: Int[AnyArray, "points"]
+    members: SparseOperator
+
+    @property
+    def number(self) -> int:
+        """How many windows there are."""
+        return len(self.members.matrix.starts) - 1
+
+    def sums(self, values: Float[AnyArray, "points columns"]) -> Float[AnyArray, "points columns"]:
+        """At each point the sum over its window."""
+        return self.members.transpose(self.members(values))
+
+    def among(self, points: Int[AnyArray, "some"]) -> SomeWindows:
+        """What some of the points have of them."""
+        label = self.label[points]
+        return SomeWindows(jnp.searchsorted(jnp.sort(label), label))
+
+
+class SomeWindows(NamedTuple):
+    """A partition of few points, which are known only when the program runs (a pytree).
+
+    Attributes
+    ----------
+    label : (p,) int array
+        Below p.
+    """
+
+    label: Int[AnyArray, "points"]
+
+    def sums(self, values: Float[AnyArray, "points columns"]) -> Float[AnyArray, "points columns"]:
+        """At each point the sum over its window."""
+        return jax.ops.segment_sum(values, self.label, len(self.label))[self.label]
+
+
+class LocalFit(NamedTuple):
+    """The best affine map of intensities in the window of each point, and what is known of the window (all (q,)).
+
+    Attributes
+    ----------
+    volume : (q,) array
+        V, mm³.
+    fixed, moving : (q,) arrays
+        f and m less their means.
+    variance : (q,) array
+        Of m.
+    gain : (q,) array
+        a.
+    residuals : (q,) array
+        r = f − a m − b.
+    """
+
+    volume: Float[AnyArray, "points"]
+    fixed: Float[AnyArray, "points"]
+    moving: Float[AnyArray, "points"]
+    variance: Float[AnyArray, "points"]
+    gain: Float[AnyArray, "points"]
+    residuals: Float[AnyArray, "points"]
+
+
+class LocalCorrelation(NamedTuple):
+    """Squared differences after the best affine map of intensities in each window; see `Similarity`.
+
+    Attributes
+    ----------
+    windows : Windows or SomeWindows
+    ridge : scalar
+        Added to the variance of m within a window, squared intensity.
+    width : scalar
+        Longest side of a window, mm.
+    """
+
+    windows: Any
+    ridge: Scalar
+    width: Scalar
+
+    @classmethod
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> LocalCorrelation:
+        """With windows of the model's width.
+
+        Raises
+        ------
+        InputError
+            If the moving image is constant at the points.
+        """
+        values = moving(jnp.asarray(positions))
+        # The spline of a constant image varies by rounding.
+        if jnp.ptp(values) <= 1e-9 * abs(values).max():
+            raise InputError("the moving image is constant in the mesh: similarity 'lncc' has nothing to correlate")
+        return cls(windows_of(positions, model.window_mm), RIDGE * values.var(), jnp.asarray(model.window_mm))
+
+    def fit(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> LocalFit:
+        """The best map in every window."""
+        volume, *sums = self.windows.sums(jnp.stack([weights, weights * fixed, weights * moving], axis=1)).T
+        f, m = (values - total / volume for values, total in zip((fixed, moving), sums, strict=True))
+        covariance, variance = self.windows.sums(jnp.stack([weights * f * m, weights * m**2], axis=1)).T / volume
+        gain = covariance / (variance + self.ridge)
+        return LocalFit(volume, f, m, variance, gain, f - gain * m)
+
+    def energy(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> Scalar:
+        """Σ_k V_k (var_k(f) − cov_k(f, m)² / (var_k(m) + ridge)), at any temperature."""
+        return _energy(self, fixed, moving, weights)
+
+    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+        """That of Gaussian noise in N − 2K dimensions, up to a constant."""
+        lost = self.windows.number * jnp.log(jnp.pi * temperature)
+        return 0.5 * jnp.log(weights / (jnp.pi * temperature)).sum() + lost
+
+    def residuals(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """f − a m − b."""
+        return self.fit(fixed, moving, weights).residuals
+
+    def convexity(
+        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> ValueCurvature:
+        """`curvature` with residuals of zero, which is twice a² W less its projection on the maps of every window."""
+        return self._curvature(self.fit(fixed, moving, weights), weights, jnp.zeros_like(fixed))
+
+    def curvature(
+        self,
+        fixed: Float[AnyArray, "points"],
+        moving: Float[AnyArray, "points"],
+        weights: Float[AnyArray, "points"],
+        temperature: Scalar,
+    ) -> ValueCurvature:
+        """Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W the diagonal of w.
+
+        It is the derivative of the slope −2 w a r, where r and a follow m.
+        """
+        found = self.fit(fixed, moving, weights)
+        return self._curvature(found, weights, found.residuals)
+
+    def _curvature(
+        self, found: LocalFit, weights: Float[AnyArray, "points"], residuals: Float[AnyArray, "points"]
+    ) -> ValueCurvature:
+        of_mean = weights * found.gain
+        of_gain = weights * (residuals - found.gain * found.moving) / jnp.sqrt(found.variance + self.ridge)
+        vectors = jnp.sqrt(2 / found.volume) * jnp.stack([of_mean, of_gain])
+        shared = SharedCurvature(self.windows.label, vectors, -jnp.ones(2))
+        return ValueCurvature(2 * weights * found.gain**2, shared)
+
+    def variance(self) -> Scalar:
+        """(N − 2K) / N."""
+        return jnp.asarray(1 - 2 * self.windows.number / len(self.windows.label))
+
+    def draw(
+        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
+    ) -> Float[AnyArray, "points"]:
+        """Standard Normal numbers less what an affine map of m explains of them in each window."""
+        scale = jnp.sqrt(weights)
+        return scale * self.residuals(jax.random.normal(key, weights.shape) / scale, moving, weights)
+
+    def at(self, positions: Float[np.ndarray, "others 3"]) -> LocalCorrelation:
+        """With windows of the same width."""
+        return self._replace(windows=windows_of(positions, float(self.width)))
+
+    def among(self, points: Int[AnyArray, "some"]) -> LocalCorrelation:
+        """With what the points have of the windows: a map is fitted to each of these parts."""
+        return self._replace(windows=self.windows.among(points))
+
+
+@jax.custom_jvp
+def _energy(similarity: LocalCorrelation, fixed: AnyArray, moving: AnyArray, weights: AnyArray) -> Scalar:
+    found = similarity.fit(fixed, moving, weights)
+    return weights @ (found.fixed * found.residuals)
+
+
+@_energy.defjvp
+def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
+    """The derivative with all maps held fixed, as they are where E_s is least; they follow m in the next derivative."""
+    similarity, *_, weights = primals
+    _, of_fixed, of_moving, of_weights = tangents
+    found = similarity.fit(*primals[1:])
+    change = 2 * (weights * found.residuals) @ (of_fixed - found.gain * of_moving)
+    change += (found.residuals**2 + similarity.ridge * found.gain**2) @ of_weights
+    return weights @ (found.fixed * found.residuals), change
+
+
+def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Windows:
+    """Boxes of points, halved across their longest side while that exceeds the width and both halves hold enough.
+
+    Parameters
+    ----------
+    positions : (q, 3) array
+        mm.
+    width : float
+        Longest side, mm; more where a box would have fewer than `LEAST` points.
+    """
+    label, found, boxes = np.zeros(len(positions), int), 0, [np.arange(len(positions))]
+    while boxes:
+        box = boxes.pop()
+        sides = np.ptp(positions[box], axis=0)
+        if sides.max() <= width or len(box) < 2 * LEAST:
+            label[box] = found
+            found += 1
+        else:
+            along = np.argsort(positions[box, sides.argmax()], kind="stable")
+            boxes += np.array_split(box[along], 2)
+    members = scipy.sparse.csr_array((np.ones(len(label)), (label, np.arange(len(label)))))
+    return Windows(jnp.asarray(label), sparse_operator(members))
