@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from bayesreg.fem.location import interpolation_at
 from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thin
-from bayesreg.inference.gaussian.about_reference import MOST_UNKNOWNS
+from bayesreg.inference.gaussian.about_gaussian import MOST_UNKNOWNS
 from bayesreg.inference.layout import dimension
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
