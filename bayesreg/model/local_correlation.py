@@ -36,7 +36,7 @@ from bayesreg.types import AnyArray, InputError, Scalar
 
 # Fewest points of a window: two of their degrees of freedom are lost.
 LEAST = 16
-# Over the variance of m: the square of a hundredth of its sd, which is less than the noise of most images.
+# Share of the variance of m: the square of a hundredth of its sd, which is less than the noise of most images.
 RIDGE = 1e-4
 
 
@@ -60,11 +60,11 @@ class Windows(NamedTuple):
         return len(self.members.matrix.starts) - 1
 
     def sums(self, values: Float[AnyArray, "points columns"]) -> Float[AnyArray, "points columns"]:
-        """At each point the sum over its window."""
+        """The sum over the window of each point, at that point."""
         return self.members.transpose(self.members(values))
 
     def among(self, points: Int[AnyArray, "some"]) -> SomeWindows:
-        """What some of the points have of them."""
+        """The partition of some of the points."""
         label = self.label[points]
         return SomeWindows(jnp.searchsorted(jnp.sort(label), label))
 
@@ -81,7 +81,7 @@ class SomeWindows(NamedTuple):
     label: Int[AnyArray, "points"]
 
     def sums(self, values: Float[AnyArray, "points columns"]) -> Float[AnyArray, "points columns"]:
-        """At each point the sum over its window."""
+        """The sum over the window of each point, at that point."""
         return jax.ops.segment_sum(values, self.label, len(self.label))[self.label]
 
 
@@ -128,7 +128,7 @@ class LocalCorrelation(NamedTuple):
 
     @classmethod
     def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> LocalCorrelation:
-        """With windows of the model's width.
+        """The similarity with windows of the model's width.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class LocalCorrelation(NamedTuple):
         return _energy(self, fixed, moving, weights)
 
     def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
-        """That of Gaussian noise in N − 2K dimensions, up to a constant."""
+        """The log normaliser of Gaussian noise in N − 2K dimensions, up to a constant."""
         lost = self.windows.number * jnp.log(jnp.pi * temperature)
         return 0.5 * jnp.log(weights / (jnp.pi * temperature)).sum() + lost
 
@@ -213,11 +213,11 @@ class LocalCorrelation(NamedTuple):
         return scale * self.residuals(jax.random.normal(key, weights.shape) / scale, moving, weights)
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> LocalCorrelation:
-        """With windows of the same width."""
+        """The similarity with windows of the same width at other points."""
         return self._replace(windows=windows_of(positions, float(self.width)))
 
     def among(self, points: Int[AnyArray, "some"]) -> LocalCorrelation:
-        """With what the points have of the windows: a map is fitted to each of these parts."""
+        """The similarity of some points, with a map for the part of each window that they hold."""
         return self._replace(windows=self.windows.among(points))
 
 
@@ -229,7 +229,7 @@ def _energy(similarity: LocalCorrelation, fixed: AnyArray, moving: AnyArray, wei
 
 @_energy.defjvp
 def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
-    """The derivative with all maps held fixed, as they are where E_s is least; they follow m in the next derivative."""
+    """The derivative with a and b held fixed, for E_s is least in them; the second derivative lets them follow m."""
     similarity, *_, weights = primals
     _, of_fixed, of_moving, of_weights = tangents
     found = similarity.fit(*primals[1:])

@@ -25,7 +25,7 @@ class ValueCurvature(NamedTuple):
     ----------
     diagonal : (q,) array
     shared : SharedCurvature or None
-        What is added for the values of groups of points, one unknown for each.
+        The curvature of groups of points, in addition; each point has one unknown, its value.
     """
 
     diagonal: Float[AnyArray, "points"]
@@ -33,7 +33,7 @@ class ValueCurvature(NamedTuple):
 
 
 class Pointwise:
-    """What all of them share; see `bayesreg.model.similarity.Similarity`.
+    """Base of these similarities; see `bayesreg.model.similarity.Similarity`.
 
     A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `on`, `energy`,
     `log_normaliser`, `variance` and `draw`.
@@ -60,7 +60,7 @@ class Pointwise:
     def convexity(
         self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
     ) -> ValueCurvature:
-        """That of eq. (1), 2 w."""
+        """The curvature of eq. (1), 2 w."""
         return ValueCurvature(2 * weights)
 
     def curvature(
@@ -75,20 +75,20 @@ class Pointwise:
         return ValueCurvature(jax.jvp(slope, (moving,), (jnp.ones_like(moving),))[1])
 
     def at(self: Same, positions: Float[np.ndarray, "others 3"]) -> Same:
-        """Itself: it knows nothing of places."""
+        """The similarity itself, which knows nothing of places."""
         return self
 
     def among(self: Same, points: Int[AnyArray, "some"]) -> Same:
-        """Itself: it knows nothing of other points."""
+        """The similarity itself, which looks at each point alone."""
         return self
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """For JAX."""
+        """The arrays, for JAX."""
         return tuple(getattr(self, name) for name in self.arrays), None
 
     @classmethod
     def tree_unflatten(cls, _: None, arrays: tuple[Any, ...]) -> Any:
-        """For JAX."""
+        """The similarity of these arrays, for JAX."""
         return cls(*arrays)
 
 
@@ -100,7 +100,7 @@ class SumOfSquaredDifferences(Pointwise):
     def on(
         cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator
     ) -> SumOfSquaredDifferences:
-        """It has no settings."""
+        """The similarity, which has no settings."""
         return cls()
 
     def energy(
@@ -147,7 +147,7 @@ class StudentT(Pointwise):
 
     @classmethod
     def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> StudentT:
-        """With the model's degrees of freedom."""
+        """The similarity with the model's degrees of freedom."""
         return cls(jnp.asarray(model.degrees_of_freedom))
 
     def energy(

@@ -13,7 +13,7 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.fem.location import interpolation_at
 from bayesreg.model import curvature
-from bayesreg.model.curvature import _assembled, _outside_curvature, _Seen
+from bayesreg.model.curvature import _assemble, _outside_curvature, _Seen
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import Outside, PointCurvature, SharedCurvature
@@ -295,7 +295,7 @@ def test_curvature_that_points_share_is_the_sum_of_products():
     groups, vectors, matrices = rng.integers(0, 3, len(points)), rng.normal(size=(2, 9, 3)), rng.normal(size=(9, 3, 3))
     nodes, weights = interpolation_at(MESH, points)
     shared = SharedCurvature(jnp.asarray(groups), jnp.asarray(vectors), jnp.array([-1.0, 1.0]))
-    found = _assembled(len(MESH.points), PointCurvature(*map(jnp.asarray, (nodes, weights, matrices)), shared))
+    found = _assemble(len(MESH.points), PointCurvature(*map(jnp.asarray, (nodes, weights, matrices)), shared))
     of_points = np.zeros((9, 3, 9, 3))
     for one in range(9):
         of_points[one, :, one] += matrices[one]

@@ -227,24 +227,24 @@ def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similar
     """Gauss and Newton's curvature in every place x_q + u(x_q)."""
     moved = term.places(u)
     convexity = term.similarity.convexity(term.fixed_values, term.moving(moved), term.quadrature.weights)
-    return _chained(term, convexity, _slope(term, moved), t_similarity)
+    return _chain(term, convexity, _slope(term, moved), t_similarity)
 
 
 @jax.jit
 def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar) -> PointCurvature:
-    """What the exact curvature has besides: with E″ the curvature in the values m_q it is ∇m E″ ∇mᵀ + E′ ∇²m."""
+    """The exact curvature, ∇m E″ ∇mᵀ + E′ ∇²m with E″ that in the values m_q, less Gauss and Newton's."""
     moved, similarity = term.places(u), term.similarity
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
     compared = term.fixed_values, term.moving(moved), term.quadrature.weights
     first = jax.grad(similarity.energy, argnums=1)(*compared, t_similarity)
-    second = _difference(similarity.curvature(*compared, t_similarity), similarity.convexity(*compared))
-    found = _chained(term, second, slope(moved), t_similarity)
+    second = _subtract(similarity.curvature(*compared, t_similarity), similarity.convexity(*compared))
+    found = _chain(term, second, slope(moved), t_similarity)
     bent = first[:, None, None] * jnp.stack(columns, axis=-1)
     return found._replace(matrices=found.matrices + term.independent_share / t_similarity * bent)
 
 
-def _chained(
+def _chain(
     term: ComparedImages, values: ValueCurvature, slope: Float[AnyArray, "points 3"], t_similarity: Scalar
 ) -> PointCurvature:
     """∇m E″ ∇mᵀ, tempered and over T_s."""
@@ -256,8 +256,8 @@ def _chained(
     return PointCurvature(term.nodes, term.quadrature.barycentric, matrices, shared)
 
 
-def _difference(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
-    """What the one has more than the other; both share by the same groups, or neither shares."""
+def _subtract(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
+    """One curvature less another; both have the same groups, or neither has any."""
     diagonal = one.diagonal - other.diagonal
     if one.shared is None or other.shared is None:
         return ValueCurvature(diagonal)

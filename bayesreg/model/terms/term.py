@@ -79,7 +79,7 @@ class PointCurvature(NamedTuple):
     matrices : (q, 3, 3) array
         The curvature in the displacement of each point, 1/mm².
     shared : SharedCurvature or None
-        What is added to it for points together, in 1/mm².
+        The curvature of groups of points, in addition, 1/mm².
     """
 
     nodes: Int[AnyArray, "points 4"]
