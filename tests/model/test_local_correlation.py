@@ -268,10 +268,10 @@ def test_predictive_checks_hold_where_the_model_does():
 def test_the_same_windows_serve_other_points_and_smoothed_images():
     post = posterior(quadrature="voxels", fixed=KNOWN)
     estimands = {"u_boundary": values()["u_boundary"]}
-    quick = post.conditioned(estimands, quick=True).terms["images"]
+    quick = post.condition(estimands, quick=True).terms["images"]
     assert len(quick.similarity.windows.label) == 4 * len(MESH.cells) != len(post.images.similarity.windows.label)
     assert quick.similarity.windows.number == posterior().images.similarity.windows.number
-    assert np.isfinite(float(post.evaluate_estimands(post.conditioned(estimands, quick=True), estimands).logdensity))
+    assert np.isfinite(float(post.evaluate_estimands(post.condition(estimands, quick=True), estimands).logdensity))
     for stage in post.mode_search.continuation():
         found = post.evaluate_estimands(stage, estimands)
         assert 0 < float(found.similarity_energy) < np.inf
