@@ -30,7 +30,7 @@ from bayesreg.types import AnyArray, InputError, Scalar
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """Two images of one contrast; how they are compared stands in `ModelConfig`.
+    """Two images; how they are compared, and what their contrasts may be, stands in `ModelConfig.similarity`.
 
     Attributes
     ----------
