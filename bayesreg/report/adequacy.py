@@ -108,10 +108,20 @@ def residual(view: View) -> Drawing | None:
         f"average weight; where the model holds nearly all of it is pale. Below, left: the residual at the {len(z):,} "
         "quadrature points, each over the scale that T_s implies there, by tissue, and the density that it should "
         f"follow, {expected.name}; {beyond} lie beyond ±3 ({expected.beyond_three:.2%} if it does). "
-        "Right: the three discrepancies of the table below."
+        "Right: the three discrepancies of the table below." + explain_difference(run.manifest)
     )
     alt = f"Residual maps and histograms; sd of the standardised residual {number(float(z.std()))}."
     return Drawing("residual", "The residual", caption, alt, uri)
+
+
+def explain_difference(manifest: Mapping[str, Any]) -> str:
+    """A sentence about maps of f − m(x + ū) where the similarity compares something else; empty where it does not."""
+    if part(manifest, "model", "similarity") != "lncc":
+        return ""
+    return (
+        " The similarity is lncc, for images of unlike contrast: maps of f − m(x + ū) do not show its residual, which "
+        "is what the best affine map of the intensities of m in each window leaves of f."
+    )
 
 
 class ExpectedNoise(NamedTuple):

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from bayesreg.image import Image
 from bayesreg.io.records import Predicted, Run
 from bayesreg.report import panels, style
+from bayesreg.report.adequacy import explain_difference
 from bayesreg.report.estimands import elastic_draws
 from bayesreg.report.metrics import divergence
 from bayesreg.report.panels import View
@@ -59,6 +60,7 @@ def registration(view: View) -> Drawing | None:
     caption = (
         f"{_focus(view)} Differences are shown inside the mesh; their root mean square over the "
         f"mesh falls from {before:.3f} to {after:.3f} (in units of the scaled intensity). {CONVENTION}"
+        f"{explain_difference(run.manifest)}"
     )
     alt = f"Fixed, moving and warped images with differences; the residual falls from {before:.3f} to {after:.3f}."
     return Drawing("registration", "Before and after", caption, alt, uri)

@@ -7,7 +7,7 @@ import pytest
 from matplotlib import image
 from matplotlib.figure import Figure
 
-from bayesreg.report import anatomy, convergence, marginals, style
+from bayesreg.report import adequacy, anatomy, convergence, marginals, style
 from bayesreg.report.estimands import Diagnosed, estimands, parameter_groups
 from bayesreg.report.panels import View, from_zero, symmetric
 from bayesreg.tissues import colours_of
@@ -60,6 +60,15 @@ def test_the_residual_is_that_of_the_labelled_voxels(study):
     expected = np.sqrt(np.mean((np.asarray(run.moving.voxels) - np.asarray(run.fixed.voxels))[inside] ** 2))
     assert anatomy.residual_sd(run, run.moving) == pytest.approx(expected, rel=1e-9)
     assert f"{expected:.3f}" in anatomy.registration(View.of(run)).caption
+
+
+@pytest.mark.parametrize("draw", [anatomy.registration, adequacy.residual])
+def test_plain_differences_are_no_residual_of_unlike_contrasts(study, draw):
+    manifest = study.run.manifest
+    unlike = replace(study.run, manifest={**manifest, "model": {**manifest["model"], "similarity": "lncc"}})
+    said = "maps of f − m(x + ū) do not show its residual"
+    assert said in draw(View.of(unlike)).caption
+    assert said not in draw(View.of(study.run)).caption
 
 
 def test_one_colour_range_holds_all_pictures_and_signs_balance():
