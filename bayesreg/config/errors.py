@@ -50,7 +50,7 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
     origins : dict
         Where each key was written ("run.yaml:3"), by its path.
     """
-    found = [(_path(details, data), details) for details in error.errors(include_url=False)]
+    found = [(_path(details, data, model), details) for details in error.errors(include_url=False)]
     messages: dict[Keys, list[str]] = {}
     for path, details in found:
         if not any(_explains(*other, path, details["type"]) for other in found):
@@ -74,7 +74,7 @@ def _join(messages: list[str]) -> str:
     return " or ".join((first, *(message.removeprefix("expected ") for message in others)))
 
 
-def _path(details: ErrorDetails, data: Any) -> Keys:
+def _path(details: ErrorDetails, data: Any, model: type[BaseModel]) -> Keys:
     """pydantic's location less the names of union members, which no user has written."""
     *parents, last = details["loc"] or ("",)
     path: Keys = ()
@@ -83,7 +83,8 @@ def _path(details: ErrorDetails, data: Any) -> Keys:
             data, path = data[key], (*path, key)
         except (KeyError, IndexError, TypeError):
             path = path or (key,)  # A section that was left out may be wrong, too.
-    if details["type"] == "missing" and path[-1] != last:
+    left_out = details["type"] == "missing" or last in _fields_at(tuple(parents), model)
+    if left_out and path[-1] != last:
         path = (*path, last)
     return (*path, *_custom_key(details))
 
