@@ -9,6 +9,8 @@ from ruamel.yaml import YAML
 
 import bayesreg as br
 from bayesreg.io import store
+from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.preparation import prepared_inputs
 from tests.phantoms import ball_mesh
 from tests.reportless import without_reports
 from tests.test_tissues import CENTRE, anatomy
@@ -53,6 +55,20 @@ def configuration(folder, observations, data=(), name="run.yaml", **sections):
 LABELS = {"labels": "labels.nii.gz", "label_table": {"liver": 3, "vessels": 5}}
 IMAGES = {"fixed": "fixed.nii.gz", "moving": "moving.nii.gz", **LABELS}
 PAIRS = {"kind": "landmarks", "file": "pairs.csv"}
+
+
+def test_a_mesh_alone_may_have_a_skull(folder):
+    """It is that of the mask, and holds the nodes as it does with labels."""
+    labels = br.load_image(folder / "labels.nii.gz")
+    distance = np.linalg.norm(labels.grid_points() - CENTRE, axis=-1)
+    br.save_image(labels.with_voxels((distance < 45).astype(np.uint8)), folder / "inside.nii.gz")
+    skulls = []
+    for data in ({}, LABELS):
+        config = br.load_config(configuration(folder, [PAIRS], data | {"intracranial": "inside.nii.gz"}))
+        inputs = prepared_inputs(config)[0]
+        assert "skull" in posterior_of(config, inputs).data.terms
+        skulls.append(inputs.skull)
+    np.testing.assert_array_equal(skulls[0].voxels, skulls[1].voxels)
 
 
 @pytest.mark.parametrize("data", [{}, LABELS], ids=["mesh alone", "labels"])

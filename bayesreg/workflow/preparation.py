@@ -66,9 +66,9 @@ def prepare(config: Config) -> Prepared:
         mesh = load_mesh(config.mesh.file)
         _require_start(config, mesh)
         clock.lap("mesh")
-        boundary = _known_boundary(config, mesh, None)
+        boundary, skull = _known_boundary(config, mesh, None), _skull(config.data.intracranial)
         tissue = _as_stored(tissue_on_grid(mesh))
-        inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, boundary=boundary, points=points)
+        inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points)
         return Prepared(inputs, clock.laps, {})
     anatomy, moving = _anatomy(config)
     if anatomy.intracranial is not None:
@@ -95,6 +95,15 @@ def prepare(config: Config) -> Prepared:
     boundary = _known_boundary(config, mesh, truth)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
     return Prepared(inputs, clock.laps, _describe(config, pair))
+
+
+def _skull(intracranial: Path | None) -> Image | None:
+    """Where no sampled node may go, from a mask of where the organ may be."""
+    if intracranial is None:
+        return None
+    mask = load_image(intracranial)
+    inside = without_ridges(mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)))
+    return _as_stored(forbidden(inside))
 
 
 def _points(config: Config) -> dict[str, PointPairs]:
