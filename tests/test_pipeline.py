@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import meshio
 import nibabel as nib
@@ -27,6 +26,7 @@ from bayesreg.workflow import preparation
 from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.check import check
+from bayesreg.workflow.result import compare, report
 from bayesreg.workflow.simulate import simulate
 from tests.phantoms import ball_mesh
 from tests.reportless import without_reports
@@ -217,12 +217,12 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
     np.testing.assert_allclose(posterior.reference()["mu"], mu)
 
 
-@pytest.mark.parametrize(("points", "draws"), [(None, 100), (900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
-def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(points, draws, monkeypatch):
-    quadrature = SimpleNamespace(weights=range(points or 0))
-    images = None if points is None else SimpleNamespace(quadrature=quadrature)
-    monkeypatch.setattr(run_module, "images_of", lambda _: images)
-    assert run_module._block(SimpleNamespace(data=None)) == draws
+@pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
+def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(finished, folder, points, draws):
+    images = posterior_of(br.load_config(folder / "run.yaml"), store.read_inputs(folder / "out")).images
+    larger = images._replace(quadrature=images.quadrature._replace(weights=np.ones(points)))
+    assert run_module._block(larger) == draws
+    assert run_module._block(None) == 100
 
 
 def test_check_estimates_without_writing(folder):
@@ -235,11 +235,10 @@ def test_uniform_beside_tissues(finished, folder):
     uniform = br.load_config(folder / "run.yaml", ["model.elasticity=uniform"])
     result = br.run(uniform, folder / "uniform", progress=False)
     assert result.idata.posterior.sizes["tissue"] == 1
-    page = result_module.compare([folder / "out", folder / "uniform"], folder / "compare.html").read_text()
+    page = compare([folder / "out", folder / "uniform"], folder / "compare.html").read_text()
     assert "Uniform" in page
     assert "By tissue" in page
-    report = result_module.report(folder / "uniform")
-    assert report.stat().st_size > 100_000
+    assert report(folder / "uniform").stat().st_size > 100_000
 
 
 @pytest.fixture

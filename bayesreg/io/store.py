@@ -73,6 +73,10 @@ def read_inputs(folder: str | Path) -> Inputs:
         load_image(path) if (path := images / f"{name}.nii.gz").exists() else None
         for name in ("fixed", "moving", "skull")
     )
+    if (fixed is None) != (moving is None):
+        raise InputError(
+            f"{folder} holds no finished run: inputs/{'fixed' if fixed is None else 'moving'}.nii.gz is missing"
+        )
     known, given, points = images / "truth.npz", images / "boundary.npz", images / "points.npz"
     truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
     boundary = load_arrays(given, "run anew, into another folder")["u_boundary"] if given.exists() else None

@@ -41,8 +41,8 @@ def _observations(config: Config, inputs: Inputs) -> list[Any]:
     """The observations of a configuration, in its order."""
     found: list[Any] = []
     if config.compares_images:
-        assert inputs.fixed is not None
-        assert inputs.moving is not None
+        if inputs.fixed is None or inputs.moving is None:
+            raise InputError("the run compares images, and its folder holds none: inputs/fixed.nii.gz is missing")
         found.append(ImagePair(inputs.fixed, inputs.moving))
     for section in config.observations or []:
         if isinstance(section, LandmarksSection):

@@ -32,6 +32,7 @@ from bayesreg.io.atomic import write_text
 from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
+from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.warp import nodal_field_on_grid, warp_image
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
@@ -234,7 +235,7 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or _block(posterior),
+        block=options.block or _block(images_of(posterior.data)),
         stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
         resume=reached,
@@ -243,12 +244,11 @@ def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, p
     )
 
 
-def _block(posterior: Posterior) -> int:
+def _block(images: ComparedImages | None) -> int:
     """Fewer draws where a step costs more, or no look would come before a time limit is long over.
 
     By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
     """
-    images = images_of(posterior.data)
     points = 0 if images is None else len(images.quadrature.weights)
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)
 
