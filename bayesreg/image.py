@@ -98,7 +98,7 @@ class Image:
         return x[:, None, None] + y[:, None] + (z + self.affine[:3, 3])
 
     def contains(self, points: Float[AnyArray, "*batch 3"]) -> Bool[AnyArray, "*batch"]:
-        """Which world points (mm) lie on the grid (its voxels' extent included)."""
+        """Tell which world points (mm) lie on the grid (its voxels' extent included)."""
         indices = self.world_to_voxel(points)
         return ((indices >= -0.5) & (indices <= np.array(self.shape) - 0.5)).all(axis=-1)
 

@@ -1,4 +1,4 @@
-"""Which tetrahedron holds a point, and P1 functions anywhere (NumPy, on the host)."""
+"""Search for the tetrahedron that holds a point, and P1 functions anywhere (NumPy, on the host)."""
 
 from __future__ import annotations
 

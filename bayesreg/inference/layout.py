@@ -59,7 +59,7 @@ def dimension(target: Placed) -> int:
 
 
 def marked(target: Placed, *names: str) -> Bool[np.ndarray, "dimension"]:
-    """Which entries of a flat position belong to the parts of these names, of which some may not exist."""
+    """Mark the entries of a flat position that belong to the parts of these names; some parts may not exist."""
     marks = np.zeros(dimension(target), bool)
     for name in names:
         if name in slices(target):

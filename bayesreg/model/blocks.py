@@ -132,7 +132,7 @@ class Displacement(_Arrays):
 
 @jax.tree_util.register_static
 class FreeEntries:
-    """Which entries of a block are sampled: static, for shapes follow from it.
+    """The sampled entries of a block; they are static, for shapes follow from them.
 
     Parameters
     ----------

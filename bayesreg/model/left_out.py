@@ -18,7 +18,9 @@ from bayesreg.model.terms.landmarks import ComparedPoints
 from bayesreg.types import AnyArray
 
 # A direction of which the others say next to nothing: share of the information that is the landmark's own.
-OWN = 1 - 1e-9
+OWN = 1 - 1e-6
+# Share of the curvature's trace that keeps directions finite of which nothing is known, such as free rigid motions.
+TRACE = 1e-9
 
 
 class LeftOut(NamedTuple):
@@ -56,13 +58,13 @@ def leave_out(posterior: Posterior, term: ComparedPoints, estimands: dict[str, A
     values = complete(data.blocks, estimands)
     curvature = np.asarray(posterior.mode_search.curvature(data, estimands).gauss_newton)
     own = curvature[-3 * len(posterior.sampled) :, -3 * len(posterior.sampled) :]
+    own = own + TRACE * np.trace(own) * np.eye(len(own))
     predicted, response = (np.asarray(found) for found in _predicted_with_response(data, term, values))
     count = len(predicted)
     A = response.reshape(3 * count, -1)
     spread = (A @ cho_solve(cho_factor(own), A.T)).reshape(count, 3, count, 3)
-    share = np.einsum("kikj->kij", spread) / np.asarray(term.sd(values))[:, None, None] ** 2
-    residual = np.asarray(term.shift) - predicted
-    sd = np.asarray(term.sd(values))
+    residual, sd = np.asarray(term.shift) - predicted, np.asarray(term.sd(values))
+    share = np.einsum("kikj->kij", spread) / sd[:, None, None] ** 2
     found = [_without(*one) for one in zip(residual, share, sd, strict=True)]
     return LeftOut(*(np.stack(parts) for parts in zip(*found, strict=True)))
 

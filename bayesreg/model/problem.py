@@ -139,6 +139,7 @@ def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelCo
         If one is no observation, or two have one name, or one has a name that is taken.
     """
     terms: Terms = {}
+    taken = {*TAKEN, *observation_blocks(observations)}
     for observation in observations:
         term: Any
         if isinstance(observation, ImagePair):
@@ -152,7 +153,7 @@ def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelCo
                 f"an observation needs a name and a function log(state); got {type(observation).__name__}: use "
                 "ImagePair, Landmarks, or an object of your own with both"
             )
-        if term.name in terms or term.name in TAKEN or term.name in observation_blocks(observations):
+        if term.name in terms or term.name in taken:
             raise InputError(f"the name {term.name!r} of an observation is taken; give another one")
         terms[term.name] = term
     return terms

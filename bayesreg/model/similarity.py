@@ -67,10 +67,10 @@ class Similarity(Protocol):
         """Residuals that follow the model, in units of their scales."""
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> Similarity:
-        """The same similarity at other points, mm."""
+        """The similarity with the same settings at other points, mm."""
 
     def among(self, points: Int[AnyArray, "some"]) -> Similarity:
-        """The same similarity of some of the points alone, given by their indices; traceable."""
+        """The similarity of some of the points alone, given by their indices; traceable."""
 
 
 SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE, "lncc": LocalCorrelation}

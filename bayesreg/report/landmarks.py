@@ -67,15 +67,17 @@ def _caption(predicted: Predicted) -> str:
         "error of each coordinate that the model gives it."
     )
     if predicted.left_out_residual is None or predicted.left_out_covariance is None:
-        return text + " There are too many landmarks to leave out each."
+        return f"{text} They were not left out in turn, as up to 60 are where nodes are sampled."
     known = np.isfinite(np.asarray(predicted.left_out_residual)).all(axis=1)
+    if not known.any():
+        return f"{text} Left out, no landmark is determined by the other observations."
     errors = np.linalg.norm(np.asarray(predicted.left_out_residual)[known], axis=1)
     found = surprise(predicted.left_out_residual, predicted.left_out_covariance)[known]
-    shares = " and ".join(f"{(found <= level).mean():.0%} of their {level:.0%}" for level in LEVELS).replace("%", " %")
+    shares = [f"{(found <= level).mean():.0%} of the landmarks lie in their {level:.0%} region" for level in LEVELS]
     return (
         f"{text} Left out: the same distance where all other observations predict the landmark, at the mean stiffness; "
-        f"its mean is {number(float(errors.mean()))} mm. Its region: the share of the prediction that lies nearer; the "
-        f"landmarks lie in {shares} regions."
+        f"its mean is {number(float(errors.mean()))} mm. Its region: the share of the prediction that lies nearer. "
+        f"{', '.join(shares)}.".replace("%", " %")
     )
 
 

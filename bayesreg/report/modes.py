@@ -29,7 +29,7 @@ SEEN = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "fie
 
 
 class Grouping(NamedTuple):
-    """Which chains lie together.
+    """The groups of chains that lie together.
 
     Attributes
     ----------

@@ -221,7 +221,7 @@ def _as_stored(image: Image) -> Image:
 
 
 def _within(domain: Image, image: Image) -> np.ndarray:
-    """Which voxels of an image on another grid lie in the domain."""
+    """Tell which voxels of an image on another grid lie in the domain."""
     return np.asarray(domain.interpolate(image.grid_points())) > 0.5
 
 

@@ -178,12 +178,15 @@ def test_left_out_landmarks_are_predicted_as_by_a_posterior_without_them():
 
 
 def test_a_landmark_that_nothing_else_determines_is_told():
-    post = br.build_posterior(
-        mesh=MESH, observations=[br.Landmarks([[10.0, 9, 11]], [[11.0, 9, 11]], 0.1)], model=MODEL
-    )
-    tight = post.data.terms["landmarks"]._replace(known_sd=jnp.array([1e-7]))
-    found = leave_out(post, tight, {"u_boundary": post.reference()["u_boundary"]})
-    assert np.isnan(found.residual).all()
+    """Without a rigid prior one landmark alone says where the body is; two leave a turn about their line."""
+    model = MODEL.model_copy(update={"rigid_sd": None})
+    rest = {"u_boundary": jnp.zeros((len(MESH.boundary), 3))}
+    for count in (1, 2):
+        points, moved, sd = (part[:count] for part in places())
+        post = br.build_posterior(mesh=MESH, observations=[br.Landmarks(points, moved, sd)], model=model)
+        found = leave_out(post, post.data.terms["landmarks"], rest)
+        assert np.isnan(found.residual).all()
+        assert np.isinf(found.covariance).all()
 
 
 def test_an_inferred_sd_has_the_posterior_of_its_evidence():
@@ -339,6 +342,7 @@ def test_wrong_observations_are_told(observations, message):
         ((np.zeros((2, 3)), np.zeros((3, 3)), 1.0), "must both have shape"),
         ((np.zeros((2, 3)), np.zeros((2, 3)), [1.0, 2.0, 3.0]), "one for each point"),
         ((np.zeros((2, 3)), np.zeros((2, 3)), 0.0), "must be positive"),
+        ((np.zeros((2, 3)), np.zeros((2, 3)), "wide"), "sd must be a number, 2 numbers or a ScalePrior; got 'wide'"),
         ((np.zeros((1, 3)), np.full((1, 3), np.nan), 1.0), "finite number"),
         ((np.zeros((2, 3)), np.zeros((2, 3)), 1.0, "pairs", ["one"]), "pairs: there must be 2 labels"),
     ],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ class Landmarks:
         if labels is not None and len(labels) != count:
             raise InputError(f"{name}: there must be {count} labels, one for each point; got {len(labels)}")
         self.name, self.labels = name, tuple(labels or map(str, range(1, count + 1)))
-        self.prior = ScalePrior(**sd) if isinstance(sd, Mapping) else sd if isinstance(sd, ScalePrior) else None
+        self.prior = sd if isinstance(sd, ScalePrior) else None
         self.sd = _known_sd(self.prior.median if self.prior else sd, count, name)
 
     @property
@@ -87,9 +87,13 @@ class Landmarks:
 
 
 def _known_sd(sd: Any, count: int, name: str) -> Float[np.ndarray, "k"]:
+    try:
+        sd = np.asarray(sd, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: sd must be a number, {count} numbers or a ScalePrior; got {sd!r}") from None
     if np.ndim(sd) and np.shape(sd) != (count,):
         raise InputError(f"{name}: sd must be one number or {count}, one for each point; got {np.shape(sd)}")
-    found = np.broadcast_to(np.asarray(sd, float), (count,)).copy()
+    found = np.broadcast_to(sd, (count,)).copy()
     if not (np.isfinite(found) & (found > 0)).all():
         raise InputError(f"{name}: every sd must be positive, mm; got {found.tolist()}")
     return found

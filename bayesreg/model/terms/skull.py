@@ -63,5 +63,5 @@ class Walls:
 
 
 def is_allowed(distance: Interpolator, points: Float[AnyArray, "nodes 3"]) -> Bool[AnyArray, "nodes"]:
-    """Which points (world, mm) lie outside Ω_SK, by the signed distance."""
+    """Tell which points (world, mm) lie outside Ω_SK, by the signed distance."""
     return distance(points) >= 0
