@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import ValueCurvature
+from bayesreg.model.pointwise import Intensities, ValueCurvature
 from bayesreg.model.terms.term import SharedCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -141,56 +141,39 @@ class LocalCorrelation(NamedTuple):
             raise InputError("the moving image is constant in the mesh: similarity 'lncc' has nothing to correlate")
         return cls(windows_of(positions, model.window_mm), RIDGE * values.var(), jnp.asarray(model.window_mm))
 
-    def fit(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> LocalFit:
+    def fit(self, pair: Intensities) -> LocalFit:
         """The best map in every window."""
-        volume, *sums = self.windows.sums(jnp.stack([weights, weights * fixed, weights * moving], axis=1)).T
-        f, m = (values - total / volume for values, total in zip((fixed, moving), sums, strict=True))
+        weights = pair.weights
+        volume, *sums = self.windows.sums(weights[:, None] * jnp.stack([jnp.ones_like(weights), *pair[:2]], axis=1)).T
+        f, m = (values - total / volume for values, total in zip(pair[:2], sums, strict=True))
         covariance, variance = self.windows.sums(jnp.stack([weights * f * m, weights * m**2], axis=1)).T / volume
         gain = covariance / (variance + self.ridge)
         return LocalFit(volume, f, m, variance, gain, f - gain * m)
 
-    def energy(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> Scalar:
+    def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Σ_k V_k (var_k(f) − cov_k(f, m)² / (var_k(m) + ridge)), at any temperature."""
-        return _energy(self, fixed, moving, weights)
+        return _energy(self, pair)
 
     def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
         """The log normaliser of Gaussian noise in N − 2K dimensions, up to a constant."""
         lost = self.windows.number * jnp.log(jnp.pi * temperature)
         return 0.5 * jnp.log(weights / (jnp.pi * temperature)).sum() + lost
 
-    def residuals(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """f − a m − b."""
-        return self.fit(fixed, moving, weights).residuals
+        return self.fit(pair).residuals
 
-    def convexity(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> ValueCurvature:
+    def convexity(self, pair: Intensities) -> ValueCurvature:
         """`curvature` with residuals of zero, which is twice a² W less its projection on the maps of every window."""
-        return self._curvature(self.fit(fixed, moving, weights), weights, jnp.zeros_like(fixed))
+        return self._curvature(self.fit(pair), pair.weights, jnp.zeros_like(pair.fixed))
 
-    def curvature(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> ValueCurvature:
+    def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W the diagonal of w.
 
         It is the derivative of the slope −2 w a r, where r and a follow m.
         """
-        found = self.fit(fixed, moving, weights)
-        return self._curvature(found, weights, found.residuals)
+        found = self.fit(pair)
+        return self._curvature(found, pair.weights, found.residuals)
 
     def _curvature(
         self, found: LocalFit, weights: Float[AnyArray, "points"], residuals: Float[AnyArray, "points"]
@@ -205,12 +188,11 @@ class LocalCorrelation(NamedTuple):
         """(N − 2K) / N."""
         return jnp.asarray(1 - 2 * self.windows.number / len(self.windows.label))
 
-    def draw(
-        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Standard Normal numbers less what an affine map of m explains of them in each window."""
-        scale = jnp.sqrt(weights)
-        return scale * self.residuals(jax.random.normal(key, weights.shape) / scale, moving, weights)
+        scale = jnp.sqrt(pair.weights)
+        noise = jax.random.normal(key, scale.shape) / scale
+        return scale * self.residuals(pair._replace(fixed=noise))
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> LocalCorrelation:
         """The similarity with windows of the same width at other points."""
@@ -222,20 +204,19 @@ class LocalCorrelation(NamedTuple):
 
 
 @jax.custom_jvp
-def _energy(similarity: LocalCorrelation, fixed: AnyArray, moving: AnyArray, weights: AnyArray) -> Scalar:
-    found = similarity.fit(fixed, moving, weights)
-    return weights @ (found.fixed * found.residuals)
+def _energy(similarity: LocalCorrelation, pair: Intensities) -> Scalar:
+    found = similarity.fit(pair)
+    return pair.weights @ (found.fixed * found.residuals)
 
 
 @_energy.defjvp
 def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
     """The derivative with a and b held fixed, for E_s is least in them; the second derivative lets them follow m."""
-    similarity, *_, weights = primals
-    _, of_fixed, of_moving, of_weights = tangents
-    found = similarity.fit(*primals[1:])
-    change = 2 * (weights * found.residuals) @ (of_fixed - found.gain * of_moving)
-    change += (found.residuals**2 + similarity.ridge * found.gain**2) @ of_weights
-    return weights @ (found.fixed * found.residuals), change
+    (similarity, pair), (_, change) = primals, tangents
+    found = similarity.fit(pair)
+    slope = 2 * (pair.weights * found.residuals) @ (change.fixed - found.gain * change.moving)
+    slope += (found.residuals**2 + similarity.ridge * found.gain**2) @ change.weights
+    return pair.weights @ (found.fixed * found.residuals), slope
 
 
 def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Windows:

@@ -18,6 +18,29 @@ from bayesreg.types import AnyArray, Scalar
 Same = TypeVar("Same")
 
 
+class Intensities(NamedTuple):
+    """Intensities of two images at the quadrature points.
+
+    Attributes
+    ----------
+    fixed : (q,) array
+        f(x_q).
+    moving : (q,) array
+        m(x_q + u(x_q)).
+    weights : (q,) array
+        Quadrature weights w_q, mm³. A point has noise of the squared scale T_s / (2 w_q).
+    """
+
+    fixed: Float[AnyArray, "points"]
+    moving: Float[AnyArray, "points"]
+    weights: Float[AnyArray, "points"]
+
+    @property
+    def differences(self) -> Float[AnyArray, "points"]:
+        """f − m."""
+        return self.fixed - self.moving
+
+
 class ValueCurvature(NamedTuple):
     """Curvature of E_s in the values m_q, mm³.
 
@@ -41,38 +64,22 @@ class Pointwise:
 
     arrays: ClassVar[tuple[str, ...]] = ()
 
-    def energy(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> Scalar:
+    def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, a sum over the points, mm³ times squared intensity."""
         raise NotImplementedError
 
-    def residuals(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """f − m."""
-        return fixed - moving
+        return pair.differences
 
-    def convexity(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> ValueCurvature:
+    def convexity(self, pair: Intensities) -> ValueCurvature:
         """The curvature of eq. (1), 2 w."""
-        return ValueCurvature(2 * weights)
+        return ValueCurvature(2 * pair.weights)
 
-    def curvature(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> ValueCurvature:
+    def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """∂²E_s/∂m_q²: the Hessian is diagonal."""
-        slope = jax.grad(lambda values: self.energy(fixed, values, weights, temperature))
-        return ValueCurvature(jax.jvp(slope, (moving,), (jnp.ones_like(moving),))[1])
+        slope = jax.grad(lambda values: self.energy(pair._replace(moving=values), temperature))
+        return ValueCurvature(jax.jvp(slope, (pair.moving,), (jnp.ones_like(pair.moving),))[1])
 
     def at(self: Same, positions: Float[np.ndarray, "others 3"]) -> Same:
         """The similarity itself, which knows nothing of places."""
@@ -103,17 +110,11 @@ class SumOfSquaredDifferences(Pointwise):
         """The similarity, which has no settings."""
         return cls()
 
-    def energy(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> Scalar:
+    def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Σ_q w_q (f − m)², at any temperature."""
         # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
         # and then redo the index arithmetic for each of its taps.
-        return weights @ (fixed - moving) ** 2
+        return pair.weights @ pair.differences**2
 
     def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
         """Σ_q −½ log(2π σ_q²)."""
@@ -123,11 +124,9 @@ class SumOfSquaredDifferences(Pointwise):
         """One."""
         return jnp.ones(())
 
-    def draw(
-        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Independent standard Normal numbers."""
-        return jax.random.normal(key, weights.shape)
+        return jax.random.normal(key, pair.weights.shape)
 
 
 @jax.tree_util.register_pytree_node_class
@@ -150,22 +149,16 @@ class StudentT(Pointwise):
         """The similarity with the model's degrees of freedom."""
         return cls(jnp.asarray(model.degrees_of_freedom))
 
-    def energy(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> Scalar:
+    def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """T_s (ν + 1)/2 Σ_q log(1 + 2 w_q (f − m)² / (ν T_s)).
 
         It is −T_s times the log of Student's t without its normaliser. For small residuals, and for many degrees of
         freedom, it is eq. (1); a large residual adds its logarithm alone.
         """
         nu = self.degrees_of_freedom
-        surprise = jnp.log1p(2 * weights * (fixed - moving) ** 2 / (nu * temperature))
+        surprise = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
         # A product of vectors, as in eq. (1).
-        return temperature * (nu + 1) / 2 * (jnp.ones_like(weights) @ surprise)
+        return temperature * (nu + 1) / 2 * (jnp.ones_like(surprise) @ surprise)
 
     def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
         """Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""
@@ -177,11 +170,9 @@ class StudentT(Pointwise):
         """ν / (ν − 2)."""
         return self.degrees_of_freedom / (self.degrees_of_freedom - 2)
 
-    def draw(
-        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Independent numbers of Student's t."""
-        return jax.random.t(key, self.degrees_of_freedom, weights.shape)
+        return jax.random.t(key, self.degrees_of_freedom, pair.weights.shape)
 
 
 POINTWISE: dict[str, type[SumOfSquaredDifferences] | type[StudentT]] = {

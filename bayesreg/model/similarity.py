@@ -11,59 +11,39 @@ from jaxtyping import Float, Int
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.local_correlation import LocalCorrelation
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import POINTWISE, ValueCurvature
+from bayesreg.model.pointwise import POINTWISE, Intensities, ValueCurvature
 from bayesreg.types import AnyArray, Scalar
 
 
 class Similarity(Protocol):
     """How the likelihood compares f and the warped m (a pytree).
 
-    `fixed` stands for f(x_q), `moving` for m(x_q + u(x_q)), `weights` for the quadrature weights w_q in mm³, each of
-    shape (q,), and `temperature` for T_s in mm³ times squared intensity. A point of weight w_q has noise of the squared
-    scale T_s / (2 w_q).
+    `temperature` stands for T_s, mm³ times squared intensity.
     """
 
     @classmethod
     def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> Similarity:
         """The similarity at these points, mm, for an image m, with the settings that the options hold."""
 
-    def energy(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> Scalar:
+    def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, mm³ times squared intensity."""
 
     def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
         """−log Z_s, with which exp(−E_s / T_s) is a density of the residuals."""
 
-    def residuals(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """The part of f that noise explains."""
 
-    def convexity(
-        self, fixed: Float[AnyArray, "points"], moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> ValueCurvature:
+    def convexity(self, pair: Intensities) -> ValueCurvature:
         """Gauss and Newton's curvature of E_s in the values m_q, positive semidefinite."""
 
-    def curvature(
-        self,
-        fixed: Float[AnyArray, "points"],
-        moving: Float[AnyArray, "points"],
-        weights: Float[AnyArray, "points"],
-        temperature: Scalar,
-    ) -> ValueCurvature:
+    def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """The curvature of E_s in the values m_q."""
 
     def variance(self) -> Scalar:
         """The mean of the residuals' variances in units of their squared scales."""
 
-    def draw(
-        self, key: AnyArray, moving: Float[AnyArray, "points"], weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "points"]:
+    def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Residuals that follow the model, in units of their scales."""
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> Similarity:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.model.blocks import Values
 from bayesreg.model.coordinates import complete
+from bayesreg.model.pointwise import Intensities
 from bayesreg.model.program import Problem
 from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.terms.skull import is_allowed
@@ -69,8 +70,8 @@ def local_logdensity(
 
     def log(u: Float[AnyArray, "3"]) -> Scalar:
         away = u - at
-        moved = images.moving(places + follows @ away)
-        similarity_energy = similarity.energy(fixed, moved, weights, temperature)
+        pair = Intensities(fixed, images.moving(places + follows @ away), weights)
+        similarity_energy = similarity.energy(pair, temperature)
         strain_energy = away @ force + 0.5 * away @ stiffness @ away
         total = -images.independent_share * similarity_energy / temperature - strain_energy / values["t_elastic"]
         if rigid is not None:

@@ -15,6 +15,7 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.model.local_correlation import LEAST, RIDGE, windows_of
+from bayesreg.model.pointwise import Intensities
 from bayesreg.model.terms.images import ImageLikelihood
 from bayesreg.workflow.prediction import predict
 from tests.model.test_gradients import assert_gradient
@@ -151,7 +152,7 @@ def test_derivatives_of_the_energy_are_those_of_the_loop():
     parts = [jnp.asarray(x) for x in compared(post, values())]
 
     def energy(*parts):
-        return post.images.similarity.energy(*parts, jnp.asarray(5.0))
+        return post.images.similarity.energy(Intensities(*parts), jnp.asarray(5.0))
 
     slopes = jax.grad(energy, argnums=(0, 1, 2))
     for k, step in ((0, 1e-5), (1, 1e-5), (2, 1e-2)):
@@ -184,7 +185,7 @@ def test_gauss_and_newtons_curvature_is_that_of_the_projected_residuals():
     post, state = posterior(), values()
     f, m, w = compared(post, state)
     gain, _, _ = fitted(post, state)
-    found = post.images.similarity.convexity(*map(jnp.asarray, (f, m, w)))
+    found = post.images.similarity.convexity(Intensities(*map(jnp.asarray, (f, m, w))))
     label, dense = np.asarray(post.images.similarity.windows.label), np.diag(np.asarray(found.diagonal))
     for vector, sign in zip(np.asarray(found.shared.vectors), np.asarray(found.shared.signs), strict=True):
         dense += sign * np.outer(vector, vector) * (label[:, None] == label)

@@ -21,7 +21,7 @@ from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.options import ModelConfig, TemperaturePrior
-from bayesreg.model.pointwise import ValueCurvature
+from bayesreg.model.pointwise import Intensities, ValueCurvature
 from bayesreg.model.similarity import SIMILARITIES, Similarity
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import PointCurvature, SharedCurvature
@@ -161,13 +161,17 @@ class ComparedImages(NamedTuple):
         """m(x_q + u(x_q))."""
         return self.moving(self.places(u))
 
+    def pair(self, predicted: Float[AnyArray, "points"]) -> Intensities:
+        """f(x_q) beside values of m."""
+        return Intensities(self.fixed_values, predicted, self.quadrature.weights)
+
     def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q))."""
-        return self.similarity.residuals(self.fixed_values, self.predicted(u), self.quadrature.weights)
+        return self.similarity.residuals(self.pair(self.predicted(u)))
 
     def standardised_noise(self, key: AnyArray, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""
-        return self.similarity.draw(key, self.predicted(u), self.quadrature.weights)
+        return self.similarity.draw(key, self.pair(self.predicted(u)))
 
     def noise_sd(self, t_similarity: float) -> float:
         """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
@@ -203,15 +207,15 @@ class ImageLikelihood(dist.Distribution):
 
     def energy(self, value: Float[AnyArray, "points"]) -> Scalar:
         """E_s, mm³ times squared intensity."""
-        return self.term.similarity.energy(value, self.predicted, self.term.quadrature.weights, self.temperature)
+        pair = Intensities(value, self.predicted, self.term.quadrature.weights)
+        return self.term.similarity.energy(pair, self.temperature)
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
         """Replicates of the fixed image, which the tempering by `independent_share` leaves as they are."""
-        similarity, weights = self.term.similarity, self.term.quadrature.weights
-        explained = self.term.fixed_values - similarity.residuals(self.term.fixed_values, self.predicted, weights)
-        keys = jax.random.split(key, sample_shape).ravel()
-        noise = jax.vmap(lambda one: similarity.draw(one, self.predicted, weights))(keys)
-        scale = jnp.sqrt(self.temperature / (2 * weights))
+        similarity, pair = self.term.similarity, self.term.pair(self.predicted)
+        explained = pair.fixed - similarity.residuals(pair)
+        noise = jax.vmap(lambda one: similarity.draw(one, pair))(jax.random.split(key, sample_shape).ravel())
+        scale = jnp.sqrt(self.temperature / (2 * pair.weights))
         return (explained + scale * noise).reshape(*sample_shape, *self.event_shape)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
@@ -226,7 +230,7 @@ class ImageLikelihood(dist.Distribution):
 def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar) -> PointCurvature:
     """Gauss and Newton's curvature in every place x_q + u(x_q)."""
     moved = term.places(u)
-    convexity = term.similarity.convexity(term.fixed_values, term.moving(moved), term.quadrature.weights)
+    convexity = term.similarity.convexity(term.pair(term.moving(moved)))
     return _chain(term, convexity, _slope(term, moved), t_similarity)
 
 
@@ -236,9 +240,9 @@ def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity
     moved, similarity = term.places(u), term.similarity
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    compared = term.fixed_values, term.moving(moved), term.quadrature.weights
-    first = jax.grad(similarity.energy, argnums=1)(*compared, t_similarity)
-    second = _subtract(similarity.curvature(*compared, t_similarity), similarity.convexity(*compared))
+    pair = term.pair(term.moving(moved))
+    first = jax.grad(similarity.energy)(pair, t_similarity).moving
+    second = _subtract(similarity.curvature(pair, t_similarity), similarity.convexity(pair))
     found = _chain(term, second, slope(moved), t_similarity)
     bent = first[:, None, None] * jnp.stack(columns, axis=-1)
     return found._replace(matrices=found.matrices + term.independent_share / t_similarity * bent)
