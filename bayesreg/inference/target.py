@@ -128,6 +128,10 @@ class Curvature(Protocol):
 class ModeSearch(Protocol):
     """The posterior as the search for a mode and Laplace's approximation there see it."""
 
+    @property
+    def scales(self) -> Sequence[str]:
+        """Names of sampled scales of the displacements, whose joint mode with these would mislead."""
+
     def continuation(self) -> Iterable[Any]:
         """Data of ever harder problems, in the displacements alone, that lead to the target's own."""
 

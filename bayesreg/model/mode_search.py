@@ -10,7 +10,7 @@ import jax
 from jaxtyping import Float
 
 from bayesreg.interpolation import Interpolation
-from bayesreg.model.blocks import Values
+from bayesreg.model.blocks import Scale, Values
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import complete
 from bayesreg.model.curvature import Curvature, displacement_curvature
@@ -35,6 +35,13 @@ class ModeSearch:
     data: Problem
     observations: Mapping[str, Any]
     interpolation: Interpolation
+
+    @property
+    def scales(self) -> tuple[str, ...]:
+        """T_r and the scales that observations brought, such as the sd of landmarks, where they are sampled."""
+        own = [name for one in self.observations.values() for name in getattr(one, "blocks", {})]
+        blocks = {name: self.data.blocks[name] for name in ("t_elastic", *own)}
+        return tuple(name for name, block in blocks.items() if isinstance(block, Scale) and block.is_sampled)
 
     def continuation(self) -> Iterator[Problem]:
         """Problems of growing difficulty, in the displacements alone, that lead to this one."""

@@ -13,7 +13,7 @@ import scipy.linalg
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.inference.gaussian.hierarchy import evidence_curvature, is_scale, is_temperature
+from bayesreg.inference.gaussian.hierarchy import Volume, mark_scales, mark_scales_of_displacements, volume_of
 from bayesreg.inference.layout import marked, unravel
 from bayesreg.inference.target import Curvature, Target, estimands_of, logdensity, without_walls
 from bayesreg.types import AnyArray, InputError
@@ -24,6 +24,8 @@ FAR = 1e6
 ALONE = 10.0
 # Of differences between gradients, in Normal scores and logarithms.
 STEP = 1e-4
+# Of differences between curvatures, in the logarithm of a scale of which they are a power.
+SCALE_STEP = 0.01
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25
 
@@ -46,11 +48,16 @@ class Gaussian(NamedTuple):
         return self.centre + self.factor @ xi
 
 
-def prior_shares(target: Target, data: Any, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "rows rows"]:
-    """C P, C the covariance of the displacements, P the elastic prior's curvature: half of T_r, and P counts twice."""
-    colder = flat - np.log(2) * is_temperature(target)
-    here, there = (_curvature(target, data, place).gauss_newton for place in (flat, colder))
-    return scipy.linalg.cho_solve(scipy.linalg.cho_factor(_regular(here)), there - here)
+def volume_at(target: Target, data: Any, flat: Float[np.ndarray, "dimension"]) -> Volume:
+    """The derivatives of −½ log det H in the scales of the displacements, H their curvature; by differences of it."""
+    here = _curvature(target, data, flat).gauss_newton
+    derivatives = []
+    for entry in np.flatnonzero(mark_scales_of_displacements(target)):
+        step = np.zeros(len(flat))
+        step[entry] = SCALE_STEP
+        ahead, behind = (_curvature(target, data, flat + way * step).gauss_newton for way in (1, -1))
+        derivatives.append(((ahead - behind) / (2 * SCALE_STEP), (ahead - 2 * here + behind) / SCALE_STEP**2))
+    return volume_of(_regular(here), derivatives)
 
 
 def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Gaussian:
@@ -64,8 +71,8 @@ def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimensio
     Where the images say little at the mode and much beside it, the curvature at the mode alone makes a Gaussian too
     wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
     large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with its argument,
-    and its mean over places would be that of the largest. In log T_r it is that at draws about the mode, which
-    trajectories meet, though the posterior of T_r is wider.
+    and its mean over places would be that of the largest. In the logarithm of a scale it is that at draws about the
+    mode, which trajectories meet, though the posterior of the scale is wider.
     """
     # One after the other: each holds more than these two arrays.
     curvatures = (_curvature(target, target.data, flat) for flat in flats)
@@ -84,7 +91,7 @@ def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarra
     where it is: its force at the mode of what it scales is no hint (see `hierarchy`).
     """
     slopes = np.mean([slope_at(target, flat) for flat in flats], axis=0)
-    factor, moving = np.asarray(gaussian.factor), 1 - is_scale(target)
+    factor, moving = np.asarray(gaussian.factor), 1 - mark_scales(target).astype(float)
     shift = moving * (factor @ (factor.T @ (moving * slopes)))
     return gaussian._replace(centre=jnp.asarray(np.mean(flats, axis=0) + shift))
 
@@ -202,7 +209,7 @@ def _jointly(
 ) -> Float[np.ndarray, "dimension dimension"]:
     """The curvature in all coordinates, given that in the displacements and, jointly, the field.
 
-    In log T_r it is that of its evidence, or that at draws of the displacements (see `hierarchy`).
+    In the scales of the displacements it is that of their evidence, or that at draws of these (see `hierarchy`).
     """
     curved = _mark_curved(target, joint)
     count = int((~curved).sum())
@@ -214,10 +221,10 @@ def _jointly(
     if joint and count:
         rows = -hessian_rows(target, data, flat, order[:count])[:, order]
         _require_an_end(np.isfinite(rows).all())
-        temperature = np.flatnonzero(is_temperature(target)[order[:count]])
-        if len(temperature):
-            shares = prior_shares(target, data, flat)
-            rows[temperature, temperature] += np.trace(shares) / 2 if at_draws else evidence_curvature(shares)
+        scales = np.flatnonzero(mark_scales_of_displacements(target)[order[:count]])
+        if len(scales):
+            volume = volume_at(target, data, flat)
+            rows[np.ix_(scales, scales)] += np.diag(volume.excess) if at_draws else volume.curvature
         precision[:count] = rows
         precision[count:, :count] = rows[:, count:].T
         cross = rows[:, count:]

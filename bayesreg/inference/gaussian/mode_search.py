@@ -12,7 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from bayesreg.inference.gaussian.hierarchy import balance_field, balance_temperature, is_scale, is_temperature
+from bayesreg.inference.gaussian.hierarchy import (
+    balance_field,
+    mark_scales,
+    mark_scales_of_displacements,
+    newton_step,
+)
 from bayesreg.inference.gaussian.laplace import (
     Gaussian,
     gaussian_of,
@@ -20,11 +25,11 @@ from bayesreg.inference.gaussian.laplace import (
     hessian_rows,
     laplace,
     precision_at,
-    prior_shares,
     slope_at,
+    volume_at,
 )
 from bayesreg.inference.gaussian.pockets import leave_pockets
-from bayesreg.inference.layout import displacements, node_count, others, unravel
+from bayesreg.inference.layout import displacements, marked, node_count, others, unravel
 from bayesreg.inference.target import Target, clearance, without_normaliser
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -100,7 +105,7 @@ def settle(
     for _ in range(REPEATS):
         before, pressed = flat, shift
         flat = _improve(target, target.data, flat, True, iterations, say, shift)
-        flat = _improve_temperature(target, balance_field(target, flat, partial(_factor, target, flat)))
+        flat = _improve_scales(target, balance_field(target, flat, partial(_factor, target, flat)))
         shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
         if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
             break
@@ -109,16 +114,18 @@ def settle(
     return _admissible(target, flat)
 
 
-def _improve_temperature(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """The flat position with T_r, if it is inferred, nearer to the maximum of its evidence."""
-    entry = np.flatnonzero(is_temperature(target))
-    if not len(entry):
+def _improve_scales(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+    """The flat position with the scales of the displacements, if any, nearer to the maximum of their evidence."""
+    scales = np.flatnonzero(mark_scales_of_displacements(target))
+    if not len(scales):
         return flat
-    slope = slope_at(target, flat)[entry]
-    curvature = -hessian_rows(target, target.data, flat, entry)[0, entry]
-    return balance_temperature(
-        target, flat, float(slope[0]), float(curvature[0]), prior_shares(target, target.data, flat)
-    )
+    volume, rows = volume_at(target, target.data, flat), hessian_rows(target, target.data, flat, scales)
+    cross = rows[:, marked(target, "field", "u_boundary")]
+    # The displacements follow the scales: the evidence is less curved than the density at given ones.
+    curvature = volume.curvature - rows[:, scales] - cross @ volume.covariance @ cross.T
+    moved = np.array(flat)
+    moved[scales] += newton_step(slope_at(target, flat)[scales] + volume.slope, curvature)
+    return moved
 
 
 def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
@@ -143,11 +150,11 @@ def _improve(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
     shift = np.zeros(node_count(target)) if shift is None else shift
-    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves), is_scale(target) > 0))
+    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves), mark_scales(target)))
     if not moves:
         # The same for all displacements.
         data = without_normaliser(target, data)
-    moving, own = 1 - is_scale(target), displacements(target)
+    moving, own = 1 - mark_scales(target).astype(float), displacements(target)
     if not moves:
         moving[others(target)] = 0.0
     best: list[tuple[Any, float, Any, float]] = []
