@@ -6,7 +6,7 @@ DEMO := runs/quickstart
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install -c constraints.txt --build-constraint constraints.txt -e .
 
-.PHONY: demo test bench calibrate check
+.PHONY: demo test test-all bench calibrate check
 .DELETE_ON_ERROR:
 
 # Status 3, "not converged within its budget", is an honest end of a demonstration.
@@ -17,6 +17,10 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest
+
+# Those that `make test` leaves out for their time, too: the examples of the docs, word for word.
+test-all: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m ''
 
 # The table and figure of the docs; a part of it, say make bench ARGS="-k '0.8k'", leaves its own under runs/.
 # Types are not checked: that would be timed, too, and lowering a program passes what is of none.

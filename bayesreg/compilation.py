@@ -19,14 +19,14 @@ QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 KNOWN_TO = "0.10."
 
 
-def compile_quickly() -> None:
+def compile_quickly(flags: str = QUICK) -> None:
     """Have XLA spend less on compiling, unless its own variable is set.
 
     Only with the version of jaxlib that this was measured with, and where JAX has no devices but the processor: for
     others one of the flags means something else.
     """
     if version("jaxlib").startswith(KNOWN_TO) and find_spec("jax_plugins") is None:
-        os.environ.setdefault("XLA_FLAGS", QUICK)
+        os.environ.setdefault("XLA_FLAGS", flags)
 
 
 def keep_compiled_programs() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-from bayesreg.compilation import compile_quickly
+from bayesreg.compilation import QUICK, compile_quickly
 
 _ROOT = Path(__file__).parent.parent
 
@@ -14,7 +14,8 @@ _ROOT = Path(__file__).parent.parent
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_ROOT / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
-compile_quickly()
+# Half of what a test takes is compiling: programs need not be fast, and two workers keep both cores busy as it is.
+compile_quickly(f"{QUICK.replace('level=1', 'level=0')} --xla_cpu_parallel_codegen_split_count=1")
 
 # Not for the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
 _MODULES = [f"bayesreg.{path.stem}" for path in (_ROOT / "bayesreg").iterdir() if path.stem[0] not in "_."]

@@ -6,6 +6,7 @@ import xarray as xr
 
 import bayesreg as br
 from bayesreg.workflow.manifest import implied_noise_sd
+from bayesreg.workflow.prediction import mean_values
 from tests.phantoms import ball_mesh, smooth_image
 
 
@@ -15,8 +16,10 @@ def test_noise_of_an_inferred_temperature_is_that_of_its_mean():
     known, inferred = (
         br.build_posterior(image, image, mesh, br.ModelConfig(t_similarity=t)) for t in (0.8, {"median": 0.8})
     )
-    u = xr.Dataset({"lam": (("chain", "draw", "tissue"), np.ones((2, 3, 3)))})
-    drawn = u.assign(t_similarity=(("chain", "draw"), [[3.0, 3.2, 3.4], [2.8, 3.2, 3.6]]))
-    assert implied_noise_sd(known, u) == known.images.noise_sd(0.8)
-    assert implied_noise_sd(inferred, drawn) == pytest.approx(2 * known.images.noise_sd(0.8))
-    assert implied_noise_sd(inferred, u) == known.images.noise_sd(0.8)
+    dims = ("chain", "draw", "tissue")
+    draws = xr.Dataset({name: (dims, np.ones((2, 3, 3))) for name in ("lam", "mu")})
+    drawn = draws.assign(t_similarity=(("chain", "draw"), [[3.0, 3.2, 3.4], [2.8, 3.2, 3.6]]))
+    rest = np.zeros((len(mesh.points), 3))
+    assert implied_noise_sd(known, mean_values(known, draws, rest)) == known.images.noise_sd(0.8)
+    found = implied_noise_sd(inferred, mean_values(inferred, drawn, rest))
+    assert found == pytest.approx(2 * known.images.noise_sd(0.8))

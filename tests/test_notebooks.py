@@ -11,6 +11,8 @@ import pytest
 FOLDER = Path(__file__).parent.parent / "notebooks"
 
 
+@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.ipynb")))
 def test_notebook_runs(name):
     cells = json.loads((FOLDER / name).read_text(encoding="utf-8"))["cells"]

@@ -85,7 +85,7 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
     np.testing.assert_allclose(predicted.landmark_sd, 0.2)
     kept, alone = (np.linalg.norm(r, axis=1) for r in (predicted.landmark_residual, predicted.left_out_residual))
     assert (alone > kept).all()
-    assert result.run.manifest["observations"] == ["landmarks"]
+    assert list(result.run.manifest["observations"]) == ["landmarks"]
     if not data:
         page = result.report.read_text(encoding="utf-8")
         assert 'id="landmarks"' in page
@@ -95,7 +95,7 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
 
 def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(folder, tmp_path):
     observed = [{"kind": "images"}, {"kind": "landmarks", "file": "plain.csv", "sd": {"median": 0.5}, "name": "vessel"}]
-    sections = {"sampler": {"name": "hmc", "chains": 2, "warm_up": 10, "block": 5}}
+    sections = {"sampler": {"name": "laplace", "chains": 2, "block": 5}}
     stop = {"rhat": None, "ess": None}
     short = configuration(folder, observed, IMAGES, "short.yaml", **sections, stop=stop | {"max_steps": 5})
     longer = configuration(folder, observed, IMAGES, "longer.yaml", **sections, stop=stop | {"max_steps": 10})
@@ -105,7 +105,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
     result = br.run(longer, tmp_path / "out", resume=True, progress=False)
     assert result.idata.posterior["vessel_sd"].shape == (2, 10)
     assert (result.idata.posterior["vessel_sd"] > 0).all()
-    assert result.run.manifest["observations"] == ["images", "vessel"]
+    assert list(result.run.manifest["observations"]) == ["images", "vessel"]
     assert result.run.manifest["model"]["vessel_sd"] == {"median": 0.5, "log_sd": 1.0}
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "vessel sd, mm" in page
@@ -118,7 +118,8 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
     [
         ([{"kind": "images"}], LABELS, {}, "images are observed, and data has none"),
         ([PAIRS, PAIRS], LABELS, {}, "two observations are named landmarks"),
-        ([PAIRS | {"name": "a b"}], LABELS, {}, "observations.0.name"),
+        ([PAIRS | {"name": "a b"}], LABELS, {}, 'observations.0.name = "a b": expected a name of letters'),
+        ([PAIRS | {"name": "solver_failed"}], LABELS, {}, "this name is taken"),
         ([PAIRS | {"file": "none.csv"}], LABELS, {}, "observations.0.file"),
         ([PAIRS], LABELS | {"fixed": "fixed.nii.gz"}, {}, "a pair of images needs both"),
         ([PAIRS], {"labels": "labels.nii.gz"}, {}, "labels and label_table belong together"),
@@ -137,6 +138,22 @@ def test_landmarks_without_an_sd_are_refused_before_anything_is_written(folder, 
     with pytest.raises(br.InputError, match="'landmarks' has no sd"):
         br.run(path, tmp_path / "out", progress=False)
     assert not (tmp_path / "out").exists()
+
+
+def test_options_of_images_are_refused_before_meshing(folder, tmp_path):
+    path = configuration(folder, [PAIRS], LABELS, model={"similarity": "lncc"})
+    with pytest.raises(br.InputError, match=r"model.similarity says how images are compared"):
+        br.run(path, tmp_path / "out", progress=False)
+
+
+def test_an_entry_of_observations_is_overridden_by_its_number(folder):
+    path = configuration(folder, [PAIRS, PAIRS | {"name": "other"}], LABELS)
+    config = br.load_config(path, ["observations.1.sd=2.5"])
+    assert [one.sd for one in config.observations] == [None, 2.5]
+    with pytest.raises(br.InputError, match=r"--set observations.2.sd=1: 2 is no entry of a list of 2"):
+        br.load_config(path, ["observations.2.sd=1"])
+    with pytest.raises(br.InputError, match=r"--set observations.1.sd=wide: observations.1.sd = "):
+        br.load_config(path, ["observations.1.sd=wide"])
 
 
 def test_nothing_observed_is_told(folder, tmp_path):

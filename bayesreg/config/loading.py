@@ -165,14 +165,19 @@ def _override(document: _Document, overrides: Sequence[str]) -> _Document:
         if not equals or not all(keys):
             raise ConfigError(f"--set {text}: expected a dotted path and a value, such as sampler.chains=4")
         data = _with_value(data, keys, _parse(value, f"--set {text}")[0], text)
-        origins[keys] = f"--set {text}"
+        origins[tuple(int(key) if key.isdecimal() else key for key in keys)] = f"--set {text}"
     return _Document(data, origins, document.folders)
 
 
-def _with_value(data: Any, keys: Sequence[str], value: Any, text: str) -> dict[str, Any]:
+def _with_value(data: Any, keys: Sequence[str], value: Any, text: str) -> Any:
     first, *rest = keys
     if data is None:
         data = {}
+    if isinstance(data, list):
+        if not (first.isdecimal() and int(first) < len(data)):
+            raise ConfigError(f"--set {text}: {first} is no entry of a list of {len(data)}; they are numbered from 0")
+        changed = _with_value(data[int(first)], rest, value, text) if rest else value
+        return [changed if index == int(first) else one for index, one in enumerate(data)]
     if not isinstance(data, dict):
         raise ConfigError(f"--set {text}: {first} would lie under {data!r:.60}, which has no keys")
     return {**data, first: _with_value(data.get(first), rest, value, text) if rest else value}

@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from bayesreg.config.values import FoundFile, Positive, Section
-from bayesreg.model.options import ScalePrior
+from bayesreg.model.options import TAKEN, ScalePrior
+
+
+def _free_name(name: str) -> str:
+    if not name.isidentifier() or name.startswith("prior_"):
+        raise ValueError("expected a name of letters, digits and _, such as left_lobe; none that begins with prior_")
+    if name in TAKEN or name == "images":
+        raise ValueError("this name is taken; expected another one")
+    return name
 
 
 class ImagesSection(Section):
@@ -27,7 +35,7 @@ class LandmarksSection(Section):
     """The points in the moving image, where they stand in a file of their own."""
     sd: Positive | ScalePrior | None = None
     """Sd of the error of each coordinate, mm, or its prior; null takes the column sd of the file."""
-    name: Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")] = "landmarks"
+    name: Annotated[str, AfterValidator(_free_name)] = "landmarks"
     """The name of the observation in tables; two observations need two."""
 
 

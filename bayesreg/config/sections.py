@@ -109,6 +109,10 @@ def _require_tissues(key: str, given: object, names: Sequence[str] | None, whole
         raise _wrong(key, f"lacks {', '.join(missing)}; expected a value for every tissue")
 
 
+def _has_images(data: Mni152Data | BrainWebData | FilesData) -> bool:
+    return not isinstance(data, FilesData) or data.fixed is not None
+
+
 def _require_nothing_else(model: ModelConfig) -> None:
     """Refuse what known_boundary leaves no room for."""
     if model.sampled != "boundary" or model.held:
@@ -185,17 +189,21 @@ class Config(Section):
     @classmethod
     def _are_there(cls, observations: Observations, info: ValidationInfo) -> Observations:
         data = info.data.get("data")
-        pictures = not isinstance(data, FilesData) or data.fixed is not None
         wanted = observations is not None and any(isinstance(one, ImagesSection) for one in observations)
-        if wanted and not pictures:
+        if wanted and data is not None and not _has_images(data):
             raise ValueError("images are observed, and data has none; expected data.fixed and data.moving")
         return observations
+
+    @property
+    def has_images(self) -> bool:
+        """Whether there is a pair of images."""
+        return _has_images(self.data)
 
     @property
     def compares_images(self) -> bool:
         """Whether the pair of images is among the observations."""
         if self.observations is None:
-            return not isinstance(self.data, FilesData) or self.data.fixed is not None
+            return self.has_images
         return any(isinstance(one, ImagesSection) for one in self.observations)
 
     @field_validator("known_boundary")

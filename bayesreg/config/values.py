@@ -82,8 +82,10 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
         raise ValueError("expected at least one tissue with its labels, such as liver: 1")
     owners: dict[int, str] = {}
     for name, labels in table.items():
-        if not name.isidentifier() or name == "all":
+        if not name.isidentifier():
             raise ValueError(f"{name!r} is no name of a tissue; expected letters, digits and _, such as left_lobe")
+        if name == "all":
+            raise ValueError("all stands for all tissues; expected another name")
         for label in labels:
             if label == 0:
                 raise ValueError(f"label 0 is the background, and cannot belong to {name}")

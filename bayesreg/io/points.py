@@ -154,7 +154,7 @@ def _read_csv(text: str, path: str) -> Points | PointPairs:
     lines = [
         (number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"
     ]
-    system = _named_system(text, "RAS")
+    system = _named_system(text, "RAS", path)
     if not lines:
         raise InputError(f"{path} is empty; expected a header such as {','.join(PLAIN)}")
     header, *rows = [(number, [cell.strip() for cell in next(csv.reader([line]))]) for number, line in lines]
@@ -186,7 +186,7 @@ def _read_csv(text: str, path: str) -> Points | PointPairs:
 
 
 def _read_fcsv(text: str, path: str) -> Points:
-    system, columns, points, names = _named_system(text, "RAS"), ["id", "x", "y", "z"], [], []
+    system, columns, points, names = _named_system(text, "RAS", path), ["id", "x", "y", "z"], [], []
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith("#"):
             key, _, value = line[1:].partition("=")
@@ -275,10 +275,13 @@ def _tag_row(line: str, wanted: int, where: str) -> tuple[list[float], str]:
     return [_number(cell, where) for cell in cells[:wanted]], quoted[0] if quoted else ""
 
 
-def _named_system(text: str, default: str) -> str:
+def _named_system(text: str, default: str, path: str) -> str:
     """The coordinate system that a line such as `# CoordinateSystem = LPS` names."""
-    named = re.findall(r"^\s*#\s*CoordinateSystem\s*=\s*(.*?)[\s,]*$", text, re.MULTILINE)
-    return str(named[-1]) if named else default
+    comments = "\n".join(re.findall(r"^\s*#.*$", text, re.MULTILINE))
+    named = re.findall(r"Coordinate\s*System\s*[=:]\s*(.*?)[\s,]*$", comments, re.MULTILINE | re.IGNORECASE)
+    if not named and re.search(r"\bLPS\b|Coordinate\s*System", comments, re.IGNORECASE):
+        raise InputError(f"{path}: a comment speaks of its coordinate system; write it as '# CoordinateSystem = LPS'")
+    return str(named[-1]).upper() if named else default
 
 
 def _in_ras(points: Sequence[Sequence[float]] | np.ndarray, system: str, path: str) -> Float[np.ndarray, "k 3"]:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.model.terms.images import ComparedImages
+from bayesreg.model.blocks import Values
+from bayesreg.model.posterior import Posterior
+from bayesreg.model.state import state_of
+from bayesreg.model.terms.images import ComparedImages, ImagePair
+from bayesreg.model.terms.landmarks import Landmarks
+from bayesreg.model.terms.term import Outside, Standardised
 from bayesreg.types import AnyArray, Scalar
 
+KINDS = {ImagePair: "images", Landmarks: "landmarks"}
 DISCREPANCIES = ("sd", "greatest", "neighbours")
 
 
@@ -20,6 +29,30 @@ def standardised_residual(
     Where the model holds, these are independent numbers, standard Normal or of Student's t.
     """
     return images.residuals(jnp.asarray(u)) * jnp.sqrt(2 * images.quadrature.weights / t_similarity)
+
+
+def describe_observations(posterior: Posterior, values: Values) -> dict[str, dict[str, Any]]:
+    """How every observation fits at some values.
+
+    Returns
+    -------
+    dict
+        By the name of the observation its "kind" ("images", "landmarks" or "own"), the "log" of its term, and where the
+        term knows its residuals their number, "values", and the root of the mean of their squares in units of their
+        variance, "residual_rms".
+    """
+    filled = posterior.fill(values)
+    state = state_of(posterior.data.body, posterior.data.blocks, filled)
+    found = {}
+    for name, given in posterior.observations.items():
+        term = posterior.data.terms[name]
+        # What stands for an observation from outside knows its log alone.
+        shown = given if isinstance(term, Outside) else term
+        found[name] = {"kind": KINDS.get(type(given), "own"), "log": float(term.log(state))}
+        if isinstance(shown, Standardised):
+            z = np.asarray(shown.standardised_residual(state))
+            found[name] |= {"values": z.size, "residual_rms": float(np.sqrt(np.mean(z**2)))}
+    return found
 
 
 def discrepancies(

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import Values
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import problem_of
-from bayesreg.model.program import Problem
-from bayesreg.model.state import state_of
+from bayesreg.model.state import State, state_of
 from bayesreg.model.terms.images import ImagePair
+from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.term import Outside
 from bayesreg.types import AnyArray, InputError
 
@@ -70,7 +71,8 @@ def build_posterior(
     model, given = model or ModelConfig(), _observations(fixed, moving, observations)
     problem, sampled = problem_of(mesh, given, model, skull, reference)
     posterior = Posterior(problem, mesh, model, sampled, {observation.name: observation for observation in given})
-    _require_scalars(posterior)
+    _require_bounded(posterior)
+    _require_numbers(posterior)
     return posterior
 
 
@@ -82,22 +84,63 @@ def _observations(fixed: Image | None, moving: Image | None, observations: Seque
         raise InputError("give either fixed and moving, or observations; a pair of images is ImagePair(fixed, moving)")
     if fixed is not None and moving is not None:
         return [ImagePair(fixed, moving)]
-    if not observations:
+    return require_observations(() if observations is None else observations)
+
+
+def require_observations(given: Any) -> list[Any]:
+    """The observations in a list; InputError if there is none, or one is no observation."""
+    if not isinstance(given, Sequence):
+        raise InputError(f"observations must be a list, got {type(given).__name__}; put one observation in a list, too")
+    if not len(given):
         raise InputError("there is nothing observed: give fixed and moving, or observations, such as Landmarks")
-    return list(observations)
-
-
-def _require_scalars(posterior: Posterior) -> None:
-    """Raise InputError where an observation from outside gives no real number, before anything long begins."""
-    outside = [name for name, term in posterior.data.terms.items() if isinstance(term, Outside)]
-    for name in outside:
-        found = jax.eval_shape(partial(_log_of, name), posterior.data, posterior.reference())
-        if found.shape != () or not jnp.issubdtype(found.dtype, jnp.floating):
+    for one in given:
+        name = getattr(one, "name", None)
+        known = isinstance(one, ImagePair | Landmarks) or callable(getattr(one, "log", None))
+        if not (known and isinstance(name, str) and name):
             raise InputError(
-                f"log(state) of the observation {name!r} must give one real number, got shape {found.shape} of "
-                f"{found.dtype}"
+                f"an observation needs a name (text) and a function log(state); got {type(one).__name__}: use "
+                "ImagePair, Landmarks, or an object of your own with both"
+            )
+    return list(given)
+
+
+def _require_bounded(posterior: Posterior) -> None:
+    """Raise InputError where nothing bounds the rigid motions: landmarks alone, too few of them, and no prior."""
+    given = posterior.observations.values()
+    bounded = not len(posterior.sampled) or {"rigid", "skull"} & set(posterior.data.terms)
+    if bounded or not all(isinstance(one, Landmarks) for one in given):
+        return
+    held = posterior.mesh.points[list(posterior.options.held)].reshape(-1, 3)
+    points = np.concatenate([*(one.fixed_points for one in given), held])
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if len(points) < 3 or spread[1] < 1e-6 * spread[0]:
+        raise InputError(
+            f"{len(points)} landmarks and held nodes do not say how the whole shifts and turns: the posterior would be "
+            "improper; give at least three that are not on one line, images, a skull, or model.rigid_sd"
+        )
+
+
+def _require_numbers(posterior: Posterior) -> None:
+    """Raise InputError where an observation from outside gives no real number, before anything long begins."""
+    problem, values = posterior.data, posterior.reference()
+    rest = state_of(problem.body, problem.blocks, values)
+    for name, term in problem.terms.items():
+        if not isinstance(term, Outside):
+            continue
+        log = partial(_log_at, term, rest)
+        found = jax.eval_shape(log, rest.u)
+        if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
+            got = f"shape {found.shape} of {found.dtype}" if hasattr(found, "shape") else type(found).__name__
+            raise InputError(f"log(state) of the observation {name!r} must give one real number, got {got}")
+        value, slope = jax.value_and_grad(log)(rest.u)
+        if jnp.isnan(value) or jnp.isnan(slope).any():
+            what = "is not a number" if jnp.isnan(value) else "has a derivative that is not a number"
+            raise InputError(
+                f"log(state) of the observation {name!r} {what} where nothing has moved, and chains may start there; "
+                "avoid, for instance, the root of a sum of squares that may be zero"
             )
 
 
-def _log_of(name: str, problem: Problem, values: Values) -> Any:
-    return jnp.asarray(problem.terms[name].log(state_of(problem.body, problem.blocks, values)))
+def _log_at(term: Outside, state: State, u: AnyArray) -> Any:
+    """The log of the term where the nodes have moved by u, mm."""
+    return term.log(replace(state, equilibrium=state.equilibrium._replace(u=u)))

@@ -17,10 +17,9 @@ from bayesreg.model.state import state_of
 from bayesreg.model.terms.landmarks import ComparedPoints
 from bayesreg.types import AnyArray
 
-# A direction of which the others say next to nothing: share of the information that is the landmark's own.
-OWN = 1 - 1e-6
 # Share of the curvature's trace that keeps directions finite of which nothing is known, such as free rigid motions.
-TRACE = 1e-9
+# Where ten times as much changes a prediction, it is this share that predicts, and not the other observations.
+TRACE, MORE = 1e-10, 10.0
 
 
 class LeftOut(NamedTuple):
@@ -57,22 +56,33 @@ def leave_out(posterior: Posterior, term: ComparedPoints, estimands: dict[str, A
     data = posterior.data
     values = complete(data.blocks, estimands)
     curvature = np.asarray(posterior.mode_search.curvature(data, estimands).gauss_newton)
-    own = curvature[-3 * len(posterior.sampled) :, -3 * len(posterior.sampled) :]
-    own = own + TRACE * np.trace(own) * np.eye(len(own))
+    # The components of a field come first.
+    components = len(curvature) - 3 * len(posterior.sampled)
+    H = curvature[components:, components:]
     predicted, response = (np.asarray(found) for found in _predicted_with_response(data, term, values))
-    count = len(predicted)
-    A = response.reshape(3 * count, -1)
-    spread = (A @ cho_solve(cho_factor(own), A.T)).reshape(count, 3, count, 3)
+    A = response.reshape(3 * len(predicted), -1)
     residual, sd = np.asarray(term.shift) - predicted, np.asarray(term.sd(values))
-    share = np.einsum("kikj->kij", spread) / sd[:, None, None] ** 2
-    found = [_without(*one) for one in zip(residual, share, sd, strict=True)]
+    shares = [_shares(H + trace * np.trace(H) * np.eye(len(H)), A, sd) for trace in (TRACE, MORE * TRACE)]
+    found = [_without(*one) for one in zip(residual, *shares, sd, strict=True)]
     return LeftOut(*(np.stack(parts) for parts in zip(*found, strict=True)))
 
 
+def _shares(
+    precision: Float[np.ndarray, "rows rows"],
+    response: Float[np.ndarray, "coordinates rows"],
+    sd: Float[np.ndarray, "k"],
+) -> Float[np.ndarray, "k 3 3"]:
+    """C / s² of every landmark: how much of what is known of its place is its own."""
+    spread = response @ cho_solve(cho_factor(precision), response.T)
+    return np.einsum("kikj->kij", spread.reshape(len(sd), 3, len(sd), 3)) / sd[:, None, None] ** 2
+
+
 def _without(
-    residual: Float[np.ndarray, "3"], share: Float[np.ndarray, "3 3"], sd: float
+    residual: Float[np.ndarray, "3"], share: Float[np.ndarray, "3 3"], less: Float[np.ndarray, "3 3"], sd: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    if np.linalg.eigvalsh(share).max() > OWN:
+    """Residual without the landmark, and its covariance; `less` is its share beside more that keeps all finite."""
+    others, kept = (np.linalg.eigvalsh(np.eye(3) - one).min() for one in (share, less))
+    if kept > 2 * others:
         return np.full(3, np.nan), np.full((3, 3), np.inf)
     left = np.linalg.inv(np.eye(3) - share)
     return left @ residual, sd**2 * left

@@ -11,6 +11,20 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, model_validator
 from pydantic_core import PydanticCustomError
 
 from bayesreg.tissues import tissue_of_unit_mu
+from bayesreg.types import InputError
+
+# Names of blocks and of the other sites of the program, which no observation may have.
+TAKEN = (
+    "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "field", "field_sd", "elastic", "rigid", "skull",
+    "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations", "solver_failed",
+    "outside_support",
+)  # fmt: skip
+
+# Options that say how images are compared.
+OF_IMAGES = (
+    "similarity", "window_mm", "degrees_of_freedom", "independent_points", "t_similarity", "interpolation",
+    "quadrature",
+)  # fmt: skip
 
 Lame = Literal["lam", "mu"]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -229,6 +243,13 @@ class ModelConfig(BaseModel):
     def _named_tissues(self) -> list[str]:
         sections = (*(self.fixed or {}).values(), *self.priors.values())
         return sorted({tissue for section in sections if isinstance(section, Mapping) for tissue in section})
+
+
+def require_default_image_options(model: ModelConfig) -> None:
+    """Raise InputError where a model without images has an option that says how they are compared."""
+    for key in OF_IMAGES:
+        if getattr(model, key) != ModelConfig.model_fields[key].default:
+            raise InputError(f"model.{key} says how images are compared, and none are observed; leave it out")
 
 
 def of_tissue(model: ModelConfig, given: Any, tissue: str) -> Any:

@@ -143,6 +143,8 @@ class Posterior:
             If a name is missing or a shape is wrong.
         """
         blocks, expected = self.data.blocks, {name: np.shape(value) for name, value in self.reference().items()}
+        if unknown := sorted(set(values) - set(expected)):
+            raise InputError(f"values hold the unknown {', '.join(unknown)}; expected {', '.join(expected)}")
         for name, shape in expected.items():
             if name not in values and (name in LAME or blocks[name].is_sampled):
                 raise InputError(f"values lack {name!r}; expected {', '.join(expected)}")

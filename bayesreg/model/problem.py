@@ -30,7 +30,16 @@ from bayesreg.model.blocks import (
     Scale,
 )
 from bayesreg.model.field import StiffnessField, stiffness_field
-from bayesreg.model.options import FieldConfig, Lame, ModelConfig, PriorConfig, TemperaturePrior, of_tissue
+from bayesreg.model.options import (
+    TAKEN,
+    FieldConfig,
+    Lame,
+    ModelConfig,
+    PriorConfig,
+    TemperaturePrior,
+    of_tissue,
+    require_default_image_options,
+)
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
 from bayesreg.model.terms.elastic import ElasticPrior
@@ -38,15 +47,10 @@ from bayesreg.model.terms.images import ImagePair
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.rigid import RigidPrior
 from bayesreg.model.terms.skull import Skull, is_allowed
-from bayesreg.model.terms.term import Outside, Term, Terms
+from bayesreg.model.terms.term import Outside, Terms
 from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
 
-# Names of blocks and of the other factors of the program.
-TAKEN = (
-    "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "field", "field_sd", "elastic", "rigid", "skull",
-    "support", "solved", "u", "strain_energy", "similarity_energy",
-)  # fmt: skip
 # The solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
 TOLERANCE = 1e-10
 
@@ -59,6 +63,8 @@ def problem_of(
     reference: Mapping[str, AnyArray] | None,
 ) -> tuple[Problem, Int[np.ndarray, "sampled"]]:
     """All arrays of the problem, and the sampled nodes; see `bayesreg.build_posterior`."""
+    if all(isinstance(one, Landmarks) for one in observations):
+        require_default_image_options(model)
     sampled, held = sampled_nodes(mesh, model)
     require_proper(mesh, model)
     field = stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None
@@ -141,21 +147,15 @@ def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelCo
     terms: Terms = {}
     taken = {*TAKEN, *observation_blocks(observations)}
     for observation in observations:
-        term: Any
+        name = observation.name
+        if name in terms or name in taken or name.startswith("prior_"):
+            raise InputError(f"the name {name!r} of an observation is taken; give another one")
         if isinstance(observation, ImagePair):
-            term = observation.on(mesh, model)
+            terms[name] = observation.on(mesh, model)
         elif isinstance(observation, Landmarks):
-            term = observation.on(mesh)
-        elif isinstance(observation, Term):
-            term = Outside(observation)
+            terms[name] = observation.on(mesh)
         else:
-            raise InputError(
-                f"an observation needs a name and a function log(state); got {type(observation).__name__}: use "
-                "ImagePair, Landmarks, or an object of your own with both"
-            )
-        if term.name in terms or term.name in taken:
-            raise InputError(f"the name {term.name!r} of an observation is taken; give another one")
-        terms[term.name] = term
+            terms[name] = Outside(observation)
     return terms
 
 

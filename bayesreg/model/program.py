@@ -44,10 +44,6 @@ class Problem(NamedTuple):
         """The problem with one term left out, if it is there."""
         return self._replace(terms={other: term for other, term in self.terms.items() if other != name})
 
-    def with_block(self, name: str, block: object) -> Problem:
-        """The problem with one block replaced."""
-        return self._replace(blocks={**self.blocks, name: block})
-
 
 def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = None) -> None:
     """p(m, u, λ, μ) of eq. (8): the program whose log joint density is the posterior's up to a constant.

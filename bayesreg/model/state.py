@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from bayesreg.fem.operators import SparseOperator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Blocks, Values
 from bayesreg.model.field import StiffnessField
-from bayesreg.types import AnyArray, Equilibrium, Scalar
+from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
 
 
 @jax.tree_util.register_static
@@ -127,7 +127,7 @@ class State:
         # Without the barrier XLA computes it twice, for the density and for the record.
         return jax.lax.optimization_barrier(energy)
 
-    def at(self, points: Float[np.ndarray, "k 3"]) -> Float[AnyArray, "k 3"]:
+    def at(self, points: Any) -> Float[AnyArray, "k 3"]:
         """Displacements of points inside the mesh, mm.
 
         Parameters
@@ -138,9 +138,11 @@ class State:
         Raises
         ------
         InputError
-            If a point lies outside the mesh.
+            If the shape is another one, or a point lies outside the mesh.
         """
         points = np.asarray(points, float)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"state.at takes points of shape (k, 3), mm; got shape {points.shape}")
         nodes, weights = _locate(StaticMesh(self.mesh), points.tobytes(), len(points))
         return jnp.einsum("ka,kai->ki", weights, self.u[nodes])
 

@@ -21,6 +21,7 @@ from bayesreg.report import (
     anatomy,
     bodies,
     convergence,
+    density,
     identifiability,
     landmarks,
     marginals,
@@ -136,6 +137,9 @@ def write_report(
         "provenance": provenance(run.manifest),
         "config": run.config,
         "elastography": not nodes,
+        "formula": density.formula(run.manifest, not nodes, run.skull is not None),
+        "similarity_energy": density.similarity_energy(run.manifest),
+        "observed": density.observation_table(run.manifest),
     }
     write_text(path, render("template.html", content))
 

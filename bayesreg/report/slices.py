@@ -23,7 +23,6 @@ NAMES = ("sagittal", "coronal", "axial")
 COORDINATES = ("x", "y", "z")
 IN_PLANE = ((1, 2), (0, 2), (0, 1))
 DIRECTIONS = (("L", "R"), ("P", "A"), ("I", "S"))
-AXIAL = 2
 
 MARGIN = 8.0
 PIXELS = 260

@@ -49,11 +49,6 @@ def _observations(config: Config, inputs: Inputs) -> list[Any]:
             pairs = inputs.points[section.name]
             labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
             sd = pairs.sd if section.sd is None else section.sd
-            if sd is None:
-                raise InputError(
-                    f"the observation {section.name!r} has no sd: give observations.{section.name}.sd in the "
-                    "configuration, mm, or a column sd in its file"
-                )
             found.append(Landmarks(pairs.fixed, pairs.moving, sd, section.name, labels))
     return found
 

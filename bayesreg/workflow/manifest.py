@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 
 from bayesreg import __version__
 from bayesreg.config import Config
@@ -24,7 +23,9 @@ from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.inference.target import clearance
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import signed_volumes
-from bayesreg.model.coordinates import fill
+from bayesreg.model.adequacy import describe_observations
+from bayesreg.model.blocks import Values
+from bayesreg.model.options import OF_IMAGES
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
 
@@ -37,7 +38,7 @@ def manifest(
     inputs: Inputs,
     posterior: Posterior,
     samples: Samples,
-    draws: xr.Dataset,
+    mean: Values,
     judged: Convergence,
     provenance: dict[str, Any],
     began: float,
@@ -50,8 +51,8 @@ def manifest(
     inputs : Inputs
     posterior : Posterior
     samples : Samples
-    draws : xarray.Dataset
-        The group `posterior`.
+    mean : mapping
+        Values of all blocks at the mean of the draws.
     judged : Convergence
     provenance : dict
         "timings" (s) of the preparation, and what is known of a synthetic "pair".
@@ -80,8 +81,8 @@ def manifest(
         },
         "pair": provenance["pair"],
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
-        "model": config.model.model_dump(mode="json") | _observation_priors(posterior),
-        "observations": list(posterior.observations),
+        "model": _model(config, posterior),
+        "observations": describe_observations(posterior, mean),
         "exact": samples.exact,
         "stopped": {
             "reason": samples.reason,
@@ -106,13 +107,15 @@ def manifest(
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
         "residual_sd": _residual_sd(posterior, samples),
-        "implied_noise_sd": implied_noise_sd(posterior, draws),
+        "implied_noise_sd": implied_noise_sd(posterior, mean),
     }
 
 
-def _observation_priors(posterior: Posterior) -> dict[str, Any]:
-    """The priors of the scales that observations brought, as those of the temperatures are given."""
-    return {
+def _model(config: Config, posterior: Posterior) -> dict[str, Any]:
+    """The options of the model, less those of images where there are none, and the priors of observations' scales."""
+    unused = () if images_of(posterior.data) is not None else OF_IMAGES
+    options = {key: value for key, value in config.model.model_dump(mode="json").items() if key not in unused}
+    return options | {
         name: {"median": float(block.median), "log_sd": float(block.log_sd)}
         for observation in posterior.observations.values()
         for name, block in getattr(observation, "blocks", {}).items()
@@ -124,16 +127,10 @@ def _residual_sd(posterior: Posterior, samples: Samples) -> float | None:
     return None if images is None else float(np.std(images.residuals(jnp.asarray(samples.u_mean))))
 
 
-def implied_noise_sd(posterior: Posterior, draws: xr.Dataset) -> float | None:
-    """The noise that T_s stands for (see `ComparedImages.noise_sd`): the known one, or its posterior mean.
-
-    None without images.
-    """
+def implied_noise_sd(posterior: Posterior, mean: Values) -> float | None:
+    """The noise that T_s stands for at the mean of the draws (see `ComparedImages.noise_sd`); None without images."""
     images = images_of(posterior.data)
-    if images is None:
-        return None
-    mean = {name: draws[name].mean().to_numpy() for name in ("t_similarity",) if name in draws}
-    return images.noise_sd(float(fill(posterior.data.blocks, mean)["t_similarity"]))
+    return None if images is None else images.noise_sd(float(mean["t_similarity"]))
 
 
 def _has_converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:

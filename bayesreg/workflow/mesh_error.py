@@ -75,8 +75,11 @@ def _require_ratios(result: Result) -> None:
         )
     if run.boundary is not None or model.held or model.is_elastography:
         raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
-    if run.fixed is None:
-        raise InputError("bodies are registered by images: the run needs data.fixed and data.moving")
+    if list(run.manifest["observations"]) != ["images"]:
+        raise InputError(
+            "bodies are registered by one pair of images: the run must have observed nothing else; it observed "
+            f"{', '.join(run.manifest['observations'])}"
+        )
     if run.skull is None:
         raise InputError("bodies are pushed inside the skull: the run needs an intracranial mask (data.intracranial)")
     if run.manifest.get("inverted_elements"):

@@ -20,7 +20,6 @@ from bayesreg.inference.layout import dimension
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
-from bayesreg.model.coordinates import fill
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
@@ -37,6 +36,13 @@ MOST_LEFT_OUT = 60
 FAR = 2.0
 REACH = 0.95
 STIFFER = 1.5
+
+
+def mean_values(posterior: Posterior, draws: xr.Dataset, u_mean: Float[np.ndarray, "nodes 3"]) -> dict[str, AnyArray]:
+    """Values of all blocks, known ones included, at the mean of the draws."""
+    names = [name for name in posterior.reference() if name in draws and name != "u_boundary"]
+    means = {name: draws[name].mean(("chain", "draw")).to_numpy() for name in names}
+    return posterior.fill({**means, "u_boundary": u_mean[posterior.sampled]})
 
 
 def predict(
@@ -95,6 +101,7 @@ def predict(
     aside: dict[str, list[np.ndarray]] = {name: [] for name in kept}
     found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
+    mean = mean_values(posterior, draws, u_mean)
     return Predicted(
         chain_mean=found.chain_mean["u"],
         far_mm=np.array(FAR),
@@ -104,17 +111,17 @@ def predict(
         place_points=np.array(list(places.values()), float),
         place_draws=whole.pop("places"),
         **whole,
-        **(_residual(posterior, u_mean, some) if with_images else {}),
-        **_landmarks(posterior, some),
+        **(_residual(posterior, u_mean, mean) if with_images else {}),
+        **_landmarks(posterior, mean),
         **(_stiffness(found) if posterior.data.body.field is not None else {}),
     )
 
 
 def _residual(
-    posterior: Posterior, u_mean: Float[np.ndarray, "nodes 3"], draws: Mapping[str, np.ndarray]
+    posterior: Posterior, u_mean: Float[np.ndarray, "nodes 3"], mean: Mapping[str, AnyArray]
 ) -> dict[str, np.ndarray]:
     """The residual of the images at the mean, in units of the noise."""
-    at_mean = standardised_residual(posterior.images, u_mean, _median_t_similarity(posterior, draws))
+    at_mean = standardised_residual(posterior.images, u_mean, mean["t_similarity"])
     return {
         "residual": np.asarray(at_mean, np.float32),
         "residual_tissue": posterior.mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
@@ -122,14 +129,12 @@ def _residual(
     }
 
 
-def _landmarks(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _landmarks(posterior: Posterior, mean: dict[str, AnyArray]) -> dict[str, np.ndarray]:
     """Residuals of all landmarks at the mean of the draws, and of each predicted by all else."""
     given = {name: one for name, one in posterior.observations.items() if isinstance(one, Landmarks)}
     if not given:
         return {}
-    mean = {name: jnp.asarray(values.mean(axis=(0, 1))) for name, values in draws.items() if name != "number"}
-    estimands = posterior.estimands(mean)
-    state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(mean))
+    state = state_of(posterior.data.body, posterior.data.blocks, mean)
     terms = [posterior.data.terms[name] for name in given]
     labels = [f"{name} {label}" if len(given) > 1 else label for name, one in given.items() for label in one.labels]
     found = {
@@ -140,7 +145,7 @@ def _landmarks(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> dict[st
     }
     if len(labels) > MOST_LEFT_OUT or not len(posterior.sampled) or dimension(posterior) > MOST_UNKNOWNS:
         return found
-    left = [leave_out(posterior, term, estimands) for term in terms]
+    left = [leave_out(posterior, term, posterior.estimands(mean)) for term in terms]
     return found | {
         "left_out_residual": np.concatenate([one.residual for one in left]),
         "left_out_covariance": np.concatenate([one.covariance for one in left]),
@@ -162,11 +167,6 @@ def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]
         for name, parts in aside.items():
             parts.append(block.pop(name))
         yield block
-
-
-def _median_t_similarity(posterior: Posterior, draws: Mapping[str, np.ndarray]) -> float:
-    median = {name: np.asarray(np.median(draws[name])) for name in ("t_similarity",) if name in draws}
-    return float(fill(posterior.data.blocks, median)["t_similarity"])
 
 
 def require_inside(mesh: TetMesh, places: Places) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Inputs, Truth
 from bayesreg.io.volumes import load_image
 from bayesreg.mesh import TetMesh
+from bayesreg.model.options import require_default_image_options
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.types import InputError
@@ -108,11 +110,17 @@ def _skull(intracranial: Path | None) -> Image | None:
 
 def _points(config: Config) -> dict[str, PointPairs]:
     """The landmarks of a configuration, read before anything takes long."""
-    return {
-        section.name: read_point_pairs(section.file, section.moving_file)
-        for section in config.observations or []
-        if isinstance(section, LandmarksSection)
-    }
+    found = {}
+    for section in config.observations or []:
+        if isinstance(section, LandmarksSection):
+            pairs = read_point_pairs(section.file, section.moving_file)
+            if section.sd is None and pairs.sd is None:
+                raise InputError(
+                    f"the observation {section.name!r} has no sd, mm: give its entry in observations an sd, or "
+                    f"{section.file} a column sd"
+                )
+            found[section.name] = pairs
+    return found
 
 
 def _scale(
@@ -126,8 +134,21 @@ def _scale(
     return _as_stored(scale(fixed)), _as_stored(own_scale(moving))
 
 
-def prepared_inputs(config: Config) -> tuple[Inputs, dict[str, Any]]:
-    """The images, mesh and truth of a configuration, and where they come from."""
+def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:
+    """The images, mesh and truth of a configuration, and where they come from.
+
+    Raises
+    ------
+    InputError
+        As `prepare`; if neither the configuration nor `observations` holds anything observed.
+    """
+    if not (config.compares_images or config.observations or observations):
+        raise InputError(
+            "there is nothing observed: data has no images; add data.fixed and data.moving, landmarks under "
+            "observations, or give observations to bayesreg.run"
+        )
+    if not config.compares_images and not observations:
+        require_default_image_options(config.model)
     prepared = prepare(config)
     require_inside(prepared.inputs.mesh, config.report.places)
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}

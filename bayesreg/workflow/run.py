@@ -30,6 +30,7 @@ from bayesreg.inference.draws.inference_data import dataset, open_posterior, sav
 from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
 from bayesreg.io.records import Inputs, Run
+from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
 from bayesreg.model.terms.images import ComparedImages
@@ -38,7 +39,7 @@ from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.manifest import manifest
-from bayesreg.workflow.prediction import predict
+from bayesreg.workflow.prediction import mean_values, predict
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
 from bayesreg.workflow.result import Result, load_result, report
 
@@ -88,12 +89,13 @@ def run(
         `distributed` is given and `bayesreg.inference.chains.devices.join` was not called.
     """
     config = config if isinstance(config, Config) else load_config(config)
+    given = require_observations(observations) if observations else []
     if config.distributed is not None:
-        return _run_together(config, Path(out), resume, progress, observations)
-    return _run(config, Path(out), resume, progress, observations)
+        return _run_together(config, Path(out), resume, progress, given)
+    return _run(config, Path(out), resume, progress, given)
 
 
-def _run_together(config: Config, out: Path, resume: bool, progress: bool, observations: Sequence[Any]) -> Result:
+def _run_together(config: Config, out: Path, resume: bool, progress: bool, observations: list[Any]) -> Result:
     """The first of several processes runs, and the others join it as if they resumed what it began.
 
     A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
@@ -115,7 +117,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
     return load_result(out)
 
 
-def _run(config: Config, out: Path, resume: bool, progress: bool, observations: Sequence[Any]) -> Result:
+def _run(config: Config, out: Path, resume: bool, progress: bool, observations: list[Any]) -> Result:
     began = time.perf_counter()
     say = _narrator(progress)
     if resume and (out / "config.yaml").exists():
@@ -127,8 +129,8 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
             wait(BEGUN)
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
-        _require_same_observations(out, provenance, observations)
         posterior = posterior_of(config, inputs, observations)
+        _require_same_observations(out, provenance, posterior, observations)
         if (out / "run.json").exists():
             checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
@@ -141,11 +143,13 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         # A run that was cut off before its configuration was written has nothing yet that is worth keeping.
         if not (resume and (out / PROVENANCE).exists()):
             store.require_fresh(out)
-        say("reading the images, meshing")
-        inputs, provenance = prepared_inputs(config)
+        say("reading the files, meshing")
+        if config.has_images and not config.compares_images:
+            say("the images are shown and not compared: observations does not name them ({kind: images})")
+        inputs, provenance = prepared_inputs(config, observations)
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs, observations)
-        provenance["observations"] = _names(observations)
+        provenance["observations"] = _fingerprint(posterior, observations)
         reached = _first(config, inputs, posterior, out, progress)
         inputs = with_initial(inputs, config)
         store_inputs(out, inputs, with_unsampled(provenance, began))
@@ -171,18 +175,31 @@ def _resumed_config(out: Path, config: Config) -> Config:
     return known
 
 
-def _names(observations: Sequence[Any]) -> list[str]:
-    return [observation.name for observation in observations]
+def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, float]:
+    """The log of each of these observations at one displacement of some millimetres, by name."""
+    if not observations:
+        return {}
+    rest = posterior.reference()
+    moved = np.sin(np.arange(rest["u_boundary"].size)).reshape(rest["u_boundary"].shape)
+    logs = posterior.energies(rest | {"u_boundary": moved})
+    return {one.name: float(logs[one.name]) for one in observations}
 
 
-def _require_same_observations(out: Path, provenance: dict[str, Any], observations: Sequence[Any]) -> None:
+def _require_same_observations(out: Path, provenance: dict[str, Any], posterior: Posterior, given: list[Any]) -> None:
     """Raise InputError where a run would go on with other observations than it began with."""
-    begun, given = provenance.get("observations", []), _names(observations)
-    if begun != given:
+    begun, now = provenance.get("observations", {}), _fingerprint(posterior, given)
+    advice = "give the same to bayesreg.run(..., observations=[...])"
+    if list(begun) != list(now):
         raise InputError(
-            f"the run in {out} began with the observations {begun or 'none'} besides its images, and is resumed with "
-            f"{given or 'none'}: give the same to bayesreg.run(..., observations=[...])"
+            f"the run in {out} began with the observations {list(begun) or 'none'} besides those of its configuration, "
+            f"and is resumed with {list(now) or 'none'}: {advice}"
         )
+    for name, log in now.items():
+        if not np.isclose(log, begun[name], rtol=1e-6, equal_nan=True):
+            raise InputError(
+                f"the run in {out} began with another observation {name!r} than it is resumed with: their logs at one "
+                f"displacement are {begun[name]:g} and {log:g}; {advice}"
+            )
 
 
 def _narrator(progress: bool) -> Callable[[str], None]:
@@ -281,9 +298,10 @@ def _finish(
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
+    mean = mean_values(posterior, draws, samples.u_mean)
     predicted = predict(posterior, draws, samples.u_mean, samples.u_sd, config.report.places, config.seed)
     finished = Run(
-        manifest=manifest(config, inputs, posterior, samples, draws, judged, provenance, began),
+        manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began),
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
         warped=_warp(inputs, mean_field),

@@ -28,7 +28,7 @@ def eigenvalues(folder: Path) -> np.ndarray:
     known = posterior.reference()
     last = known | {name: jnp.asarray(draws[name].values[0, -1], float) for name in known if name in draws}
     estimands = posterior.estimands(last)
-    without_images = posterior.data.with_block("t_similarity", Scale(jnp.asarray(1e30)))
+    without_images = posterior.data._replace(blocks={**posterior.data.blocks, "t_similarity": Scale(jnp.asarray(1e30))})
     both, prior = (
         posterior.mode_search.curvature(data, estimands).gauss_newton for data in (posterior.data, without_images)
     )

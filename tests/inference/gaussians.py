@@ -87,6 +87,8 @@ class ModeSearch:
     def __init__(self, data):
         self.data = data
 
+    scales = ()
+
     def continuation(self):
         yield self.data
 

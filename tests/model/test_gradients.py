@@ -137,7 +137,7 @@ def test_curvature_follows_lam_and_mu():
     """The response of the free nodes is kept while these stay, and no longer: there and back, and at two places."""
     post = posterior()
     u = state(LAM, MU)["u_boundary"]
-    data = post.data.with_block("t_similarity", Scale(jnp.asarray(1e12)))
+    data = post.data._replace(blocks={**post.data.blocks, "t_similarity": Scale(jnp.asarray(1e12))})
     soft, stiff, again = (
         post.mode_search.curvature(data, {"u_boundary": u, "lam": factor * LAM, "mu": factor * MU}).gauss_newton
         for factor in (1.0, 2.0, 1.0)

@@ -13,6 +13,8 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.fem.location import interpolation_at
 from bayesreg.model import curvature
+from bayesreg.model.adequacy import describe_observations
+from bayesreg.model.build import require_observations
 from bayesreg.model.curvature import _assemble, _outside_curvature, _Seen
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.state import State
@@ -178,41 +180,50 @@ def test_left_out_landmarks_are_predicted_as_by_a_posterior_without_them():
 
 
 def test_a_landmark_that_nothing_else_determines_is_told():
-    """Without a rigid prior one landmark alone says where the body is; two leave a turn about their line."""
+    """Without a rigid prior three landmarks say where the body is; any two of them leave a turn about their line."""
     model = MODEL.model_copy(update={"rigid_sd": None})
     rest = {"u_boundary": jnp.zeros((len(MESH.boundary), 3))}
-    for count in (1, 2):
-        points, moved, sd = (part[:count] for part in places())
-        post = br.build_posterior(mesh=MESH, observations=[br.Landmarks(points, moved, sd)], model=model)
-        found = leave_out(post, post.data.terms["landmarks"], rest)
-        assert np.isnan(found.residual).all()
-        assert np.isinf(found.covariance).all()
+    points, moved, sd = (part[:3] for part in places())
+    post = br.build_posterior(mesh=MESH, observations=[br.Landmarks(points, moved, sd)], model=model)
+    found = leave_out(post, post.data.terms["landmarks"], rest)
+    assert np.isnan(found.residual).all()
+    assert np.isinf(found.covariance).all()
 
 
-def test_an_inferred_sd_has_the_posterior_of_its_evidence():
+# The wider prior allows the sd of the joint mode, next to zero, where the nodes follow every landmark.
+@pytest.mark.parametrize(("median", "log_sd"), [(0.3, 0.7), (1.5, 1.0)])
+def test_an_inferred_sd_has_the_posterior_of_its_evidence(median, log_sd):
     """The displacements are integrated out in closed form: the shifts are N(0, A Σ Aᵀ + sd² I) given sd."""
     points, moved, _ = places()
-    sd = br.ScalePrior(median=0.3, log_sd=0.7)
-    observed = [br.Landmarks(points, moved, sd)]
+    observed = [br.Landmarks(points, moved, br.ScalePrior(median=median, log_sd=log_sd))]
     post = br.build_posterior(mesh=MESH, observations=observed, model=MODEL)
     precision, whole = prior()
     A = np.kron(barycentric(points), np.eye(3)) @ whole
     spread, shift = A @ np.linalg.solve(precision, A.T), (moved - points).ravel()
-    log_sd = np.linspace(np.log(0.3) - 3, np.log(0.3) + 3, 400)
+    grid = np.linspace(np.log(0.3) - 4, np.log(0.3) + 4, 400)
     height = [
         stats.multivariate_normal.logpdf(shift, np.zeros(len(shift)), spread + np.exp(2 * s) * np.eye(len(shift)))
-        + stats.norm.logpdf(s, np.log(0.3), 0.7)
-        for s in log_sd
+        + stats.norm.logpdf(s, np.log(median), log_sd)
+        for s in grid
     ]
     weight = np.exp(np.array(height) - max(height))
     weight /= weight.sum()
-    expected = weight @ log_sd
-    deviation = np.sqrt(weight @ (log_sd - expected) ** 2)
+    expected = weight @ grid
+    deviation = np.sqrt(weight @ (grid - expected) ** 2)
+
     found = br.sample(post, "hmc", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
     draws = np.log(found.idata.posterior["landmarks_sd"].values)[:, 20:]
     error = draws.mean(axis=1).std(ddof=1) / np.sqrt(CHAINS)
     assert abs(draws.mean() - expected) < 4 * error + 0.02 * deviation
     assert draws.std() == pytest.approx(deviation, rel=0.12)
+
+    # Laplace's approximation is at the evidence's greatest value, and as wide as its curvature there.
+    best = np.argmax(height)
+    second = (height[best + 1] - 2 * height[best] + height[best - 1]) / (grid[1] - grid[0]) ** 2
+    found = br.sample(post, "laplace", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
+    draws = np.log(found.idata.posterior["landmarks_sd"].values)
+    assert draws.mean() == pytest.approx(grid[best], abs=0.1 * deviation + grid[1] - grid[0])
+    assert draws.std() == pytest.approx((-second) ** -0.5, rel=0.05)
 
 
 def test_the_papers_kernel_runs_with_them():
@@ -309,19 +320,31 @@ def test_curvature_that_points_share_is_the_sum_of_products():
     np.testing.assert_allclose(found.toarray(), rows.T @ of_points.reshape(27, 27) @ rows, atol=1e-12)
 
 
-class Wrong:
-    name = "wrong"
+class Own:
+    name = "own"
 
-    def log(self, state):
-        return jnp.zeros(3)
+    def __init__(self, log, **other):
+        self.log = log
+        vars(self).update(other)
+
+
+TWO = br.Landmarks([[1.0, 1, 1], [2.0, 1, 1]], [[1.0, 1, 1], [2.0, 1, 1]], 1.0)
+LOOSE = MODEL.model_copy(update={"rigid_sd": None})
 
 
 @pytest.mark.parametrize(
     ("observations", "message"),
     [
         ([], "nothing observed"),
-        ([3], "needs a name and a function log"),
-        ([Wrong()], "must give one real number, got shape"),
+        ([3], "needs a name .* and a function log"),
+        ([Own(lambda state: jnp.zeros(3))], "must give one real number, got shape"),
+        ([Own(lambda state: None)], "must give one real number, got NoneType"),
+        ([Own(3)], "needs a name .* and a function log"),
+        ([Own(lambda state: jnp.zeros(()), name=None)], "needs a name .* and a function log"),
+        ([Own(lambda state: jnp.zeros(()), name="prior_lam")], "'prior_lam' of an observation is taken"),
+        ([Own(lambda state: jnp.log(state.u[0, 0] - 1.0))], "'own' is not a number where nothing has moved"),
+        ([Own(lambda state: -jnp.linalg.norm(state.u[0]))], "'own' has a derivative that is not a number"),
+        ([Own(lambda state: state.at([1.0, 1.0, 1.0]).sum())], "points of shape"),
         ([landmarks(), landmarks()], "'landmarks' of an observation is taken"),
         ([br.Landmarks([[1.0, 1, 1]], [[1.0, 1, 1]], 1.0, name="elastic")], "'elastic' of an observation is taken"),
         (
@@ -343,13 +366,61 @@ def test_wrong_observations_are_told(observations, message):
         ((np.zeros((2, 3)), np.zeros((2, 3)), [1.0, 2.0, 3.0]), "one for each point"),
         ((np.zeros((2, 3)), np.zeros((2, 3)), 0.0), "must be positive"),
         ((np.zeros((2, 3)), np.zeros((2, 3)), "wide"), "sd must be a number, 2 numbers or a ScalePrior; got 'wide'"),
+        ((np.zeros((2, 3)), np.zeros((2, 3)), None), "sd is not a number"),
+        (([[1.0, 2.0], [1.0]], np.zeros((2, 3)), 1.0), "points must be numbers"),
         ((np.zeros((1, 3)), np.full((1, 3), np.nan), 1.0), "finite number"),
-        ((np.zeros((2, 3)), np.zeros((2, 3)), 1.0, "pairs", ["one"]), "pairs: there must be 2 labels"),
+        ((np.zeros((2, 3)), np.zeros((2, 3)), 1.0, "pairs", ["one"]), "pairs: labels must be a list of 2"),
     ],
 )
 def test_wrong_landmarks_are_told(arguments, message):
     with pytest.raises(br.InputError, match=message):
         br.Landmarks(*arguments)
+
+
+def test_one_observation_alone_is_put_in_a_list():
+    with pytest.raises(br.InputError, match="observations must be a list, got Landmarks"):
+        require_observations(landmarks())
+
+
+def test_landmarks_must_bound_the_rigid_motions():
+    """Two points, or three on a line, leave them free unless a prior or nodes that are held do not."""
+    for few in (TWO, br.Landmarks([[x, 1.0, 1.0] for x in (0.5, 1.0, 1.5)], np.zeros((3, 3)), 1.0)):
+        with pytest.raises(br.InputError, match="the posterior would be improper; give at least three"):
+            br.build_posterior(mesh=MESH, observations=[few], model=LOOSE)
+    held = LOOSE.model_copy(update={"held": {int(MESH.boundary[0]): (0.0, 0.0, 0.0)}})
+    for model, observations in ((MODEL, [TWO]), (held, [TWO]), (LOOSE, [landmarks()])):
+        br.build_posterior(mesh=MESH, observations=observations, model=model)
+
+
+def test_options_of_images_without_images_are_told():
+    model = MODEL.model_copy(update={"t_similarity": br.TemperaturePrior(median=0.1)})
+    with pytest.raises(br.InputError, match=r"model.t_similarity says how images are compared, and none are"):
+        br.build_posterior(mesh=MESH, observations=[landmarks()], model=model)
+
+
+def test_unknown_names_of_values_are_told():
+    post = posterior()
+    with pytest.raises(br.InputError, match="values hold the unknown t_simlarity"):
+        post.logdensity_constrained({**post.reference(), "t_simlarity": 1.0})
+
+
+def test_observations_say_how_they_fit():
+    """By the root of the mean square of their residuals over the sd, if they know these."""
+    points, moved, sd = places()
+    own = Own(lambda state: -0.5 * (state.u[3] ** 2).sum(), standardised_residual=lambda state: state.u[3])
+    post = br.build_posterior(
+        mesh=MESH, observations=[landmarks(), own, Own(lambda state: state.u[0, 0], name="shift")], model=MODEL
+    )
+    told = describe_observations(post, post.reference())
+    z = (moved - points) / sd[:, None]
+    assert told["landmarks"] == {
+        "kind": "landmarks",
+        "log": pytest.approx(-0.5 * (z**2).sum()),
+        "values": z.size,
+        "residual_rms": pytest.approx(np.sqrt((z**2).mean())),
+    }
+    assert told["own"] == {"kind": "own", "log": 0.0, "values": 3, "residual_rms": 0.0}
+    assert told["shift"] == {"kind": "own", "log": 0.0}
 
 
 def test_two_forms_at_once_and_half_a_pair_are_told():

@@ -237,6 +237,7 @@ def manifest(uniform: bool, converged: bool) -> dict:
         "steps_per_second_per_chain": 63.4,
         "residual_sd": 0.0151,
         "implied_noise_sd": 0.0146,
+        "observations": {"images": {"kind": "images", "log": -6021.4, "values": 12_000, "residual_rms": 1.03}},
         "model": {
             "elasticity": "uniform" if uniform else "tissue",
             "t_similarity": 0.05,

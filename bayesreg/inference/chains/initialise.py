@@ -102,7 +102,7 @@ def require_numbers(points: Estimands) -> None:
 def require_density(found: Evaluation) -> None:
     """Raise InputError where a chain (leading axis) would start with density zero."""
     for chain in np.flatnonzero(~np.isfinite(found.logdensity)):
-        why = "a node lies in the skull or a parameter outside its prior's range"
+        why = "a node lies in the skull, or a parameter outside its prior's range or without end"
         if not found.outside_support[chain]:
             why = "the elastic solve failed" if found.solver_failed[chain] else "it is not a number"
         raise InputError(

@@ -38,11 +38,25 @@ class ImagePair:
         f and m; their intensities are taken as they are.
     name : str, default "images"
         Its name in tables and in the NumPyro program.
+
+    Raises
+    ------
+    InputError
+        If one is no image.
+
+    Notes
+    -----
+    All pairs of a posterior share the options of the model, T_s among them.
     """
 
     fixed: Image
     moving: Image
     name: str = "images"
+
+    def __post_init__(self) -> None:
+        for which in ("fixed", "moving"):
+            if not isinstance(given := getattr(self, which), Image):
+                raise InputError(f"{self.name}: {which} must be an Image, got {type(given).__name__}; see load_image")
 
     def on(self, mesh: TetMesh, model: ModelConfig) -> ComparedImages:
         """The term on a mesh.
@@ -168,6 +182,11 @@ class ComparedImages(NamedTuple):
     def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q))."""
         return self.similarity.residuals(self.pair(self.predicted(u)))
+
+    def standardised_residual(self, state: State) -> Float[AnyArray, "points"]:
+        """`residuals` in units of the sd that the model gives them."""
+        scale = state.values["t_similarity"] / (2 * self.quadrature.weights)
+        return self.residuals(state.u) / jnp.sqrt(self.similarity.variance() * scale)
 
     def standardised_noise(self, key: AnyArray, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""

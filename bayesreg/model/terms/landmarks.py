@@ -52,16 +52,16 @@ class Landmarks:
         name: str = "landmarks",
         labels: Sequence[str] | None = None,
     ) -> None:
-        self.fixed_points, self.moving_points = np.asarray(fixed_points, float), np.asarray(moving_points, float)
+        self.fixed_points, self.moving_points = (_points(given, name) for given in (fixed_points, moving_points))
         shapes = self.fixed_points.shape, self.moving_points.shape
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3 or not shapes[0][0]:
             raise InputError(f"{name}: fixed_points and moving_points must both have shape (k, 3), got {shapes}")
         count = shapes[0][0]
         if not all(np.isfinite(part).all() for part in (self.fixed_points, self.moving_points)):
             raise InputError(f"{name}: every coordinate must be a finite number")
-        if labels is not None and len(labels) != count:
-            raise InputError(f"{name}: there must be {count} labels, one for each point; got {len(labels)}")
-        self.name, self.labels = name, tuple(labels or map(str, range(1, count + 1)))
+        if isinstance(labels, str) or (labels is not None and len(labels) != count):
+            raise InputError(f"{name}: labels must be a list of {count}, one for each point; got {labels!r:.60}")
+        self.name, self.labels = name, tuple(map(str, range(1, count + 1) if labels is None else labels))
         self.prior = sd if isinstance(sd, ScalePrior) else None
         self.sd = _known_sd(self.prior.median if self.prior else sd, count, name)
 
@@ -86,6 +86,13 @@ class Landmarks:
         )
 
 
+def _points(given: Any, name: str) -> np.ndarray:
+    try:
+        return np.asarray(given, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: points must be numbers in an array of shape (k, 3)") from None
+
+
 def _known_sd(sd: Any, count: int, name: str) -> Float[np.ndarray, "k"]:
     try:
         sd = np.asarray(sd, float)
@@ -94,6 +101,8 @@ def _known_sd(sd: Any, count: int, name: str) -> Float[np.ndarray, "k"]:
     if np.ndim(sd) and np.shape(sd) != (count,):
         raise InputError(f"{name}: sd must be one number or {count}, one for each point; got {np.shape(sd)}")
     found = np.broadcast_to(sd, (count,)).copy()
+    if np.isnan(found).all():
+        raise InputError(f"{name}: sd is not a number; give one, mm, or a ScalePrior to have it inferred")
     if not (np.isfinite(found) & (found > 0)).all():
         raise InputError(f"{name}: every sd must be positive, mm; got {found.tolist()}")
     return found

@@ -49,6 +49,14 @@ class Support(Protocol):
         """Whether the density may be positive there."""
 
 
+@runtime_checkable
+class Standardised(Protocol):
+    """A term that knows its residuals; the report shows their root mean square."""
+
+    def standardised_residual(self, state: State) -> AnyArray:
+        """Residuals in units of their standard deviation: where the model holds their mean square is about one."""
+
+
 class SharedCurvature(NamedTuple):
     """Curvature that groups of points have together: Σ_r s_r Σ_k g_rk g_rkᵀ, where g_rk holds v_rq for q in group k.
 
