@@ -13,7 +13,8 @@ from bayesreg.types import InputError
 
 # Wide enough to lead back a body that has strayed from what is allowed, mm.
 MARGIN = 16.0
-# Of the smoothing, voxels: its standard deviation, where it ends, and what is left of a voxel centre's own side.
+# The smoothing: its standard deviation and its reach, voxels, and the least distance, voxels, of a voxel centre from
+# the surface.
 _SMOOTHING, _END, _KEPT = 1.0, 4, 0.02
 
 

@@ -79,7 +79,7 @@ def _with_gradient(
 def _with_gradient_jvp(
     method: Interpolation, primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]
 ) -> tuple[Any, Any]:
-    # Of second derivatives; what has chains as columns has none of its own.
+    # This serves second derivatives: functions with chains as columns have none of their own.
     looked = _in_batches(partial(_value_and_gradient_at, _SPLINES[method]))
     return jax.jvp(partial(_of_one_chain, looked, primals[0]), primals[1:], tangents[1:])
 

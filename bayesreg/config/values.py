@@ -59,7 +59,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if length == 0:
         raise ValueError("expected a direction that is not zero")
     if math.isclose(length, 1, rel_tol=1e-12):
-        return vector  # What was written out as resolved reads back unchanged.
+        return vector  # A resolved configuration reads back unchanged.
     x, y, z = (component / length for component in vector)
     return x, y, z
 

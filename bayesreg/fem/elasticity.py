@@ -124,7 +124,7 @@ def force_between(
 
 @force_between.defjvp
 def _force_between_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[AnyArray, AnyArray]:
-    # What has chains as columns has no derivative: where one is asked for, the same formula gives it.
+    # Functions with chains as columns have no derivative: where one is asked for, the same formula gives it.
     *shared, lam, mu, u = primals
 
     def force(*given: AnyArray) -> AnyArray:

@@ -14,7 +14,7 @@ from bayesreg.mesh import FACES
 # standard deviations of millimetres and the longest autocorrelation times of all.
 FEWEST = 6
 LEAST_MEAN_RATIO = 0.1
-# In the place of a node: beyond the boundary.
+# Stands for the neighbour of a face of the boundary.
 _OUTSIDE = -1
 
 

@@ -21,7 +21,7 @@ from bayesreg.types import InputError
 
 FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
 PLAIN = ("x", "y", "z")
-# What takes points in a file's system to RAS.
+# Factors that take points in a file's system to RAS.
 SYSTEMS = {"RAS": (1.0, 1.0, 1.0), "0": (1.0, 1.0, 1.0), "LPS": (-1.0, -1.0, 1.0), "1": (-1.0, -1.0, 1.0)}
 
 

@@ -48,7 +48,7 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
     images = folder / "inputs"
     images.mkdir(parents=True, exist_ok=True)
     names = [name for name in ("fixed", "moving", "tissue", "skull") if getattr(inputs, name) is not None]
-    # What compresses lets other threads run.
+    # The compression lets other threads run.
     with ThreadPoolExecutor() as pool:
         list(pool.map(lambda name: save_image(getattr(inputs, name), images / f"{name}.nii.gz"), names))
     if inputs.truth is not None:

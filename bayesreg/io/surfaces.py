@@ -17,7 +17,7 @@ from bayesreg.io.domain import main_part
 from bayesreg.mesh import signed_volumes
 from bayesreg.tissues import BRAIN, is_fluid
 
-# In units of the edge length: what the mesh cannot show is smoothed away (standard deviation), and the
+# In units of the edge length: detail that the mesh cannot show is smoothed away (standard deviation), and the
 # triangles that describe the rest need not be finer than the stride.
 SMOOTHING = 0.22
 FLUID_SMOOTHING = 0.12

@@ -22,11 +22,12 @@ from bayesreg.model.single_node import images_of
 from bayesreg.model.state import StaticMesh
 from bayesreg.model.terms.images import ImagePair
 
-# Of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance can tell.
+# Tolerance of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance
+# can tell.
 CHAIN_TOLERANCE = 1e-6
 
-# Of the solves behind their slopes. A slope that is a little off, and the same at the same place, leaves what is
-# sampled as it is: it only proposes.
+# Tolerance of the solves behind their slopes. A slope that is a little off, and the same at the same place, leaves the
+# sampled density as it is: it only proposes.
 CHAIN_ADJOINT_TOLERANCE = 1e-3
 
 # Solves are preconditioned at λ and μ within this factor of the posterior's own reference.

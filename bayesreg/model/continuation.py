@@ -64,5 +64,5 @@ def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
             yield made
         yield coming.result()
     finally:
-        # Who has had enough does not wait for what is under way.
+        # A caller that stops early does not wait for problems that are still being made.
         pool.shutdown(wait=False, cancel_futures=True)

@@ -86,7 +86,7 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
 
     def reduced(nodal: scipy.sparse.csr_matrix) -> np.ndarray:
         """The curvature in (z, u_B) of one in all nodes."""
-        # What is sampled moves by itself, and the rest by W.
+        # Sampled nodes move by themselves, and the others by W.
         cross = nodal[sampled][:, free] @ W
         found = W.T @ (nodal[free][:, free] @ W)
         found[modes:] += cross
@@ -114,7 +114,7 @@ def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix
 
 
 class _Seen(NamedTuple):
-    """Where a term from outside is looked at (a pytree): what a state is made of, but for the displacements."""
+    """The place at which a term from outside is differentiated (a pytree): a state less its displacements."""
 
     problem: Problem
     values: dict[str, AnyArray]

@@ -188,7 +188,7 @@ class ModelConfig(BaseModel):
                 raise wrong("normalised", "expected false where no node is sampled: a given u_B has no prior")
             self._require_rest()
         if self.normalised or self.is_elastography:
-            # Of a mesh without named tissues one at least is free, or known as `known` says.
+            # Where the options name no tissue, the mesh has one at least, which is free or known as `known` says.
             self.require_proper_priors(self._named_tissues or ("the tissue",))
         return self
 

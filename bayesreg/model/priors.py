@@ -73,7 +73,7 @@ class RangeTransform(Transform):
     @jax.jit
     def _inverse(self, x: AnyArray) -> AnyArray:
         share, endless = (x - self.low) / self._width, jnp.isinf(self.high)
-        # Of the two tails the lesser, and of what is not taken nothing that has no gradient.
+        # The lesser of the two tails; a branch that is not taken must have a gradient all the same.
         upper, far = endless & (share >= 0.5), endless & (share > 600)
         small, middle, beyond = (jnp.where(taken, share, 1.0) for taken in (endless & ~upper, upper & ~far, far))
         tail = jnp.where(endless, jnp.where(upper, jnp.exp(-middle), -jnp.expm1(-small)), share)

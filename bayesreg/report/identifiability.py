@@ -23,7 +23,7 @@ IDENTIFIED = 10.0
 REACHES_ZERO = 20.0
 # … and, of a ratio, the bound is within this factor of the median.
 BOUND = 5.0
-# As wide as the prior, or nearly.
+# An interval of at least this share of the prior’s is called as wide as the prior.
 PRIOR_SHARE = 0.8
 LAME = ("lam", "mu")
 

@@ -130,7 +130,7 @@ def recalibrate(
         expected = known(np.exp(-candidates))
         weight = logsumexp([student.logpdf(-np.log(draw) - expected) for draw in some], axis=0)
         heavy = candidates[weight > weight.max() + np.log(LEAST_WEIGHT)]
-        # As uniform as before, and half as far again: what lies between candidates is not cut off.
+        # The new range reaches half as far again, so that nothing between two candidates is cut off.
         margin = (heavy.max(axis=0) - heavy.min(axis=0)) / 2 + (high - low) / CANDIDATES ** (1 / tissues)
         low = np.maximum(heavy.min(axis=0) - margin, low)
         high = np.minimum(heavy.max(axis=0) + margin, high)

@@ -19,7 +19,7 @@ from bayesreg.synthetic.recalibration import least_bodies
 from bayesreg.types import InputError
 from bayesreg.workflow.result import Result, load_result, report
 
-# Of the finer mesh's edges to those of the registering one.
+# Ratio of the finer mesh's edges to those of the registering one.
 FINER = 0.6
 
 
@@ -70,14 +70,14 @@ def _require_ratios(result: Result) -> None:
     run, model = result.run, model_of(result.run.config)
     if model.elasticity != "tissue" or not sought_tissues(model, run.mesh.names):
         raise InputError(
-            "the mesh's share is that of λ/μ by tissue: the run needs elasticity: tissue, and a solid tissue of "
-            "which λ or μ is free"
+            "the mesh errs in λ/μ by tissue: the run needs elasticity: tissue, and a solid tissue of which λ or μ is "
+            "free"
         )
     if run.boundary is not None or model.held or model.is_elastography:
         raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
     if list(run.manifest["observations"]) != ["images"]:
         raise InputError(
-            "bodies are registered by one pair of images: the run must have observed nothing else; it observed "
+            "bodies are registered by one pair of images: the run must have observed nothing else; this one observed "
             f"{', '.join(run.manifest['observations'])}"
         )
     if run.skull is None:

@@ -236,7 +236,7 @@ def _load_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
 
 
 def _as_stored(image: Image) -> Image:
-    """In the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
+    """Round to the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
     voxels = np.asarray(image.voxels)
     return Image(voxels.astype(np.float32) if voxels.dtype.kind == "f" else voxels, image.affine.astype(np.float32))
 

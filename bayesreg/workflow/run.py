@@ -46,7 +46,7 @@ from bayesreg.workflow.result import Result, load_result, report
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
 # whole state is written.
 BLOCK, POINTS, FEWEST = 100, 20_000, 10
-# Where several processes wait for one another.
+# The points at which several processes wait for one another.
 BEGUN, KEPT, SAMPLED, ENDED = (
     "the run has begun",
     "a block of draws is kept",
@@ -101,7 +101,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
     A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
     """
     require_joined(config.sampler.chains)
-    # Where a run is made is no part of it.
+    # The machines that share a run are no part of it.
     config = config.model_copy(update={"distributed": None})
     if is_first():
         result = _run(config, out, resume, progress, observations)

@@ -97,13 +97,9 @@ def grid_posterior():
     return [(axis, weights / weights.sum()) for axis, weights in ((lam, mass.sum(axis=1)), (mu, mass.sum(axis=0)))]
 
 
-@pytest.fixture(scope="module")
-def draws():
-    return br.sample(posterior(), "hmc", chains=4, draws=300, seed=0, warm_up=40, block=300, progress=False)
-
-
 @pytest.mark.slow
-def test_draws_follow_the_posterior_on_a_grid(draws):
+def test_draws_follow_the_posterior_on_a_grid():
+    draws = br.sample(posterior(), "hmc", chains=4, draws=300, seed=0, warm_up=40, block=300, progress=False)
     found = convergence(draws.idata)
     sampled = draws.idata.posterior["lam"].values[..., 1], draws.idata.posterior["mu"].values[..., 2]
     ess = float(found.ess_bulk["lam"][1]), float(found.ess_bulk["mu"][2])
@@ -113,18 +109,12 @@ def test_draws_follow_the_posterior_on_a_grid(draws):
         assert count > 400
         assert abs(chain_draws.mean() - mean) < 4 * sd / np.sqrt(count)
         assert chain_draws.std() == pytest.approx(sd, rel=4 / np.sqrt(2 * count))
-
-
-@pytest.mark.slow
-def test_intervals_contain_the_truth(draws):
+    # Intervals contain the truth.
     for name, index, truth in (("lam", 1, LAM[1]), ("mu", 2, MU[2])):
         low, high = np.quantile(draws.idata.posterior[name].values[..., index], (0.025, 0.975))
         assert low < truth < high
         assert high - low < 0.1 * (RANGE[name][1] - RANGE[name][0])
-
-
-@pytest.mark.slow
-def test_no_displacement_is_an_estimand(draws):
+    # No displacement is an estimand.
     assert draws.idata.posterior["u_boundary"].shape == (4, 300, 0, 3)
     boundary = MESH.boundary
     np.testing.assert_allclose(draws.u_mean[boundary], phantom()[3][boundary], rtol=1e-12)

@@ -70,7 +70,7 @@ def test_an_inverted_contrast_is_registered_where_squared_differences_fail():
 
 @pytest.mark.slow
 def test_trajectories_agree_with_the_approximation():
-    error, away, found = registered("lncc", INVERTED, "hmc", chains=4, draws=100, warm_up=50, block=100)
+    error, away, found = registered("lncc", INVERTED, "hmc", chains=2, draws=60, warm_up=30, block=60)
     quick_error, _, quick = registered("lncc", INVERTED, "laplace", **QUICK)
     sd, quick_sd = (r.idata.posterior["u_boundary"].std(("chain", "draw")).values for r in (found, quick))
     print(f"error {error:.3f} mm, {quick_error:.3f} of laplace; {away:.2f} sd; sd {np.median(sd / quick_sd):.3f}")

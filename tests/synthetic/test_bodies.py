@@ -150,7 +150,8 @@ def test_a_damaged_file_is_told(tmp_path, content):
         ({"config": "model: {held: {0: [0.0, 0.0, 0.0]}}"}, "must not be held"),
         ({"config": "model: {elasticity: uniform}"}, "elasticity: tissue"),
         ({"config": "model: {fixed: {lam: 9.0, mu: 1.0}}"}, "elasticity: tissue"),
-        ({"manifest": {"inverted_elements": 2}}, "inside out"),
+        ({"manifest": {"observations": {"images": {}}, "inverted_elements": 2}}, "inside out"),
+        ({"manifest": {"observations": {"images": {}, "landmarks": {}}}}, "observed images, landmarks"),
         ({"mesh": ("csf", "fluid", "FLUID")}, "and a solid tissue"),
     ],
 )

@@ -166,7 +166,7 @@ def about_gaussian(
 
     data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
-    # What is approximate anyway does without the normaliser's own value.
+    # A sampler that is approximate anyway does without the normaliser's own value.
     if has_costly_normaliser(target) and exact:
         sampler = _with_normaliser(target, sampler)
     return _with_loose_nodes(target, sampler, begin, density) if alone else sampler
@@ -194,8 +194,8 @@ def _warm_up(
     setup, points, path = tune(_condition(target, setup), walk, setup, points, key_tune, stage, say=say)
     if settling is None or path is None:
         return setup, points
-    # Of the second stage alone, where trajectories are whole from the first: before, they are short, and chains on
-    # their way.
+    # The slowest nodes are those of the second stage, whose trajectories are whole from the first: before, they are
+    # short, and chains are on their way.
     nodes = find_slowest(np.asarray(path), alone)
     say(f"nodes that are moved alone, too: {', '.join(map(str, np.asarray(target.variables.coords['node'])[nodes]))}")
     late = np.concatenate([np.asarray(part[len(part) // 4 :, :, nodes]) for part in (settling, path)])

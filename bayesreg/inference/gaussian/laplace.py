@@ -18,13 +18,13 @@ from bayesreg.inference.layout import marked, unravel
 from bayesreg.inference.target import Curvature, Target, estimands_of, logdensity, without_walls
 from bayesreg.types import AnyArray, InputError
 
-# So many times what is expected of any of its kind, a parameter has no end.
+# A parameter that exceeds so many times the greatest start value of its kind runs away.
 FAR = 1e6
-# Of coordinates other than the displacements, where these alone are moved.
+# Precision of the other coordinates where the displacements alone are moved.
 ALONE = 10.0
-# Of differences between gradients, in Normal scores and logarithms.
+# Step of differences between gradients, in Normal scores and logarithms.
 STEP = 1e-4
-# Of differences between curvatures, in the logarithm of a scale of which they are a power.
+# Step of differences between curvatures, which are powers of a scale, in the logarithm of that scale.
 SCALE_STEP = 0.01
 # Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
 LEAST_RATIO = 0.25

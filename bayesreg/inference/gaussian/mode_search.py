@@ -152,7 +152,7 @@ def _improve(
     shift = np.zeros(node_count(target)) if shift is None else shift
     gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves), mark_scales(target)))
     if not moves:
-        # The same for all displacements.
+        # The normaliser is the same for all displacements.
         data = without_normaliser(target, data)
     moving, own = 1 - mark_scales(target).astype(float), displacements(target)
     if not moves:

@@ -50,7 +50,7 @@ def leave_pockets(
         Their rows of "u_boundary".
     """
     count, moved = node_count(target), []
-    # The same for all displacements.
+    # The normaliser is the same for all displacements.
     data = without_normaliser(target, target.data)
     estimands = estimands_of(target, data, unravel(target)(jnp.asarray(flat)))
     for first in range(0, 0 if target.single_nodes is None else count, AT_A_TIME):

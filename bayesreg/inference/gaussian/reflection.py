@@ -154,7 +154,7 @@ def rotate(
 def shift(
     walls: Walls, clearance: Clearance, position: AnyArray, momentum: AnyArray, time: AnyArray | float
 ) -> tuple[AnyArray, AnyArray]:
-    """As `rotate`, in a straight line."""
+    """Move in a straight line, and reflect at the walls as `rotate` does."""
     return _reflect(_shift, walls, clearance, position, momentum, time)
 
 

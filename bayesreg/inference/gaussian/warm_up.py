@@ -15,7 +15,7 @@ from bayesreg.types import AnyArray
 
 # The tuning of the step starts here, and is drawn to ten times as much.
 FIRST_STEP = 0.05
-# Of a trajectory while chains are tuned apart: it ends when the slowest of them does.
+# Steps of a trajectory while chains are tuned apart: it ends when the slowest of them does.
 FEW_STEPS = 8
 
 

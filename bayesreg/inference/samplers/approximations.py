@@ -51,7 +51,7 @@ def _turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: _Place)
 
 
 def pathfinder(target: Target, settings: Pathfinder) -> Sampler:
-    """As `laplace`, from Pathfinder's Gaussian (Zhang et al. 2022): that of the greatest evidence bound on a path.
+    """Draw from Pathfinder's Gaussian (Zhang et al. 2022): that of the greatest evidence bound on a path.
 
     The path is that of L-BFGS in the coordinates that Laplace's approximation whitens, from an overdispersed start; the
     skull is soft there, and cuts off the draws.

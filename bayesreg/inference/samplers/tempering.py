@@ -114,7 +114,7 @@ def _rise(
     def broad(xi: AnyArray) -> AnyArray:
         return -0.5 * (xi @ xi) / spread**2
 
-    # That of the tempered gaussian, about which trajectories rotate.
+    # The precision of the tempered Gaussian, about which trajectories rotate.
     precision = (1 - state.tempering_param) / spread**2 + state.tempering_param
     kernel = adaptive_tempered.build_kernel(
         broad,

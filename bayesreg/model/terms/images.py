@@ -106,7 +106,7 @@ class ImagePair:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Comparison:
-    """What is static of a comparison of two images.
+    """The static part of a comparison of two images.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class ComparedImages(NamedTuple):
         return _gauss_newton(self, u, values["t_similarity"])
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """What the exact curvature of E_s / T_s has besides, 1/mm²."""
+        """The rest of the exact curvature of E_s / T_s, 1/mm²."""
         return _remainder(self, u, values["t_similarity"])
 
 
