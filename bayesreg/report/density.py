@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,7 +22,7 @@ E_S = {
 KINDS = {"images": "pair of images", "landmarks": "pairs of points", "own": "an observation of your own"}
 
 
-def formula(manifest: Mapping[str, Any], elastography: bool, has_skull: bool) -> Markup:
+def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
     """The logarithm of the density as a sum of its terms.
 
     Parameters
@@ -29,7 +30,6 @@ def formula(manifest: Mapping[str, Any], elastography: bool, has_skull: bool) ->
     manifest : mapping
     elastography : bool
         Whether the displacement of the boundary is given, and so has no prior.
-    has_skull : bool
     """
     observed, model = part(manifest, "observations") or {}, part(manifest, "model") or {}
     several = len(_pairs_of_images(manifest)) > 1
@@ -44,10 +44,10 @@ def formula(manifest: Mapping[str, Any], elastography: bool, has_skull: bool) ->
         " − <var>E</var><sub>r</sub> / <var>T</var><sub>r</sub>": True,
         " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": model.get("normalised"),
         " + log p(rigid motion of <var>u</var>)": model.get("rigid_sd") is not None,
-        " + log p(no node in the skull)": has_skull,
     }
     found += Markup("".join(text for text, holds in priors.items() if holds and not elastography))
-    return found + Markup(" + log p(λ) + log p(μ)") + _priors_of_scales(model)
+    total = found + Markup(" + log p(λ) + log p(μ)") + _priors_of_scales(model)
+    return Markup(re.sub("^ − ", "−", total).removeprefix(" + "))
 
 
 def _priors_of_scales(model: Mapping[str, Any]) -> Markup:

@@ -137,7 +137,8 @@ def write_report(
         "provenance": provenance(run.manifest),
         "config": run.config,
         "elastography": not nodes,
-        "formula": density.formula(run.manifest, not nodes, run.skull is not None),
+        "formula": density.formula(run.manifest, not nodes),
+        "skull": run.skull is not None,
         "similarity_energy": density.similarity_energy(run.manifest),
         "observed": density.observation_table(run.manifest),
     }

@@ -1,0 +1,46 @@
+"""The density in symbols names every term that the run had, and none that it had not."""
+
+import re
+
+from bayesreg.report.density import formula, observation_table, similarity_energy
+
+IMAGES = {"kind": "images", "log": -12.0, "values": 400, "residual_rms": 0.9}
+POINTS = {"kind": "landmarks", "log": -3.0, "values": 24, "residual_rms": 1.1}
+OWN = {"kind": "own", "log": -0.5}
+
+
+def plain(markup):
+    return re.sub("<[^>]*>", "", str(markup))
+
+
+def test_the_papers_density():
+    manifest = {"observations": {"images": IMAGES}, "model": {"normalised": False, "rigid_sd": None}}
+    assert plain(formula(manifest, elastography=False)) == "−Es / Ts − Er / Tr + log p(λ) + log p(μ)"
+    assert plain(formula(manifest, elastography=True)) == "−Es / Ts + log p(λ) + log p(μ)"
+
+
+def test_every_term_is_named():
+    scales = {"t_similarity": {"median": 1.0, "log_sd": 1.0}, "points_sd": {"median": 1.0, "log_sd": 1.0}}
+    model = {"normalised": True, "rigid_sd": 3.0, "similarity": "lncc", **scales}
+    observed = {"images": IMAGES, "t2": IMAGES, "points": POINTS, "<own>": OWN}
+    found = formula({"observations": observed, "model": model}, elastography=False)
+    assert "&lt;own&gt;" in found
+    assert plain(found) == (
+        "−Es(images) / Ts − Es(t2) / Ts + log p(points | u) + log p(&lt;own&gt; | u) − Er / Tr − log Z(λ, μ, Tr) "
+        "+ log p(rigid motion of u) + log p(λ) + log p(μ) + log p(Ts) + log p(points sd)"
+    )
+
+
+def test_landmarks_alone_have_no_similarity():
+    manifest = {"observations": {"points": POINTS}, "model": {}}
+    assert similarity_energy(manifest) is None
+    assert plain(formula(manifest, elastography=False)) == "log p(points | u) − Er / Tr + log p(λ) + log p(μ)"
+
+
+def test_observations_without_residuals_leave_their_cells_empty():
+    table = observation_table({"observations": {"points": POINTS, "own": OWN}})
+    assert table.groups[0][1] == [
+        ["points", "pairs of points", "24", "1.10", "−3.00"],
+        ["own", "an observation of your own", "–", "–", "−0.500"],
+    ]
+    assert observation_table({}) is None
