@@ -3,6 +3,7 @@
 import re
 from contextlib import nullcontext
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
@@ -11,7 +12,8 @@ import bayesreg as br
 from bayesreg.io import store
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import prepared_inputs
-from tests.phantoms import ball_mesh
+from bayesreg.workflow.run import _fingerprint, _require_same_observations
+from tests.phantoms import ball_mesh, box_mesh
 from tests.reportless import without_reports
 from tests.test_tissues import CENTRE, anatomy
 
@@ -154,6 +156,29 @@ def test_an_entry_of_observations_is_overridden_by_its_number(folder):
         br.load_config(path, ["observations.2.sd=1"])
     with pytest.raises(br.InputError, match=r"--set observations.1.sd=wide: observations.1.sd = "):
         br.load_config(path, ["observations.1.sd=wide"])
+
+
+class Near:
+    """The first node has moved by less than a distance, mm: a log that is −∞ elsewhere."""
+
+    name = "near"
+
+    def __init__(self, distance):
+        self.distance = distance
+
+    def log(self, state):
+        return jnp.where(jnp.abs(state.u[0]).max() < self.distance, 0.0, -jnp.inf)
+
+
+def test_an_observation_that_forbids_is_known_again(tmp_path):
+    """Also where its log is −∞ at the displacement at which observations are compared, which JSON writes as null."""
+    posterior = {d: br.build_posterior(mesh=box_mesh(2), observations=[Near(d)]) for d in (1e-6, 100.0)}
+    known = {d: _fingerprint(one, [Near(d)]) for d, one in posterior.items()}
+    assert known == {1e-6: {"near": None}, 100.0: {"near": 0.0}}
+    for distance, one in posterior.items():
+        _require_same_observations(tmp_path, {"observations": known[distance]}, one, [Near(distance)])
+    with pytest.raises(br.InputError, match=r"another observation 'near' .* are None and 0\.0"):
+        _require_same_observations(tmp_path, {"observations": known[1e-6]}, posterior[100.0], [Near(100.0)])
 
 
 def test_nothing_observed_is_told(folder, tmp_path):

@@ -11,8 +11,8 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.draws.predictive import predictive_p
-from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
-from bayesreg.workflow.prediction import default_places, predict, require_inside
+from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
+from bayesreg.workflow.prediction import default_places, mean_values, predict, require_inside
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(3)
@@ -55,7 +55,7 @@ def everywhere() -> np.ndarray:
 def predicted():
     posterior, draws, _ = problem()
     mean, sd = everywhere().mean(axis=(0, 1)), everywhere().std(axis=(0, 1))
-    return predict(posterior, draws, mean, sd, PLACES, seed=1)
+    return predict(posterior, draws, mean_values(posterior, draws, mean), mean, sd, PLACES, seed=1)
 
 
 def test_maps_are_those_of_all_draws():
@@ -106,15 +106,16 @@ def test_replications_differ_between_draws_and_follow_the_seed():
     posterior, draws, _ = problem()
     found = predicted()
     assert len(np.unique(found.replicated[..., 0])) == 36
-    again = predict(posterior, draws, everywhere().mean(axis=(0, 1)), np.zeros((len(MESH.points), 3)), {}, seed=1)
+    mean = everywhere().mean(axis=(0, 1))
+    again = predict(posterior, draws, mean_values(posterior, draws, mean), mean, np.zeros_like(mean), {}, seed=1)
     np.testing.assert_array_equal(again.replicated, found.replicated)
 
 
 def test_the_residual_at_the_truth_is_standard_normal():
     posterior, _, u = problem()
-    z = np.asarray(standardised_residual(posterior.images, u, 0.05))
+    z = np.asarray(posterior.images.scaled_residual(u, 0.05))
     assert z.std() == pytest.approx(1, abs=4 / np.sqrt(2 * len(z)))
-    np.testing.assert_allclose(standardised_residual(posterior.images, u, 0.2), z / 2, rtol=1e-12)
+    np.testing.assert_allclose(posterior.images.scaled_residual(u, 0.2), z / 2, rtol=1e-12)
 
 
 def test_a_sampled_temperature_sets_the_unit_of_its_draw():
@@ -122,7 +123,7 @@ def test_a_sampled_temperature_sets_the_unit_of_its_draw():
     posterior = _Heated(**vars(posterior))
     heated = draws.assign(t_similarity=(("chain", "draw"), np.full((3, 12), 0.2)))
     mean = everywhere().mean(axis=(0, 1))
-    found = predict(posterior, heated, mean, mean, PLACES, seed=1)
+    found = predict(posterior, heated, mean_values(posterior, heated, mean), mean, mean, PLACES, seed=1)
     np.testing.assert_allclose(found.observed[..., :2], predicted().observed[..., :2] / 2, rtol=1e-6)
     np.testing.assert_allclose(found.residual, predicted().residual / 2, rtol=1e-5)
 
@@ -191,7 +192,7 @@ def test_replicates_follow_students_t_where_the_model_does():
         {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
     )
     zero = np.zeros_like(MESH.points)
-    found = predict(posterior, draws, zero, zero, PLACES, seed=0)
+    found = predict(posterior, draws, mean_values(posterior, draws, zero), zero, zero, PLACES, seed=0)
     for k in range(len(found.discrepancies)):
         assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, found.discrepancies[k]
 

@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from bayesreg.config.values import FoundFile, Positive, Section
-from bayesreg.model.options import TAKEN, ScalePrior
+from bayesreg.model.options import ScalePrior, is_taken
 
 
 def _free_name(name: str) -> str:
-    if not name.isidentifier() or name.startswith("prior_"):
-        raise ValueError("expected a name of letters, digits and _, such as left_lobe; none that begins with prior_")
-    if name in TAKEN or name == "images":
+    if not name.isidentifier():
+        raise ValueError("expected a name of letters, digits and _, such as left_lobe")
+    if is_taken(name) or name == "images":
         raise ValueError("this name is taken; expected another one")
     return name
 

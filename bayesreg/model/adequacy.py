@@ -12,23 +12,13 @@ from jaxtyping import Float, Int
 from bayesreg.model.blocks import Values
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import state_of
-from bayesreg.model.terms.images import ComparedImages, ImagePair
+from bayesreg.model.terms.images import ImagePair
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.term import Outside, Standardised
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.types import AnyArray
 
 KINDS = {ImagePair: "images", Landmarks: "landmarks"}
 DISCREPANCIES = ("sd", "greatest", "neighbours")
-
-
-def standardised_residual(
-    images: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float
-) -> Float[AnyArray, "points"]:
-    """(f(x_q) − m(x_q + u(x_q))) / √(T_s / 2w_q) at every quadrature point.
-
-    Where the model holds, these are independent numbers, standard Normal or of Student's t.
-    """
-    return images.residuals(jnp.asarray(u)) * jnp.sqrt(2 * images.quadrature.weights / t_similarity)
 
 
 def describe_observations(posterior: Posterior, values: Values) -> dict[str, dict[str, Any]]:

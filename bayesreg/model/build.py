@@ -15,7 +15,7 @@ from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.problem import problem_of
+from bayesreg.model.problem import fix_a_body, problem_of
 from bayesreg.model.state import State, state_of
 from bayesreg.model.terms.images import ImagePair
 from bayesreg.model.terms.landmarks import Landmarks
@@ -112,8 +112,7 @@ def _require_bounded(posterior: Posterior) -> None:
         return
     held = posterior.mesh.points[list(posterior.options.held)].reshape(-1, 3)
     points = np.concatenate([*(one.fixed_points for one in given), held])
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if len(points) < 3 or spread[1] < 1e-6 * spread[0]:
+    if not fix_a_body(points):
         raise InputError(
             f"{len(points)} landmarks and held nodes do not say how the whole shifts and turns: the posterior would be "
             "improper; give at least three that are not on one line, images, a skull, or model.rigid_sd"

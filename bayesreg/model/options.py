@@ -252,6 +252,11 @@ def require_default_image_options(model: ModelConfig) -> None:
             raise InputError(f"model.{key} says how images are compared, and none are observed; leave it out")
 
 
+def is_taken(name: str) -> bool:
+    """Whether no observation may have this name, nor bring an unknown of this name."""
+    return name in TAKEN or name.startswith("prior_")
+
+
 def of_tissue(model: ModelConfig, given: Any, tissue: str) -> Any:
     """The option of one tissue, given for all or in a mapping by tissue; None where it is not given."""
     if not isinstance(given, Mapping):

@@ -31,12 +31,12 @@ from bayesreg.model.blocks import (
 )
 from bayesreg.model.field import StiffnessField, stiffness_field
 from bayesreg.model.options import (
-    TAKEN,
     FieldConfig,
     Lame,
     ModelConfig,
     PriorConfig,
     TemperaturePrior,
+    is_taken,
     of_tissue,
     require_default_image_options,
 )
@@ -130,7 +130,7 @@ def observation_blocks(observations: Sequence[Any]) -> Blocks:
     found: Blocks = {}
     for observation in observations:
         for name, block in getattr(observation, "blocks", {}).items():
-            if name in found or name in TAKEN:
+            if name in found or is_taken(name):
                 raise InputError(f"the name {name!r} of an unknown of {observation.name!r} is taken; rename the latter")
             found[name] = block
     return found
@@ -145,10 +145,10 @@ def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelCo
         If one is no observation, or two have one name, or one has a name that is taken.
     """
     terms: Terms = {}
-    taken = {*TAKEN, *observation_blocks(observations)}
+    unknowns = observation_blocks(observations)
     for observation in observations:
         name = observation.name
-        if name in terms or name in taken or name.startswith("prior_"):
+        if name in terms or name in unknowns or is_taken(name):
             raise InputError(f"the name {name!r} of an observation is taken; give another one")
         if isinstance(observation, ImagePair):
             terms[name] = observation.on(mesh, model)
@@ -238,13 +238,18 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
             f"boundary node held (model.held); {len(unknown)} of {len(mesh.boundary)} are not, the first is node "
             f"{unknown[0]}"
         )
-    spread = np.linalg.svd(prescribed - prescribed.mean(axis=0), compute_uv=False)
-    if len(prescribed) < 3 or spread[1] < 1e-6 * spread[0]:
+    if not fix_a_body(prescribed):
         raise InputError(
             f"{len(prescribed)} sampled and held nodes do not hold the mesh in place: "
             "give at least three that are not on one line (model.sampled, model.held)"
         )
     return sampled, held
+
+
+def fix_a_body(points: Float[np.ndarray, "k 3"]) -> bool:
+    """Whether a rigid body rests where these of its points do: three at least, and not on one line."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return len(points) >= 3 and bool(spread[1] >= 1e-6 * spread[0])
 
 
 def cell_entries(mesh: TetMesh, model: ModelConfig) -> Int[np.ndarray, "cells"]:

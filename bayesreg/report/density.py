@@ -58,7 +58,7 @@ def _priors_of_scales(model: Mapping[str, Any]) -> Markup:
 
 def similarity_energy(manifest: Mapping[str, Any]) -> Markup | None:
     """E_s in symbols; None where no images were compared."""
-    return Markup(E_S[part(manifest, "model", "similarity") or "ssd"]) if _pairs_of_images(manifest) else None
+    return Markup(E_S[manifest["model"]["similarity"]]) if _pairs_of_images(manifest) else None
 
 
 def observation_table(manifest: Mapping[str, Any]) -> Table | None:
@@ -72,7 +72,7 @@ def observation_table(manifest: Mapping[str, Any]) -> Table | None:
             KINDS[one["kind"]],
             f"{one['values']:,}" if "values" in one else NONE,
             number(one["residual_rms"]) if "residual_rms" in one else NONE,
-            number(one["log"]),
+            NONE if one["log"] is None else number(one["log"]),
         ]
         for name, one in observed.items()
     ]

@@ -19,7 +19,7 @@ from bayesreg.inference.gaussian.about_gaussian import MOST_UNKNOWNS
 from bayesreg.inference.layout import dimension
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
-from bayesreg.model.adequacy import DISCREPANCIES, discrepancies, standardised_residual
+from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
@@ -48,6 +48,7 @@ def mean_values(posterior: Posterior, draws: xr.Dataset, u_mean: Float[np.ndarra
 def predict(
     posterior: Posterior,
     draws: xr.Dataset,
+    mean: dict[str, AnyArray],
     u_mean: Float[np.ndarray, "nodes 3"],
     u_sd: Float[np.ndarray, "nodes 3"],
     places: Places,
@@ -60,6 +61,8 @@ def predict(
     posterior : Posterior
     draws : xarray.Dataset
         The group `posterior` of the run.
+    mean : dict
+        Values of all blocks at the mean of the draws (`mean_values`).
     u_mean, u_sd : (n, 3) arrays
         Posterior mean and standard deviation at every node over all draws, mm.
     places : mapping
@@ -88,7 +91,7 @@ def predict(
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         if with_images:
             values, cells = here.fill(draw), here.images.quadrature.cells
-            z = standardised_residual(here.images, u, values["t_similarity"])
+            z = here.images.scaled_residual(u, values["t_similarity"])
             noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), u)
             for name, x in (("observed", z), ("replicated", noise)):
                 found[name] = discrepancies(x, cells, neighbours, len(mesh.cells))
@@ -101,7 +104,6 @@ def predict(
     aside: dict[str, list[np.ndarray]] = {name: [] for name in kept}
     found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
-    mean = mean_values(posterior, draws, u_mean)
     return Predicted(
         chain_mean=found.chain_mean["u"],
         far_mm=np.array(FAR),
@@ -121,7 +123,7 @@ def _residual(
     posterior: Posterior, u_mean: Float[np.ndarray, "nodes 3"], mean: Mapping[str, AnyArray]
 ) -> dict[str, np.ndarray]:
     """The residual of the images at the mean, in units of the noise."""
-    at_mean = standardised_residual(posterior.images, u_mean, mean["t_similarity"])
+    at_mean = posterior.images.scaled_residual(jnp.asarray(u_mean), mean["t_similarity"])
     return {
         "residual": np.asarray(at_mean, np.float32),
         "residual_tissue": posterior.mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),

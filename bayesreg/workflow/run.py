@@ -175,14 +175,15 @@ def _resumed_config(out: Path, config: Config) -> Config:
     return known
 
 
-def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, float]:
-    """The log of each of these observations at one displacement of some millimetres, by name."""
+def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, float | None]:
+    """The log of each of these observations at one displacement of up to a millimetre, by name; None if not finite."""
     if not observations:
         return {}
     rest = posterior.reference()
     moved = np.sin(np.arange(rest["u_boundary"].size)).reshape(rest["u_boundary"].shape)
     logs = posterior.energies(rest | {"u_boundary": moved})
-    return {one.name: float(logs[one.name]) for one in observations}
+    found = {one.name: float(logs[one.name]) for one in observations}
+    return {name: log if np.isfinite(log) else None for name, log in found.items()}
 
 
 def _require_same_observations(out: Path, provenance: dict[str, Any], posterior: Posterior, given: list[Any]) -> None:
@@ -195,10 +196,11 @@ def _require_same_observations(out: Path, provenance: dict[str, Any], posterior:
             f"and is resumed with {list(now) or 'none'}: {advice}"
         )
     for name, log in now.items():
-        if not np.isclose(log, begun[name], rtol=1e-6, equal_nan=True):
+        then = begun[name]
+        if (log is None) != (then is None) or (log is not None and not np.isclose(log, then, rtol=1e-6)):
             raise InputError(
                 f"the run in {out} began with another observation {name!r} than it is resumed with: their logs at one "
-                f"displacement are {begun[name]:g} and {log:g}; {advice}"
+                f"displacement are {then} and {log}; {advice}"
             )
 
 
@@ -299,7 +301,7 @@ def _finish(
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean = mean_values(posterior, draws, samples.u_mean)
-    predicted = predict(posterior, draws, samples.u_mean, samples.u_sd, config.report.places, config.seed)
+    predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed)
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began),
         u_mean=samples.u_mean,

@@ -240,6 +240,7 @@ def manifest(uniform: bool, converged: bool) -> dict:
         "observations": {"images": {"kind": "images", "log": -6021.4, "values": 12_000, "residual_rms": 1.03}},
         "model": {
             "elasticity": "uniform" if uniform else "tissue",
+            "similarity": "ssd",
             "t_similarity": 0.05,
             "t_elastic": 1e4,
             "quadrature": "gauss4",

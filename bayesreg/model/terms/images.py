@@ -183,10 +183,13 @@ class ComparedImages(NamedTuple):
         """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q))."""
         return self.similarity.residuals(self.pair(self.predicted(u)))
 
+    def scaled_residual(self, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float) -> Float[AnyArray, "points"]:
+        """`residuals` in units of their scale √(T_s / 2w): where the model holds, as `standardised_noise`."""
+        return self.residuals(u) * jnp.sqrt(2 * self.quadrature.weights / t_similarity)
+
     def standardised_residual(self, state: State) -> Float[AnyArray, "points"]:
-        """`residuals` in units of the sd that the model gives them."""
-        scale = state.values["t_similarity"] / (2 * self.quadrature.weights)
-        return self.residuals(state.u) / jnp.sqrt(self.similarity.variance() * scale)
+        """`residuals` in units of their standard deviation."""
+        return self.scaled_residual(state.u, state.values["t_similarity"]) / jnp.sqrt(self.similarity.variance())
 
     def standardised_noise(self, key: AnyArray, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
         """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""
