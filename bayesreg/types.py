@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
 if TYPE_CHECKING:
@@ -16,6 +17,9 @@ else:
 
 # The environment variable that names a folder in which files are looked for.
 DATA_FOLDER = "BAYESREG_DATA"
+
+# On the host, dense or sparse.
+Matrix = np.ndarray | scipy.sparse.spmatrix
 
 Scalar = Float[AnyArray, ""]
 Points = Float[AnyArray, "nodes 3"]

@@ -113,9 +113,9 @@ def test_replications_differ_between_draws_and_follow_the_seed():
 
 def test_the_residual_at_the_truth_is_standard_normal():
     posterior, _, u = problem()
-    z = np.asarray(posterior.images.scaled_residual(u, 0.05))
+    z = np.asarray(posterior.images.scaled_residual(u, {"t_similarity": np.array(0.05)}))
     assert z.std() == pytest.approx(1, abs=4 / np.sqrt(2 * len(z)))
-    np.testing.assert_allclose(posterior.images.scaled_residual(u, 0.2), z / 2, rtol=1e-12)
+    np.testing.assert_allclose(posterior.images.scaled_residual(u, {"t_similarity": np.array(0.2)}), z / 2, rtol=1e-12)
 
 
 def test_a_sampled_temperature_sets_the_unit_of_its_draw():

@@ -64,6 +64,13 @@ def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
     return np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
 
 
+def boundary_areas(mesh: TetMesh) -> Float[np.ndarray, "nodes"]:
+    """A third of the area of the boundary's faces about each node, mm²; zero inside."""
+    corners = mesh.points[mesh.boundary_faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    return np.bincount(mesh.boundary_faces.ravel(), np.repeat(areas / 3, 3), len(mesh.points))
+
+
 # ∂u_k/∂x_j of every cell by k, then j; where u has a last axis of chains, each entry has it, too.
 Gradient = tuple[tuple[AnyArray, ...], ...]
 

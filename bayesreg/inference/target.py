@@ -129,14 +129,23 @@ class ModeSearch(Protocol):
     """The posterior as the search for a mode and Laplace's approximation there see it."""
 
     @property
-    def scales(self) -> Sequence[str]:
-        """Names of sampled scales of the displacements, whose joint mode with these would mislead."""
+    def hyperparameters(self) -> Sequence[str]:
+        """Names of sampled parameters of the displacements' prior and noise, whose joint mode with these misleads."""
 
     def continuation(self) -> Iterable[Any]:
         """Data of ever harder problems, in the displacements alone, that lead to the target's own."""
 
     def curvature(self, data: Any, estimands: Estimands) -> Curvature:
         """Curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""
+
+    def quadratic_part(self, data: Any) -> Any:
+        """The data of the problem without the terms that are far from quadratic in the displacements."""
+
+    def quadratic_curvature(self, data: Any, estimands: Estimands, near: Estimands) -> Any:
+        """The part of `curvature` that belongs to `quadratic_part`, as a dense or a sparse matrix.
+
+        What follows "u_boundary" does so as at the estimands `near`.
+        """
 
 
 @runtime_checkable

@@ -25,6 +25,8 @@ Values = Mapping[str, AnyArray]
 
 LAME = ("lam", "mu")
 
+ONE = np.ones(())
+
 
 @runtime_checkable
 class Block(Protocol):
@@ -259,12 +261,14 @@ class Scale(_Positive):
         The known value, or the median of the prior.
     log_sd : scalar, optional
         Standard deviation of the logarithm; None means that the value is known.
+    factor : scalar
+        The value is the estimand times this, which is one but on the way to a mode.
     """
 
-    arrays = ("median", "log_sd")
+    arrays = ("median", "log_sd", "factor")
 
-    def __init__(self, median: Any, log_sd: Any = None) -> None:
-        self.median, self.log_sd = median, log_sd
+    def __init__(self, median: Any, log_sd: Any = None, factor: Any = ONE) -> None:
+        self.median, self.log_sd, self.factor = median, log_sd, factor
 
     @property
     def is_sampled(self) -> bool:
@@ -281,9 +285,17 @@ class Scale(_Positive):
         """The median."""
         return jnp.asarray(self.median)
 
+    def complete(self, estimand: AnyArray | float) -> AnyArray:
+        """The estimand times the factor."""
+        return jnp.asarray(estimand) * self.factor
+
+    def estimand(self, value: AnyArray | float) -> AnyArray:
+        """The value over the factor."""
+        return jnp.asarray(value, float) / self.factor
+
     def times(self, factor: float) -> Scale:
-        """A scale with the same spread and a median multiplied by a factor."""
-        return Scale(factor * self.median, self.log_sd)
+        """The scale whose values are those of this one times a factor."""
+        return Scale(factor * self.median, self.log_sd, factor * self.factor)
 
 
 @jax.tree_util.register_pytree_node_class
@@ -332,6 +344,30 @@ class FieldComponents(_Arrays):
     def reference(self) -> AnyArray:
         """Zero."""
         return jnp.asarray(self.zero)
+
+
+@jax.tree_util.register_pytree_node_class
+class Coefficients(_Arrays):
+    """Independent Normal numbers of mean zero.
+
+    Parameters
+    ----------
+    sd : (k,) array
+        Their standard deviations.
+    """
+
+    arrays = ("sd",)
+
+    def __init__(self, sd: Any) -> None:
+        self.sd = sd
+
+    def draw(self, name: str) -> AnyArray:
+        """See `Block`."""
+        return numpyro.sample(name, dist.Normal(jnp.zeros_like(self.sd), self.sd).to_event(1))
+
+    def reference(self) -> AnyArray:
+        """Zero."""
+        return jnp.zeros_like(self.sd)
 
 
 # Blocks by name; what is particular to one kind is asked of it by those who know that it is there.

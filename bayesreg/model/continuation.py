@@ -47,11 +47,11 @@ def _ease(
     similarity: float,
     elastic: float,
 ) -> Problem:
-    """The problem with all images smoothed, and factors on T_s and T_r."""
+    """The problem with all images smoothed, and factors on T_s and T_r; a load is the square root of a temperature."""
     smooth = {name: pair.smoothed(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
-    warmer = problem.blocks["t_similarity"].times(similarity), problem.blocks["t_elastic"].times(elastic)
-    temperatures = dict(zip(("t_similarity", "t_elastic"), warmer, strict=True))
-    return problem._replace(blocks={**problem.blocks, **temperatures}, terms={**problem.terms, **smooth})
+    powers = {"t_similarity": similarity, "t_elastic": elastic, "body_load": elastic**0.5, "surface_load": elastic**0.5}
+    scales = {name: problem.blocks[name].times(factor) for name, factor in powers.items() if name in problem.blocks}
+    return problem._replace(blocks={**problem.blocks, **scales}, terms={**problem.terms, **smooth})
 
 
 def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:

@@ -16,11 +16,19 @@ from jaxtyping import Float, Int
 from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
 from bayesreg.fem.preconditioners import DENSE_LIMIT, solve
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import Values
+from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.program import Problem
-from bayesreg.model.state import Body, State
+from bayesreg.model.state import Body, State, StaticMesh
+from bayesreg.model.terms.images import ComparedImages
+from bayesreg.model.terms.skull import SoftSkull
 from bayesreg.model.terms.term import Curved, Outside, PointCurvature
-from bayesreg.types import AnyArray, Equilibrium
+from bayesreg.types import AnyArray, Equilibrium, Matrix
+
+# Terms that are far from quadratic in the displacements.
+FAR_FROM_QUADRATIC = (ComparedImages, SoftSkull)
+
+# With more entries of λ and μ than this, K is assembled anew for each.
+FEW_ENTRIES = 20
 
 # Random places at which a term from outside shows what it looks at, and the sd of their displacements, mm.
 NEARBY, NEARBY_SD = 3, 0.1
@@ -69,42 +77,155 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
     Curvature
         First z, then row 3 · node + axis, 1/mm².
     """
-    body, u = problem.body, jnp.asarray(u)
-    mesh = body.mesh.mesh
-    sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.slots)])
-    free = unknowns_of(np.asarray(body.system.free))
-    lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell(values))
-    parts = sampled, free, lam, mu
-    if body.field is not None:
-        load = _element_forces(body, lam, mu, u) @ (float(values["field_sd"]) * np.asarray(body.field.basis))
-        W, schur = _response(mesh, *parts, load[free])
-    elif len(free) > DENSE_LIMIT:
-        W, schur = _response(mesh, *parts, np.zeros((len(free), 0)))
-    else:
-        W, schur = _kept_response(mesh, *(tuple(part.tolist()) for part in parts))
-    modes = W.shape[1] - len(sampled)
+    response = _Response.at(problem, values, u)
+    curved = [term for term in problem.terms.values() if isinstance(term, Curved)]
+    summed = partial(_sum, len(u))
+    outside = _outside_curvatures(problem, values, u)
+    gauss_newton = _dense(response.reduce(outside + summed(term.gauss_newton(u, values) for term in curved)))
+    gauss_newton += response.place(_prior_curvature(problem, response.schur, values))
+    gauss_newton[: response.modes, : response.modes] += np.eye(response.modes)
+    return Curvature(
+        gauss_newton, lambda: _dense(response.reduce(summed(term.remainder(u, values) for term in curved)))
+    )
 
-    def reduced(nodal: scipy.sparse.csr_matrix) -> np.ndarray:
-        """The curvature in (z, u_B) of one in all nodes."""
+
+def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float[AnyArray, "nodes 3"]) -> Matrix:
+    """The curvature of all terms but images and skull, which are quadratic in the displacements, or nearly.
+
+    The equilibrium follows the sampled nodes as at other values near by. Since it minimises the energy, the first
+    derivatives of the curvature in the values are those of the curvature itself.
+
+    Its rows are those of `displacement_curvature`.
+
+    Parameters
+    ----------
+    problem : Problem
+    values, near : mapping
+        Values of all blocks.
+    u : (n, 3) array
+        The equilibrium at the latter, mm.
+    """
+    response = _Response.at(problem, near, u)
+    K = _stiffness(problem.body, values)
+    curved = (t for t in problem.terms.values() if isinstance(t, Curved) and not isinstance(t, FAR_FROM_QUADRATIC))
+    observed = _sum(len(u), (term.gauss_newton(u, values) for term in curved))
+    found = response.reduce(observed + _outside_curvatures(problem, values, u))
+    energy = response.reduce(K, with_field=False)
+    prior = _prior_curvature(problem, energy, values)
+    if not response.modes and not len(response.free):
+        return scipy.sparse.csr_matrix(found + prior)
+    total = _dense(found) + response.place(_dense(prior))
+    total[: response.modes, : response.modes] += np.eye(response.modes)
+    return total
+
+
+def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
+    """K; where there are a few entries of λ and μ, as a sum of fixed matrices."""
+    entries = tuple(np.asarray(body.cell_entry).tolist())
+    if body.field is not None or max(entries) >= FEW_ENTRIES:
+        return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
+    pattern, parts = _stiffness_parts(body.mesh, entries)
+    found = pattern.copy()
+    found.data = parts @ np.concatenate([np.asarray(values[name]) for name in LAME])
+    return found
+
+
+@lru_cache(maxsize=2)
+def _stiffness_parts(
+    mesh: StaticMesh, entries: tuple[int, ...]
+) -> tuple[scipy.sparse.csr_matrix, Float[np.ndarray, "entries parameters"]]:
+    """A matrix with the pattern of K, and the entries of K by each λ and μ."""
+    owned = [np.equal(entries, entry).astype(float) for entry in range(max(entries) + 1)]
+    nothing = np.zeros(len(entries))
+    pattern = stiffness(mesh.mesh, np.ones(len(entries)), np.ones(len(entries)))
+    pattern.sort_indices()
+    parts = [stiffness(mesh.mesh, one, nothing) for one in owned] + [
+        stiffness(mesh.mesh, nothing, one) for one in owned
+    ]
+    # All have the same pattern, zeros stored.
+    for part in parts:
+        part.sort_indices()
+    return pattern, np.stack([part.data for part in parts], axis=1)
+
+
+class _Response(NamedTuple):
+    """How the nodes that are not sampled follow, and the field moves all of these: u_I = W (z, u_B).
+
+    Attributes
+    ----------
+    sampled, free : int arrays
+        Unknowns 3 · node + axis.
+    W : (free, modes + sampled) array
+    schur : (sampled, sampled) matrix
+        The Schur complement of K in the sampled nodes; sparse where no node is free.
+    """
+
+    sampled: Int[np.ndarray, "sampled"]
+    free: Int[np.ndarray, "free"]
+    W: Float[np.ndarray, "free columns"]
+    schur: Matrix
+
+    @classmethod
+    def at(cls, problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> _Response:
+        """The response at some values and their equilibrium u, mm."""
+        body, u = problem.body, jnp.asarray(u)
+        mesh = body.mesh.mesh
+        sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.slots)])
+        free = unknowns_of(np.asarray(body.system.free))
+        lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell(values))
+        parts = sampled, free, lam, mu
+        if body.field is not None:
+            load = _element_forces(body, lam, mu, u) @ (float(values["field_sd"]) * np.asarray(body.field.basis))
+            return cls(sampled, free, *_response(mesh, *parts, load[free]))
+        if len(free) > DENSE_LIMIT:
+            return cls(sampled, free, *_response(mesh, *parts, np.zeros((len(free), 0))))
+        return cls(sampled, free, *_kept_response(mesh, *(tuple(part.tolist()) for part in parts)))
+
+    @property
+    def modes(self) -> int:
+        """The number of components of the field."""
+        return self.W.shape[1] - len(self.sampled)
+
+    def reduce(self, nodal: scipy.sparse.csr_matrix, with_field: bool = True) -> Matrix:
+        """The curvature in (z, u_B), or in u_B alone, of one in all nodes; sparse where no node is free."""
+        W = self.W if with_field else self.W[:, self.modes :]
+        if not len(self.free):
+            return nodal[self.sampled][:, self.sampled]
+        modes = W.shape[1] - len(self.sampled)
         # Sampled nodes move by themselves, and the others by W.
-        cross = nodal[sampled][:, free] @ W
-        found = W.T @ (nodal[free][:, free] @ W)
+        cross = nodal[self.sampled][:, self.free] @ W
+        found = W.T @ (nodal[self.free][:, self.free] @ W)
         found[modes:] += cross
         found[:, modes:] += cross.T
-        found[modes:, modes:] += nodal[sampled][:, sampled].toarray()
+        found[modes:, modes:] += nodal[self.sampled][:, self.sampled].toarray()
         return (found + found.T) / 2
 
-    curved = [term for term in problem.terms.values() if isinstance(term, Curved)]
-    seen = _Seen(problem, dict(values), jnp.asarray(lam), jnp.asarray(mu))
-    outside = [_outside_curvature(term, seen, u) for term in problem.terms.values() if isinstance(term, Outside)]
-    summed = partial(_sum, len(u))
-    gauss_newton = reduced(sum(outside, summed(term.gauss_newton(u, values) for term in curved)))
+    def place(self, curvature: Matrix) -> Float[np.ndarray, "rows rows"]:
+        """A curvature in u_B as one in (z, u_B)."""
+        return np.pad(_dense(curvature), (self.modes, 0))
+
+
+def _prior_curvature(problem: Problem, energy: Matrix, values: Values) -> Matrix:
+    """The curvature of the elastic and the rigid prior in u_B, where the elastic energy has the Hessian `energy`."""
+    found = scipy.sparse.csr_matrix(energy.shape)
     if "elastic" in problem.terms:
-        gauss_newton[modes:, modes:] += schur / float(values["t_elastic"])
+        found = problem.terms["elastic"].curvature(energy, values)
     if "rigid" in problem.terms:
-        gauss_newton[modes:, modes:] += np.asarray(problem.terms["rigid"].precision())
-    gauss_newton[:modes, :modes] += np.eye(modes)
-    return Curvature(gauss_newton, lambda: reduced(summed(term.remainder(u, values) for term in curved)))
+        found = _dense(found) + np.asarray(problem.terms["rigid"].precision())
+    return found
+
+
+def _outside_curvatures(problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
+    """The sum over the terms from outside of the package, in all nodes."""
+    lam, mu = problem.body.lame_by_cell(values)
+    seen = _Seen(problem, dict(values), lam, mu)
+    found = scipy.sparse.csr_matrix((3 * len(u), 3 * len(u)))
+    terms = (term for term in problem.terms.values() if isinstance(term, Outside))
+    return sum((_outside_curvature(term, seen, jnp.asarray(u)) for term in terms), found)
+
+
+def _dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
+    return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
 
 
 def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
@@ -179,13 +300,14 @@ def _response(
     lam: Float[np.ndarray, "cells"],
     mu: Float[np.ndarray, "cells"],
     load: Float[np.ndarray, "free loads"],
-) -> tuple[Float[np.ndarray, "free columns"], Float[np.ndarray, "sampled sampled"]]:
-    """−K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W."""
+) -> tuple[Float[np.ndarray, "free columns"], Matrix]:
+    """−K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W, sparse where no node is free."""
     K = stiffness(mesh, lam, mu)
     coupling = K[free][:, sampled]
     W = np.hstack([load, coupling.toarray()])
-    if len(free):
-        W = -solve(K[free][:, free], W)
+    if not len(free):
+        return W, K[sampled][:, sampled]
+    W = -solve(K[free][:, free], W)
     schur = np.asarray(K[sampled][:, sampled] + coupling.T @ W[:, load.shape[1] :])
     return W, (schur + schur.T) / 2
 
@@ -193,7 +315,7 @@ def _response(
 @lru_cache(maxsize=1)
 def _kept_response(
     mesh: TetMesh, sampled: tuple[int, ...], free: tuple[int, ...], lam: tuple[float, ...], mu: tuple[float, ...]
-) -> tuple[Float[np.ndarray, "free sampled"], Float[np.ndarray, "sampled sampled"]]:
+) -> tuple[Float[np.ndarray, "free sampled"], Matrix]:
     """`_response` without loads, kept for the stages of a search, which share λ and μ."""
     rows, others = np.array(sampled, int), np.array(free, int)
     return _response(mesh, rows, others, np.array(lam), np.array(mu), np.zeros((len(others), 0)))

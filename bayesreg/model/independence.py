@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from bayesreg.image import Image
@@ -50,18 +50,75 @@ def independent_points(residual: Image, mask: Image) -> float:
     return float(np.clip(inside.sum() / correlation[near].sum(), 1, inside.sum()))
 
 
+def independent_scores(
+    scores: Float[np.ndarray, "points axes"], voxels: Int[np.ndarray, "points 3"], grid: Image
+) -> float:
+    """Effective number of independent points of a sum over some voxels: as many have the variance that the sum has.
+
+    The sum is what pulls a displacement that is smooth on the scale on which the scores are correlated: of
+    w (f − m) ∇m at the voxels, say. Noise that is smoother than the images costs it little, and a misfit of the model
+    much. n scores s_i with the autocovariance c(h), summed over the axes, have the variance Σ_h n(h) c(h) of their sum,
+    n(h) the number of pairs at lag h, and count as n² c(0) over it. The sum over h runs as in `independent_points`.
+    (So adjusted, the likelihood has the curvature that the variance of its slope asks for: Ribatet, Cooley and Davison
+    2012, "Bayesian inference from composite likelihoods, with an application to spatial extremes".)
+
+    Parameters
+    ----------
+    scores : (n, a) array
+    voxels : (n, 3) int array
+        Their places on the grid.
+    grid : Image
+        Its shape and affine alone count.
+
+    Returns
+    -------
+    float
+        Between one and n.
+
+    Raises
+    ------
+    InputError
+        If all scores are zero.
+    """
+    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
+    inside = np.zeros(high - low, bool)
+    places = tuple((voxels - low).T)
+    inside[places] = True
+    covariances = []
+    for score in scores.T:
+        field = np.zeros(inside.shape)
+        field[places] = score
+        products, pairs = _products(field, inside)
+        covariances.append(products)
+    covariance = np.sum(covariances, axis=0)
+    if not covariance[0, 0, 0] > 0:
+        raise InputError("the residual is zero at every point: nothing tells how it is correlated")
+    correlation = covariance / np.maximum(pairs, 1) / (covariance[0, 0, 0] / pairs[0, 0, 0])
+    lags = _lag_lengths(pairs.shape, grid)
+    near = (pairs > 0) & (lags < _first_gap(correlation, pairs, lags, grid.voxel_sizes.max()))
+    share = (pairs * correlation)[near].sum() / len(voxels)
+    return float(np.clip(len(voxels) / share, 1, len(voxels)))
+
+
 def _autocorrelation(
     centred: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
 ) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
     """ρ(h) and the number of pairs at every lag, zero lag first, negative lags last."""
+    products, pairs = _products(centred, inside)
+    covariance = products / np.maximum(pairs, 1)
+    return covariance / covariance[0, 0, 0], pairs
+
+
+def _products(
+    field: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
+) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
+    """Sums of the products of all pairs at every lag, and the number of these pairs; see `_autocorrelation`."""
     shape = [scipy.fft.next_fast_len(2 * n) for n in inside.shape]
 
     def products(field: np.ndarray) -> np.ndarray:
         return scipy.fft.irfftn(np.abs(scipy.fft.rfftn(field, shape)) ** 2, shape)
 
-    pairs = np.rint(products(inside.astype(float)))
-    covariance = products(centred) / np.maximum(pairs, 1)
-    return covariance / covariance[0, 0, 0], pairs
+    return products(field), np.rint(products(inside.astype(float)))
 
 
 def _lag_lengths(shape: tuple[int, ...], grid: Image) -> Float[np.ndarray, "U V W"]:

@@ -163,7 +163,7 @@ class LocalCorrelation(NamedTuple):
         """f − a m − b."""
         return self.fit(pair).residuals
 
-    def convexity(self, pair: Intensities) -> ValueCurvature:
+    def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """`curvature` with residuals of zero, which is twice a² W less its projection on the maps of every window."""
         return self._curvature(self.fit(pair), pair.weights, jnp.zeros_like(pair.fixed))
 

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import jax
 from jaxtyping import Float
 
 from bayesreg.interpolation import Interpolation
-from bayesreg.model.blocks import Scale, Values
+from bayesreg.model.blocks import LAME, Scale, Values
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import complete
-from bayesreg.model.curvature import Curvature, displacement_curvature
+from bayesreg.model.curvature import FAR_FROM_QUADRATIC, Curvature, displacement_curvature, quadratic_curvature
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
 from bayesreg.types import AnyArray
+
+# Scales of the elastic priors.
+SCALES = ("t_elastic", "body_load", "surface_load")
+# With more entries of λ or μ, as by element, derivatives in each of them would cost too much.
+MOST_ENTRIES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +43,17 @@ class ModeSearch:
     interpolation: Interpolation
 
     @property
-    def scales(self) -> tuple[str, ...]:
-        """T_r and the scales that observations brought, such as the sd of landmarks, where they are sampled."""
+    def hyperparameters(self) -> tuple[str, ...]:
+        """The scales of the elastic prior and of observations, such as T_r and the sd of landmarks, and λ and μ.
+
+        The latter where the elastic prior is normalised and they are not too many.
+        """
         own = [name for one in self.observations.values() for name in getattr(one, "blocks", {})]
-        blocks = {name: self.data.blocks[name] for name in ("t_elastic", *own)}
-        return tuple(name for name, block in blocks.items() if isinstance(block, Scale) and block.is_sampled)
+        names = [name for name in (*SCALES, *own) if isinstance(self.data.blocks.get(name), Scale)]
+        elastic = self.data.terms.get("elastic")
+        if elastic is not None and elastic.determinant is not None:
+            names += [name for name in LAME if len(self.data.blocks[name].free.index) <= MOST_ENTRIES]
+        return tuple(name for name in names if self.data.blocks[name].is_sampled)
 
     def continuation(self) -> Iterator[Problem]:
         """Problems of growing difficulty, in the displacements alone, that lead to this one."""
@@ -58,6 +70,19 @@ class ModeSearch:
         """
         values = complete(data.blocks, estimands)
         return displacement_curvature(data, values, _equilibrium(data, values))
+
+    def quadratic_part(self, data: Problem) -> Problem:
+        """The problem without images and skull: what is left is quadratic in the displacements, or nearly."""
+        others = [name for name, term in data.terms.items() if isinstance(term, FAR_FROM_QUADRATIC)]
+        return reduce(Problem.without_term, others, data)
+
+    def quadratic_curvature(self, data: Problem, estimands: Values, near: Values) -> Any:
+        """The part of `curvature` that belongs to `quadratic_part`.
+
+        The equilibrium follows the sampled nodes as at the estimands `near`. Sparse where every node is sampled.
+        """
+        values, others = (complete(data.blocks, one) for one in (estimands, near))
+        return quadratic_curvature(data, values, others, _equilibrium(data, others))
 
 
 @jax.jit

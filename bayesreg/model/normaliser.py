@@ -37,4 +37,4 @@ class Normaliser:
 @jax.jit
 def _log_normaliser(problem: Problem, values: dict[str, AnyArray]) -> Scalar:
     lam, mu = physical_lame_by_cell(problem.body, problem.blocks, values)
-    return problem.terms["elastic"].log_normaliser(problem.body.system.elements, lam, mu, values["t_elastic"])
+    return problem.terms["elastic"].log_normaliser(problem.body.system.elements, lam, mu, values)

@@ -15,15 +15,15 @@ from bayesreg.types import InputError
 
 # Names of blocks and of the other sites of the program, which no observation may have.
 TAKEN = (
-    "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "field", "field_sd", "elastic", "rigid", "skull",
-    "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations", "solver_failed",
-    "outside_support",
+    "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load", "field", "field_sd", "elastic",
+    "rigid", "skull", "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations",
+    "solver_failed", "outside_support",
 )  # fmt: skip
 
 # Options that say how images are compared.
 OF_IMAGES = (
     "similarity", "window_mm", "degrees_of_freedom", "independent_points", "t_similarity", "interpolation",
-    "quadrature",
+    "quadrature", "most_points", "smoothing", "intensity_map",
 )  # fmt: skip
 
 Lame = Literal["lam", "mu"]
@@ -103,11 +103,33 @@ class FieldConfig(BaseModel):
     modes: Annotated[int, Field(strict=True, ge=1)] = 300
 
 
+# Options by the name of a preset; what else is given replaces them.
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    "registration": {
+        "elastic_prior": "loads",
+        "normalised": True,
+        "sampled": "all",
+        "priors": {"lam": {"high": 100.0}, "mu": {"high": 20.0}},
+        "similarity": "student_t",
+        "t_similarity": {"median": 0.05, "log_sd": 3.0},
+        "interpolation": "cubic",
+        "quadrature": "voxels",
+        "most_points": 100_000,
+        "smoothing": 0.8,
+        "intensity_map": 2,
+        "skull_width": 0.5,
+    },
+}
+
+
 class ModelConfig(BaseModel):
     """The posterior to sample; the defaults are the paper's.
 
     Attributes
     ----------
+    preset : {"paper", "registration"}
+        The options that are not given: the paper's, or those of `PRESETS` for pairs of images that no model made.
     elasticity : {"tissue", "uniform", "element", "field"}
         One pair (λ, μ) for each tissue, one for all, one for each tetrahedron; or one for each tissue, times the
         exponential of a smooth random field over its tetrahedra.
@@ -134,6 +156,13 @@ class ModelConfig(BaseModel):
         is tempered by its share of all of them. None: all are independent.
     t_similarity, t_elastic : float or TemperaturePrior
         Boltzmann temperatures T_s (mm³ times squared intensity) and T_r (energy), known or inferred.
+    elastic_prior : {"boltzmann", "loads"}
+        exp(−E_r / T_r), eq. (12); or equilibrium with random loads, K u = q in place of eq. (7), of all nodes, which
+        depends much less on the mesh (`bayesreg.model.terms.elastic`). The latter needs `sampled: all` and `normalised:
+        true`, and has no T_r.
+    body_load, surface_load : float or ScalePrior
+        Standard deviations of the white noise of body forces (unit of μ times mm^½) and of surface forces (unit of μ
+        times mm), known or inferred; for "loads" alone.
     normalised : bool
         False: the paper's density, without the normaliser of the elastic prior in λ, μ. True: with it; then
         every free λ, μ needs a prior with a finite `high`, and `fixed: {}` lets all be free if T_r is known.
@@ -142,11 +171,23 @@ class ModelConfig(BaseModel):
     quadrature : {"gauss4", "gauss32", "gauss256", "voxels"}
         Points of the integral in eq. (1): 4, 32 or 256 for each tetrahedron, or the fixed image's voxel
         centres inside the mesh.
+    most_points : int, optional
+        With "voxels": where there are more, a fixed random choice of so many of them.
+    smoothing : float
+        Standard deviation, in voxels of the coarser image, of a Gaussian that both images are smoothed with. Between
+        voxel centres interpolation averages the noise of m, and at them it does not: without smoothing that draws
+        displacements towards half voxels.
+    intensity_map : int, optional
+        Where the intensities of both images differ by a slow shading: f is compared with m less a polynomial of this
+        degree in x, times f, and less a constant, whose coefficients are inferred. 0 is a gain and an offset.
     sampled : "boundary", "all" or list of int
         Nodes whose displacements are sampled; the others follow by the elastic solve.
     held : mapping of int to (x, y, z)
         Nodes with a known displacement, mm; they are not sampled. Elastography: all boundary nodes held and
         ``sampled=[]``; only λ, μ are then sampled, and E_r, the prior of u_B, is no part of the density.
+    skull_width : float
+        0: no sampled node lies in the skull. Else the depth, mm, to which one goes in as easily as by a standard
+        deviation, such as half a voxel: masks of skulls are no better, and nodes that rest on one cost no reflections.
     rigid_sd : float, optional
         Standard deviation, mm, of the root-mean-square displacement of each of the six rigid motions of
         the sampled nodes under a Gaussian prior; None is flat.
@@ -154,6 +195,7 @@ class ModelConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    preset: Literal["paper", "registration"] = "paper"
     elasticity: Literal["tissue", "uniform", "element", "field"] = "tissue"
     field: FieldConfig | None = None
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
@@ -164,17 +206,35 @@ class ModelConfig(BaseModel):
     independent_points: Positive | None = None
     t_similarity: Positive | TemperaturePrior = 0.05
     t_elastic: Positive | TemperaturePrior = 1e4
+    elastic_prior: Literal["boltzmann", "loads"] = "boltzmann"
+    body_load: Positive | ScalePrior = ScalePrior(median=0.1, log_sd=3.0)
+    surface_load: Positive | ScalePrior = ScalePrior(median=0.1, log_sd=3.0)
     normalised: StrictBool = False
     interpolation: Literal["linear", "cubic"] = "linear"
     quadrature: Literal["gauss4", "gauss32", "gauss256", "voxels"] = "gauss4"
+    most_points: Annotated[int, Field(strict=True, ge=1)] | None = None
+    smoothing: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] = 0.0
+    intensity_map: Annotated[int, Field(strict=True, ge=0, le=6)] | None = None
     sampled: Literal["boundary", "all"] | list[Annotated[int, Field(ge=0)]] = "boundary"
     held: dict[Annotated[int, Field(ge=0)], Vector] = {}
+    skull_width: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] = 0.0
     rigid_sd: Positive | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_over_preset(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping):
+            return given
+        return {**PRESETS.get(str(given.get("preset")), {}), **given}
 
     @model_validator(mode="after")
     def _is_proper(self) -> ModelConfig:
         if self.field is not None and self.elasticity != "field":
             raise wrong("field", f"expected null: it belongs to elasticity: field, which is {self.elasticity} here")
+        if self.intensity_map is not None and self.similarity == "lncc":
+            raise wrong("intensity_map", "expected null with similarity: lncc, which finds a map in each window")
+        if self.elastic_prior == "loads":
+            self._require_random_loads()
         if isinstance(self.t_elastic, TemperaturePrior) and not self.normalised:
             raise wrong("t_elastic", "a T_r with a prior needs normalised: true; without it T_r has no likelihood")
         if isinstance(self.t_elastic, TemperaturePrior) and self.fixed is not None and not any(self.fixed.values()):
@@ -191,6 +251,24 @@ class ModelConfig(BaseModel):
             # Where the options name no tissue, the mesh has one at least, which is free or known as `known` says.
             self.require_proper_priors(self._named_tissues or ("the tissue",))
         return self
+
+    def _require_random_loads(self) -> None:
+        """Refuse what the prior of random loads leaves no room for."""
+        if self.sampled != "all" or self.held:
+            raise wrong("sampled", "expected all, and no node held: with elastic_prior: loads every node is sampled")
+        if not self.normalised:
+            raise wrong("normalised", "expected true with elastic_prior: loads, which is a proper density of u")
+        if self.t_elastic != ModelConfig.model_fields["t_elastic"].default:
+            raise wrong(
+                "t_elastic", "belongs to elastic_prior: boltzmann; random loads have body_load and surface_load"
+            )
+        inferred = any(isinstance(load, ScalePrior) for load in (self.body_load, self.surface_load))
+        if inferred and self.fixed is not None and not any(self.fixed.values()):
+            raise wrong(
+                "fixed",
+                "the loads have a prior and no λ or μ is known: their common scale cannot be told; fix one parameter, "
+                "or both loads",
+            )
 
     @property
     def is_elastography(self) -> bool:

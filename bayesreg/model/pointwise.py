@@ -72,7 +72,7 @@ class Pointwise:
         """f − m."""
         return pair.differences
 
-    def convexity(self, pair: Intensities) -> ValueCurvature:
+    def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """The curvature of eq. (1), 2 w."""
         return ValueCurvature(2 * pair.weights)
 
@@ -159,6 +159,16 @@ class StudentT(Pointwise):
         surprise = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
         # A product of vectors, as in eq. (1).
         return temperature * (nu + 1) / 2 * (jnp.ones_like(surprise) @ surprise)
+
+    def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
+        """2 w (ν + 1)/(ν + 3) times the weights (ν + 1)/(ν + z²) of iteratively reweighted least squares.
+
+        The mean of the weights is one where residuals z, in units of their scale, follow the model, and the curvature
+        then Fisher's information; it is less where they are outliers.
+        """
+        nu = self.degrees_of_freedom
+        squares = 2 * pair.weights * pair.differences**2 / temperature
+        return ValueCurvature(2 * pair.weights * (nu + 1) ** 2 / ((nu + 3) * (nu + squares)))
 
     def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
         """Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""

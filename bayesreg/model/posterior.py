@@ -24,8 +24,8 @@ from bayesreg.model.normaliser import Normaliser
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.program import Problem
 from bayesreg.model.single_node import SingleNodes, images_of
-from bayesreg.model.terms.images import ComparedImages
-from bayesreg.model.terms.skull import Walls
+from bayesreg.model.terms.images import ComparedImages, ImagePair
+from bayesreg.model.terms.skull import Skull, Walls
 from bayesreg.model.variables import Variables
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -192,7 +192,7 @@ class Posterior:
 
         With `quick` the images are compared at four points of each tetrahedron, whatever the model's quadrature.
         """
-        observations, interpolation = self.observations, self.options.interpolation
+        observations, interpolation = self._smooth_observations, self.options.interpolation
         data = compare_at_four_points(self.data, observations, interpolation) if quick else self.data
         return condition(data, estimands, np.asarray(alone, int))
 
@@ -211,7 +211,7 @@ class Posterior:
     @property
     def walls(self) -> Walls | None:
         """The skull, if there is one."""
-        return Walls() if "skull" in self.data.terms else None
+        return Walls() if isinstance(self.data.terms.get("skull"), Skull) else None
 
     @property
     def normaliser(self) -> Normaliser | None:
@@ -225,9 +225,16 @@ class Posterior:
         """Densities of single nodes, where a dense preconditioner says what follows a node, and there are images."""
         system = self.data.body.system
         knows = isinstance(system.preconditioner, ReferenceInverse) or not len(system.free)
+        knows &= self.options.elastic_prior == "boltzmann" and self.options.intensity_map is None
         return SingleNodes() if knows and images_of(self.data) is not None else None
 
     @property
     def mode_search(self) -> ModeSearch:
         """The posterior as the search for a mode sees it."""
-        return ModeSearch(self.data, self.observations, self.options.interpolation)
+        return ModeSearch(self.data, self._smooth_observations, self.options.interpolation)
+
+    @property
+    def _smooth_observations(self) -> dict[str, Any]:
+        """The observations, images smoothed as the options say."""
+        pairs = {name: one for name, one in self.observations.items() if isinstance(one, ImagePair)}
+        return {**self.observations, **{name: pair.smoothed_as(self.options) for name, pair in pairs.items()}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import (
     LAME,
     Blocks,
+    Coefficients,
     Displacement,
     FieldComponents,
     FieldScale,
@@ -30,26 +32,30 @@ from bayesreg.model.blocks import (
     Scale,
 )
 from bayesreg.model.field import StiffnessField, stiffness_field
+from bayesreg.model.intensity_map import SHARE
 from bayesreg.model.options import (
     FieldConfig,
     Lame,
     ModelConfig,
     PriorConfig,
-    TemperaturePrior,
+    ScalePrior,
     is_taken,
     of_tissue,
     require_default_image_options,
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
-from bayesreg.model.terms.elastic import ElasticPrior
-from bayesreg.model.terms.images import ImagePair
+from bayesreg.model.terms.elastic import BoltzmannPrior, LoadPrior
+from bayesreg.model.terms.images import ComparedImages, ImagePair, shading_name
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.rigid import RigidPrior
-from bayesreg.model.terms.skull import Skull, is_allowed
+from bayesreg.model.terms.skull import Skull, SoftSkull, is_allowed
 from bayesreg.model.terms.term import Outside, Terms
 from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
+
+# The scales that each elastic prior has.
+ELASTIC_SCALES = {"boltzmann": ("t_elastic",), "loads": ("body_load", "surface_load")}
 
 # The solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
 TOLERANCE = 1e-10
@@ -71,7 +77,9 @@ def problem_of(
     blocks = {**_blocks(mesh, model, sampled, field, reference), **observation_blocks(observations)}
     body = _body(mesh, model, sampled, held, field, blocks)
     # The observations first: what is wrong with them is told before anything that takes long.
-    terms = {**observation_terms(mesh, observations, model), **_priors(mesh, model, sampled, held, skull)}
+    terms = observation_terms(mesh, observations, model)
+    blocks |= _shading_blocks(terms)
+    terms |= _priors(mesh, model, sampled, held, skull)
     return Problem(body, blocks, terms), sampled
 
 
@@ -86,16 +94,16 @@ def _blocks(
         "u_boundary": Displacement(jnp.asarray(mesh.points[sampled])),
         "lam": lame_parameter("lam", mesh, model, reference),
         "mu": lame_parameter("mu", mesh, model, reference),
-        "t_similarity": _temperature(model.t_similarity),
-        "t_elastic": _temperature(model.t_elastic),
+        "t_similarity": _scale(model.t_similarity),
+        **{name: _scale(getattr(model, name)) for name in ELASTIC_SCALES[model.elastic_prior]},
     }
     if field is not None:
         blocks |= {"field": FieldComponents(jnp.zeros(field.basis.shape[1])), "field_sd": FieldScale(field.sd_scale)}
     return blocks
 
 
-def _temperature(given: float | TemperaturePrior) -> Scale:
-    if isinstance(given, TemperaturePrior):
+def _scale(given: float | ScalePrior) -> Scale:
+    if isinstance(given, ScalePrior):
         return Scale(jnp.asarray(given.median), jnp.asarray(given.log_sd))
     return Scale(jnp.asarray(given))
 
@@ -123,6 +131,13 @@ def _body(
         placed=sparse_operator(scipy.sparse.eye_array(len(prescribed), format="csc")[:, slots]),
         held=jnp.asarray(displacement),
     )
+
+
+def _shading_blocks(terms: Terms) -> Blocks:
+    """The coefficients of the shading of every pair of images that has one, see `bayesreg.model.intensity_map`."""
+    pairs = [term for term in terms.values() if isinstance(term, ComparedImages)]
+    bases = {shading_name(pair.name): pair.shading for pair in pairs}
+    return {name: Coefficients(jnp.full(one.shape[1], SHARE)) for name, one in bases.items() if one is not None}
 
 
 def observation_blocks(observations: Sequence[Any]) -> Blocks:
@@ -171,11 +186,14 @@ def _priors(
     if not len(sampled):
         return terms
     determinant = schur_determinant(mesh, sampled, np.array(list(held), int)) if model.normalised else None
-    terms["elastic"] = ElasticPrior(determinant)
+    loads = model.elastic_prior == "loads"
+    terms["elastic"] = LoadPrior.on(mesh, determinant) if loads else BoltzmannPrior(determinant)
     if model.rigid_sd is not None:
         terms["rigid"] = RigidPrior(jnp.asarray(rigid_modes(mesh.points[sampled])), jnp.asarray(model.rigid_sd))
     if skull is not None:
-        terms["skull"] = Skull(skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled]))
+        arrays = skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled])
+        soft = partial(SoftSkull, nodes=jnp.asarray(sampled), width=jnp.asarray(model.skull_width))
+        terms["skull"] = soft(*arrays) if model.skull_width else Skull(*arrays)
     return terms
 
 

@@ -34,7 +34,7 @@ class Similarity(Protocol):
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """The part of f that noise explains."""
 
-    def convexity(self, pair: Intensities) -> ValueCurvature:
+    def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Gauss and Newton's curvature of E_s in the values m_q, positive semidefinite."""
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:

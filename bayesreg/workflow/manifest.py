@@ -106,7 +106,7 @@ def manifest(
         "steps_per_chain": int(tally.steps[0]),
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
-        "residual_sd": _residual_sd(posterior, samples),
+        "residual_sd": _residual_sd(posterior, samples, mean),
         "implied_noise_sd": implied_noise_sd(posterior, mean),
     }
 
@@ -122,9 +122,9 @@ def _model(config: Config, posterior: Posterior) -> dict[str, Any]:
     }
 
 
-def _residual_sd(posterior: Posterior, samples: Samples) -> float | None:
+def _residual_sd(posterior: Posterior, samples: Samples, mean: Values) -> float | None:
     images = images_of(posterior.data)
-    return None if images is None else float(np.std(images.residuals(jnp.asarray(samples.u_mean))))
+    return None if images is None else float(np.std(images.residuals(jnp.asarray(samples.u_mean), mean)))
 
 
 def implied_noise_sd(posterior: Posterior, mean: Values) -> float | None:

@@ -91,8 +91,8 @@ def predict(
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         if with_images:
             values, cells = here.fill(draw), here.images.quadrature.cells
-            z = here.images.scaled_residual(u, values["t_similarity"])
-            noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), u)
+            z = here.images.scaled_residual(u, values)
+            noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), u, values)
             for name, x in (("observed", z), ("replicated", noise)):
                 found[name] = discrepancies(x, cells, neighbours, len(mesh.cells))
         return found
@@ -123,7 +123,7 @@ def _residual(
     posterior: Posterior, u_mean: Float[np.ndarray, "nodes 3"], mean: Mapping[str, AnyArray]
 ) -> dict[str, np.ndarray]:
     """The residual of the images at the mean, in units of the noise."""
-    at_mean = posterior.images.scaled_residual(jnp.asarray(u_mean), mean["t_similarity"])
+    at_mean = posterior.images.scaled_residual(jnp.asarray(u_mean), mean)
     return {
         "residual": np.asarray(at_mean, np.float32),
         "residual_tissue": posterior.mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),

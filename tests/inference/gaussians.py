@@ -87,13 +87,19 @@ class ModeSearch:
     def __init__(self, data):
         self.data = data
 
-    scales = ()
+    hyperparameters = ()
 
     def continuation(self):
         yield self.data
 
     def curvature(self, data, estimands):
         return Curvature(np.asarray(data.precision), lambda: np.zeros((DIMENSION, DIMENSION)))
+
+    def quadratic_part(self, data):
+        return data
+
+    def quadratic_curvature(self, data, estimands, near):
+        return np.asarray(data.precision)
 
 
 class GaussianTarget:

@@ -6,18 +6,21 @@ p_i / T_r, marginally N(0, T_r / p_i + σ²).
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.optimize import minimize
 
-from bayesreg.inference.gaussian.hierarchy import (
-    balance_field,
-    newton_step,
-    volume_of,
-)
+from bayesreg.inference.gaussian.evidence import Expansion, evidence, evidence_curvature, maximise_evidence
+from bayesreg.inference.gaussian.hierarchy import balance_field
+from bayesreg.inference.layout import unravel
 
 COUNT, NOISE = 100, 0.5
+# Components of displacements.
+MOVED = 99
 
 
 class Field:
@@ -84,34 +87,87 @@ def test_without_a_field_nothing_is_asked_for():
     np.testing.assert_array_equal(balance_field(target, flat, never), flat)
 
 
+class Displaced:
+    """A target of T_r, the noise σ and displacements u of the data y = u + σ e, without images."""
+
+    data = walls = normaliser = single_nodes = variables = None
+
+    def unused(self, *_):
+        raise AssertionError("nobody asks for it")
+
+    condition = supports = continuation = curvature = least_curvature = unused
+
+    def __init__(self, precision, y):
+        self.precision, self.y = jnp.asarray(precision), jnp.asarray(y)
+
+    @property
+    def coordinates(self):
+        return self
+
+    mode_search = coordinates
+    hyperparameters = ("noise", "t_elastic")
+
+    def reference(self):
+        return {"noise": jnp.ones(()), "t_elastic": jnp.ones(()), "u_boundary": jnp.zeros((MOVED // 3, 3))}
+
+    def unconstrain(self, data, estimands):
+        return {name: x if name == "u_boundary" else jnp.log(x) for name, x in estimands.items()}
+
+    def constrain(self, data, position):
+        return {name: x if name == "u_boundary" else jnp.exp(x) for name, x in position.items()}, jnp.zeros(())
+
+    def evaluate_estimands(self, data, estimands):
+        prior, noise = self.precision / estimands["t_elastic"], estimands["noise"]
+        u, logs = estimands["u_boundary"].ravel(), jnp.log(jnp.stack([estimands["t_elastic"], noise]))
+        found = -prior @ u**2 / 2 + jnp.log(prior).sum() / 2 - ((self.y - u) ** 2).sum() / noise**2 / 2
+        return SimpleNamespace(logdensity=found - len(u) * jnp.log(noise) - logs @ logs / 8)
+
+    def quadratic_part(self, data):
+        return data
+
+    def quadratic_curvature(self, data, estimands, near):
+        return np.diag(np.asarray(self.precision / estimands["t_elastic"] + estimands["noise"] ** -2.0))
+
+
 @pytest.mark.parametrize("first", [1e-3, 1e3])
 @pytest.mark.parametrize(("temperature", "noise"), [(0.2, 0.5), (3.0, 0.5), (1.0, 0.01), (0.3, 2.0)])
 def test_scales_come_to_the_maximum_of_their_evidence(temperature, noise, first):
     """T_r and the noise together, from far off: below lies the joint mode. Log-normal priors about 1, of sd 2."""
     rng = np.random.default_rng(0)
-    precision = 10 ** rng.uniform(-1, 2, COUNT)
-    y = np.sqrt(temperature / precision) * rng.normal(size=COUNT) + noise * rng.normal(size=COUNT)
+    precision = 10 ** rng.uniform(-1, 2, MOVED)
+    y = np.sqrt(temperature / precision) * rng.normal(size=MOVED) + noise * rng.normal(size=MOVED)
 
-    def evidence(logs):
-        variance = np.exp(logs[0]) / precision + np.exp(2 * logs[1])
+    def log_evidence(logs):
+        variance = np.exp(logs[1]) / precision + np.exp(2 * logs[0])
         return stats.norm.logpdf(y, scale=np.sqrt(variance)).sum() + stats.norm.logpdf(logs, scale=2.0).sum()
 
-    logs = np.log([first, first])
-    for _ in range(60):
-        prior, data = precision * np.exp(-logs[0]), np.full(COUNT, np.exp(-2 * logs[1]))
-        u = data * y / (prior + data)
-        energies = np.array([prior @ u**2 / 2, data @ (y - u) ** 2 / 2])
-        slope = np.array([energies[0] - COUNT / 2, 2 * energies[1] - COUNT]) - logs / 4
-        own = np.diag([energies[0], 4 * energies[1]]) + np.eye(2) / 4
-        cross = np.array([prior * u, -2 * data * (y - u)])
-        derivatives = [(np.diag(-prior), np.diag(prior)), (np.diag(-2 * data), np.diag(4 * data))]
-        volume = volume_of(np.diag(prior + data), derivatives)
-        found = volume.curvature + own - cross @ volume.covariance @ cross.T
-        logs = logs + newton_step(slope + volume.slope, found)
-    best = minimize(lambda logs: -evidence(logs), np.zeros(2), tol=1e-9).x
-    np.testing.assert_allclose(logs, best, atol=1e-3)
+    target = Displaced(precision, y)
+    flat, found = np.append(np.log([first, first]), np.zeros(MOVED)), None
+    for _ in range(10):
+        found = maximise_evidence(target, flat, target.quadratic_curvature(None, *[at(target, flat)] * 2))
+        flat = found.flat
+        if found.moved < 1e-3:
+            break
+    best = minimize(lambda logs: -log_evidence(logs), np.zeros(2), tol=1e-9).x
+    np.testing.assert_allclose(flat[:2], best, atol=1e-2)
+    prior, data = precision * np.exp(-flat[1]), np.exp(-2 * flat[0])
+    np.testing.assert_allclose(flat[2:], data * y / (prior + data), rtol=1e-8)
 
-    # At the maximum this is the evidence's own curvature.
+    # The evidence itself, up to a constant, and its slope; at the maximum also its curvature.
+    curvature = target.quadratic_curvature(None, *[at(target, flat)] * 2)
+    about = Expansion(flat, np.arange(2), np.zeros((MOVED, MOVED)), np.zeros(len(flat)))
+    heights = [
+        evidence(target, about, best + step)[0] - log_evidence(best + step) for step in ([0, 0], [1, 0], [0, -1])
+    ]
+    np.testing.assert_allclose(heights, heights[0], rtol=1e-6)
     step, ways = 1e-3 * np.eye(2), [(1, 1), (-1, -1), (1, -1), (-1, 1)]
-    corners = [[sum(a * b * evidence(best + a * e + b * f) for a, b in ways) for f in step] for e in step]
-    np.testing.assert_allclose(found, -np.array(corners) / (2 * 1e-3) ** 2, rtol=1e-3, atol=1e-3)
+    slope = [(log_evidence(flat[:2] + e) - log_evidence(flat[:2] - e)) / 2e-3 for e in step]
+    np.testing.assert_allclose(evidence(target, about, flat[:2])[1], slope, atol=1e-2)
+    corners = [[sum(a * b * log_evidence(flat[:2] + a * e + b * f) for a, b in ways) for f in step] for e in step]
+    expected = -np.array(corners) / (2 * 1e-3) ** 2
+    np.testing.assert_allclose(evidence_curvature(target, about, curvature), expected, rtol=2e-3, atol=2e-2)
+
+
+def at(target, flat):
+    """The estimands of a flat position."""
+    return target.constrain(None, unravel(target)(jnp.asarray(flat)))[0]

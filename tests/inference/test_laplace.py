@@ -9,7 +9,8 @@ from scipy import stats
 from scipy.optimize import lsq_linear, minimize_scalar
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import _add_convexly, hessian_rows, laplace, precision_at, recentre
+from bayesreg.inference.gaussian.density import hessian_rows
+from bayesreg.inference.gaussian.laplace import _add_convexly, laplace, precision_at, recentre
 from bayesreg.inference.gaussian.mode_search import GAP, find_mode
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import logdensity

@@ -5,7 +5,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
-from bayesreg.inference.gaussian.laplace import _height_and_slope
+from bayesreg.inference.gaussian.density import _height_and_slope
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
 from tests.phantoms import box_mesh, flat_skull, smooth_image

@@ -7,7 +7,8 @@ import pytest
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.model.independence import independent_points
+from bayesreg.model.independence import independent_points, independent_scores
+from bayesreg.types import InputError
 from tests.phantoms import rotated_affine
 
 SIZES = np.array([1.0, 1.5, 2.0])
@@ -70,3 +71,31 @@ def test_what_has_no_autocorrelation():
         independent_points(image, mask)
     with pytest.raises(ValueError, match="one grid"):
         independent_points(Image(np.ones((3, 3, 3)), grid), mask)
+
+
+def test_scores_of_white_noise_are_worth_all_their_points():
+    grid, voxels = Image(np.zeros(SHAPE), affine()), np.argwhere(ball())
+    scores = np.random.default_rng(1).normal(size=(len(voxels), 3))
+    assert 0.9 * len(voxels) < independent_scores(scores, voxels, grid) <= len(voxels)
+
+
+@pytest.mark.parametrize("density", [1.0, 0.2])
+def test_scores_of_some_voxels_count_by_the_variance_of_their_sum(density):
+    """n independent ones of the same variance would have a sum as variable as this one, over many realisations."""
+    rng = np.random.default_rng(0)
+    chosen = np.argwhere(ball() & (rng.uniform(size=SHAPE) < density))
+    at, found, sums, variance = tuple(chosen.T), [], [], []
+    for seed in range(60):
+        values = field(2.0, seed)[at] - 0.3
+        sums.append(values.sum())
+        variance.append((values**2).mean())
+        if seed < 6:
+            found.append(independent_scores(values[:, None], chosen, Image(np.zeros(SHAPE), affine())))
+    expected = len(chosen) ** 2 * np.mean(variance) / np.mean(np.square(sums))
+    assert np.mean(found) == pytest.approx(expected, rel=0.4)
+    assert np.mean(found) < 0.5 * len(chosen)
+
+
+def test_a_residual_of_nothing_is_told():
+    with pytest.raises(InputError, match="zero at every point"):
+        independent_scores(np.zeros((3, 1)), np.arange(9).reshape(3, 3), Image(np.zeros(SHAPE), affine()))

@@ -185,7 +185,7 @@ def test_gauss_and_newtons_curvature_is_that_of_the_projected_residuals():
     post, state = posterior(), values()
     f, m, w = compared(post, state)
     gain, _, _ = fitted(post, state)
-    found = post.images.similarity.convexity(Intensities(*map(jnp.asarray, (f, m, w))))
+    found = post.images.similarity.convexity(Intensities(*map(jnp.asarray, (f, m, w))), jnp.asarray(1.0))
     label, dense = np.asarray(post.images.similarity.windows.label), np.diag(np.asarray(found.diagonal))
     for vector, sign in zip(np.asarray(found.shared.vectors), np.asarray(found.shared.signs), strict=True):
         dense += sign * np.outer(vector, vector) * (label[:, None] == label)

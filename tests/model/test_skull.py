@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from itertools import product
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import ndimage
 
+import bayesreg as br
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
+from bayesreg.model.state import state_of
 from bayesreg.model.terms.skull import is_allowed
 from tests.oracles.paper import in_skull
-from tests.phantoms import flat_skull, rotated_affine
+from tests.phantoms import ball_mesh, flat_skull, rotated_affine, smooth_image
 
 CORNERS = np.array(list(product((-40.0, 40.0), repeat=3)))
 
@@ -119,3 +123,43 @@ def test_on_a_wide_grid_a_body_deep_in_the_skull_is_led_back():
     wide = Image(np.pad(np.zeros((10, 10, 10), np.uint8), 40, constant_values=1), np.eye(4))
     x = np.array([[45.0, 45.0, 49.5 + depth] for depth in (18.0, 25.0, 35.0)])
     np.testing.assert_allclose(signed_distance(wide).interpolate(x), 49.5 - x[:, 2], atol=0.2)
+
+
+def soft(width=0.5):
+    """A soft skull, and displacements that take some nodes into it."""
+    mesh = ball_mesh(spacing=24.0)
+    image = smooth_image(mesh.points, seed=1)
+    wall = mesh.points[:, 2].max() + 1.0
+    model = br.ModelConfig(skull_width=width)
+    posterior = br.build_posterior(image, image, mesh, model=model, skull=flat_skull(mesh.points, 2, wall))
+    u = np.zeros((len(posterior.sampled), 3))
+    u[:, 2] = 3.0
+    return posterior, {"u_boundary": u, "lam": np.ones(3), "mu": np.ones(3)}, wall
+
+
+def test_a_soft_skull_lets_nodes_in_at_a_price():
+    posterior, values, wall = soft()
+    depth = np.maximum(posterior.mesh.points[posterior.sampled, 2] + 3.0 - wall, 0.0)
+    assert 0 < (depth > 0).sum() < len(depth)
+    assert float(posterior.energies(values)["skull"]) == pytest.approx(-0.5 * (depth**2).sum() / 0.25)
+    assert posterior.walls is None
+    assert np.isfinite(posterior.evaluate(values).logdensity)
+    outside = values | {"u_boundary": np.zeros_like(values["u_boundary"])}
+    assert float(posterior.energies(outside)["skull"]) == 0
+
+
+def test_the_curvature_of_a_soft_skull_is_that_of_its_log():
+    posterior, values, _ = soft()
+    term, filled = posterior.data.terms["skull"], posterior.fill(values)
+    found = np.asarray(term.gauss_newton(posterior.evaluate(values).u, filled).matrices)
+
+    def log(u):
+        state = state_of(posterior.data.body, posterior.data.blocks, {**filled, "u_boundary": u})
+        return -term.log(state)
+
+    u = jnp.asarray(values["u_boundary"])
+    slope = jax.jit(jax.grad(log))
+    for row, axis in ((int(found[:, 2, 2].argmax()), 2), (0, 0), (0, 1)):
+        step = jnp.zeros_like(u).at[row, axis].set(1e-3)
+        expected = (slope(u + step) - slope(u - step)) / 2e-3
+        np.testing.assert_allclose(found[row, axis], expected[row], atol=1e-6)

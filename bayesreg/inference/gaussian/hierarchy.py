@@ -5,14 +5,15 @@ much less room z has the greater sd is. The Gaussian is better placed where the 
 MacKay's fixed point (1992): |z|² = γ, the number of components that the data determine.
 
 T_r is such a scale of u_B, whose prior's curvature P falls as 1 / T_r: the joint mode lies next to T_r = 0, where
-nothing moves. So is the sd of landmarks: nodes may follow all of them, and the joint mode lies next to sd = 0. With u_B
-integrated out by Laplace's approximation, H its curvature and C = H⁻¹, the log density of the logarithm θ of such a
-scale gains −½ log det H, whose derivatives are
+nothing moves. So is the sd of landmarks: nodes may follow all of them, and the joint mode lies next to sd = 0. λ and μ
+are in the prior's curvature, too: the joint mode would have them wherever they let all displacements pass. With u_B
+integrated out by Laplace's approximation, H its curvature and C = H⁻¹, the log density of such hyperparameters θ, in
+the coordinates of a position, gains −½ log det H, whose derivatives are
 
-∂/∂θ_k = −½ tr(C H_k) and −∂²/∂θ_k∂θ_l = ½ tr(C H_kl) − ½ tr(C H_k C H_l), where H_kl = 0 for k ≠ l.
+∂/∂θ_k = −½ tr(C H_k) and −∂²/∂θ_k∂θ_l = ½ tr(C H_kl) − ½ tr(C H_k C H_l).
 
 For T_r these are ½ tr(C P) and ½ tr(C P − (C P)²), so that 2 E_r / T_r = γ where its prior says nothing. At a typical
-draw of u_B, whose energies are greater than at the mode, the density itself is more curved in θ_k, by ½ tr(C H_kk).
+draw of u_B, whose energies are greater than at the mode, the density itself is more curved in θ, by ½ tr(C H_kl).
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Bool, Float
 
 from bayesreg.inference.layout import Placed, marked
 from bayesreg.inference.target import Target
+from bayesreg.types import Matrix
 
 SCALE, COMPONENTS = "field_sd", "field"
 _MOST = 1.0
 
 
 def mark_scales(target: Target) -> Bool[np.ndarray, "dimension"]:
-    """Mark the entries of a flat position that hold the logarithm of a scale, that of the field included."""
-    return marked(target, SCALE) | mark_scales_of_displacements(target)
+    """Mark the entries of a flat position that hold hyperparameters, the logarithm of the field's sd included."""
+    return marked(target, SCALE) | mark_hyperparameters(target)
 
 
-def mark_scales_of_displacements(target: Target) -> Bool[np.ndarray, "dimension"]:
-    """Mark the entries of a flat position that hold the logarithm of a scale of the displacements."""
-    return marked(target, *(target.mode_search.scales if target.mode_search else ()))
+def mark_hyperparameters(target: Target) -> Bool[np.ndarray, "dimension"]:
+    """Mark the entries of a flat position that hold hyperparameters of the displacements."""
+    return marked(target, *(target.mode_search.hyperparameters if target.mode_search else ()))
 
 
 def balance_field(
@@ -74,52 +75,39 @@ def balance_field(
 
 
 class Volume(NamedTuple):
-    """Derivatives of −½ log det H in the logarithms θ of scales.
+    """Derivatives of −½ log det H in hyperparameters θ.
 
     Attributes
     ----------
     slope : (k,) array
     curvature : (k, k) array
         Minus the second derivatives.
-    excess : (k,) array
-        By how much the log density is more curved in each θ at a typical draw of the displacements than at their mode.
-    covariance : (r, r) array
-        C.
+    excess : (k, k) array
+        By how much the log density is more curved in θ at a typical draw of the displacements than at their mode.
     """
 
-    slope: Float[np.ndarray, "scales"]
-    curvature: Float[np.ndarray, "scales scales"]
-    excess: Float[np.ndarray, "scales"]
-    covariance: Float[np.ndarray, "rows rows"]
+    slope: Float[np.ndarray, "hyperparameters"]
+    curvature: Float[np.ndarray, "hyperparameters hyperparameters"]
+    excess: Float[np.ndarray, "hyperparameters hyperparameters"]
 
 
 def volume_of(
-    curvature: Float[np.ndarray, "rows rows"],
-    derivatives: Sequence[tuple[Float[np.ndarray, "rows rows"], Float[np.ndarray, "rows rows"]]],
+    covariance: Float[np.ndarray, "rows rows"],
+    first: Sequence[Matrix],
+    second_traces: Float[np.ndarray, "hyperparameters hyperparameters"],
 ) -> Volume:
     """The derivatives of −½ log det H.
 
     Parameters
     ----------
-    curvature : (r, r) array
-        H.
-    derivatives : sequence
-        H_k and H_kk of every scale.
+    covariance : (r, r) array
+        C.
+    first : sequence of (r, r) matrices, dense or sparse
+        H_k of every hyperparameter.
+    second_traces : (k, k) array
+        tr(C H_kl).
     """
-    covariance = scipy.linalg.cho_solve(scipy.linalg.cho_factor(curvature), np.eye(len(curvature)))
-    excess = np.array([(covariance * second).sum() / 2 for _, second in derivatives])
-    shares = np.array([covariance @ first for first, _ in derivatives])
-    slope = -np.trace(shares, axis1=1, axis2=2) / 2
-    return Volume(slope, np.diag(excess) - np.einsum("kij,lji->kl", shares, shares) / 2, excess, covariance)
-
-
-def newton_step(
-    slope: Float[np.ndarray, "scales"], curvature: Float[np.ndarray, "scales scales"]
-) -> Float[np.ndarray, "scales"]:
-    """A step of the logarithms of scales towards the maximum of their evidence, of 1 at most in each.
-
-    Where the evidence is not convex, it counts by the size of its curvature.
-    """
-    values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
-    step = vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), np.finfo(float).tiny))
-    return np.clip(step, -_MOST, _MOST)
+    shares = [np.asarray((one @ covariance).T) for one in first]
+    slope = -np.array([np.trace(share) for share in shares]) / 2
+    squares = np.array([[(one * other.T).sum() for other in shares] for one in shares])
+    return Volume(slope, (second_traces - squares.reshape(second_traces.shape)) / 2, second_traces / 2)

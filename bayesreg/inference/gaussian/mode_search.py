@@ -12,31 +12,20 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from bayesreg.inference.gaussian.hierarchy import (
-    balance_field,
-    mark_scales,
-    mark_scales_of_displacements,
-    newton_step,
-)
-from bayesreg.inference.gaussian.laplace import (
-    Gaussian,
-    gaussian_of,
-    height_and_slope,
-    hessian_rows,
-    laplace,
-    precision_at,
-    slope_at,
-    volume_at,
-)
+from bayesreg.inference.gaussian.density import estimands_at, height_and_slope
+from bayesreg.inference.gaussian.evidence import Found, maximise_evidence
+from bayesreg.inference.gaussian.hierarchy import balance_field, mark_hyperparameters, mark_scales
+from bayesreg.inference.gaussian.laplace import Gaussian, gaussian_of, laplace, precision_at
 from bayesreg.inference.gaussian.pockets import leave_pockets
-from bayesreg.inference.layout import displacements, marked, node_count, others, unravel
+from bayesreg.inference.layout import displacements, node_count, others, unravel
 from bayesreg.inference.target import Target, clearance, without_normaliser
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
 SOFTNESS, GAP = 0.05, 0.02
-# The last stage is repeated so often, at most, or until no coordinate moves by more.
-REPEATS, SETTLED = 20, 1e-3
+# The last stage is repeated so often, at most, or until no coordinate moves by more, and no hyperparameter by more of
+# its standard deviations.
+REPEATS, SETTLED, SETTLED_SD = 20, 3e-3, 0.1
 # A stage ends where an iteration gains less than this share of the height. On the way nothing is owed to a place that
 # the next stage leaves: with that of the last, twice as many gradients led to the same modes.
 ROUGH, FINE = 1e-4, 1e-10
@@ -101,31 +90,34 @@ def settle(
     # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
     # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
     # skull and not in it, however great the force that presses.
-    shift = np.zeros(node_count(target))
+    shift, resting, before = np.zeros(node_count(target)), mark_hyperparameters(target), flat
+    better = Found(flat, np.inf)
     for _ in range(REPEATS):
-        before, pressed = flat, shift
-        flat = _improve(target, target.data, flat, True, iterations, say, shift)
-        flat = _improve_scales(target, balance_field(target, flat, partial(_factor, target, flat)))
-        shift = np.maximum(shift + GAP - _gaps(target, flat), 0.0)
-        if max(np.abs(flat - before).max(), np.abs(shift - pressed).max(initial=0.0)) < SETTLED:
-            break
-    else:
-        say("mode: not settled")
-    return _admissible(target, flat)
+        found, pressed = _improve(target, target.data, better.flat, True, iterations, say, shift), shift
+        shift = np.maximum(shift + GAP - _gaps(target, found), 0.0)
+        balanced = balance_field(target, found, partial(_factor, target, found))
+        moved = np.abs(balanced - before)[~resting].max(), np.abs(shift - pressed).max(initial=0.0)
+        # Once they rest, what else moves is too little for them to follow.
+        if better.moved < SETTLED_SD:
+            better = better._replace(flat=balanced)
+        else:
+            better = _improve_hyperparameters(target, balanced)
+        before = balanced
+        if max(moved) < SETTLED and better.moved < SETTLED_SD:
+            # The evidence knows nothing of walls: nodes that press on them stay where they were found.
+            return _admissible(target, balanced)
+    say("mode: not settled")
+    return _admissible(target, balanced)
 
 
-def _improve_scales(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """The flat position with the scales of the displacements, if any, nearer to the maximum of their evidence."""
-    scales = np.flatnonzero(mark_scales_of_displacements(target))
-    if not len(scales):
-        return flat
-    volume, rows = volume_at(target, target.data, flat), hessian_rows(target, target.data, flat, scales)
-    cross = rows[:, marked(target, "field", "u_boundary")]
-    # The displacements follow the scales: the evidence is less curved than the density at given ones.
-    curvature = volume.curvature - rows[:, scales] - cross @ volume.covariance @ cross.T
-    moved = np.array(flat)
-    moved[scales] += newton_step(slope_at(target, flat)[scales] + volume.slope, curvature)
-    return moved
+def _improve_hyperparameters(target: Target, flat: Float[np.ndarray, "dimension"]) -> Found:
+    """The hyperparameters, if any, at the maximum of their evidence about a flat position."""
+    assert target.mode_search is not None
+    if not mark_hyperparameters(target).any():
+        return Found(flat, 0.0)
+    estimands = estimands_at(target, target.data, jnp.asarray(flat))
+    curvature = target.mode_search.curvature(target.data, estimands).gauss_newton
+    return maximise_evidence(target, flat, curvature)
 
 
 def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
@@ -150,11 +142,12 @@ def _improve(
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
     shift = np.zeros(node_count(target)) if shift is None else shift
-    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves), mark_scales(target)))
+    resting = mark_scales(target)
+    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves, resting), resting))
     if not moves:
         # The normaliser is the same for all displacements.
         data = without_normaliser(target, data)
-    moving, own = 1 - mark_scales(target).astype(float), displacements(target)
+    moving, own = 1 - resting.astype(float), displacements(target)
     if not moves:
         moving[others(target)] = 0.0
     best: list[tuple[Any, float, Any, float]] = []

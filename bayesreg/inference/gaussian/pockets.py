@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.inference.gaussian.laplace import height_and_slope
+from bayesreg.inference.gaussian.density import height_and_slope
 from bayesreg.inference.layout import displacements, node_count, unravel
 from bayesreg.inference.target import Estimands, Target, estimands_of, without_normaliser
 from bayesreg.types import AnyArray

@@ -78,7 +78,7 @@ def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray, alone: Any
     centre = gaussian.centre[own].reshape(nodes, 3)
     rows = gaussian.factor[own].reshape(nodes, 3, len(gaussian.centre))
     nothing = no_stand_in(target)
-    held = walls(centre, rows, jnp.arange(nodes))
+    held = walls(centre, rows, jnp.arange(nodes if target.walls else 0))
     at = middle[own].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
     nodes_alone = place_loose_nodes(gaussian, own.start, jnp.asarray(alone, int), at)
     step_size, steps = jnp.asarray(FIRST_STEP), jnp.asarray(1, int)

@@ -1,20 +1,25 @@
-"""The elastic prior exp(−E_r / T_r) of eq. (12), with or without its normaliser."""
+"""Elastic priors of the displacements: the Boltzmann prior of eq. (12), and random loads on the right of eq. (7)."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
 from jaxtyping import Float
 
 from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
-from bayesreg.fem.elements import Elements
+from bayesreg.fem.elasticity import internal_force, rigid_modes
+from bayesreg.fem.elements import Elements, boundary_areas
+from bayesreg.mesh import TetMesh
+from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.types import AnyArray, Matrix, Scalar
 
 
-class ElasticPrior(NamedTuple):
-    """The Boltzmann prior of the displacements.
+class BoltzmannPrior(NamedTuple):
+    """exp(−E_r / T_r), eq. (12), with or without its normaliser.
 
     Attributes
     ----------
@@ -31,14 +36,88 @@ class ElasticPrior(NamedTuple):
 
     def log(self, state: State) -> Scalar:
         """−E_r / T_r, and the normaliser if it is part of the density."""
-        t_elastic = state.values["t_elastic"]
-        return -state.strain_energy / t_elastic + self.log_normaliser(state.elements, state.lam, state.mu, t_elastic)
+        energy = state.strain_energy / state.values["t_elastic"]
+        return -energy + self.log_normaliser(state.elements, state.lam, state.mu, state.values)
 
     def log_normaliser(
-        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], t_elastic: Scalar
+        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], values: Values
     ) -> Scalar:
         """½ log pdet S(λ, μ) − r/2 log(2π T_r), r the rank of S; zero where it is left out."""
         if self.determinant is None:
             return jnp.zeros(())
         log_pdet = log_pseudo_determinant(self.determinant, elements, lam, mu)
-        return 0.5 * (log_pdet - self.determinant.rank * jnp.log(2 * jnp.pi * t_elastic))
+        return 0.5 * (log_pdet - self.determinant.rank * jnp.log(2 * jnp.pi * values["t_elastic"]))
+
+    def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
+        """S / T_r, 1/mm², of the Schur complement S of the stiffness in the sampled nodes."""
+        return stiffness / float(values["t_elastic"])
+
+
+class LoadPrior(NamedTuple):
+    """Equilibrium with random loads: K u = q in place of eq. (7), q ~ N(0, D), D = s² M + t² A on the diagonal.
+
+    The body forces are white noise of the density s, M the lumped volumes of the nodes, and the surface forces white
+    noise of the density t, A their lumped areas; a free body is at rest, so that they are in balance. What follows for
+    u is N(0, (K D⁻¹ K)⁺), up to a rigid motion, as smooth as elastic bodies are. Its variance at a point has a limit
+    where the mesh is refined, unlike that of exp(−E_r / T_r) on all nodes (Lindgren, Rue and Lindström 2011; Bui-Thanh,
+    Ghattas, Martin and Stadler 2013). Without body forces, s → 0, the inside is in equilibrium: eq. (7).
+
+    Attributes
+    ----------
+    determinant : SchurDeterminant or None
+        None leaves the normaliser out.
+    volumes : (n,) array
+        Diagonal of M, mm³.
+    areas : (n,) array
+        Diagonal of A, mm², zero inside.
+    rigid : (3n, 6) array
+        Orthonormal basis of the rigid motions, which cost nothing.
+    """
+
+    determinant: SchurDeterminant | None
+    volumes: Float[AnyArray, "nodes"]
+    areas: Float[AnyArray, "nodes"]
+    rigid: Float[AnyArray, "rows 6"]
+
+    @classmethod
+    def on(cls, mesh: TetMesh, determinant: SchurDeterminant | None) -> LoadPrior:
+        """The prior on a mesh whose nodes are all sampled."""
+        volumes = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.points))
+        arrays = volumes, boundary_areas(mesh), rigid_modes(mesh.points)
+        return cls(determinant, *(jnp.asarray(array) for array in arrays))
+
+    @property
+    def name(self) -> str:
+        """The name of the term."""
+        return "elastic"
+
+    def variances(self, values: Values) -> Float[AnyArray, "nodes"]:
+        """The diagonal of D, of each node: the variance of every component of its load."""
+        return values["body_load"] ** 2 * self.volumes + values["surface_load"] ** 2 * self.areas
+
+    def log(self, state: State) -> Scalar:
+        """−½ qᵀ D⁻¹ q, and the normaliser if it is part of the density."""
+        load = internal_force(state.elements, state.lam, state.mu, state.u)
+        energy = (load**2 / self.variances(state.values)[:, None]).sum() / 2
+        return -energy + self.log_normaliser(state.elements, state.lam, state.mu, state.values)
+
+    def log_normaliser(
+        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], values: Values
+    ) -> Scalar:
+        """½ log pdet(K D⁻¹ K) − r/2 log 2π, r = 3n − 6; zero where it is left out.
+
+        With an orthonormal basis R of the null space of K, pdet(K D⁻¹ K) = (pdet K)² det(Rᵀ D R) / det D, since the
+        block of D⁻¹ in the complement of R has the determinant of the block of D in R over that of D (Jacobi).
+        """
+        if self.determinant is None:
+            return jnp.zeros(())
+        log_pdet = log_pseudo_determinant(self.determinant, elements, lam, mu)
+        variances = jnp.repeat(self.variances(values), 3)
+        in_null_space = jnp.linalg.slogdet(self.rigid.T @ (variances[:, None] * self.rigid))[1]
+        rest = in_null_space - jnp.log(variances).sum() - self.determinant.rank * jnp.log(2 * jnp.pi)
+        return log_pdet + 0.5 * rest
+
+    def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
+        """K D⁻¹ K, 1/mm²."""
+        weights = np.repeat(1 / np.asarray(self.variances(values)), 3)
+        return stiffness @ (scipy.sparse.diags(weights) @ stiffness)

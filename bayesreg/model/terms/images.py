@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -20,12 +21,15 @@ from bayesreg.image import Image
 from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
+from bayesreg.model.intensity_map import shading_basis
 from bayesreg.model.options import ModelConfig, TemperaturePrior
 from bayesreg.model.pointwise import Intensities, ValueCurvature
 from bayesreg.model.similarity import SIMILARITIES, Similarity
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import PointCurvature, SharedCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
+
+NOTHING: Values = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,17 +75,27 @@ class ImagePair:
         require_overlap(mesh, self.moving, f"moving image{of_pair}")
         quadrature = quadrature_of(mesh, self.fixed, model)
         positions = quadrature.positions(mesh)
-        moving = self.moving.interpolator(model.interpolation)
+        smooth = self.smoothed_as(model)
+        moving = smooth.moving.interpolator(model.interpolation)
+        fixed_values = smooth.fixed.interpolate(positions, model.interpolation)
+        shading = None
+        if model.intensity_map is not None:
+            shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, model.intensity_map))
         return ComparedImages(
             comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior)),
             similarity=SIMILARITIES[model.similarity].on(model, positions, moving),
-            fixed_values=self.fixed.interpolate(positions, model.interpolation),
+            fixed_values=fixed_values,
             moving=moving,
             quadrature=quadrature,
             nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
             positions=jnp.asarray(positions),
             independent_share=jnp.asarray(independent_share(model, len(positions))),
+            shading=shading,
         )
+
+    def smoothed_as(self, model: ModelConfig) -> ImagePair:
+        """The pair with both images smoothed as the options say."""
+        return _smoothed_as(self, model.smoothing) if model.smoothing else self
 
     def smoothed(self, term: ComparedImages, sd: float, interpolation: Interpolation) -> ComparedImages:
         """The term with both images smoothed, sd in mm."""
@@ -91,7 +105,7 @@ class ImagePair:
         return term._replace(moving=moving, fixed_values=fixed(term.positions))
 
     def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
-        """The term with the images compared at four points of every tetrahedron."""
+        """The term with the images compared at four points of every tetrahedron, without a shading."""
         quadrature = gauss_quadrature(mesh, "gauss4")
         positions = quadrature.positions(mesh)
         return term._replace(
@@ -100,6 +114,7 @@ class ImagePair:
             nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
             positions=jnp.asarray(positions),
             fixed_values=self.fixed.interpolate(positions, interpolation),
+            shading=None,
         )
 
 
@@ -137,6 +152,8 @@ class ComparedImages(NamedTuple):
         World positions x_q of the quadrature points, mm.
     independent_share : scalar
         Effective number of independent quadrature points over that of all: tempers the likelihood.
+    shading : (q, k) array or None
+        Functions of which m has some more than f (`bayesreg.model.intensity_map`).
     """
 
     comparison: Comparison
@@ -147,6 +164,7 @@ class ComparedImages(NamedTuple):
     nodes: Int[AnyArray, "points 4"]
     positions: Float[AnyArray, "points 3"]
     independent_share: Scalar
+    shading: Float[AnyArray, "points coefficients"] | None = None
 
     @property
     def name(self) -> str:
@@ -164,36 +182,42 @@ class ComparedImages(NamedTuple):
     def likelihood(self, state: State) -> ImageLikelihood:
         """The distribution of f(x_q), given m(x_q + u(x_q))."""
         # Without the barrier XLA interpolates twice, for the density and for the record.
-        predicted = jax.lax.optimization_barrier(self.predicted(state.u))
+        predicted = jax.lax.optimization_barrier(self.predicted(state.u, state.values))
         return ImageLikelihood(self, predicted, state.values["t_similarity"])
 
     def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
         """x_q + u(x_q), mm."""
         return self.positions + self.quadrature.interpolation(u)
 
-    def predicted(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
-        """m(x_q + u(x_q))."""
-        return self.moving(self.places(u))
+    def predicted(self, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING) -> Float[AnyArray, "points"]:
+        """m(x_q + u(x_q)), less the shading, if one is inferred: its coefficients must then be among the values."""
+        return self.without_shading(self.moving(self.places(u)), values)
+
+    def without_shading(self, moving: Float[AnyArray, "points"], values: Values) -> Float[AnyArray, "points"]:
+        """Values of m less what they have more of than f, if a shading is inferred."""
+        return moving if self.shading is None else moving - self.shading @ values[shading_name(self.name)]
 
     def pair(self, predicted: Float[AnyArray, "points"]) -> Intensities:
         """f(x_q) beside values of m."""
         return Intensities(self.fixed_values, predicted, self.quadrature.weights)
 
-    def residuals(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+    def residuals(self, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING) -> Float[AnyArray, "points"]:
         """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q))."""
-        return self.similarity.residuals(self.pair(self.predicted(u)))
+        return self.similarity.residuals(self.pair(self.predicted(u, values)))
 
-    def scaled_residual(self, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar | float) -> Float[AnyArray, "points"]:
+    def scaled_residual(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points"]:
         """`residuals` in units of their scale √(T_s / 2w): where the model holds, as `standardised_noise`."""
-        return self.residuals(u) * jnp.sqrt(2 * self.quadrature.weights / t_similarity)
+        return self.residuals(u, values) * jnp.sqrt(2 * self.quadrature.weights / values["t_similarity"])
 
     def standardised_residual(self, state: State) -> Float[AnyArray, "points"]:
         """`residuals` in units of their standard deviation."""
-        return self.scaled_residual(state.u, state.values["t_similarity"]) / jnp.sqrt(self.similarity.variance())
+        return self.scaled_residual(state.u, state.values) / jnp.sqrt(self.similarity.variance())
 
-    def standardised_noise(self, key: AnyArray, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points"]:
+    def standardised_noise(
+        self, key: AnyArray, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING
+    ) -> Float[AnyArray, "points"]:
         """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""
-        return self.similarity.draw(key, self.pair(self.predicted(u)))
+        return self.similarity.draw(key, self.pair(self.predicted(u, values)))
 
     def noise_sd(self, t_similarity: float) -> float:
         """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
@@ -202,11 +226,11 @@ class ComparedImages(NamedTuple):
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Gauss and Newton's curvature of E_s / T_s, tempered: that of eq. (1) is 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
-        return _gauss_newton(self, u, values["t_similarity"])
+        return _gauss_newton(self, u, dict(values))
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """The rest of the exact curvature of E_s / T_s, 1/mm²."""
-        return _remainder(self, u, values["t_similarity"])
+        return _remainder(self, u, dict(values))
 
 
 class ImageLikelihood(dist.Distribution):
@@ -249,22 +273,23 @@ class ImageLikelihood(dist.Distribution):
 
 
 @jax.jit
-def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar) -> PointCurvature:
+def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
     """Gauss and Newton's curvature in every place x_q + u(x_q)."""
     moved = term.places(u)
-    convexity = term.similarity.convexity(term.pair(term.moving(moved)))
-    return _chain(term, convexity, _slope(term, moved), t_similarity)
+    pair = term.pair(term.without_shading(term.moving(moved), values))
+    convexity = term.similarity.convexity(pair, values["t_similarity"])
+    return _chain(term, convexity, _slope(term, moved), values["t_similarity"])
 
 
 @jax.jit
-def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], t_similarity: Scalar) -> PointCurvature:
+def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
     """The exact curvature, ∇m E″ ∇mᵀ + E′ ∇²m with E″ that in the values m_q, less Gauss and Newton's."""
-    moved, similarity = term.places(u), term.similarity
+    moved, similarity, t_similarity = term.places(u), term.similarity, values["t_similarity"]
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    pair = term.pair(term.moving(moved))
+    pair = term.pair(term.without_shading(term.moving(moved), values))
     first = jax.grad(similarity.energy)(pair, t_similarity).moving
-    second = _subtract(similarity.curvature(pair, t_similarity), similarity.convexity(pair))
+    second = _subtract(similarity.curvature(pair, t_similarity), similarity.convexity(pair, t_similarity))
     found = _chain(term, second, slope(moved), t_similarity)
     bent = first[:, None, None] * jnp.stack(columns, axis=-1)
     return found._replace(matrices=found.matrices + term.independent_share / t_similarity * bent)
@@ -295,6 +320,20 @@ def _subtract(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
     """∇m."""
     return jax.grad(lambda x: term.moving(x).sum())(places)
+
+
+def shading_name(name: str) -> str:
+    """The name of the coefficients of the shading of a pair of images."""
+    return f"{name}_shading"
+
+
+@lru_cache(maxsize=4)
+def _smoothed_as(pair: ImagePair, voxels: float) -> ImagePair:
+    """Both images smoothed by so many voxels of the coarser one."""
+    sd = voxels * max(image.voxel_volume for image in (pair.fixed, pair.moving)) ** (1 / 3)
+    with ThreadPoolExecutor() as pool:
+        fixed, moving = pool.map(lambda image: image.smoothed(sd), (pair.fixed, pair.moving))
+    return replace(pair, fixed=fixed, moving=moving)
 
 
 def _smooth(sd: float, interpolation: Interpolation, image: Image) -> Interpolator:
@@ -348,5 +387,8 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
     inside = cells >= 0
     if not inside.any():
         raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
-    weights = np.full(inside.sum(), fixed.voxel_volume)
-    return quadrature_at(mesh, cells[inside], barycentric[inside], weights)
+    kept = np.flatnonzero(inside)
+    volume = fixed.voxel_volume * len(kept)
+    if model.most_points is not None and len(kept) > model.most_points:
+        kept = np.sort(np.random.default_rng(0).choice(kept, model.most_points, replace=False))
+    return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))

@@ -1,15 +1,17 @@
-"""The hard skull constraint: no sampled node lies in Ω_SK."""
+"""The skull: no sampled node lies in Ω_SK, or none lies deep in it."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
+from bayesreg.model.terms.term import PointCurvature
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -47,6 +49,53 @@ class Skull(NamedTuple):
         return self.distance(self.points[nodes] + u)
 
 
+class SoftSkull(NamedTuple):
+    """A skull that nobody knows to a hair: exp(−½ Σ (d / width)²) over the sampled nodes at a depth d inside of it.
+
+    Attributes
+    ----------
+    distance : Interpolator
+        Signed distance to Ω_SK, mm, positive outside it.
+    points : (b, 3) array
+        Positions of the sampled nodes at rest, mm.
+    nodes : (b,) int array
+        Their numbers.
+    width : scalar
+        mm.
+    """
+
+    distance: Interpolator
+    points: Float[AnyArray, "sampled 3"]
+    nodes: Int[AnyArray, "sampled"]
+    width: Scalar
+
+    @property
+    def name(self) -> str:
+        """The name of the term."""
+        return "skull"
+
+    def depth(self, points: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
+        """How deep points lie inside, mm; zero outside."""
+        return -jnp.minimum(self.distance(points), 0.0)
+
+    def log(self, state: State) -> Scalar:
+        """−½ Σ (d / width)²."""
+        return -0.5 * (self.depth(self.points + state.values["u_boundary"]) ** 2).sum() / self.width**2
+
+    def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """n nᵀ / width² at every node inside, n the gradient of the distance, 1/mm²."""
+        places = self.points + values["u_boundary"]
+        normal = jax.grad(lambda at: self.depth(at).sum())(places) / self.width
+        own = jnp.broadcast_to(jnp.eye(4)[0], (len(self.nodes), 4))
+        nodes = jnp.broadcast_to(self.nodes[:, None], own.shape)
+        return PointCurvature(nodes, own, normal[:, :, None] * normal[:, None])
+
+    def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """Nothing: walls are nearly flat."""
+        found = self.gauss_newton(u, values)
+        return found._replace(matrices=jnp.zeros_like(found.matrices))
+
+
 class Walls:
     """The skull, as the samplers see it (`bayesreg.inference.target.Walls`); the data are a `Problem`."""
 
@@ -55,7 +104,7 @@ class Walls:
     ) -> Float[AnyArray, "*batch nodes"]:
         """See `Skull.clearance`; infinite in data without a skull."""
         skull = data.terms.get("skull")
-        return jnp.full(u.shape[:-1], jnp.inf) if skull is None else skull.clearance(u, nodes)
+        return skull.clearance(u, nodes) if isinstance(skull, Skull) else jnp.full(u.shape[:-1], jnp.inf)
 
     def without(self, data: Any) -> Any:
         """The data of the same problem without a skull."""

@@ -1,0 +1,239 @@
+"""The search for hyperparameters: the maximum of their evidence, with the displacements integrated out.
+
+The joint mode of displacements and hyperparameters misleads (see `hierarchy`). Of the displacements u, the images alone
+are far from quadratic. With these to second order about a place u_0, A their curvature and g their slope, all else is
+quadratic in u at given hyperparameters θ, and the evidence is
+
+log p(θ | data) = g · d − ½ dᵀ A d + log rest(u_0 + d, θ) − ½ log det (A + R(θ)) + const,
+
+R the curvature of the rest and d = (A + R)⁻¹ (g + ∇ log rest(u_0, θ)), the maximum over u. Its derivative is that of
+log rest there, less ½ tr((A + R)⁻¹ ∂R).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.optimize import minimize
+
+from bayesreg.inference.gaussian.density import estimands_at, height_and_slope, hessian_rows, regular
+from bayesreg.inference.gaussian.hierarchy import Volume, mark_hyperparameters, volume_of
+from bayesreg.inference.layout import marked
+from bayesreg.inference.target import Target
+from bayesreg.types import Matrix
+
+# Step of differences between curvatures, in the logarithm of a scale or a Normal score.
+STEP = 0.01
+# Hyperparameters move by no more in one search: far away another place is the better one to expand about.
+FARTHEST = 3.0
+# Of a search, whose coordinates are standard deviations: most iterations, the slope at which it ends, and the least
+# curvature of a hyperparameter's evidence, that of a prior of ±3.
+MOST_ITERATIONS, PRECISE, LEAST_CURVATURE = 10, 0.02, 0.1
+
+
+class Expansion(NamedTuple):
+    """The density about a flat position.
+
+    Attributes
+    ----------
+    flat : (d,) array
+    entries : (k,) int array
+        The hyperparameters.
+    images : (r, r) array
+        A, in "field" and "u_boundary".
+    slope : (d,) array
+        Of the images' part.
+    """
+
+    flat: Float[np.ndarray, "dimension"]
+    entries: Int[np.ndarray, "hyperparameters"]
+    images: Float[np.ndarray, "rows rows"]
+    slope: Float[np.ndarray, "dimension"]
+
+
+class Found(NamedTuple):
+    """What a search for hyperparameters found.
+
+    Attributes
+    ----------
+    flat : (d,) array
+        The hyperparameters at the maximum of their evidence, and u following them.
+    moved : float
+        How far the hyperparameters have moved, in units of their standard deviations.
+    """
+
+    flat: Float[np.ndarray, "dimension"]
+    moved: float
+
+
+def maximise_evidence(
+    target: Target, flat: Float[np.ndarray, "dimension"], curvature: Float[np.ndarray, "rows rows"]
+) -> Found:
+    """Look for the maximum of the evidence of the hyperparameters, if any, about a flat position.
+
+    Parameters
+    ----------
+    target : Target
+    flat : (d,) array
+        A mode given the hyperparameters, or near to one.
+    curvature : (r, r) array
+        Gauss and Newton's there, in "field" and "u_boundary".
+    """
+    entries = np.flatnonzero(mark_hyperparameters(target))
+    if not len(entries):
+        return Found(flat, 0.0)
+    about = _expand(target, flat, entries, curvature)
+    values, vectors = np.linalg.eigh(evidence_curvature(target, about, curvature))
+    units = vectors / np.sqrt(np.maximum(np.abs(values), LEAST_CURVATURE))
+    best: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
+        height, slope, place = evidence(target, about, flat[entries] + units @ xi)
+        slope = units.T @ slope
+        if not (np.isfinite(height) and np.isfinite(slope).all()):
+            # A wall for the line search: uphill from the best place so far, sloping back to it.
+            top, _, at, there = best[-1]
+            return -top + 2 * abs(there @ (xi - at)), there
+        if not best or height > best[-1][0]:
+            best[:] = [(height, place, xi.copy(), slope)]
+        return -height, -slope
+
+    reach = FARTHEST / np.abs(units).max(axis=0)
+    options = {"maxiter": MOST_ITERATIONS, "ftol": 1e-12, "gtol": PRECISE}
+    minimize(objective, np.zeros(len(entries)), jac=True, method="L-BFGS-B", bounds=[(-r, r) for r in reach],
+             options=options)  # fmt: skip
+    return Found(best[-1][1], float(np.abs(best[-1][2]).max()))
+
+
+def evidence_curvature(
+    target: Target, about: Expansion, curvature: Float[np.ndarray, "rows rows"]
+) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
+    """Minus the second derivatives of the log evidence at the place of the expansion.
+
+    The displacements follow the hyperparameters: the evidence is less curved than the density at given ones.
+    """
+    assert target.mode_search is not None
+    data = target.mode_search.quadratic_part(target.data)
+    rows = hessian_rows(target, data, about.flat, about.entries)
+    cross = rows[:, marked(target, "field", "u_boundary")]
+    factor = scipy.linalg.cho_factor(regular(curvature))
+    following = cross @ scipy.linalg.cho_solve(factor, cross.T)
+    found = volume_at(target, about.flat, regular(curvature)).curvature - rows[:, about.entries] - following
+    return (found + found.T) / 2
+
+
+def evidence(
+    target: Target, about: Expansion, theta: Float[np.ndarray, "hyperparameters"]
+) -> tuple[float, Float[np.ndarray, "hyperparameters"], Float[np.ndarray, "dimension"]]:
+    """The log evidence of θ, its slope, and the flat position there with the displacements of highest density."""
+    assert target.mode_search is not None
+    data = target.mode_search.quadratic_part(target.data)
+    there = np.array(about.flat)
+    there[about.entries] = theta
+    own, rows = marked(target, "u_boundary"), marked(target, "field", "u_boundary")
+    height, slope = height_and_slope(target, data, there)
+    precision = regular(about.images + dense(_curvature(target, there, there)))
+    factor = scipy.linalg.cho_factor(precision, lower=True, check_finite=False)
+    moving = own[rows]
+    push = np.where(moving, (about.slope + slope)[rows], 0.0)
+    # The field rests: its part in the rest is not quadratic.
+    inner = factor if moving.all() else scipy.linalg.cho_factor(precision[np.ix_(moving, moving)], lower=True)
+    step = np.zeros(len(push))
+    step[moving] = scipy.linalg.cho_solve(inner, push[moving])
+    place = np.array(there)
+    place[rows] += step
+    height, slope = height_and_slope(target, data, place)
+    gain = about.slope @ (place - about.flat) - step @ (about.images @ step) / 2
+    covariance = _inverse(factor[0])
+    traces = [trace(covariance, first) for first in slopes_of_curvature(target, there, about.entries)]
+    log_det = 2 * np.log(np.diag(factor[0])).sum()
+    return (
+        float(gain + height - log_det / 2),
+        about.slope[about.entries] + slope[about.entries] - np.array(traces) / 2,
+        place,
+    )
+
+
+def _expand(
+    target: Target,
+    flat: Float[np.ndarray, "dimension"],
+    entries: Int[np.ndarray, "hyperparameters"],
+    curvature: Float[np.ndarray, "rows rows"],
+) -> Expansion:
+    assert target.mode_search is not None
+    data = target.mode_search.quadratic_part(target.data)
+    images = curvature - dense(_curvature(target, flat, flat))
+    slope = height_and_slope(target, target.data, flat)[1] - height_and_slope(target, data, flat)[1]
+    return Expansion(flat, entries, images, slope)
+
+
+def slopes_of_curvature(
+    target: Target, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "hyperparameters"]
+) -> list[Matrix]:
+    """The derivatives of the curvature in u of all but images, in hyperparameters."""
+    found = []
+    for entry in entries.tolist():
+        ahead, behind = (_curvature(target, _moved(flat, {entry: way * STEP}), flat) for way in (1, -1))
+        found.append((ahead - behind) / (2 * STEP))
+    return found
+
+
+def volume_at(
+    target: Target, flat: Float[np.ndarray, "dimension"], curvature: Float[np.ndarray, "rows rows"]
+) -> Volume:
+    """The derivatives of −½ log det H in the hyperparameters, H the curvature in "field" and "u_boundary" there."""
+    entries = np.flatnonzero(mark_hyperparameters(target)).tolist()
+    covariance = _inverse(scipy.linalg.cho_factor(curvature, lower=True)[0])
+
+    def at(steps: dict[int, float]) -> float:
+        return trace(covariance, _curvature(target, _moved(flat, steps), flat))
+
+    here = at({})
+    alone = {(k, way): at({k: way * STEP}) for k in entries for way in (1, -1)}
+    traces = np.zeros((len(entries), len(entries)))
+    for row, k in enumerate(entries):
+        traces[row, row] = alone[k, 1] + alone[k, -1] - 2 * here
+        for column, other in enumerate(entries[:row]):
+            both = at({k: STEP, other: STEP}) + at({k: -STEP, other: -STEP})
+            apart = sum(alone[entry, way] for entry in (k, other) for way in (1, -1))
+            traces[row, column] = traces[column, row] = (both - apart + 2 * here) / 2
+    return volume_of(covariance, slopes_of_curvature(target, flat, np.array(entries)), traces / STEP**2)
+
+
+def _inverse(lower: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
+    """The inverse of a matrix from its lower Cholesky factor."""
+    found, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
+    return np.tril(found) + np.tril(found, -1).T
+
+
+def trace(covariance: Float[np.ndarray, "rows rows"], matrix: Matrix) -> float:
+    """tr(C M) of two symmetric matrices."""
+    if scipy.sparse.issparse(matrix):
+        entries = matrix.tocoo()
+        return float(covariance[entries.row, entries.col] @ entries.data)
+    return float((covariance * matrix).sum())
+
+
+def dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
+    """The matrix as an array."""
+    return matrix.toarray() if scipy.sparse.issparse(matrix) else np.asarray(matrix)
+
+
+def _moved(flat: Float[np.ndarray, "dimension"], steps: dict[int, float]) -> Float[np.ndarray, "dimension"]:
+    moved = np.array(flat)
+    for entry, step in steps.items():
+        moved[entry] += step
+    return moved
+
+
+def _curvature(target: Target, flat: Float[np.ndarray, "dimension"], near: Float[np.ndarray, "dimension"]) -> Matrix:
+    """The curvature of all but images, where the inside follows the sampled nodes as at a place near by."""
+    assert target.mode_search is not None
+    data = target.mode_search.quadratic_part(target.data)
+    one, other = (estimands_at(target, data, jnp.asarray(place)) for place in (flat, near))
+    return target.mode_search.quadratic_curvature(data, one, other)
