@@ -323,32 +323,8 @@ class FieldScale(_Positive):
 
 
 @jax.tree_util.register_pytree_node_class
-class FieldComponents(_Arrays):
-    """Whitened components of the field of log-stiffness, independent standard Normal numbers.
-
-    Parameters
-    ----------
-    zero : (k,) array
-        All of them at rest.
-    """
-
-    arrays = ("zero",)
-
-    def __init__(self, zero: Any) -> None:
-        self.zero = zero
-
-    def draw(self, name: str) -> AnyArray:
-        """See `Block`."""
-        return numpyro.sample(name, dist.Normal(jnp.zeros_like(self.zero), 1.0).to_event(1))
-
-    def reference(self) -> AnyArray:
-        """Zero."""
-        return jnp.asarray(self.zero)
-
-
-@jax.tree_util.register_pytree_node_class
 class Coefficients(_Arrays):
-    """Independent Normal numbers of mean zero.
+    """Independent Normal numbers of mean zero, such as the whitened components of the field of log-stiffness.
 
     Parameters
     ----------

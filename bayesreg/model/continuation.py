@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from bayesreg.interpolation import Interpolation
 from bayesreg.model.program import Problem
+from bayesreg.model.terms.elastic import SCALES
 from bayesreg.model.terms.images import ImagePair
 
 Made = TypeVar("Made")
@@ -47,10 +48,11 @@ def _ease(
     similarity: float,
     elastic: float,
 ) -> Problem:
-    """The problem with all images smoothed, and factors on T_s and T_r; a load is the square root of a temperature."""
+    """The problem with all images smoothed, and factors on T_s and T_r, or on the loads."""
     smooth = {name: pair.smoothed(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
-    powers = {"t_similarity": similarity, "t_elastic": elastic, "body_load": elastic**0.5, "surface_load": elastic**0.5}
-    scales = {name: problem.blocks[name].times(factor) for name, factor in powers.items() if name in problem.blocks}
+    powers = {name: power for own in SCALES.values() for name, power in own.items()}
+    factors = {"t_similarity": similarity, **{name: elastic**power for name, power in powers.items()}}
+    scales = {name: problem.blocks[name].times(factor) for name, factor in factors.items() if name in problem.blocks}
     return problem._replace(blocks={**problem.blocks, **scales}, terms={**problem.terms, **smooth})
 
 

@@ -27,7 +27,7 @@ from bayesreg.types import AnyArray, Equilibrium, Matrix
 # Terms that are far from quadratic in the displacements.
 FAR_FROM_QUADRATIC = (ComparedImages, SoftSkull)
 
-# With more entries of λ and μ than this, K is assembled anew for each.
+# With more entries of λ or μ, as by element, derivatives in each of them would cost too much.
 FEW_ENTRIES = 20
 
 # Random places at which a term from outside shows what it looks at, and the sd of their displacements, mm.

@@ -14,15 +14,17 @@ from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import LAME, Scale, Values
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import complete
-from bayesreg.model.curvature import FAR_FROM_QUADRATIC, Curvature, displacement_curvature, quadratic_curvature
+from bayesreg.model.curvature import (
+    FAR_FROM_QUADRATIC,
+    FEW_ENTRIES,
+    Curvature,
+    displacement_curvature,
+    quadratic_curvature,
+)
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
+from bayesreg.model.terms.elastic import SCALES
 from bayesreg.types import AnyArray
-
-# Scales of the elastic priors.
-SCALES = ("t_elastic", "body_load", "surface_load")
-# With more entries of λ or μ, as by element, derivatives in each of them would cost too much.
-MOST_ENTRIES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +51,11 @@ class ModeSearch:
         The latter where the elastic prior is normalised and they are not too many.
         """
         own = [name for one in self.observations.values() for name in getattr(one, "blocks", {})]
-        names = [name for name in (*SCALES, *own) if isinstance(self.data.blocks.get(name), Scale)]
+        elastic_scales = [name for prior in SCALES.values() for name in prior]
+        names = [name for name in (*elastic_scales, *own) if isinstance(self.data.blocks.get(name), Scale)]
         elastic = self.data.terms.get("elastic")
         if elastic is not None and elastic.determinant is not None:
-            names += [name for name in LAME if len(self.data.blocks[name].free.index) <= MOST_ENTRIES]
+            names += [name for name in LAME if len(self.data.blocks[name].free.index) <= FEW_ENTRIES]
         return tuple(name for name in names if self.data.blocks[name].is_sampled)
 
     def continuation(self) -> Iterator[Problem]:

@@ -108,6 +108,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     "registration": {
         "elastic_prior": "loads",
+        "body_load": {"median": 0.1, "log_sd": 3.0},
+        "surface_load": {"median": 0.1, "log_sd": 3.0},
         "normalised": True,
         "sampled": "all",
         "priors": {"lam": {"high": 100.0}, "mu": {"high": 20.0}},
@@ -160,7 +162,7 @@ class ModelConfig(BaseModel):
         exp(−E_r / T_r), eq. (12); or equilibrium with random loads, K u = q in place of eq. (7), of all nodes, which
         depends much less on the mesh (`bayesreg.model.terms.elastic`). The latter needs `sampled: all` and `normalised:
         true`, and has no T_r.
-    body_load, surface_load : float or ScalePrior
+    body_load, surface_load : float or ScalePrior, optional
         Standard deviations of the white noise of body forces (unit of μ times mm^½) and of surface forces (unit of μ
         times mm), known or inferred; for "loads" alone.
     normalised : bool
@@ -207,8 +209,8 @@ class ModelConfig(BaseModel):
     t_similarity: Positive | TemperaturePrior = 0.05
     t_elastic: Positive | TemperaturePrior = 1e4
     elastic_prior: Literal["boltzmann", "loads"] = "boltzmann"
-    body_load: Positive | ScalePrior = ScalePrior(median=0.1, log_sd=3.0)
-    surface_load: Positive | ScalePrior = ScalePrior(median=0.1, log_sd=3.0)
+    body_load: Positive | ScalePrior | None = None
+    surface_load: Positive | ScalePrior | None = None
     normalised: StrictBool = False
     interpolation: Literal["linear", "cubic"] = "linear"
     quadrature: Literal["gauss4", "gauss32", "gauss256", "voxels"] = "gauss4"
@@ -235,6 +237,8 @@ class ModelConfig(BaseModel):
             raise wrong("intensity_map", "expected null with similarity: lncc, which finds a map in each window")
         if self.elastic_prior == "loads":
             self._require_random_loads()
+        elif (self.body_load, self.surface_load) != (None, None):
+            raise wrong("body_load", "expected null, as surface_load: they belong to elastic_prior: loads")
         if isinstance(self.t_elastic, TemperaturePrior) and not self.normalised:
             raise wrong("t_elastic", "a T_r with a prior needs normalised: true; without it T_r has no likelihood")
         if isinstance(self.t_elastic, TemperaturePrior) and self.fixed is not None and not any(self.fixed.values()):
@@ -262,6 +266,9 @@ class ModelConfig(BaseModel):
             raise wrong(
                 "t_elastic", "belongs to elastic_prior: boltzmann; random loads have body_load and surface_load"
             )
+        for name in ("body_load", "surface_load"):
+            if getattr(self, name) is None:
+                raise wrong(name, "missing: random loads need its size, or {median: 0.1, log_sd: 3} to infer it")
         inferred = any(isinstance(load, ScalePrior) for load in (self.body_load, self.surface_load))
         if inferred and self.fixed is not None and not any(self.fixed.values()):
             raise wrong(

@@ -25,7 +25,7 @@ from bayesreg.model.options import ModelConfig
 from bayesreg.model.program import Problem
 from bayesreg.model.single_node import SingleNodes, images_of
 from bayesreg.model.terms.images import ComparedImages, ImagePair
-from bayesreg.model.terms.skull import Skull, Walls
+from bayesreg.model.terms.skull import Skull, SoftSkull, Walls
 from bayesreg.model.variables import Variables
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -225,7 +225,9 @@ class Posterior:
         """Densities of single nodes, where a dense preconditioner says what follows a node, and there are images."""
         system = self.data.body.system
         knows = isinstance(system.preconditioner, ReferenceInverse) or not len(system.free)
+        # They know Boltzmann's prior, images without a shading and a hard skull alone.
         knows &= self.options.elastic_prior == "boltzmann" and self.options.intensity_map is None
+        knows &= not isinstance(self.data.terms.get("skull"), SoftSkull)
         return SingleNodes() if knows and images_of(self.data) is not None else None
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -25,7 +24,6 @@ from bayesreg.model.blocks import (
     Blocks,
     Coefficients,
     Displacement,
-    FieldComponents,
     FieldScale,
     FreeEntries,
     LameParameter,
@@ -45,7 +43,7 @@ from bayesreg.model.options import (
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
-from bayesreg.model.terms.elastic import BoltzmannPrior, LoadPrior
+from bayesreg.model.terms.elastic import SCALES, BoltzmannPrior, LoadPrior
 from bayesreg.model.terms.images import ComparedImages, ImagePair, shading_name
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.rigid import RigidPrior
@@ -53,9 +51,6 @@ from bayesreg.model.terms.skull import Skull, SoftSkull, is_allowed
 from bayesreg.model.terms.term import Outside, Terms
 from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
-
-# The scales that each elastic prior has.
-ELASTIC_SCALES = {"boltzmann": ("t_elastic",), "loads": ("body_load", "surface_load")}
 
 # The solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
 TOLERANCE = 1e-10
@@ -95,10 +90,10 @@ def _blocks(
         "lam": lame_parameter("lam", mesh, model, reference),
         "mu": lame_parameter("mu", mesh, model, reference),
         "t_similarity": _scale(model.t_similarity),
-        **{name: _scale(getattr(model, name)) for name in ELASTIC_SCALES[model.elastic_prior]},
+        **{name: _scale(getattr(model, name)) for name in SCALES[model.elastic_prior]},
     }
     if field is not None:
-        blocks |= {"field": FieldComponents(jnp.zeros(field.basis.shape[1])), "field_sd": FieldScale(field.sd_scale)}
+        blocks |= {"field": Coefficients(jnp.ones(field.basis.shape[1])), "field_sd": FieldScale(field.sd_scale)}
     return blocks
 
 
@@ -191,9 +186,9 @@ def _priors(
     if model.rigid_sd is not None:
         terms["rigid"] = RigidPrior(jnp.asarray(rigid_modes(mesh.points[sampled])), jnp.asarray(model.rigid_sd))
     if skull is not None:
-        arrays = skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled])
-        soft = partial(SoftSkull, nodes=jnp.asarray(sampled), width=jnp.asarray(model.skull_width))
-        terms["skull"] = soft(*arrays) if model.skull_width else Skull(*arrays)
+        hard = Skull(skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled]))
+        soft = SoftSkull(hard, jnp.asarray(sampled), jnp.asarray(model.skull_width))
+        terms["skull"] = soft if model.skull_width else hard
     return terms
 
 

@@ -40,9 +40,11 @@ def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
             found += Markup(" − <var>E</var><sub>s</sub>{} / <var>T</var><sub>s</sub>").format(pair)
         else:
             found += Markup(" + log p({} | <var>u</var>)").format(name)
+    loads = model.get("elastic_prior") == "loads"
     priors = {
-        " − <var>E</var><sub>r</sub> / <var>T</var><sub>r</sub>": True,
-        " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": model.get("normalised"),
+        " + log p(<var>u</var> | λ, μ, random loads)": loads,
+        " − <var>E</var><sub>r</sub> / <var>T</var><sub>r</sub>": not loads,
+        " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": model.get("normalised") and not loads,
         " + log p(rigid motion of <var>u</var>)": model.get("rigid_sd") is not None,
     }
     found += Markup("".join(text for text, holds in priors.items() if holds and not elastography))

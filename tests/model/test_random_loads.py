@@ -133,6 +133,8 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
         ({"sampled": "boundary"}, "sampled"),
         ({"normalised": False}, "proper density"),
         ({"t_elastic": 5.0}, "t_elastic"),
+        ({"body_load": None}, "random loads need its size"),
+        ({"elastic_prior": "boltzmann"}, "belong to elastic_prior: loads"),
         ({"held": {0: (0.0, 0.0, 0.0)}}, "held"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import re
 
+import bayesreg as br
 from bayesreg.report.density import formula, observation_table, similarity_energy
 
 IMAGES = {"kind": "images", "log": -12.0, "values": 400, "residual_rms": 0.9}
@@ -29,6 +30,21 @@ def test_every_term_is_named():
         "−Es(images) / Ts − Es(t2) / Ts + log p(points | u) + log p(&lt;own&gt; | u) − Er / Tr − log Z(λ, μ, Tr) "
         "+ log p(rigid motion of u) + log p(λ) + log p(μ) + log p(Ts) + log p(points sd)"
     )
+
+
+def test_random_loads_take_the_place_of_the_elastic_energy():
+    load = {"median": 0.1, "log_sd": 3.0}
+    model = {"normalised": True, "elastic_prior": "loads", "body_load": load, "surface_load": load}
+    found = plain(formula({"observations": {"images": IMAGES}, "model": model}, elastography=False))
+    sizes = "log p(body load) + log p(surface load)"
+    assert found == f"−Es / Ts + log p(u | λ, μ, random loads) + log p(λ) + log p(μ) + {sizes}"
+
+
+def test_the_default_model_has_the_papers_density():
+    """As a run writes its options down, those that it does not use among them."""
+    model = br.ModelConfig().model_dump(mode="json")
+    found = plain(formula({"observations": {"images": IMAGES}, "model": model}, elastography=False))
+    assert found == "−Es / Ts − Er / Tr + log p(λ) + log p(μ)"
 
 
 def test_landmarks_alone_have_no_similarity():

@@ -74,7 +74,7 @@ class Found(NamedTuple):
 def maximise_evidence(
     target: Target, flat: Float[np.ndarray, "dimension"], curvature: Float[np.ndarray, "rows rows"]
 ) -> Found:
-    """Look for the maximum of the evidence of the hyperparameters, if any, about a flat position.
+    """Look for the maximum of the evidence of the hyperparameters about a flat position.
 
     Parameters
     ----------
@@ -85,8 +85,6 @@ def maximise_evidence(
         Gauss and Newton's there, in "field" and "u_boundary".
     """
     entries = np.flatnonzero(mark_hyperparameters(target))
-    if not len(entries):
-        return Found(flat, 0.0)
     about = _expand(target, flat, entries, curvature)
     values, vectors = np.linalg.eigh(evidence_curvature(target, about, curvature))
     units = vectors / np.sqrt(np.maximum(np.abs(values), LEAST_CURVATURE))
@@ -121,9 +119,8 @@ def evidence_curvature(
     data = target.mode_search.quadratic_part(target.data)
     rows = hessian_rows(target, data, about.flat, about.entries)
     cross = rows[:, marked(target, "field", "u_boundary")]
-    factor = scipy.linalg.cho_factor(regular(curvature))
-    following = cross @ scipy.linalg.cho_solve(factor, cross.T)
-    found = volume_at(target, about.flat, regular(curvature)).curvature - rows[:, about.entries] - following
+    volume = volume_at(target, about.flat, regular(curvature))
+    found = volume.curvature - rows[:, about.entries] - cross @ volume.covariance @ cross.T
     return (found + found.T) / 2
 
 

@@ -84,11 +84,14 @@ class Volume(NamedTuple):
         Minus the second derivatives.
     excess : (k, k) array
         By how much the log density is more curved in θ at a typical draw of the displacements than at their mode.
+    covariance : (r, r) array
+        C.
     """
 
     slope: Float[np.ndarray, "hyperparameters"]
     curvature: Float[np.ndarray, "hyperparameters hyperparameters"]
     excess: Float[np.ndarray, "hyperparameters hyperparameters"]
+    covariance: Float[np.ndarray, "rows rows"]
 
 
 def volume_of(
@@ -110,4 +113,4 @@ def volume_of(
     shares = [np.asarray((one @ covariance).T) for one in first]
     slope = -np.array([np.trace(share) for share in shares]) / 2
     squares = np.array([[(one * other.T).sum() for other in shares] for one in shares])
-    return Volume(slope, (second_traces - squares.reshape(second_traces.shape)) / 2, second_traces / 2)
+    return Volume(slope, (second_traces - squares.reshape(second_traces.shape)) / 2, second_traces / 2, covariance)

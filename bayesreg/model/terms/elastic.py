@@ -17,6 +17,9 @@ from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
 from bayesreg.types import AnyArray, Matrix, Scalar
 
+# The scales of each prior, and the powers of a temperature that they are.
+SCALES = {"boltzmann": {"t_elastic": 1.0}, "loads": {"body_load": 0.5, "surface_load": 0.5}}
+
 
 class BoltzmannPrior(NamedTuple):
     """exp(−E_r / T_r), eq. (12), with or without its normaliser.

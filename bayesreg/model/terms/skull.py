@@ -54,38 +54,33 @@ class SoftSkull(NamedTuple):
 
     Attributes
     ----------
-    distance : Interpolator
-        Signed distance to Ω_SK, mm, positive outside it.
-    points : (b, 3) array
-        Positions of the sampled nodes at rest, mm.
+    hard : Skull
     nodes : (b,) int array
-        Their numbers.
+        Numbers of the sampled nodes.
     width : scalar
         mm.
     """
 
-    distance: Interpolator
-    points: Float[AnyArray, "sampled 3"]
+    hard: Skull
     nodes: Int[AnyArray, "sampled"]
     width: Scalar
 
     @property
     def name(self) -> str:
         """The name of the term."""
-        return "skull"
+        return self.hard.name
 
-    def depth(self, points: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
-        """How deep points lie inside, mm; zero outside."""
-        return -jnp.minimum(self.distance(points), 0.0)
+    def depth(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
+        """How deep the sampled nodes lie inside, displaced by u, mm; zero outside."""
+        return -jnp.minimum(self.hard.distance(self.hard.points + u), 0.0)
 
     def log(self, state: State) -> Scalar:
         """−½ Σ (d / width)²."""
-        return -0.5 * (self.depth(self.points + state.values["u_boundary"]) ** 2).sum() / self.width**2
+        return -0.5 * (self.depth(state.values["u_boundary"]) ** 2).sum() / self.width**2
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """n nᵀ / width² at every node inside, n the gradient of the distance, 1/mm²."""
-        places = self.points + values["u_boundary"]
-        normal = jax.grad(lambda at: self.depth(at).sum())(places) / self.width
+        normal = jax.grad(lambda u: self.depth(u).sum())(values["u_boundary"]) / self.width
         own = jnp.broadcast_to(jnp.eye(4)[0], (len(self.nodes), 4))
         nodes = jnp.broadcast_to(self.nodes[:, None], own.shape)
         return PointCurvature(nodes, own, normal[:, :, None] * normal[:, None])
