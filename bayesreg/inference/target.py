@@ -89,6 +89,10 @@ class Normaliser(Protocol):
     def is_costly(self) -> bool:
         """Whether it costs much more than the rest of the density."""
 
+    @property
+    def depends_on(self) -> Sequence[str]:
+        """Names of what it depends on; some may not be sampled."""
+
     def log(self, data: Any, estimands: Estimands) -> Scalar:
         """The logarithm of this factor, as part of the log density."""
 

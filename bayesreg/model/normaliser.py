@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import jax
 
-from bayesreg.model.blocks import Values
+from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.coordinates import complete
 from bayesreg.model.program import Problem
 from bayesreg.model.state import physical_lame_by_cell
@@ -15,7 +15,9 @@ from bayesreg.types import AnyArray, Scalar
 
 @dataclass(frozen=True)
 class Normaliser:
-    """½ log pdet S(λ, μ) − r/2 log(2π T_r), the same for all displacements (`bayesreg.inference.target.Normaliser`).
+    """What the elastic prior's normaliser has of λ and μ (`bayesreg.inference.target.Normaliser`).
+
+    ½ log pdet S(λ, μ) − r/2 log(2π T_r) of the Boltzmann prior, and log pdet K(λ, μ) of random loads.
 
     Attributes
     ----------
@@ -24,6 +26,11 @@ class Normaliser:
     """
 
     is_costly: bool
+
+    @property
+    def depends_on(self) -> tuple[str, ...]:
+        """λ and μ, the field that multiplies them, and T_r."""
+        return (*LAME, "field", "field_sd", "t_elastic")
 
     def log(self, data: Problem, estimands: Values) -> Scalar:
         """The logarithm of this factor; zero in data from which it was left out."""

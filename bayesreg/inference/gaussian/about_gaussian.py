@@ -152,12 +152,12 @@ def about_gaussian(
         keys = jax.random.split(key_start, len(found.chains))
         modes = [np.asarray(gaussian.centre) for gaussian in found.gaussians]
         about = [recentre(target, gaussian, [mode]) for gaussian, mode in zip(found.gaussians, modes, strict=True)]
-        setups = [_about(target, gaussian, mode) for gaussian, mode in zip(about, modes, strict=True)]
+        setups = [setup_about(target, gaussian, mode) for gaussian, mode in zip(about, modes, strict=True)]
         starts = [_scatter(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
-            return setups[0], points
+            return _about(target, about[0], modes[0]), points
         return _warm_up(walk, tuning, alone, modes[0], points, key_tune, say)
 
     def blank() -> Setup:

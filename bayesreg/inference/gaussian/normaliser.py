@@ -1,4 +1,4 @@
-"""A normaliser too costly for every step of a trajectory, which sees a quadratic instead: the test sees both.
+"""A normaliser too costly for every step of a trajectory, which sees a polynomial instead: the test sees both.
 
 The normaliser of the elastic prior depends on the parameters alone, a few coordinates in which it is smooth. A kernel
 that is reversible for the density with a stand-in proposes; its proposal is accepted with the ratio of the normaliser
@@ -9,7 +9,8 @@ Christen and Fox 2005), and costs one normaliser a transition.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from itertools import combinations_with_replacement
+from math import comb
 from typing import Any, NamedTuple
 
 import jax
@@ -18,33 +19,47 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.layout import others, unravel
+from bayesreg.inference.layout import marked, unravel
 from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
 
-# With more parameters than this the stand-in is linear: its curvature would cost two gradients for each of them.
-MOST_CURVED = 20
+# The degree of the polynomial is as high as its number of terms allows, which cost as many numbers to find.
+HIGHEST_DEGREE, MOST_TERMS = 4, 150
+# The polynomial is fitted so far about the middle, in standard deviations of the Gaussian, and goes on linearly: the
+# posterior of a parameter is wider than the Gaussian (see `average_gaussian`), and skew.
+REACH = 5.0
+# So many values and slopes are found for each coefficient.
+REDUNDANCY = 2
 
 
 class StandIn(NamedTuple):
-    """The normaliser to second order about the middle of the chains, less its value there (a pytree).
+    """A polynomial about the middle of the chains (a pytree), the normaliser up to a constant.
 
     Attributes
     ----------
     entries : (k,) int array
-        The entries of a flat position that are no displacements.
-    slope : (k,) array
-    curvature : (k, k) array
+        The entries of a flat position that the normaliser depends on.
+    unit : (k,) array
+        Their standard deviations in the Gaussian, in units of which they are factors of the terms.
+    factors : (terms, degree) int array
+        The factors of each term: 0 is one, and i + 1 is entry i.
+    coefficients : (terms,) array
     """
 
-    entries: Int[AnyArray, "parameters"]
-    slope: Float[AnyArray, "parameters"]
-    curvature: Float[AnyArray, "parameters parameters"]
+    entries: Int[AnyArray, "entries"]
+    unit: Float[AnyArray, "entries"]
+    factors: Int[AnyArray, "terms degree"]
+    coefficients: Float[AnyArray, "terms"]
 
     def __call__(self, away: Float[AnyArray, "dimension"]) -> Scalar:
         """The value at a flat position, given less the middle."""
-        x = away[self.entries]
-        return self.slope @ x + 0.5 * (x @ self.curvature @ x)
+        z = away[self.entries] / self.unit
+        near = z * jnp.minimum(1.0, REACH / jnp.sqrt((z**2).sum() + 1e-12))
+        value, change = jax.jvp(self._polynomial, (near,), (z - near,))
+        return value + change
+
+    def _polynomial(self, z: Float[AnyArray, "entries"]) -> Scalar:
+        return terms_of(self.factors, z) @ self.coefficients
 
 
 class Delayed(NamedTuple):
@@ -61,29 +76,46 @@ class Delayed(NamedTuple):
     log_normaliser: Scalar
 
 
+def terms_of(factors: Int[AnyArray, "terms degree"], z: Float[AnyArray, "entries"]) -> Float[AnyArray, "terms"]:
+    """The terms of a polynomial at z."""
+    return jnp.concatenate([jnp.ones(1), z])[factors].prod(axis=1)
+
+
 def no_stand_in(target: Target) -> StandIn:
-    """The stand-in of a density without a normaliser, or before it is found."""
-    entries = others(target)
-    return StandIn(jnp.asarray(entries), jnp.zeros(len(entries)), jnp.zeros((len(entries), len(entries))))
+    """The stand-in of a density without a normaliser, or before it is found: zero."""
+    depends = target.normaliser.depends_on if target.normaliser is not None else ()
+    entries = np.flatnonzero(marked(target, *depends))
+    count = len(entries)
+    degrees = range(HIGHEST_DEGREE, 1, -1)
+    degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
+    factors = np.array(list(combinations_with_replacement(range(count + 1), degree)))
+    return StandIn(jnp.asarray(entries), jnp.ones(count), jnp.asarray(factors), jnp.zeros(len(factors)))
 
 
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
-    """The normaliser's slope at a flat position, and its curvature by differences over one sd of the Gaussian."""
-    found, entries = no_stand_in(target), others(target)
-    count = len(entries)
+    """The polynomial that fits the normaliser and its slopes about a flat position best, by least squares."""
+    found = no_stand_in(target)
+    entries, count = np.asarray(found.entries), len(found.entries)
     if not has_costly_normaliser(target) or not count:
         return found
-    slope_at = partial(_slope, target, target.data)
-    found = found._replace(slope=slope_at(middle)[entries])
-    if count > MOST_CURVED:
-        return found
-    sd = np.minimum(np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), 1.0)
-    rows = []
-    for index, h in zip(entries, sd, strict=True):
-        step = jnp.zeros_like(middle).at[index].set(h)
-        rows.append((slope_at(middle + step) - slope_at(middle - step))[entries] / (2 * h))
-    curvature = jnp.stack(rows)
-    return found._replace(curvature=(curvature + curvature.T) / 2)
+    unit = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1)
+    terms, degree = found.factors.shape
+    if degree == 1:
+        slope = np.asarray(_value_and_slope(target, target.data, middle)[1])[entries]
+        return found._replace(unit=jnp.asarray(unit), coefficients=jnp.asarray(np.append(0.0, unit * slope)))
+    rng = np.random.default_rng(0)
+    rows, values = [], []
+    for _ in range(-(-REDUNDANCY * terms // (count + 1))):
+        direction = rng.normal(size=count)
+        z = REACH * rng.uniform() * direction / np.linalg.norm(direction)
+        value, slope = _value_and_slope(target, target.data, jnp.asarray(middle).at[entries].add(unit * z))
+        rows += [terms_of(found.factors, z)[None], _slopes_of_terms(found.factors, z).T]
+        values += [np.append(value, unit * np.asarray(slope)[entries])]
+    coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values))[0]
+    return found._replace(unit=jnp.asarray(unit), coefficients=jnp.asarray(coefficients))
+
+
+_slopes_of_terms = jax.jit(jax.jacfwd(terms_of, argnums=1))
 
 
 def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
@@ -92,7 +124,7 @@ def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
     return target.normaliser.log(data, estimands_of(target, data, unravel(target)(flat)))
 
 
-_slope = jax.jit(jax.grad(log_normaliser_at, argnums=2), static_argnums=0)
+_value_and_slope = jax.jit(jax.value_and_grad(log_normaliser_at, argnums=2), static_argnums=0)
 
 
 def delay_acceptance(

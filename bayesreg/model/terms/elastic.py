@@ -68,7 +68,7 @@ class LoadPrior(NamedTuple):
     Attributes
     ----------
     determinant : SchurDeterminant or None
-        None leaves the normaliser out.
+        None leaves log pdet K out of the normaliser.
     volumes : (n,) array
         Diagonal of M, mm³.
     areas : (n,) array
@@ -99,26 +99,31 @@ class LoadPrior(NamedTuple):
         return values["body_load"] ** 2 * self.volumes + values["surface_load"] ** 2 * self.areas
 
     def log(self, state: State) -> Scalar:
-        """−½ qᵀ D⁻¹ q, and the normaliser if it is part of the density."""
+        """−½ qᵀ D⁻¹ q and the normaliser, but for log pdet K where that is left out."""
         load = internal_force(state.elements, state.lam, state.mu, state.u)
         energy = (load**2 / self.variances(state.values)[:, None]).sum() / 2
-        return -energy + self.log_normaliser(state.elements, state.lam, state.mu, state.values)
+        log_pdet = self.log_normaliser(state.elements, state.lam, state.mu, state.values)
+        return -energy + log_pdet + self._log_normaliser_of_loads(state.values)
 
     def log_normaliser(
         self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], values: Values
     ) -> Scalar:
-        """½ log pdet(K D⁻¹ K) − r/2 log 2π, r = 3n − 6; zero where it is left out.
+        """log pdet K, the costly part of the normaliser; zero where it is left out.
 
-        With an orthonormal basis R of the null space of K, pdet(K D⁻¹ K) = (pdet K)² det(Rᵀ D R) / det D, since the
-        block of D⁻¹ in the complement of R has the determinant of the block of D in R over that of D (Jacobi).
+        The whole normaliser is ½ log pdet(K D⁻¹ K) − r/2 log 2π, r = 3n − 6. With an orthonormal basis R of the null
+        space of K, pdet(K D⁻¹ K) = (pdet K)² det(Rᵀ D R) / det D, since the block of D⁻¹ in the complement of R has the
+        determinant of the block of D in R over that of D (Jacobi).
         """
         if self.determinant is None:
             return jnp.zeros(())
-        log_pdet = log_pseudo_determinant(self.determinant, elements, lam, mu)
+        return log_pseudo_determinant(self.determinant, elements, lam, mu)
+
+    def _log_normaliser_of_loads(self, values: Values) -> Scalar:
+        """½ (log det Rᵀ D R − log det D − r log 2π)."""
         variances = jnp.repeat(self.variances(values), 3)
         in_null_space = jnp.linalg.slogdet(self.rigid.T @ (variances[:, None] * self.rigid))[1]
-        rest = in_null_space - jnp.log(variances).sum() - self.determinant.rank * jnp.log(2 * jnp.pi)
-        return log_pdet + 0.5 * rest
+        rank = len(variances) - self.rigid.shape[1]
+        return 0.5 * (in_null_space - jnp.log(variances).sum() - rank * jnp.log(2 * jnp.pi))
 
     def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
         """K D⁻¹ K, 1/mm²."""
