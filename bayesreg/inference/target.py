@@ -136,6 +136,14 @@ class ModeSearch(Protocol):
     def hyperparameters(self) -> Sequence[str]:
         """Names of sampled parameters of the displacements' prior and noise, whose joint mode with these misleads."""
 
+    @property
+    def approached(self) -> AnyArray | None:
+        """Rows of "u_boundary" where the search begins; None: where the chains start."""
+
+    @property
+    def tempering(self) -> Callable[[Estimands], Target] | None:
+        """Where the target has yet to be tempered: from estimands near the mode to the target that is to be sampled."""
+
     def continuation(self) -> Iterable[Any]:
         """Data of ever harder problems, in the displacements alone, that lead to the target's own."""
 

@@ -70,7 +70,8 @@ def build_posterior(
         raise InputError(f"build_posterior needs a mesh: a TetMesh; got {type(mesh).__name__}")
     model, given = model or ModelConfig(), _observations(fixed, moving, observations)
     problem, sampled = problem_of(mesh, given, model, skull, reference)
-    posterior = Posterior(problem, mesh, model, sampled, {observation.name: observation for observation in given})
+    tempered = model.independent_points != "residual" or not any(isinstance(one, ImagePair) for one in given)
+    posterior = Posterior(problem, mesh, model, sampled, {one.name: one for one in given}, tempered=tempered)
     _require_bounded(posterior)
     _require_numbers(posterior)
     return posterior

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -38,11 +38,17 @@ class ModeSearch:
         By name, as they were given.
     interpolation : {"linear", "cubic"}
         Interpolation of the moving images.
+    approached : (b, 3) array or None
+        Displacements that the continuation has led to already, mm.
+    tempering : callable or None
+        From estimands near the mode to the posterior that is tempered by its residuals there; None where it is.
     """
 
     data: Problem
     observations: Mapping[str, Any]
     interpolation: Interpolation
+    approached: Float[AnyArray, "sampled 3"] | None = None
+    tempering: Callable[[Values], Any] | None = None
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
@@ -59,7 +65,9 @@ class ModeSearch:
         return tuple(name for name in names if self.data.blocks[name].is_sampled)
 
     def continuation(self) -> Iterator[Problem]:
-        """Problems of growing difficulty, in the displacements alone, that lead to this one."""
+        """Problems of growing difficulty, in the displacements alone, that lead to this one; none once approached."""
+        if self.approached is not None:
+            return iter(())
         return continuation(self.data, self.observations, self.interpolation)
 
     def curvature(self, data: Problem, estimands: Values) -> Curvature:

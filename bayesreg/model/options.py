@@ -118,6 +118,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "interpolation": "cubic",
         "quadrature": "voxels",
         "most_points": 100_000,
+        "independent_points": "residual",
         "smoothing": 0.8,
         "intensity_map": 2,
         "skull_width": 0.5,
@@ -153,9 +154,10 @@ class ModelConfig(BaseModel):
     window_mm : float
         Longest side of a window of "lncc", mm, within which one affine map should relate the contrasts. Where the
         quadrature has few points, windows are as much larger as to hold 16.
-    independent_points : float, optional
-        Effective number of independent quadrature points (see `bayesreg.independent_points`): the log likelihood
-        is tempered by its share of all of them. None: all are independent.
+    independent_points : float or "residual", optional
+        Effective number of independent quadrature points: the log likelihood is tempered by its share of all of them.
+        None: all are independent. "residual": as many as the correlation of the residuals tells where the images first
+        lead to (`bayesreg.model.independence`); for `quadrature: voxels`. Sampling estimates it before all else.
     t_similarity, t_elastic : float or TemperaturePrior
         Boltzmann temperatures T_s (mm³ times squared intensity) and T_r (energy), known or inferred.
     elastic_prior : {"boltzmann", "loads"}
@@ -205,7 +207,7 @@ class ModelConfig(BaseModel):
     similarity: Literal["ssd", "student_t", "lncc"] = "ssd"
     window_mm: Positive = 10.0
     degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
-    independent_points: Positive | None = None
+    independent_points: Positive | Literal["residual"] | None = None
     t_similarity: Positive | TemperaturePrior = 0.05
     t_elastic: Positive | TemperaturePrior = 1e4
     elastic_prior: Literal["boltzmann", "loads"] = "boltzmann"
@@ -235,6 +237,8 @@ class ModelConfig(BaseModel):
             raise wrong("field", f"expected null: it belongs to elasticity: field, which is {self.elasticity} here")
         if self.intensity_map is not None and self.similarity == "lncc":
             raise wrong("intensity_map", "expected null with similarity: lncc, which finds a map in each window")
+        if self.independent_points == "residual" and self.quadrature != "voxels":
+            raise wrong("independent_points", f"residual needs quadrature: voxels, which is {self.quadrature} here")
         if self.elastic_prior == "loads":
             self._require_random_loads()
         elif (self.body_load, self.surface_load) != (None, None):

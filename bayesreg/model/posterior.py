@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +19,7 @@ from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.conditioning import compare_at_four_points, condition
 from bayesreg.model.coordinates import Coordinates
 from bayesreg.model.evaluation import Evaluation
+from bayesreg.model.independence import independent_scores
 from bayesreg.model.mode_search import ModeSearch
 from bayesreg.model.normaliser import Normaliser
 from bayesreg.model.options import ModelConfig
@@ -55,6 +56,11 @@ class Posterior:
         The nodes whose displacements are sampled, sorted.
     observations : mapping
         The observations by name, as they were given.
+    approached : (b, 3) array, optional
+        Displacements of the sampled nodes, mm, where the search for a mode begins.
+    tempered : bool
+        False where residuals have yet to tell how many quadrature points are independent (`independent_points:
+        residual`): all count until then.
 
     Notes
     -----
@@ -67,6 +73,8 @@ class Posterior:
     options: ModelConfig
     sampled: Int[np.ndarray, "sampled"]
     observations: Mapping[str, Any]
+    approached: Float[AnyArray, "sampled 3"] | None = None
+    tempered: bool = True
 
     # For a user
 
@@ -152,6 +160,34 @@ class Posterior:
                 raise InputError(f"values[{name!r}] must have shape {shape}, got {np.shape(values[name])}")
         return coordinates.fill(blocks, values)
 
+    def count_independent_points(self, values: Values) -> dict[str, float]:
+        """How many quadrature points of each pair of images are independent, by its residuals at these values.
+
+        They are those of the rule "voxels"; see `bayesreg.model.independence.independent_scores`.
+        """
+        filled = self.fill(values)
+        u = self.evaluate(filled).u
+        found = {}
+        for name, one in self.observations.items():
+            if isinstance(one, ImagePair):
+                term = self.data.terms[name]
+                voxels = np.rint(one.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
+                found[name] = independent_scores(np.asarray(term.scores(u, filled)), voxels, one.fixed)
+        return found
+
+    def with_independent_points(self, counts: Mapping[str, float]) -> Posterior:
+        """The posterior with the likelihood of pairs of images tempered as for so many independent points."""
+        data = self.data
+        for name, count in counts.items():
+            data = data.with_term(name, data.terms[name].with_independent_points(count))
+        return replace(self, data=data, tempered=True)
+
+    @property
+    def independent_points(self) -> dict[str, float]:
+        """How many quadrature points of each pair of images the likelihood counts as independent."""
+        terms = {name: self.data.terms[name] for name, one in self.observations.items() if isinstance(one, ImagePair)}
+        return {name: float(term.independent_share * len(term.positions)) for name, term in terms.items()}
+
     @property
     def images(self) -> ComparedImages:
         """The first pair of images on the mesh; InputError if there is none."""
@@ -233,7 +269,13 @@ class Posterior:
     @property
     def mode_search(self) -> ModeSearch:
         """The posterior as the search for a mode sees it."""
-        return ModeSearch(self.data, self._smooth_observations, self.options.interpolation)
+        tempering = None if self.tempered else self._temper
+        return ModeSearch(self.data, self._smooth_observations, self.options.interpolation, self.approached, tempering)
+
+    def _temper(self, estimands: Values) -> Posterior:
+        """The posterior tempered by its residuals at these estimands, where a search may go on."""
+        counts = self.count_independent_points(coordinates.complete(self.data.blocks, estimands))
+        return replace(self.with_independent_points(counts), approached=np.asarray(estimands["u_boundary"]))
 
     @property
     def _smooth_observations(self) -> dict[str, Any]:

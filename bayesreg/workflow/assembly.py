@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,24 @@ from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.types import InputError
 
 
-def posterior_of(config: Config, inputs: Inputs, observations: Sequence[Any] = ()) -> Posterior:
+def posterior_of(
+    config: Config,
+    inputs: Inputs,
+    observations: Sequence[Any] = (),
+    independent_points: Mapping[str, float] | None = None,
+) -> Posterior:
     """The posterior of a run, with observations besides those of its configuration.
 
-    Solves are preconditioned at the start parameters.
+    Solves are preconditioned at the start parameters. Where a run has found how many points are independent, its
+    likelihood is tempered by that.
     """
     reference = {name: _reference(name, config, inputs.mesh) for name in ("lam", "mu")}
     model = _model(config.model, inputs)
     observed = [*_observations(config, inputs), *observations]
-    return build_posterior(
+    posterior = build_posterior(
         mesh=inputs.mesh, observations=observed, model=model, skull=inputs.skull, reference=reference
     )
+    return posterior.with_independent_points(independent_points) if independent_points else posterior
 
 
 def _observations(config: Config, inputs: Inputs) -> list[Any]:

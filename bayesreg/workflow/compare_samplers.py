@@ -11,6 +11,7 @@ from bayesreg.config import Config, load_config, resolved_yaml
 from bayesreg.config.samplers import sampler_section
 from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.efficiency import Budget, Efficiency, efficiency
+from bayesreg.inference.chains.run import temper_target
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.samplers.registry import SAMPLERS
 from bayesreg.io import store
@@ -62,6 +63,7 @@ def compare_samplers(
     inputs = prepared_inputs(config)[0]
     posterior, setting = posterior_of(config, inputs), _setting(config, minutes)
     start = start_of(config, inputs, posterior)
+    target = temper_target(posterior, config.sampler.chains, config.seed, start, console.print)
     rule = StopRule(config.stop.rhat, config.stop.ess, 60 * minutes)
     found = []
     for name in samplers:
@@ -70,7 +72,7 @@ def compare_samplers(
         budget = Budget(config.sampler.chains, max(config.stop.max_steps // own.thin, 4), rule)
         found.append(
             efficiency(
-                posterior,
+                target,
                 name,
                 budget,
                 config.seed,

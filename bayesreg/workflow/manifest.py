@@ -83,6 +83,7 @@ def manifest(
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
         "model": _model(config, posterior),
         "observations": describe_observations(posterior, mean),
+        "independent_points": posterior.independent_points,
         "exact": samples.exact,
         "stopped": {
             "reason": samples.reason,

@@ -22,6 +22,7 @@ from bayesreg.inference.chains.run import (
     checkpoint_from_arrays,
     first_checkpoint,
     sample,
+    temper_target,
 )
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block, Blocks
@@ -110,7 +111,8 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
     wait(BEGUN)
     if not (out / "run.json").exists():
         begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
-        posterior = posterior_of(begun, inputs, observations)
+        found = store.read_json(out / PROVENANCE)["independent_points"]
+        posterior = posterior_of(begun, inputs, observations, found)
         _sample(begun, posterior, _load_reached(begun, inputs, posterior, out, progress=False), out, progress=False)
         wait(SAMPLED)
     wait(ENDED)
@@ -129,7 +131,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
             wait(BEGUN)
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
-        posterior = posterior_of(config, inputs, observations)
+        posterior = posterior_of(config, inputs, observations, provenance["independent_points"])
         _require_same_observations(out, provenance, posterior, observations)
         if (out / "run.json").exists():
             checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
@@ -150,6 +152,8 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs, observations)
         provenance["observations"] = _fingerprint(posterior, observations)
+        posterior = _temper(config, inputs, posterior, say)
+        provenance["independent_points"] = posterior.independent_points
         reached = _first(config, inputs, posterior, out, progress)
         inputs = with_initial(inputs, config)
         store_inputs(out, inputs, with_unsampled(provenance, began))
@@ -215,6 +219,18 @@ def _describe_mesh(inputs: Inputs) -> str:
 
 
 Reached = tuple[Checkpoint, Blocks]
+
+
+def _temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[[str], None]) -> Posterior:
+    """The posterior that the chains are to draw from."""
+    if posterior.tempered:
+        return posterior
+    say("how many points are independent: where the images first lead to")
+    found = temper_target(posterior, config.sampler.chains, config.seed, start_of(config, inputs, posterior), say)
+    assert isinstance(found, Posterior)
+    for name, count in found.independent_points.items():
+        say(f"{name}: {count:,.0f} of {len(found.data.terms[name].positions):,} points are independent")
+    return found
 
 
 def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+import bayesreg as br
 from bayesreg.image import Image
+from bayesreg.inference.chains.run import temper_target
+from bayesreg.inference.gaussian.mode_search import approach
+from bayesreg.inference.layout import flat_position, slices
 from bayesreg.model.independence import independent_points, independent_scores
 from bayesreg.types import InputError
-from tests.phantoms import rotated_affine
+from tests.phantoms import ball_mesh, rotated_affine, smooth_image
 
 SIZES = np.array([1.0, 1.5, 2.0])
 SHAPE = (60, 44, 36)
@@ -99,3 +103,62 @@ def test_scores_of_some_voxels_count_by_the_variance_of_their_sum(density):
 def test_a_residual_of_nothing_is_told():
     with pytest.raises(InputError, match="zero at every point"):
         independent_scores(np.zeros((3, 1)), np.arange(9).reshape(3, 3), Image(np.zeros(SHAPE), affine()))
+
+
+MESH = ball_mesh(spacing=30.0)
+OPTIONS = {
+    "elastic_prior": "loads",
+    "body_load": 0.3,
+    "surface_load": 0.3,
+    "normalised": True,
+    "sampled": "all",
+    "priors": {"lam": {"high": 60.0}, "mu": {"high": 60.0}},
+    "quadrature": "voxels",
+    "interpolation": "cubic",
+    "t_similarity": 0.5,
+}
+
+
+def posterior(**options):
+    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
+    return br.build_posterior(*images, MESH, model=br.ModelConfig(**(OPTIONS | options)))
+
+
+def test_scores_are_what_the_images_pull_with():
+    """Their sum, against differences of the energy where all nodes are shifted."""
+    post = posterior(similarity="student_t")
+    values = post.fill(post.reference())
+    term, shift = post.images, np.array([0.3, -0.2, 0.5])
+    scores = np.asarray(term.scores(values["u_boundary"], values))
+    assert scores.shape == (len(term.positions), 3)
+    ahead, behind = (post.evaluate({**values, "u_boundary": values["u_boundary"] + h * shift}) for h in (1e-4, -1e-4))
+    slope = float(ahead.similarity_energy - behind.similarity_energy) / 2e-4
+    assert -scores.sum(axis=0) @ shift == pytest.approx(slope, rel=1e-6)
+
+
+def test_residuals_temper_the_likelihood_where_that_is_wanted():
+    post = posterior(independent_points="residual")
+    assert not post.tempered
+    said = []
+    found = temper_target(post, 2, 0, say=said.append)
+    count = found.independent_points["images"]
+    assert found.tempered
+    assert said
+    # The images are smooth, and no displacement makes them equal: far fewer than all are independent.
+    assert 1 < count < 0.1 * len(post.images.positions)
+    values = {**post.fill(post.reference()), "u_boundary": np.asarray(found.approached)}
+    assert post.count_independent_points(values)["images"] == pytest.approx(count, rel=1e-9)
+    same = posterior(independent_points=count)
+    assert float(found.logdensity_constrained(values)) == pytest.approx(float(same.logdensity_constrained(values)))
+    assert temper_target(found, 2, 0) is found
+
+
+def test_a_search_goes_on_where_the_tempering_has_led_to():
+    found = temper_target(posterior(independent_points="residual"), 2, 0)
+    start = np.asarray(flat_position(found, found.data, found.estimands(found.reference())))
+    np.testing.assert_array_equal(approach(found, start)[slices(found)["u_boundary"]], np.ravel(found.approached))
+
+
+def test_residuals_tell_of_voxels_alone():
+    with pytest.raises(ValueError, match="residual needs quadrature: voxels"):
+        br.ModelConfig(independent_points="residual")

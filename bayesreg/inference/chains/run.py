@@ -21,10 +21,11 @@ from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, out_of_
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_inference_data
 from bayesreg.inference.draws.moments import pool, scale_reduction, zero_moments
+from bayesreg.inference.gaussian.modes import temper
 from bayesreg.inference.kernel import Draw
 from bayesreg.inference.samplers.registry import Chosen, choose_sampler
 from bayesreg.inference.target import Target
-from bayesreg.types import InputError
+from bayesreg.types import AnyArray, InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,7 @@ class Samples:
     Attributes
     ----------
     posterior : Posterior
+        That of the draws: tempered, where residuals were to tell how.
     blocks : Blocks
         The draws, as arrays (chain, draw, …) of the estimands and of their statistics.
     u_mean, u_sd : (n, 3) arrays
@@ -126,6 +128,7 @@ def sample(
         if value < 1:
             raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
+    posterior = temper_target(posterior, chains, seed, start) if resume is None else posterior
     chosen = choose_sampler(sampler, posterior, **settings)
     began = time.perf_counter()
     if resume is None:
@@ -147,6 +150,23 @@ def sample(
     return _gather_samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
 
 
+def temper_target(
+    posterior: Target,
+    chains: int,
+    seed: int,
+    start: Start | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Target:
+    """The posterior that `sample` draws from: tempered by its residuals, where the options want that, or as it is."""
+    points = starting_points(posterior, start or Start(), chains, _start_key(seed))
+    require_numbers(points)
+    return temper(posterior, points, say)
+
+
+def _start_key(seed: int) -> AnyArray:
+    return jax.random.split(jax.random.key(seed))[0]
+
+
 def first_checkpoint(
     posterior: Target,
     sampler: str,
@@ -166,7 +186,7 @@ def first_checkpoint(
         If a chain cannot start there.
     """
     began = time.perf_counter()
-    key_start, _ = jax.random.split(jax.random.key(seed))
+    key_start = _start_key(seed)
     points = starting_points(posterior, start or Start(), chains, key_start)
     require_numbers(points)
     chosen = choose_sampler(sampler, posterior, **settings)

@@ -63,11 +63,7 @@ def find_mode(
     InputError
         If the density is not finite at the start.
     """
-    assert target.mode_search is not None
-    flat = np.asarray(start)
-    for data in target.mode_search.continuation():
-        flat = _improve(target, data, flat, False, iterations, say, gain=ROUGH)
-    flat = settle(target, flat, say, iterations)
+    flat = settle(target, approach(target, start, say, iterations), say, iterations)
     for _ in range(RESCUES):
         elsewhere, nodes = leave_pockets(target, flat)
         if not len(nodes):
@@ -77,6 +73,22 @@ def find_mode(
         flat = settle(target, elsewhere, say, iterations)
     else:
         say("mode: single nodes may be more probable elsewhere")
+    return flat
+
+
+def approach(
+    target: Target,
+    start: Float[np.ndarray, "dimension"],
+    say: Callable[[str], None] = lambda text: None,
+    iterations: int = 40,
+) -> Float[np.ndarray, "dimension"]:
+    """Where the target's continuation leads the displacements from a flat position, or has led them already."""
+    assert target.mode_search is not None
+    flat = np.array(start)
+    if target.mode_search.approached is not None:
+        flat[displacements(target)] = np.ravel(target.mode_search.approached)
+    for data in target.mode_search.continuation():
+        flat = _improve(target, data, flat, False, iterations, say, gain=ROUGH)
     return flat
 
 

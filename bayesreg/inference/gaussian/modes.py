@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.inference.gaussian.laplace import Gaussian, laplace
-from bayesreg.inference.gaussian.mode_search import find_mode
+from bayesreg.inference.gaussian.mode_search import approach, find_mode
 from bayesreg.inference.kernel import Say
 from bayesreg.inference.layout import flat_position, unravel
-from bayesreg.inference.target import Target, logdensity
+from bayesreg.inference.target import Target, estimands_of, logdensity
 
 # Modes count as one where no coordinate lies further apart than this, in its standard deviations.
 SAME = 1.0
@@ -41,13 +41,20 @@ def search_modes(target: Target, points: Any, each: bool, say: Say) -> Modes:
     """
     chains = len(next(iter(points.values())))
     if not each:
-        middle = jax.tree.map(lambda x: jnp.asarray(x).mean(axis=0), points)
-        return Modes([laplace(target, find_mode(target, _flat(target, middle), say))], [0] * chains)
+        return Modes([laplace(target, find_mode(target, _middle(target, points), say))], [0] * chains)
     found = []
     for chain in range(chains):
         say(f"chain {chain}:")
         found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points)), say))
     return report_modes(target, tell_apart(target, np.stack(found)), say)
+
+
+def temper(target: Target, points: Any, say: Say) -> Target:
+    """The target, tempered where the search from the mean of the start points first leads, if it has yet to be."""
+    if target.mode_search is None or target.mode_search.tempering is None:
+        return target
+    there = approach(target, _middle(target, points), say)
+    return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(there))))
 
 
 def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
@@ -86,6 +93,10 @@ def report_modes(target: Target, modes: Modes, say: Say) -> Modes:
 
 def _height(target: Target, flat: np.ndarray) -> float:
     return float(logdensity(target, target.data, unravel(target)(jnp.asarray(flat))))
+
+
+def _middle(target: Target, points: Any) -> np.ndarray:
+    return _flat(target, jax.tree.map(lambda x: jnp.asarray(x).mean(axis=0), points))
 
 
 def _flat(target: Target, estimands: Any) -> np.ndarray:

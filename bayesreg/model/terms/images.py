@@ -224,6 +224,14 @@ class ComparedImages(NamedTuple):
         variance = self.similarity.variance() * t_similarity
         return float(np.sqrt(variance / (2 * np.mean(self.quadrature.weights))))
 
+    def scores(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points 3"]:
+        """−∂E_s/∂x at every place x_q + u(x_q), by which the images pull there."""
+        return _scores(self, u, dict(values))
+
+    def with_independent_points(self, count: float) -> ComparedImages:
+        """The term with the likelihood tempered as for so many independent points."""
+        return self._replace(independent_share=jnp.asarray(count / len(self.positions)))
+
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Gauss and Newton's curvature of E_s / T_s, tempered: that of eq. (1) is 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
         return _gauss_newton(self, u, dict(values))
@@ -270,6 +278,14 @@ class ImageLikelihood(dist.Distribution):
         if self.term.comparison.normalised:
             found += self.term.similarity.log_normaliser(self.term.quadrature.weights, self.temperature)
         return self.term.independent_share * found
+
+
+@jax.jit
+def _scores(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points 3"]:
+    moved = term.places(u)
+    pair = term.pair(term.without_shading(term.moving(moved), values))
+    slope = jax.grad(term.similarity.energy)(pair, values["t_similarity"]).moving
+    return -slope[:, None] * _slope(term, moved)
 
 
 @jax.jit
@@ -348,7 +364,8 @@ def independent_share(model: ModelConfig, points: int) -> float:
     InputError
         If there are fewer points than are said to be independent.
     """
-    if model.independent_points is None:
+    # What residuals tell is known later, see `Posterior.count_independent_points`.
+    if model.independent_points is None or model.independent_points == "residual":
         return 1.0
     if model.independent_points > points:
         raise InputError(
