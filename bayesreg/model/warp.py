@@ -13,6 +13,7 @@ from bayesreg.fem.location import locate
 from bayesreg.image import Image
 from bayesreg.interpolation import Interpolation
 from bayesreg.mesh import TetMesh
+from bayesreg.model.submesh import submesh_variance
 from bayesreg.types import AnyArray
 
 
@@ -31,6 +32,24 @@ def nodal_field_on_grid(
     nodal = np.asarray(values)[mesh.cells[cells]]
     field[tuple(index.T)] = np.einsum("qa,qac->qc", barycentric, nodal)
     return field
+
+
+def moments_on_grid(
+    mesh: TetMesh, mean: Float[np.ndarray, "nodes 3"], sd: Float[np.ndarray, "nodes 3"], grid: Image
+) -> tuple[Float[np.ndarray, "X Y Z 3"], Float[np.ndarray, "X Y Z 3"]]:
+    """The mean and the standard deviation of the displacement at the voxel centres of an image, mm.
+
+    Both are those of the nodes, interpolated, and zero outside the mesh; the variance holds besides what the mesh
+    cannot follow of a smooth displacement (`bayesreg.model.submesh`).
+    """
+    index, cells, barycentric = covered_voxels(grid, mesh)
+    nodal = np.concatenate([mean, sd], axis=1)[mesh.cells[cells]]
+    there = np.einsum("qa,qac->qc", barycentric, nodal)
+    beyond = submesh_variance(mesh, mean)[cells]
+    fields = np.zeros((2, *grid.shape, 3))
+    fields[(0, *index.T)] = there[:, :3]
+    fields[(1, *index.T)] = np.sqrt(there[:, 3:] ** 2 + beyond)
+    return fields[0], fields[1]
 
 
 class Covered(NamedTuple):

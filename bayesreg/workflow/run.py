@@ -35,7 +35,7 @@ from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
 from bayesreg.model.terms.images import ComparedImages
-from bayesreg.model.warp import nodal_field_on_grid, warp_image
+from bayesreg.model.warp import moments_on_grid, warp_image
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
@@ -309,10 +309,8 @@ def _finish(
     save_posterior(posterior, samples.blocks, out / "posterior.nc")
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)
-    moments = np.concatenate([samples.u_mean, samples.u_sd], axis=1)
-    mean_field, sd_field = np.split(
-        nodal_field_on_grid(inputs.mesh, moments, inputs.fixed or inputs.tissue), 2, axis=-1
-    )
+    grid = inputs.fixed or inputs.tissue
+    mean_field, sd_field = moments_on_grid(inputs.mesh, samples.u_mean, samples.u_sd, grid)
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)

@@ -1,0 +1,58 @@
+"""What a mesh cannot follow, against the error of interpolation of fields that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesreg.fem.elements import gauss_quadrature
+from bayesreg.image import Image
+from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.warp import covered_voxels, moments_on_grid
+from tests.phantoms import ball_mesh, refined
+
+MESH = refined(refined(ball_mesh(spacing=30.0)))
+LENGTH = 40.0
+
+
+def smooth(x):
+    """A displacement whose three components bend in different directions."""
+    return np.stack([np.sin(x[:, 0] / LENGTH), np.cos(x[:, 1] / LENGTH), np.sin((x[:, 0] + x[:, 2]) / LENGTH)], axis=1)
+
+
+def squared_error(mesh):
+    """Of interpolation, its mean over each cell."""
+    quadrature = gauss_quadrature(mesh, "gauss32")
+    x = quadrature.positions(mesh)
+    error = (smooth(x) - np.asarray(quadrature.interpolation(smooth(mesh.points)))) ** 2
+    counts = np.bincount(quadrature.cells)
+    return np.stack([np.bincount(quadrature.cells, one) for one in error.T], axis=1) / counts[:, None]
+
+
+def test_a_linear_field_is_followed():
+    u = MESH.points @ np.random.default_rng(0).normal(size=(3, 3)) + 1.0
+    np.testing.assert_allclose(submesh_variance(MESH, u), 0.0, atol=1e-20)
+
+
+def test_it_is_the_error_of_interpolation_inside():
+    inside = ~np.isin(MESH.cells, MESH.boundary).any(axis=1)
+    found = submesh_variance(MESH, smooth(MESH.points))[inside].mean(axis=0)
+    expected = squared_error(MESH)[inside].mean(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=0.25)
+
+
+def test_the_sd_of_a_voxel_holds_what_the_mesh_cannot_follow():
+    affine = np.diag([3.0, 3.0, 3.0, 1.0])
+    affine[:3, 3] = -43.5
+    grid = Image(np.zeros((30, 30, 30)), affine)
+    u, sd = smooth(MESH.points), np.full(MESH.points.shape, 0.2)
+    mean, found = moments_on_grid(MESH, u, sd, grid)
+    covered = covered_voxels(grid, MESH)
+    at = tuple(covered.voxel.T)
+    expected = np.sqrt(0.04 + submesh_variance(MESH, u)[covered.cell])
+    np.testing.assert_allclose(found[at], expected)
+    assert np.abs(mean[at] - smooth(grid.voxel_to_world(covered.voxel.astype(float)))).max() < 0.1
+    outside = np.ones(grid.shape, bool)
+    outside[at] = False
+    assert outside.any()
+    assert (found[outside] == 0).all()
+    assert (mean[outside] == 0).all()
