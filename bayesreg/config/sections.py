@@ -122,6 +122,16 @@ def _require_nothing_else(model: ModelConfig) -> None:
         raise _wrong("normalised", "expected false with known_boundary: a given u_B has no prior to be normalised")
 
 
+def _compares_files(given: Mapping[str, Any]) -> bool:
+    """Whether a configuration, before it is checked, compares a pair of images that are files."""
+    data, observations = given.get("data"), given.get("observations")
+    if not isinstance(data, Mapping) or data.get("source") != "files" or data.get("fixed") is None:
+        return False
+    if not isinstance(observations, list):
+        return True
+    return any(isinstance(one, Mapping) and one.get("kind") == "images" for one in observations)
+
+
 class Config(Section):
     """Everything that a run needs to know."""
 
@@ -140,6 +150,7 @@ class Config(Section):
     observations: Annotated[Observations, Field(validate_default=True)] = None
     """The data of the run; null is the pair of images alone."""
     model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
+    """Of a pair of images that are files, preset: registration is the default, and preset: paper of all else."""
     sampler: Annotated[
         SamplerConfig,
         Field(discriminator="name"),
@@ -150,6 +161,14 @@ class Config(Section):
     report: ReportConfig = ReportConfig()
     distributed: DistributedConfig | None = None
     """Other processes that share the chains; null runs alone."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose_preset(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping) or given.get("known_boundary") is not None or not _compares_files(given):
+            return given
+        model = given.get("model", {})
+        return {**given, "model": {"preset": "registration", **model}} if isinstance(model, Mapping) else given
 
     # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
 

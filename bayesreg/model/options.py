@@ -229,7 +229,11 @@ class ModelConfig(BaseModel):
     def _take_over_preset(cls, given: Any) -> Any:
         if not isinstance(given, Mapping):
             return given
-        return {**PRESETS.get(str(given.get("preset")), {}), **given}
+        chosen = dict(PRESETS.get(str(given.get("preset")), {}))
+        if given.get("similarity") == "lncc":
+            # Its windows have a map each.
+            chosen.pop("intensity_map", None)
+        return {**chosen, **given}
 
     @model_validator(mode="after")
     def _is_proper(self) -> ModelConfig:
@@ -263,12 +267,17 @@ class ModelConfig(BaseModel):
     def _require_random_loads(self) -> None:
         """Refuse what the prior of random loads leaves no room for."""
         if self.sampled != "all" or self.held:
-            raise wrong("sampled", "expected all, and no node held: with elastic_prior: loads every node is sampled")
+            raise wrong(
+                "sampled",
+                "expected all, and no node held: with elastic_prior: loads every node is sampled; preset: paper has "
+                "elastic_prior: boltzmann, with which some may be",
+            )
         if not self.normalised:
             raise wrong("normalised", "expected true with elastic_prior: loads, which is a proper density of u")
         if self.t_elastic != ModelConfig.model_fields["t_elastic"].default:
             raise wrong(
-                "t_elastic", "belongs to elastic_prior: boltzmann; random loads have body_load and surface_load"
+                "t_elastic",
+                "belongs to elastic_prior: boltzmann (preset: paper); random loads have body_load and surface_load",
             )
         for name in ("body_load", "surface_load"):
             if getattr(self, name) is None:

@@ -14,13 +14,13 @@ import pytest
 
 import bayesreg as br
 from bayesreg.inference.chains.initialise import starting_points
+from bayesreg.inference.gaussian.density import log_normaliser_at
 from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.normaliser import (
     REACH,
     Delayed,
     StandIn,
     delay_acceptance,
-    log_normaliser_at,
     make_stand_in,
     no_stand_in,
 )

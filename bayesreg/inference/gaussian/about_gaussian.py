@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayesreg.inference.gaussian.density import log_normaliser_at
 from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, recentre, slope_at
 from bayesreg.inference.gaussian.loose import find_slowest, move_alone, place_loose_nodes, search_places
 from bayesreg.inference.gaussian.modes import search_modes
-from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, log_normaliser_at, make_stand_in
+from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, make_stand_in
 from bayesreg.inference.gaussian.reflection import rotate
 from bayesreg.inference.gaussian.warm_up import Tuning, tune
 from bayesreg.inference.gaussian.whitened import (

@@ -12,6 +12,7 @@ log rest there, less ½ tr((A + R)⁻¹ ∂R).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -21,10 +22,16 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.optimize import minimize
 
-from bayesreg.inference.gaussian.density import estimands_at, height_and_slope, hessian_rows, regular
-from bayesreg.inference.gaussian.hierarchy import Volume, mark_hyperparameters, volume_of
+from bayesreg.inference.gaussian.density import (
+    estimands_at,
+    height_and_slope,
+    hessian_rows,
+    normaliser_and_slope,
+    regular,
+)
+from bayesreg.inference.gaussian.hierarchy import Volume, mark_hyperparameters
 from bayesreg.inference.layout import marked
-from bayesreg.inference.target import Target
+from bayesreg.inference.target import Target, without_normaliser
 from bayesreg.types import Matrix
 
 # Step of differences between curvatures, in the logarithm of a scale or a Normal score.
@@ -133,7 +140,10 @@ def evidence(
     there = np.array(about.flat)
     there[about.entries] = theta
     own, rows = marked(target, "u_boundary"), marked(target, "field", "u_boundary")
-    height, slope = height_and_slope(target, data, there)
+    # θ is the same at both places: so is the normaliser, which may be costly.
+    plain = without_normaliser(target, data)
+    log_normaliser, push_of_normaliser = normaliser_and_slope(target, there)
+    slope = height_and_slope(target, plain, there)[1]
     precision = regular(about.images + dense(_curvature(target, there, there)))
     factor = scipy.linalg.cho_factor(precision, lower=True, check_finite=False)
     moving = own[rows]
@@ -144,7 +154,8 @@ def evidence(
     step[moving] = scipy.linalg.cho_solve(inner, push[moving])
     place = np.array(there)
     place[rows] += step
-    height, slope = height_and_slope(target, data, place)
+    height, slope = height_and_slope(target, plain, place)
+    height, slope = height + log_normaliser, slope + push_of_normaliser
     gain = about.slope @ (place - about.flat) - step @ (about.images @ step) / 2
     covariance = _inverse(factor[0])
     traces = [trace(covariance, first) for first in slopes_of_curvature(target, there, about.entries)]
@@ -163,9 +174,10 @@ def _expand(
     curvature: Float[np.ndarray, "rows rows"],
 ) -> Expansion:
     assert target.mode_search is not None
-    data = target.mode_search.quadratic_part(target.data)
+    data = without_normaliser(target, target.data)
+    rest = target.mode_search.quadratic_part(data)
     images = curvature - dense(_curvature(target, flat, flat))
-    slope = height_and_slope(target, target.data, flat)[1] - height_and_slope(target, data, flat)[1]
+    slope = height_and_slope(target, data, flat)[1] - height_and_slope(target, rest, flat)[1]
     return Expansion(flat, entries, images, slope)
 
 
@@ -183,7 +195,7 @@ def slopes_of_curvature(
 def volume_at(
     target: Target, flat: Float[np.ndarray, "dimension"], curvature: Float[np.ndarray, "rows rows"]
 ) -> Volume:
-    """The derivatives of −½ log det H in the hyperparameters, H the curvature in "field" and "u_boundary" there."""
+    """−½ log det H as a function of the hyperparameters, H the curvature in "field" and "u_boundary" there."""
     entries = np.flatnonzero(mark_hyperparameters(target)).tolist()
     covariance = _inverse(scipy.linalg.cho_factor(curvature, lower=True)[0])
 
@@ -199,7 +211,7 @@ def volume_at(
             both = at({k: STEP, other: STEP}) + at({k: -STEP, other: -STEP})
             apart = sum(alone[entry, way] for entry in (k, other) for way in (1, -1))
             traces[row, column] = traces[column, row] = (both - apart + 2 * here) / 2
-    return volume_of(covariance, slopes_of_curvature(target, flat, np.array(entries)), traces / STEP**2)
+    return Volume(covariance, traces / STEP**2, partial(slopes_of_curvature, target, flat, np.array(entries)))
 
 
 def _inverse(lower: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:

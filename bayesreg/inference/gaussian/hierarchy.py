@@ -19,9 +19,11 @@ draw of u_B, whose energies are greater than at the mode, the density itself is 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float
 
 from bayesreg.inference.layout import Placed, marked
@@ -74,43 +76,37 @@ def balance_field(
     return moved
 
 
-class Volume(NamedTuple):
-    """Derivatives of −½ log det H in hyperparameters θ.
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Second derivatives of −½ log det H in hyperparameters θ.
 
     Attributes
     ----------
-    slope : (k,) array
-    curvature : (k, k) array
-        Minus the second derivatives.
-    excess : (k, k) array
-        By how much the log density is more curved in θ at a typical draw of the displacements than at their mode.
     covariance : (r, r) array
         C.
-    """
-
-    slope: Float[np.ndarray, "hyperparameters"]
-    curvature: Float[np.ndarray, "hyperparameters hyperparameters"]
-    excess: Float[np.ndarray, "hyperparameters hyperparameters"]
-    covariance: Float[np.ndarray, "rows rows"]
-
-
-def volume_of(
-    covariance: Float[np.ndarray, "rows rows"],
-    first: Sequence[Matrix],
-    second_traces: Float[np.ndarray, "hyperparameters hyperparameters"],
-) -> Volume:
-    """The derivatives of −½ log det H.
-
-    Parameters
-    ----------
-    covariance : (r, r) array
-        C.
-    first : sequence of (r, r) matrices, dense or sparse
-        H_k of every hyperparameter.
     second_traces : (k, k) array
         tr(C H_kl).
+    slopes : callable
+        () → H_k of every hyperparameter, dense or sparse, which not everybody needs.
     """
-    shares = [np.asarray((one @ covariance).T) for one in first]
-    slope = -np.array([np.trace(share) for share in shares]) / 2
-    squares = np.array([[(one * other.T).sum() for other in shares] for one in shares])
-    return Volume(slope, (second_traces - squares.reshape(second_traces.shape)) / 2, second_traces / 2, covariance)
+
+    covariance: Float[np.ndarray, "rows rows"]
+    second_traces: Float[np.ndarray, "hyperparameters hyperparameters"]
+    slopes: Callable[[], Sequence[Matrix]]
+
+    @property
+    def excess(self) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
+        """By how much the log density is more curved in θ at a typical draw of the displacements than at their mode."""
+        return self.second_traces / 2
+
+    @cached_property
+    def curvature(self) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
+        """Minus the second derivatives."""
+        # Products of dense matrices are faster than those with a sparse one of so many entries.
+        shares = [(one.toarray() if scipy.sparse.issparse(one) else one) @ self.covariance for one in self.slopes()]
+        squares = np.zeros(self.second_traces.shape)
+        for row, one in enumerate(shares):
+            turned = np.ascontiguousarray(one.T)
+            for column, other in enumerate(shares[: row + 1]):
+                squares[row, column] = squares[column, row] = np.vdot(turned, other)
+        return (self.second_traces - squares) / 2

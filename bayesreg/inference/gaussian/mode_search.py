@@ -12,7 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
-from bayesreg.inference.gaussian.density import estimands_at, height_and_slope
+from bayesreg.inference.gaussian.density import (
+    estimands_at,
+    height_and_slope,
+    mark_normaliser,
+    normaliser_and_slope,
+)
 from bayesreg.inference.gaussian.evidence import Found, maximise_evidence
 from bayesreg.inference.gaussian.hierarchy import balance_field, mark_hyperparameters, mark_scales
 from bayesreg.inference.gaussian.laplace import Gaussian, gaussian_of, laplace, precision_at
@@ -155,10 +160,12 @@ def _improve(
     """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
     shift = np.zeros(node_count(target)) if shift is None else shift
     resting = mark_scales(target)
-    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves, resting), resting))
-    if not moves:
-        # The normaliser is the same for all displacements.
+    log_normaliser = 0.0
+    if not moves or resting[mark_normaliser(target)].all():
+        # The normaliser is the same for all that moves.
         data = without_normaliser(target, data)
+        log_normaliser = normaliser_and_slope(target, flat)[0] if moves else 0.0
+    gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves, resting), resting))
     moving, own = 1 - resting.astype(float), displacements(target)
     if not moves:
         moving[others(target)] = 0.0
@@ -184,7 +191,7 @@ def _improve(
     options = {"maxiter": iterations, "maxcor": 20, "ftol": gain, "gtol": 1e-2}
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
     place, least, _, pressed = best[-1]
-    say(f"mode: log density {pressed - least:.1f}")
+    say(f"mode: log density {pressed - least + log_normaliser:.1f}")
     return np.asarray(_place(gaussian, moving * place))
 
 

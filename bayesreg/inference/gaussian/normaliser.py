@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayesreg.inference.gaussian.density import mark_normaliser, normaliser_and_slope
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.layout import marked, unravel
-from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
+from bayesreg.inference.target import Target, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
 
 # The degree of the polynomial is as high as its number of terms allows, which cost as many numbers to find.
@@ -83,8 +83,7 @@ def terms_of(factors: Int[AnyArray, "terms degree"], z: Float[AnyArray, "entries
 
 def no_stand_in(target: Target) -> StandIn:
     """The stand-in of a density without a normaliser, or before it is found: zero."""
-    depends = target.normaliser.depends_on if target.normaliser is not None else ()
-    entries = np.flatnonzero(marked(target, *depends))
+    entries = np.flatnonzero(mark_normaliser(target))
     count = len(entries)
     degrees = range(HIGHEST_DEGREE, 1, -1)
     degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
@@ -101,30 +100,23 @@ def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> Stand
     unit = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1)
     terms, degree = found.factors.shape
     if degree == 1:
-        slope = np.asarray(_value_and_slope(target, target.data, middle)[1])[entries]
+        slope = normaliser_and_slope(target, np.asarray(middle))[1][entries]
         return found._replace(unit=jnp.asarray(unit), coefficients=jnp.asarray(np.append(0.0, unit * slope)))
     rng = np.random.default_rng(0)
     rows, values = [], []
     for _ in range(-(-REDUNDANCY * terms // (count + 1))):
         direction = rng.normal(size=count)
         z = REACH * rng.uniform() * direction / np.linalg.norm(direction)
-        value, slope = _value_and_slope(target, target.data, jnp.asarray(middle).at[entries].add(unit * z))
+        there = np.array(middle)
+        there[entries] += unit * z
+        value, slope = normaliser_and_slope(target, there)
         rows += [terms_of(found.factors, z)[None], _slopes_of_terms(found.factors, z).T]
-        values += [np.append(value, unit * np.asarray(slope)[entries])]
+        values += [np.append(value, unit * slope[entries])]
     coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values))[0]
     return found._replace(unit=jnp.asarray(unit), coefficients=jnp.asarray(coefficients))
 
 
 _slopes_of_terms = jax.jit(jax.jacfwd(terms_of, argnums=1))
-
-
-def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
-    """The true one, at a flat position."""
-    assert target.normaliser is not None
-    return target.normaliser.log(data, estimands_of(target, data, unravel(target)(flat)))
-
-
-_value_and_slope = jax.jit(jax.value_and_grad(log_normaliser_at, argnums=2), static_argnums=0)
 
 
 def delay_acceptance(
