@@ -93,6 +93,9 @@ class Normaliser(Protocol):
     def depends_on(self) -> Sequence[str]:
         """Names of what it depends on; some may not be sampled."""
 
+    def smooth_coordinates(self, data: Any, estimands: Estimands) -> AnyArray:
+        """As many coordinates (k,) as it depends on, of which it is as smooth a function as can be."""
+
     def log(self, data: Any, estimands: Estimands) -> Scalar:
         """The logarithm of this factor, as part of the log density."""
 

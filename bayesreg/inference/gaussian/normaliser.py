@@ -1,14 +1,15 @@
 """A normaliser too costly for every step of a trajectory, which sees a polynomial instead: the test sees both.
 
-The normaliser of the elastic prior depends on the parameters alone, a few coordinates in which it is smooth. A kernel
-that is reversible for the density with a stand-in proposes; its proposal is accepted with the ratio of the normaliser
-to the stand-in, there over here. That is exact (the surrogate transition method, Liu 2001; delayed acceptance,
-Christen and Fox 2005), and costs one normaliser a transition.
+The normaliser of the elastic prior depends on the parameters alone, and is a smooth function of a few coordinates. A
+kernel that is reversible for the density with a stand-in proposes; its proposal is accepted with the ratio of the
+normaliser to the stand-in, there over here. That is exact (the surrogate transition method, Liu 2001; delayed
+acceptance, Christen and Fox 2005), and costs one normaliser a transition.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import combinations_with_replacement
 from math import comb
 from typing import Any, NamedTuple
@@ -20,45 +21,47 @@ from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.density import mark_normaliser, normaliser_and_slope
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.target import Target, has_costly_normaliser
+from bayesreg.inference.layout import dimension, unravel
+from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
 
 # The degree of the polynomial is as high as its number of terms allows, which cost as many numbers to find.
 HIGHEST_DEGREE, MOST_TERMS = 4, 150
-# The polynomial is fitted so far about the middle, in standard deviations of the Gaussian, and goes on linearly: the
-# posterior of a parameter is wider than the Gaussian (see `average_gaussian`), and skew.
+# The polynomial is fitted so far about the middle, in standard deviations of the Gaussian: the posterior of a parameter
+# is wider (see `average_gaussian`), and skew.
 REACH = 5.0
 # So many values and slopes are found for each coefficient.
 REDUNDANCY = 2
 
 
 class StandIn(NamedTuple):
-    """A polynomial about the middle of the chains (a pytree), the normaliser up to a constant.
+    """A polynomial in the normaliser's smooth coordinates (a pytree), the normaliser up to a constant.
 
     Attributes
     ----------
-    entries : (k,) int array
-        The entries of a flat position that the normaliser depends on.
-    unit : (k,) array
-        Their standard deviations in the Gaussian, in units of which they are factors of the terms.
+    centre, unit : (k,) arrays
+        The factors of its terms are the coordinates less the centre, over these units.
+    reach : scalar
+        Length of a vector of factors beyond which the polynomial goes on linearly.
     factors : (terms, degree) int array
-        The factors of each term: 0 is one, and i + 1 is entry i.
+        The factors of each term: 0 is one, and i + 1 is that of coordinate i.
     coefficients : (terms,) array
     """
 
-    entries: Int[AnyArray, "entries"]
-    unit: Float[AnyArray, "entries"]
+    centre: Float[AnyArray, "coordinates"]
+    unit: Float[AnyArray, "coordinates"]
+    reach: Scalar
     factors: Int[AnyArray, "terms degree"]
     coefficients: Float[AnyArray, "terms"]
 
-    def __call__(self, away: Float[AnyArray, "dimension"]) -> Scalar:
-        """The value at a flat position, given less the middle."""
-        z = away[self.entries] / self.unit
-        near = z * jnp.minimum(1.0, REACH / jnp.sqrt((z**2).sum() + 1e-12))
+    def __call__(self, coordinates: Float[AnyArray, "coordinates"]) -> Scalar:
+        """The value at smooth coordinates."""
+        z = (coordinates - self.centre) / self.unit
+        near = z * jnp.minimum(1.0, self.reach / jnp.sqrt((z**2).sum() + 1e-12))
         value, change = jax.jvp(self._polynomial, (near,), (z - near,))
         return value + change
 
-    def _polynomial(self, z: Float[AnyArray, "entries"]) -> Scalar:
+    def _polynomial(self, z: Float[AnyArray, "coordinates"]) -> Scalar:
         return terms_of(self.factors, z) @ self.coefficients
 
 
@@ -81,59 +84,87 @@ def terms_of(factors: Int[AnyArray, "terms degree"], z: Float[AnyArray, "entries
     return jnp.concatenate([jnp.ones(1), z])[factors].prod(axis=1)
 
 
+def smooth_coordinates(target: Target, data: Any, flat: AnyArray) -> Float[AnyArray, "coordinates"]:
+    """The normaliser's smooth coordinates at a flat position; none where there is no normaliser."""
+    if target.normaliser is None:
+        return jnp.zeros(0)
+    return target.normaliser.smooth_coordinates(data, estimands_of(target, data, unravel(target)(flat)))
+
+
 def no_stand_in(target: Target) -> StandIn:
     """The stand-in of a density without a normaliser, or before it is found: zero."""
-    entries = np.flatnonzero(mark_normaliser(target))
-    count = len(entries)
+    count = len(jax.eval_shape(partial(smooth_coordinates, target), target.data, jnp.zeros(dimension(target))))
     degrees = range(HIGHEST_DEGREE, 1, -1)
     degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
     factors = np.array(list(combinations_with_replacement(range(count + 1), degree)))
-    return StandIn(jnp.asarray(entries), jnp.ones(count), jnp.asarray(factors), jnp.zeros(len(factors)))
+    nothing, one = jnp.zeros(count), jnp.ones(count)
+    return StandIn(nothing, one, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)))
 
 
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
     """The polynomial that fits the normaliser and its slopes about a flat position best, by least squares."""
     found = no_stand_in(target)
-    entries, count = np.asarray(found.entries), len(found.entries)
-    if not has_costly_normaliser(target) or not count:
+    if not has_costly_normaliser(target) or not len(found.centre):
         return found
-    unit = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1)
-    terms, degree = found.factors.shape
-    if degree == 1:
-        slope = normaliser_and_slope(target, np.asarray(middle))[1][entries]
-        return found._replace(unit=jnp.asarray(unit), coefficients=jnp.asarray(np.append(0.0, unit * slope)))
-    rng = np.random.default_rng(0)
-    rows, values = [], []
-    for _ in range(-(-REDUNDANCY * terms // (count + 1))):
-        direction = rng.normal(size=count)
-        z = REACH * rng.uniform() * direction / np.linalg.norm(direction)
+    entries, middle = np.flatnonzero(mark_normaliser(target)), np.asarray(middle)
+    unit, rng = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), np.random.default_rng(0)
+    seen = []
+    # Some more than there are numbers for, so that a linear one, too, is found from several places.
+    for _ in range(2 + REDUNDANCY * len(found.factors) // (len(entries) + 1)):
+        direction = rng.normal(size=len(entries))
         there = np.array(middle)
-        there[entries] += unit * z
+        there[entries] += unit * REACH * rng.uniform() * direction / np.linalg.norm(direction)
         value, slope = normaliser_and_slope(target, there)
-        rows += [terms_of(found.factors, z)[None], _slopes_of_terms(found.factors, z).T]
-        values += [np.append(value, unit * slope[entries])]
-    coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values))[0]
-    return found._replace(unit=jnp.asarray(unit), coefficients=jnp.asarray(coefficients))
+        coordinates, change = _coordinates_and_change(target, target.data, jnp.asarray(there), jnp.asarray(entries))
+        seen.append((value, unit * slope[entries], np.asarray(coordinates), np.asarray(change) * unit))
+    values, slopes, coordinates, changes = (np.stack(parts) for parts in zip(*seen, strict=True))
+    centre, spread = coordinates.mean(axis=0), coordinates.std(axis=0)
+    z, changes = (coordinates - centre) / spread, changes / spread[:, None]
+    rows = [terms_of(found.factors, one)[None] for one in z]
+    rows += [(_slopes_of_terms(found.factors, one) @ change).T for one, change in zip(z, changes, strict=True)]
+    coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate([values, slopes.ravel()]))[0]
+    reach = np.linalg.norm(z, axis=1).max()
+    return found._replace(
+        centre=jnp.asarray(centre),
+        unit=jnp.asarray(spread),
+        reach=jnp.asarray(reach),
+        coefficients=jnp.asarray(coefficients),
+    )
 
 
 _slopes_of_terms = jax.jit(jax.jacfwd(terms_of, argnums=1))
+
+
+@partial(jax.jit, static_argnums=0)
+def _coordinates_and_change(
+    target: Target, data: Any, flat: AnyArray, entries: AnyArray
+) -> tuple[Float[AnyArray, "coordinates"], Float[AnyArray, "coordinates entries"]]:
+    """The smooth coordinates at a flat position, and their derivatives in some of its entries."""
+
+    def there(some: AnyArray) -> AnyArray:
+        return smooth_coordinates(target, data, flat.at[entries].set(some))
+
+    return there(flat[entries]), jax.jacfwd(there)(flat[entries])
 
 
 def delay_acceptance(
     step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Any]],
     flat_of: Callable[[Any, Any], AnyArray],
     log_normaliser: Callable[[Any, AnyArray], Scalar],
+    stand_in: Callable[[Any, Any, AnyArray], Scalar],
 ) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Any]]:
     """A step for the density with the stand-in made one for the density with the normaliser.
 
     Parameters
     ----------
     step : callable
-        (data, setup, key, state) → (state, info); reversible, and setup with fields `middle` and `make_stand_in`.
+        (data, setup, key, state) → (state, info); reversible.
     flat_of : callable
         (setup, state) → flat position.
     log_normaliser : callable
         (data, flat position) → the true one.
+    stand_in : callable
+        (data, setup, flat position) → what the kernel sees.
     """
 
     def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Any]:
@@ -141,8 +172,7 @@ def delay_acceptance(
         proposed, info = step(data, setup, key_step, state.kernel)
         here, there = flat_of(setup, state.kernel), flat_of(setup, proposed)
         true = log_normaliser(data, there)
-        middle, approximate = setup.middle, setup.stand_in
-        gain = true - state.log_normaliser - approximate(there - middle) + approximate(here - middle)
+        gain = true - state.log_normaliser - stand_in(data, setup, there) + stand_in(data, setup, here)
         probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
         accepted = jax.random.uniform(key_accept) < probability
         moved = Delayed(proposed, true)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.loose import Loose, place_loose_nodes
-from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in
+from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in, smooth_coordinates
 from bayesreg.inference.gaussian.reflection import Clearance, Walls, walls
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP
 from bayesreg.inference.layout import displacements, node_count, unravel
@@ -104,9 +104,14 @@ def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyAr
 
     def density(xi: AnyArray) -> AnyArray:
         flat = gaussian.place(xi)
-        return logdensity(target, plain, unravel(target)(flat)) + setup.stand_in(flat - setup.middle)
+        return logdensity(target, plain, unravel(target)(flat)) + stand_in_at(target, plain, setup, flat)
 
     return density
+
+
+def stand_in_at(target: Target, data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
+    """The stand-in for the normaliser at a flat position."""
+    return setup.stand_in(smooth_coordinates(target, data, flat))
 
 
 def clearance_of(target: Target, data: Any, setup: Setup) -> Clearance:
