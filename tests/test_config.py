@@ -7,6 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from bayesreg.config import Config, ConfigError, load_config, model_of, resolved_yaml, schema
+from bayesreg.model.options import ModelConfig
 from bayesreg.types import InputError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -325,3 +326,31 @@ def test_schema_describes_every_section_and_forbids_unknown_keys():
     temperature = found["$defs"]["ModelConfig"]["properties"]["t_elastic"]["anyOf"]
     assert {"$ref": "#/$defs/TemperaturePrior"} in temperature
     assert found["$defs"]["RandomWalk"]["properties"]["sigma_u"]["description"].endswith("mm.")
+
+
+@pytest.mark.parametrize(
+    ("given", "preset"),
+    [
+        (FILES, "registration"),
+        (FILES + "model: {t_similarity: 0.02}", "registration"),
+        (FILES + "model: {preset: paper}", "paper"),
+        (FILES + "known_boundary: mesh.vtu\nmodel: {fixed: {lam: 1.0, mu: 1.0}}", "paper"),
+        (FILES + "observations: [{kind: landmarks, file: points.csv}]", "paper"),
+        (FILES + "observations: [{kind: images}]", "registration"),
+        (SMALL, "paper"),
+    ],
+)
+def test_images_that_are_files_have_the_model_for_real_pairs(write, given, preset):
+    path = write(given)
+    for name in ("mesh.vtu", "points.csv"):
+        (path.parent / name).touch()
+    model = load_config(path).model
+    expected, changed = ModelConfig(preset=preset), {"t_similarity", "fixed"}
+    assert model.model_dump(exclude=changed) == expected.model_dump(exclude=changed)
+    assert (model.t_similarity == 0.02) == ("0.02" in given)
+
+
+def test_windows_with_a_map_each_have_no_other_one():
+    model = ModelConfig(preset="registration", similarity="lncc")
+    assert model.intensity_map is None
+    assert model.elastic_prior == "loads"

@@ -45,7 +45,7 @@ def configuration(folder, observations, data=(), name="run.yaml", **sections):
         "data": {"source": "files", **dict(data)},
         "mesh": {"file": "mesh.vtu"},
         "observations": observations,
-        "model": {"fixed": {"lam": 10.0, "mu": 1.0}, "t_elastic": 50.0, "rigid_sd": 5.0},
+        "model": {"preset": "paper", "fixed": {"lam": 10.0, "mu": 1.0}, "t_elastic": 50.0, "rigid_sd": 5.0},
         "sampler": {"name": "laplace"},
         "stop": {"rhat": None, "ess": None, "max_steps": 40},
         **sections,

@@ -71,6 +71,7 @@ def folder(anatomy, tmp_path_factory):
         "seed": 3,
         "data": {"source": "files", **files, "label_table": {"csf": [1], "gm": [2], "wm": [3]}},
         "mesh": {"file": "mesh.vtu"},
+        "model": {"preset": "paper"},
         "sampler": SAMPLER,
         "stop": STOP,
     }

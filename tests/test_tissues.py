@@ -76,7 +76,7 @@ def case(request, tmp_path_factory):
         },
         "sampler": {"name": "rwmh", "chains": 2, "thin": 2, "block": 4, "sigma_u": 0.02},
         "stop": {"rhat": 1.2, "ess": None, "max_steps": 16},
-        "model": {"rigid_sd": 5.0},
+        "model": {"preset": "paper", "rigid_sd": 5.0},
         "start": {"lam": {list(names)[-1]: 20.0}},
     }
     if request.param == "liver":

@@ -140,8 +140,8 @@ class ModeSearch(Protocol):
         """Names of sampled parameters of the displacements' prior and noise, whose joint mode with these misleads."""
 
     @property
-    def approached(self) -> AnyArray | None:
-        """Rows of "u_boundary" where the search begins; None: where the chains start."""
+    def approached(self) -> Estimands | None:
+        """Estimands near the mode, where the search begins; None: where the chains start."""
 
     @property
     def tempering(self) -> Callable[[Estimands], Target] | None:

@@ -38,8 +38,8 @@ class ModeSearch:
         By name, as they were given.
     interpolation : {"linear", "cubic"}
         Interpolation of the moving images.
-    approached : (b, 3) array or None
-        Displacements that the continuation has led to already, mm.
+    approached : mapping or None
+        Estimands near the mode, that a search has led to already.
     tempering : callable or None
         From estimands near the mode to the posterior that is tempered by its residuals there; None where it is.
     """
@@ -47,7 +47,7 @@ class ModeSearch:
     data: Problem
     observations: Mapping[str, Any]
     interpolation: Interpolation
-    approached: Float[AnyArray, "sampled 3"] | None = None
+    approached: Values | None = None
     tempering: Callable[[Values], Any] | None = None
 
     @property

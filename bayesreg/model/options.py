@@ -156,8 +156,8 @@ class ModelConfig(BaseModel):
         quadrature has few points, windows are as much larger as to hold 16.
     independent_points : float or "residual", optional
         Effective number of independent quadrature points: the log likelihood is tempered by its share of all of them.
-        None: all are independent. "residual": as many as the correlation of the residuals tells where the images first
-        lead to (`bayesreg.model.independence`); for `quadrature: voxels`. Sampling estimates it before all else.
+        None: all are independent. "residual": as many as the correlation of the residuals tells near the mode
+        (`bayesreg.model.independence`); for `quadrature: voxels`. Sampling estimates it before all else.
     t_similarity, t_elastic : float or TemperaturePrior
         Boltzmann temperatures T_s (mm³ times squared intensity) and T_r (energy), known or inferred.
     elastic_prior : {"boltzmann", "loads"}

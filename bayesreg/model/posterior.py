@@ -56,8 +56,8 @@ class Posterior:
         The nodes whose displacements are sampled, sorted.
     observations : mapping
         The observations by name, as they were given.
-    approached : (b, 3) array, optional
-        Displacements of the sampled nodes, mm, where the search for a mode begins.
+    approached : mapping, optional
+        Estimands near the mode, where a search for it begins.
     tempered : bool
         False where residuals have yet to tell how many quadrature points are independent (`independent_points:
         residual`): all count until then.
@@ -73,7 +73,7 @@ class Posterior:
     options: ModelConfig
     sampled: Int[np.ndarray, "sampled"]
     observations: Mapping[str, Any]
-    approached: Float[AnyArray, "sampled 3"] | None = None
+    approached: Values | None = None
     tempered: bool = True
 
     # For a user
@@ -275,7 +275,7 @@ class Posterior:
     def _temper(self, estimands: Values) -> Posterior:
         """The posterior tempered by its residuals at these estimands, where a search may go on."""
         counts = self.count_independent_points(coordinates.complete(self.data.blocks, estimands))
-        return replace(self.with_independent_points(counts), approached=np.asarray(estimands["u_boundary"]))
+        return replace(self.with_independent_points(counts), approached=dict(estimands))
 
     @property
     def _smooth_observations(self) -> dict[str, Any]:

@@ -34,14 +34,29 @@ def nodal_field_on_grid(
     return field
 
 
+class Moments(NamedTuple):
+    """The displacement at the voxel centres of an image, mm; zero outside the mesh.
+
+    Attributes
+    ----------
+    mean : (X, Y, Z, 3) array
+        That of the nodes, interpolated.
+    sd : (X, Y, Z, 3) array
+        Its variance is that of the nodes, interpolated as a standard deviation, and what the mesh cannot follow of a
+        smooth displacement (`bayesreg.model.submesh`).
+    rms_sd : dict
+        Root mean square over the voxels and axes of both parts of the standard deviation: "nodes", "mesh".
+    """
+
+    mean: Float[np.ndarray, "X Y Z 3"]
+    sd: Float[np.ndarray, "X Y Z 3"]
+    rms_sd: dict[str, float]
+
+
 def moments_on_grid(
     mesh: TetMesh, mean: Float[np.ndarray, "nodes 3"], sd: Float[np.ndarray, "nodes 3"], grid: Image
-) -> tuple[Float[np.ndarray, "X Y Z 3"], Float[np.ndarray, "X Y Z 3"]]:
-    """The mean and the standard deviation of the displacement at the voxel centres of an image, mm.
-
-    Both are those of the nodes, interpolated, and zero outside the mesh; the variance holds besides what the mesh
-    cannot follow of a smooth displacement (`bayesreg.model.submesh`).
-    """
+) -> Moments:
+    """The mean and the standard deviation of the displacement on the grid of an image, from those of the nodes, mm."""
     index, cells, barycentric = covered_voxels(grid, mesh)
     nodal = np.concatenate([mean, sd], axis=1)[mesh.cells[cells]]
     there = np.einsum("qa,qac->qc", barycentric, nodal)
@@ -49,7 +64,8 @@ def moments_on_grid(
     fields = np.zeros((2, *grid.shape, 3))
     fields[(0, *index.T)] = there[:, :3]
     fields[(1, *index.T)] = np.sqrt(there[:, 3:] ** 2 + beyond)
-    return fields[0], fields[1]
+    parts = {"nodes": there[:, 3:] ** 2, "mesh": beyond}
+    return Moments(fields[0], fields[1], {name: float(np.sqrt(part.mean())) for name, part in parts.items()})
 
 
 class Covered(NamedTuple):

@@ -33,6 +33,7 @@ from bayesreg.report.estimands import Diagnosed, Estimand, estimands
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.report.modes import Grouping, grouping
 from bayesreg.report.panels import View
+from bayesreg.report.trust import explain_intervals
 from bayesreg.report.verdict import (
     Verdict,
     approximation,
@@ -123,6 +124,7 @@ def write_report(
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
         "error_tables": error_tables(metrics, run.mesh.names),
+        "trust": explain_intervals(run.manifest),
         "places": uncertainty.place_table(view, predicted) if predicted else None,
         "landmarks": landmarks.landmark_table(run.mesh, predicted) if predicted else None,
         "groups": modes.explanation(groups) if apart else "",

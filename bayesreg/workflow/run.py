@@ -310,23 +310,24 @@ def _finish(
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)
     grid = inputs.fixed or inputs.tissue
-    mean_field, sd_field = moments_on_grid(inputs.mesh, samples.u_mean, samples.u_sd, grid)
+    moments = moments_on_grid(inputs.mesh, samples.u_mean, samples.u_sd, grid)
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean = mean_values(posterior, draws, samples.u_mean)
     predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed)
     finished = Run(
-        manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began),
+        manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
+        | {"displacement_sd": moments.rms_sd},
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
-        warped=_warp(inputs, mean_field),
+        warped=_warp(inputs, moments.mean),
         metrics=metrics,
         predicted=predicted,
         bodies=store.read_bodies(out),
         **inputs._asdict(),
     )
-    store.write_results(out, finished, mean_field, sd_field)
+    store.write_results(out, finished, moments.mean, moments.sd)
     checkpoints.remove_blocks(out)
     result = Result(out, finished)
     write_report(finished, idata, *judged, result.report)

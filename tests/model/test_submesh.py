@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from bayesreg.fem.elements import gauss_quadrature
 from bayesreg.image import Image
@@ -45,12 +46,14 @@ def test_the_sd_of_a_voxel_holds_what_the_mesh_cannot_follow():
     affine[:3, 3] = -43.5
     grid = Image(np.zeros((30, 30, 30)), affine)
     u, sd = smooth(MESH.points), np.full(MESH.points.shape, 0.2)
-    mean, found = moments_on_grid(MESH, u, sd, grid)
+    mean, found, parts = moments_on_grid(MESH, u, sd, grid)
     covered = covered_voxels(grid, MESH)
     at = tuple(covered.voxel.T)
     expected = np.sqrt(0.04 + submesh_variance(MESH, u)[covered.cell])
     np.testing.assert_allclose(found[at], expected)
     assert np.abs(mean[at] - smooth(grid.voxel_to_world(covered.voxel.astype(float)))).max() < 0.1
+    assert parts["nodes"] == pytest.approx(0.2)
+    assert parts["nodes"] ** 2 + parts["mesh"] ** 2 == pytest.approx((found[at] ** 2).mean())
     outside = np.ones(grid.shape, bool)
     outside[at] = False
     assert outside.any()

@@ -159,7 +159,7 @@ def about_gaussian(
         own = jnp.asarray(found.chains), jnp.arange(len(keys))
         points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
         if tuning is None:
-            return _about(target, about[0], modes[0]), points
+            return setups[0]._replace(stand_in=make_stand_in(target, about[0], modes[0])), points
         return _warm_up(walk, tuning, alone, modes[0], points, key_tune, say)
 
     def blank() -> Setup:
@@ -191,8 +191,10 @@ def _warm_up(
     target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2, watched=alone > 0)
     key_settle, key_tune, key_search = jax.random.split(key, 3)
     begun = _setup_on_average(target, mode, points, alone)
+    begun = begun._replace(stand_in=make_stand_in(target, begun.gaussian, begun.middle))
     _, points, settling = tune(_condition(target, begun), walk, begun, points, key_settle, stage, apart=True)
-    setup = _setup_on_average(target, mode, points, alone)
+    # The stand-in reaches far about both middles.
+    setup = _setup_on_average(target, mode, points, alone)._replace(stand_in=begun.stand_in)
     setup, points, path = tune(_condition(target, setup), walk, setup, points, key_tune, stage, say=say)
     if settling is None or path is None:
         return setup, points
@@ -253,21 +255,15 @@ def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
     return sampler._replace(init=init, step=step, observe=observe)
 
 
-def _about(target: Target, gaussian: Gaussian, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
-    """A setup before its tuning, with the stand-in about the middle."""
-    setup = setup_about(target, gaussian, middle, alone)
-    return setup._replace(stand_in=make_stand_in(target, gaussian, jnp.asarray(middle)))
-
-
 def _setup_on_average(target: Target, mode: AnyArray, points: Any, alone: int = 0) -> Setup:
     """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there.
 
-    Which nodes are moved alone is not known yet: the first stands for so many.
+    It has no stand-in yet. Which nodes are moved alone is not known yet: the first stands for so many.
     """
     flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
-    return _about(target, average_gaussian(target, places), np.mean(places, axis=0), np.zeros(alone, int))
+    return setup_about(target, average_gaussian(target, places), np.mean(places, axis=0), np.zeros(alone, int))
 
 
 def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:

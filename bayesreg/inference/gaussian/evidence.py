@@ -72,14 +72,20 @@ class Found(NamedTuple):
         The hyperparameters at the maximum of their evidence, and u following them.
     moved : float
         How far the hyperparameters have moved, in units of their standard deviations.
+    units : (k, k) array or None
+        These units, one in each column; None before a search.
     """
 
     flat: Float[np.ndarray, "dimension"]
     moved: float
+    units: Float[np.ndarray, "hyperparameters hyperparameters"] | None = None
 
 
 def maximise_evidence(
-    target: Target, flat: Float[np.ndarray, "dimension"], curvature: Float[np.ndarray, "rows rows"]
+    target: Target,
+    flat: Float[np.ndarray, "dimension"],
+    curvature: Float[np.ndarray, "rows rows"],
+    units: Float[np.ndarray, "hyperparameters hyperparameters"] | None = None,
 ) -> Found:
     """Look for the maximum of the evidence of the hyperparameters about a flat position.
 
@@ -90,11 +96,15 @@ def maximise_evidence(
         A mode given the hyperparameters, or near to one.
     curvature : (r, r) array
         Gauss and Newton's there, in "field" and "u_boundary".
+    units : (k, k) array, optional
+        Those of a search near by. Without them they are found from the evidence's curvature, which costs several
+        evaluations.
     """
     entries = np.flatnonzero(mark_hyperparameters(target))
     about = _expand(target, flat, entries, curvature)
-    values, vectors = np.linalg.eigh(evidence_curvature(target, about, curvature))
-    units = vectors / np.sqrt(np.maximum(np.abs(values), LEAST_CURVATURE))
+    if units is None:
+        values, vectors = np.linalg.eigh(evidence_curvature(target, about, curvature))
+        units = vectors / np.sqrt(np.maximum(np.abs(values), LEAST_CURVATURE))
     best: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
@@ -112,7 +122,7 @@ def maximise_evidence(
     options = {"maxiter": MOST_ITERATIONS, "ftol": 1e-12, "gtol": PRECISE}
     minimize(objective, np.zeros(len(entries)), jac=True, method="L-BFGS-B", bounds=[(-r, r) for r in reach],
              options=options)  # fmt: skip
-    return Found(best[-1][1], float(np.abs(best[-1][2]).max()))
+    return Found(best[-1][1], float(np.abs(best[-1][2]).max()), units)
 
 
 def evidence_curvature(
@@ -157,7 +167,7 @@ def evidence(
     height, slope = height_and_slope(target, plain, place)
     height, slope = height + log_normaliser, slope + push_of_normaliser
     gain = about.slope @ (place - about.flat) - step @ (about.images @ step) / 2
-    covariance = _inverse(factor[0])
+    covariance, _ = scipy.linalg.lapack.dpotri(factor[0], lower=1)
     traces = [trace(covariance, first) for first in slopes_of_curvature(target, there, about.entries)]
     log_det = 2 * np.log(np.diag(factor[0])).sum()
     return (
@@ -221,11 +231,13 @@ def _inverse(lower: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows r
 
 
 def trace(covariance: Float[np.ndarray, "rows rows"], matrix: Matrix) -> float:
-    """tr(C M) of two symmetric matrices."""
+    """tr(C M) of two symmetric matrices; of C the lower triangle is enough."""
     if scipy.sparse.issparse(matrix):
-        entries = matrix.tocoo()
-        return float(covariance[entries.row, entries.col] @ entries.data)
-    return float((covariance * matrix).sum())
+        entries = scipy.sparse.tril(matrix, format="coo")
+        below = float(covariance[entries.row, entries.col] @ entries.data)
+    else:
+        below = float(np.vdot(np.tril(covariance), matrix))
+    return 2 * below - float(covariance.diagonal() @ matrix.diagonal())
 
 
 def dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:

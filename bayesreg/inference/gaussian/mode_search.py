@@ -18,11 +18,11 @@ from bayesreg.inference.gaussian.density import (
     mark_normaliser,
     normaliser_and_slope,
 )
-from bayesreg.inference.gaussian.evidence import Found, maximise_evidence
+from bayesreg.inference.gaussian.evidence import FARTHEST, Found, maximise_evidence
 from bayesreg.inference.gaussian.hierarchy import balance_field, mark_hyperparameters, mark_scales
 from bayesreg.inference.gaussian.laplace import Gaussian, gaussian_of, laplace, precision_at
 from bayesreg.inference.gaussian.pockets import leave_pockets
-from bayesreg.inference.layout import displacements, node_count, others, unravel
+from bayesreg.inference.layout import displacements, flat_position, node_count, others, unravel
 from bayesreg.inference.target import Target, clearance, without_normaliser
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -87,11 +87,11 @@ def approach(
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
-    """Where the target's continuation leads the displacements from a flat position, or has led them already."""
+    """Where the target's continuation leads the displacements from a flat position, or where a search has been."""
     assert target.mode_search is not None
-    flat = np.array(start)
+    flat = np.asarray(start)
     if target.mode_search.approached is not None:
-        flat[displacements(target)] = np.ravel(target.mode_search.approached)
+        flat = np.asarray(flat_position(target, target.data, target.mode_search.approached))
     for data in target.mode_search.continuation():
         flat = _improve(target, data, flat, False, iterations, say, gain=ROUGH)
     return flat
@@ -102,14 +102,18 @@ def settle(
     flat: Float[np.ndarray, "dimension"],
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
+    repeats: int = REPEATS,
 ) -> Float[np.ndarray, "dimension"]:
-    """The mode next to a flat position: L-BFGS on the problem itself, whitened anew until it moves nothing."""
+    """The mode next to a flat position: L-BFGS on the problem itself, whitened anew until it moves nothing.
+
+    With fewer `repeats`, a place near it.
+    """
     # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
     # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
     # skull and not in it, however great the force that presses.
     shift, resting, before = np.zeros(node_count(target)), mark_hyperparameters(target), flat
     better = Found(flat, np.inf)
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         found, pressed = _improve(target, target.data, better.flat, True, iterations, say, shift), shift
         shift = np.maximum(shift + GAP - _gaps(target, found), 0.0)
         balanced = balance_field(target, found, partial(_factor, target, found))
@@ -118,23 +122,29 @@ def settle(
         if better.moved < SETTLED_SD:
             better = better._replace(flat=balanced)
         else:
-            better = _improve_hyperparameters(target, balanced)
+            # The units of a search that did not end at its bounds still hold.
+            better = _improve_hyperparameters(target, balanced, better.units if better.moved < FARTHEST else None)
         before = balanced
         if max(moved) < SETTLED and better.moved < SETTLED_SD:
             # The evidence knows nothing of walls: nodes that press on them stay where they were found.
             return _admissible(target, balanced)
-    say("mode: not settled")
-    return _admissible(target, balanced)
+    if repeats == REPEATS:
+        say("mode: not settled")
+    return _admissible(target, better.flat)
 
 
-def _improve_hyperparameters(target: Target, flat: Float[np.ndarray, "dimension"]) -> Found:
+def _improve_hyperparameters(
+    target: Target,
+    flat: Float[np.ndarray, "dimension"],
+    units: Float[np.ndarray, "hyperparameters hyperparameters"] | None,
+) -> Found:
     """The hyperparameters, if any, at the maximum of their evidence about a flat position."""
     assert target.mode_search is not None
     if not mark_hyperparameters(target).any():
         return Found(flat, 0.0)
     estimands = estimands_at(target, target.data, jnp.asarray(flat))
     curvature = target.mode_search.curvature(target.data, estimands).gauss_newton
-    return maximise_evidence(target, flat, curvature)
+    return maximise_evidence(target, flat, curvature, units)
 
 
 def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:

@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.inference.gaussian.laplace import Gaussian, laplace
-from bayesreg.inference.gaussian.mode_search import approach, find_mode
+from bayesreg.inference.gaussian.mode_search import approach, find_mode, settle
 from bayesreg.inference.kernel import Say
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.inference.target import Target, estimands_of, logdensity
 
+# Residuals are near those of the mode where the search has been whitened anew so often.
+FEW = 2
 # Modes count as one where no coordinate lies further apart than this, in its standard deviations.
 SAME = 1.0
 
@@ -50,10 +52,10 @@ def search_modes(target: Target, points: Any, each: bool, say: Say) -> Modes:
 
 
 def temper(target: Target, points: Any, say: Say) -> Target:
-    """The target, tempered where the search from the mean of the start points first leads, if it has yet to be."""
+    """The target, tempered near the mode that the mean of the start points leads to, if it has yet to be."""
     if target.mode_search is None or target.mode_search.tempering is None:
         return target
-    there = approach(target, _middle(target, points), say)
+    there = settle(target, approach(target, _middle(target, points), say), say, repeats=FEW)
     return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(there))))
 
 
