@@ -37,6 +37,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 Kind = Literal["sag", "gravity", "resect"]
 KINDS = ("sag", "gravity", "resect")
 
+T1, LABELS = "colin27_t1_1mm_unedited.nii.gz", "brainweb_crisp_1mm.nii.gz"
 # Of BrainWeb.
 CSF, GM, WM, GLIA = 1, 2, 3, 8
 # Intensities of Colin27.
@@ -94,7 +95,7 @@ class Site(NamedTuple):
 
 def read_anatomy(data: Path) -> Anatomy:
     """BrainWeb's labels and the T1 of Colin27 from a folder."""
-    t1, crisp = (nib.load(data / name) for name in ("colin27_t1_1mm_unedited.nii.gz", "brainweb_crisp_1mm.nii.gz"))
+    t1, crisp = (nib.load(data / name) for name in (T1, LABELS))
     labels = np.asarray(crisp.dataobj).astype(np.uint8)
     inside = _largest(np.isin(labels, (CSF, GM, WM, GLIA)))
     margin, width = 12, 8
@@ -444,13 +445,14 @@ def _save(array: np.ndarray, affine: np.ndarray, path: Path, kind: type) -> None
 
 
 def data_folder() -> Path:
-    """That of BAYESREG_DATA; ends the program where it names none."""
-    folder = os.environ.get("BAYESREG_DATA")
-    if not folder:
+    """That of BAYESREG_DATA; ends the program where it does not hold both files."""
+    folder = Path(os.environ.get("BAYESREG_DATA") or ".")
+    missing = [name for name in (T1, LABELS) if not (folder / name).is_file()]
+    if missing:
         raise SystemExit(
-            "set BAYESREG_DATA to the folder of BrainWeb's labels and Colin27's T1 (README, The paper's experiment)"
+            f"no {' and no '.join(missing)}; set BAYESREG_DATA to the folder that holds both (see README.md)"
         )
-    return Path(folder)
+    return folder
 
 
 def main() -> None:
