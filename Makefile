@@ -6,7 +6,7 @@ DEMO := runs/quickstart
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install -c constraints.txt --build-constraint constraints.txt -e .
 
-.PHONY: demo test test-all bench calibrate check
+.PHONY: demo test test-all bench calibrate peers check
 .DELETE_ON_ERROR:
 
 # Status 3, "not converged within its budget", is an honest end of a demonstration.
@@ -35,6 +35,11 @@ bench: $(VENV)/.installed-dev
 calibrate: $(VENV)/.installed-dev
 	OPENBLAS_NUM_THREADS=1 JAX_COMPILATION_CACHE_DIR=.jax_cache $(BIN)/python -m tests.calibration -o runs/calibration
 
+# Beside Demons, B-splines and SyN, on pairs with a known truth; on others, say make peers ARGS="sag:14:0.2".
+# It needs the two images of the paper's experiment in the folder that BAYESREG_DATA names.
+peers: $(VENV)/.installed-peers
+	$(BIN)/python -m tests.external $(ARGS)
+
 # What the tests ask of the source before anything else, in half a minute.
 check: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest tests/test_habits.py -n 0
@@ -47,6 +52,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install -c constraints.txt --upgrade pip
 	$(INSTALL) --group dev
+	@touch $(VENV)/.installed $@
+
+$(VENV)/.installed-peers: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install -c constraints.txt --upgrade pip
+	$(INSTALL) --group peers
 	@touch $(VENV)/.installed $@
 
 $(BIN)/python:
