@@ -225,7 +225,7 @@ def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Datase
     Parameters
     ----------
     manifest : mapping
-        Its entries `solver`, `inverted_elements`, `residual_sd`, `implied_noise_sd`, `model` and `pair` are read.
+        Its entries `solver`, `inverted_elements`, `residual_to_noise`, `implied_noise_sd`, `model` and `pair` are read.
     mesh : TetMesh
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.
@@ -274,15 +274,14 @@ def _folding(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _noise(manifest: Mapping[str, Any]) -> list[str]:
-    implied, residual = part(manifest, "implied_noise_sd"), part(manifest, "residual_sd")
-    if not implied or not residual or 1 / NOISE_FACTOR <= residual / implied <= NOISE_FACTOR:
+    implied, ratio = part(manifest, "implied_noise_sd"), part(manifest, "residual_to_noise")
+    if not implied or not ratio or 1 / NOISE_FACTOR <= ratio <= NOISE_FACTOR:
         return []
-    wide = residual > implied
     early = part(manifest, "stopped", "converged") is False
     return [
         f"T_s implies a noise sd of {number(implied)} (variance T_s / 2w at a quadrature point of weight w), but the "
-        f"residual at the mean has sd {number(residual)}: the posterior is too {'narrow' if wide else 'wide'}. "
-        f"A T_s {number((residual / implied) ** 2, 2)} times the present one would agree."
+        f"residual at the mean is {number(ratio, 2)} times as great as such noise: the posterior is too "
+        f"{'narrow' if ratio > 1 else 'wide'}. A T_s {number(ratio**2, 2)} times the present one would agree."
         + (" Before convergence this may only show that the chains have not arrived yet." if early else "")
     ]
 

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import stats
 
 from bayesreg import __version__
 from bayesreg.config import Config
@@ -28,6 +29,7 @@ from bayesreg.model.blocks import Values
 from bayesreg.model.options import OF_IMAGES
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
+from bayesreg.types import AnyArray
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
 CONTACT = 0.5
@@ -109,6 +111,7 @@ def manifest(
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
         "residual_sd": _residual_sd(posterior, samples, mean),
         "implied_noise_sd": implied_noise_sd(posterior, mean),
+        "residual_to_noise": residual_to_noise(posterior, jnp.asarray(samples.u_mean), mean),
     }
 
 
@@ -132,6 +135,20 @@ def implied_noise_sd(posterior: Posterior, mean: Values) -> float | None:
     """The noise that T_s stands for at the mean of the draws (see `ComparedImages.noise_sd`); None without images."""
     images = images_of(posterior.data)
     return None if images is None else images.noise_sd(float(mean["t_similarity"]))
+
+
+def residual_to_noise(posterior: Posterior, u: AnyArray, mean: Values) -> float | None:
+    """How many times as great as T_s implies a residual is at the mean: by its sd, or by its median where outliers are.
+
+    A few outliers, which Student's t forgives, have a great share in the former.
+    """
+    images = images_of(posterior.data)
+    if images is None:
+        return None
+    z = np.asarray(images.scaled_residual(u, mean))
+    if posterior.options.similarity == "student_t":
+        return float(np.median(np.abs(z)) / stats.t(posterior.options.degrees_of_freedom).ppf(0.75))
+    return float(np.std(z) / np.sqrt(images.similarity.variance()))
 
 
 def _has_converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:

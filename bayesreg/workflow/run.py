@@ -165,7 +165,17 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
     say("writing the results")
     result = _finish(config, inputs, posterior, samples, provenance, out, began)
     say(f"{samples.reason}")
+    _warn(config, result, say)
     return result
+
+
+def _warn(config: Config, result: Result, say: Callable[[str], None]) -> None:
+    """Say what the report says first of a model that real images seldom fit."""
+    from bayesreg.report.verdict import doubt_of_equilibrium
+
+    doubt = doubt_of_equilibrium(result.run.manifest["model"], simulated=config.simulate is not None)
+    if doubt is not None and config.compares_images:
+        say(f"beware: {doubt}")
 
 
 def _resumed_config(out: Path, config: Config) -> Config:

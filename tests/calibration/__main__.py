@@ -1,6 +1,8 @@
 """`make calibrate`: simulation-based calibration and Geweke's test, with figures and a JSON file.
 
-python -m tests.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share]; status 1 where a part fails.
+python -m tests.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share external]
+
+Its status is 1 where a part fails.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import bayesreg as br
-from tests.calibration import figures, geweke, mesh_share, pairs, sbc
+from tests.calibration import external, figures, geweke, mesh_share, pairs, sbc
 from tests.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, posterior_of
 
 # Wrong on purpose, and to be found out: T_s held at 1.5 times its true value, the elastic prior without its normaliser.
@@ -119,12 +121,18 @@ def share_of_the_mesh(out: Path) -> dict[str, Any]:
     return mesh_share.measure(out, say)
 
 
+def register_external_pairs(out: Path) -> dict[str, Any]:
+    """Pairs that no model of this project made; each takes some twenty minutes."""
+    return external.register_pairs(out, say)
+
+
 PARTS = {
     "sbc": calibrate_by_simulation,
     "geweke": compare_simulators,
     "pairs": register_pairs,
     "same_mesh": register_on_one_mesh,
     "mesh_share": share_of_the_mesh,
+    "external": register_external_pairs,
 }
 
 

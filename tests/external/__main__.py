@@ -3,7 +3,7 @@
     BAYESREG_DATA=… python -m tests.external [KIND:SEED:BIAS …] [-o OUT] [--runs DIR] [--peers-only]
 
 By default the pairs are sag and gravity of `tests.external.make_pair`, seeds 11, 12 and 13 with a bias of 0, 0.15
-and 0.25 in turn. bayesreg is given the files and the labels, `preset: registration` and no other option, the peers what
+and 0.25 in turn. bayesreg is given the files and the labels and no other option, the peers what
 `tests.external.peers` says. All are scored on the voxels of bayesreg's run; with --peers-only there is none, and they
 are scored wherever the truth is valid. Two tables are printed; times are those of whole programs, from files to files.
 
@@ -122,7 +122,7 @@ def configure(pair: Path) -> Path:
     """Write what a new user tells bayesreg of a pair: files and labels. JSON is YAML, too."""
     files = {name: str(pair.resolve() / f"{name}.nii.gz") for name in ("fixed", "moving", "labels", "intracranial")}
     path = pair.parent / f"{OURS}.yaml"
-    _write(path, {"data": {"source": "files", **files, "label_table": TISSUES}, "model": {"preset": "registration"}})
+    _write(path, {"data": {"source": "files", **files, "label_table": TISSUES}})
     return path
 
 

@@ -105,15 +105,15 @@ def test_an_empty_manifest_gives_dashes():
 
 
 @pytest.mark.parametrize(
-    ("residual", "expected"), [(0.0292, "too narrow. A T_s 4.0 times"), (0.0073, "too wide. A T_s 0.25 times")]
+    ("ratio", "expected"), [(2.0, "too narrow. A T_s 4.0 times"), (0.5, "too wide. A T_s 0.25 times")]
 )
-def test_a_residual_that_does_not_fit_t_s_is_warned_of(residual, expected):
-    manifest = {"residual_sd": residual, "implied_noise_sd": 0.0146}
+def test_a_residual_that_does_not_fit_t_s_is_warned_of(ratio, expected):
+    manifest = {"residual_to_noise": ratio, "implied_noise_sd": 0.0146}
     assert any(expected in text for text in warnings_of(manifest, box_mesh(), elastic([1.0] * 3, [1.0] * 3)))
 
 
 def test_a_residual_that_fits_is_not():
-    manifest = {"residual_sd": 0.015, "implied_noise_sd": 0.0146, "exact": True, "solver": {"failed": 0}}
+    manifest = {"residual_to_noise": 1.03, "implied_noise_sd": 0.0146, "exact": True, "solver": {"failed": 0}}
     assert warnings_of(manifest, box_mesh(), elastic([1.0, 10.0, 20.0], [1.0] * 3)) == []
 
 
