@@ -111,7 +111,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
     wait(BEGUN)
     if not (out / "run.json").exists():
         begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
-        found = store.read_json(out / PROVENANCE)["independent_points"]
+        found = store.read_json(out / PROVENANCE).get("independent_points")
         posterior = posterior_of(begun, inputs, observations, found)
         _sample(begun, posterior, _load_reached(begun, inputs, posterior, out, progress=False), out, progress=False)
         wait(SAMPLED)
@@ -131,8 +131,11 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
             wait(BEGUN)
             return load_result(out)
         inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
-        posterior = posterior_of(config, inputs, observations, provenance["independent_points"])
+        posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
         _require_same_observations(out, provenance, posterior, observations)
+        # What `simulate` has made is not tempered yet.
+        posterior = _temper(config, inputs, posterior, say)
+        provenance["independent_points"] = posterior.independent_points
         if (out / "run.json").exists():
             checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
         inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)

@@ -117,7 +117,7 @@ def summarise(found: dict[str, Found]) -> dict[str, Any]:
         "ratio of white over grey held": f"{sum(holds.values())} of {len(holds)}",
         "converged": sum(one.converged for one in found.values()),
         "pairs": {
-            name: {key: np.round(value, 3).tolist() for key, value in one._asdict().items()}
+            name: {key: np.round(np.asarray(value, float), 3).tolist() for key, value in one._asdict().items()}
             for name, one in found.items()
         },
     }

@@ -88,6 +88,7 @@ class ModeSearch:
         self.data = data
 
     hyperparameters = ()
+    approached = tempering = None
 
     def continuation(self):
         yield self.data

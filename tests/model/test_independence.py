@@ -11,6 +11,7 @@ from bayesreg.image import Image
 from bayesreg.inference.chains.run import temper_target
 from bayesreg.inference.gaussian.mode_search import approach
 from bayesreg.inference.layout import flat_position
+from bayesreg.model.coordinates import complete
 from bayesreg.model.independence import independent_points, independent_scores
 from bayesreg.types import InputError
 from tests.phantoms import ball_mesh, rotated_affine, smooth_image
@@ -146,7 +147,7 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted():
     assert said
     # The images are smooth, and no displacement makes them equal: far fewer than all are independent.
     assert 1 < count < 0.2 * len(post.images.positions)
-    values = {**post.fill(post.reference()), **found.approached}
+    values = complete(post.data.blocks, found.approached)
     assert post.count_independent_points(values)["images"] == pytest.approx(count, rel=1e-9)
     same = posterior(independent_points=count)
     assert float(found.logdensity_constrained(values)) == pytest.approx(float(same.logdensity_constrained(values)))
