@@ -92,7 +92,9 @@ def b_spline(pair: Path, field: Path) -> None:
     _, found = itk.elastix_registration_method(
         fixed, moving, parameter_object=parameters, fixed_mask=inside, number_of_threads=THREADS
     )
-    itk.imwrite(itk.transformix_deformation_field(moving, found), str(field))
+    # It also writes a field of its own, by default into the current folder.
+    u = itk.transformix_deformation_field(moving, found, output_directory=str(pair))
+    itk.imwrite(u, str(field))
 
 
 def syn(pair: Path, field: Path) -> None:
