@@ -8,7 +8,7 @@ from scipy import ndimage
 
 import bayesreg as br
 from bayesreg.image import Image
-from bayesreg.inference.chains.run import temper_target
+from bayesreg.inference.chains.run import first_checkpoint, temper_target
 from bayesreg.inference.gaussian.mode_search import approach
 from bayesreg.inference.layout import flat_position
 from bayesreg.model.coordinates import complete
@@ -166,3 +166,10 @@ def test_a_search_goes_on_where_the_tempering_has_led_to():
 def test_residuals_tell_of_voxels_alone():
     with pytest.raises(ValueError, match="residual needs quadrature: voxels"):
         br.ModelConfig(independent_points="residual")
+
+
+def test_draws_are_resumed_with_the_posterior_that_they_are_of():
+    post = posterior(independent_points="residual")
+    checkpoint = first_checkpoint(post.with_independent_points({"images": 20.0}), "hmc", 2, 0, warm_up=2)
+    with pytest.raises(InputError, match="resume them with the posterior of their samples"):
+        br.sample(post, "hmc", 2, 4, resume=(checkpoint, []), warm_up=2, progress=False)

@@ -122,13 +122,17 @@ def sample(
     Raises
     ------
     InputError
-        If an option is out of range, a chain cannot start, or those to resume are not where their draws end.
+        If an option is out of range, a chain cannot start, or those to resume are not where their draws end or are of
+        another posterior.
     """
     for name, value in {"chains": chains, "draws": draws, "thin": thin, "block": block}.items():
         if value < 1:
             raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
-    posterior = temper_target(posterior, chains, seed, start) if resume is None else posterior
+    if resume is None:
+        posterior = temper_target(posterior, chains, seed, start)
+    elif posterior.mode_search is not None and posterior.mode_search.tempering is not None:
+        raise InputError("these draws are of a tempered posterior: resume them with the posterior of their samples")
     chosen = choose_sampler(sampler, posterior, **settings)
     began = time.perf_counter()
     if resume is None:
