@@ -33,6 +33,19 @@ class Info(NamedTuple):
     densities: AnyArray
 
 
+def together(infos: Info) -> Info:
+    """One report of several transitions, stacked: rates are averaged, costs are added, and what befell one counts."""
+    return Info(
+        acceptance_rate=infos.acceptance_rate.mean(),
+        outside_support=infos.outside_support.any(),
+        solver_failed=infos.solver_failed.any(),
+        solver_iterations=infos.solver_iterations.sum(),
+        diverging=infos.diverging.any(),
+        gradients=infos.gradients.sum(),
+        densities=infos.densities.sum(),
+    )
+
+
 class Draw(NamedTuple):
     """Where a chain stands: estimands, and the `Evaluation` there."""
 
