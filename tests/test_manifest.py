@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 
 import bayesreg as br
-from bayesreg.workflow.manifest import implied_noise_sd
+from bayesreg.workflow.manifest import implied_noise_sd, inverted_share
 from bayesreg.workflow.prediction import mean_values
-from tests.phantoms import ball_mesh, smooth_image
+from tests.phantoms import ball_mesh, box_mesh, smooth_image
 
 
 def test_noise_of_an_inferred_temperature_is_that_of_its_mean():
@@ -23,3 +23,13 @@ def test_noise_of_an_inferred_temperature_is_that_of_its_mean():
     assert implied_noise_sd(known, mean_values(known, draws, rest)) == known.images.noise_sd(0.8)
     found = implied_noise_sd(inferred, mean_values(inferred, drawn, rest))
     assert found == pytest.approx(2 * known.images.noise_sd(0.8))
+
+
+def test_the_share_of_inverted_tetrahedra_is_over_all_draws():
+    mesh = box_mesh()
+    u = np.zeros((2, 3, *mesh.points.shape))
+    # A reflection turns every tetrahedron of one of eight draws inside out.
+    u[1, 2] = mesh.points * [-2.0, 0.0, 0.0]
+    blocks = [{"u_boundary": u}, {"u_boundary": u[:, :1]}]
+    assert inverted_share(mesh, blocks) == pytest.approx(1 / 8)
+    assert inverted_share(mesh, [{"u_boundary": u[:, :, :-1]}]) is None

@@ -68,7 +68,7 @@ class StopConfig(Section):
     """Least effective sample size, bulk and tail, of all estimands, R-hat then being rank-normalised and split;
     null leaves it out, and R-hat is the unsplit one of the paper."""
     max_steps: Count = 10_000
-    """Transitions per chain, thinned ones included."""
+    """Steps per chain, thinned ones included."""
     max_minutes: Positive | None = None
     """Minutes of sampling."""
 

@@ -133,11 +133,11 @@ def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[n
     nodes, count = np.unique(unknowns // 3), len(mesh.points)
     pairs = np.repeat(mesh.cells, 4, axis=1).ravel(), np.tile(mesh.cells, (1, 4)).ravel()
     graph = scipy.sparse.csr_matrix((np.ones(len(pairs[0])), pairs), shape=(count, count))[nodes][:, nodes]
-    ordered = unknowns_of(nodes[_order_by_neighbours(graph)])
+    ordered = unknowns_of(nodes[order_by_neighbours(graph)])
     return ordered[np.isin(ordered, unknowns)]
 
 
-def _order_by_neighbours(graph: scipy.sparse.csr_matrix) -> Int[np.ndarray, "nodes"]:
+def order_by_neighbours(graph: scipy.sparse.csr_matrix) -> Int[np.ndarray, "nodes"]:
     """The best of some orders: that of a library, which knows graphs of several parts, and those from some nodes.
 
     Breadth first is what Cuthill and McKee do, where of the neighbours those with the fewest of their own come first.
@@ -146,13 +146,14 @@ def _order_by_neighbours(graph: scipy.sparse.csr_matrix) -> Int[np.ndarray, "nod
     by_degree = np.argsort(np.diff(graph.indptr), kind="stable")
     relabelled = graph[by_degree][:, by_degree].sorted_indices()
     starts = np.linspace(0, count - 1, min(count, STARTS)).round().astype(int)
-    walks = (breadth_first_order(relabelled, start, directed=False, return_predecessors=False) for start in starts)
+    walks = (breadth_first_order(relabelled, start, return_predecessors=False) for start in starts)
     orders = [reverse_cuthill_mckee(graph, symmetric_mode=True)]
     orders += [by_degree[walk[::-1]] for walk in walks if len(walk) == count]
-    return min(orders, key=lambda order: _bandwidth(graph, order))
+    return min(orders, key=lambda order: bandwidth(graph, order))
 
 
-def _bandwidth(graph: scipy.sparse.csr_matrix, order: Int[np.ndarray, "nodes"]) -> int:
+def bandwidth(graph: scipy.sparse.csr_matrix, order: Int[np.ndarray, "nodes"]) -> int:
+    """How far apart two neighbours stand in an order of the nodes, at most."""
     rank = np.argsort(order)
     row, column = graph.nonzero()
     return int(np.abs(rank[row] - rank[column]).max())

@@ -19,13 +19,14 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, State, StaticMesh
+from bayesreg.model.terms.barrier import Barrier
 from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.terms.skull import SoftSkull
 from bayesreg.model.terms.term import Curved, Outside, PointCurvature
 from bayesreg.types import AnyArray, Equilibrium, Matrix
 
 # Terms that are far from quadratic in the displacements.
-FAR_FROM_QUADRATIC = (ComparedImages, SoftSkull)
+FAR_FROM_QUADRATIC = (Barrier, ComparedImages, SoftSkull)
 
 # With more entries of λ or μ, as by element, derivatives in each of them would cost too much.
 FEW_ENTRIES = 20
@@ -90,7 +91,7 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
 
 
 def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float[AnyArray, "nodes 3"]) -> Matrix:
-    """The curvature of all terms but images and skull, which are quadratic in the displacements, or nearly.
+    """The curvature of all terms but images, barrier and skull, which are quadratic in the displacements, or nearly.
 
     The equilibrium follows the sampled nodes as at other values near by. Since it minimises the energy, the first
     derivatives of the curvature in the values are those of the curvature itself.

@@ -83,7 +83,7 @@ class ModeSearch:
         return displacement_curvature(data, values, _equilibrium(data, values))
 
     def quadratic_part(self, data: Problem) -> Problem:
-        """The problem without images and skull: what is left is quadratic in the displacements, or nearly."""
+        """The problem without images, barrier and skull: what is left is quadratic in the displacements, or nearly."""
         others = [name for name, term in data.terms.items() if isinstance(term, FAR_FROM_QUADRATIC)]
         return reduce(Problem.without_term, others, data)
 

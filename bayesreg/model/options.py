@@ -16,7 +16,7 @@ from bayesreg.types import InputError
 # Names of blocks and of the other sites of the program, which no observation may have.
 TAKEN = (
     "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load", "field", "field_sd", "elastic",
-    "rigid", "skull", "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations",
+    "rigid", "skull", "barrier", "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations",
     "solver_failed", "outside_support",
 )  # fmt: skip
 
@@ -122,6 +122,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "smoothing": 0.8,
         "intensity_map": 2,
         "skull_width": 0.5,
+        "least_volume": 0.1,
     },
 }
 
@@ -192,6 +193,9 @@ class ModelConfig(BaseModel):
     skull_width : float
         0: no sampled node lies in the skull. Else the depth, mm, to which one goes in as easily as by a standard
         deviation, such as half a voxel: masks of skulls are no better, and nodes that rest on one cost no reflections.
+    least_volume : float
+        0: tetrahedra may be inverted. Else a barrier, which begins where a tetrahedron is left with less than this
+        share of its volume (`bayesreg.model.terms.barrier`). Like the skull it has no part in the normaliser.
     rigid_sd : float, optional
         Standard deviation, mm, of the root-mean-square displacement of each of the six rigid motions of
         the sampled nodes under a Gaussian prior; None is flat.
@@ -222,6 +226,7 @@ class ModelConfig(BaseModel):
     sampled: Literal["boundary", "all"] | list[Annotated[int, Field(ge=0)]] = "boundary"
     held: dict[Annotated[int, Field(ge=0)], Vector] = {}
     skull_width: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] = 0.0
+    least_volume: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     rigid_sd: Positive | None = None
 
     @model_validator(mode="before")

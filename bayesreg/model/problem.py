@@ -43,6 +43,7 @@ from bayesreg.model.options import (
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
+from bayesreg.model.terms.barrier import Barrier
 from bayesreg.model.terms.elastic import SCALES, BoltzmannPrior, LoadPrior
 from bayesreg.model.terms.images import ComparedImages, ImagePair, shading_name
 from bayesreg.model.terms.landmarks import Landmarks
@@ -176,7 +177,7 @@ def _priors(
     held: Mapping[int, tuple[float, float, float]],
     skull: Image | None,
 ) -> Terms:
-    """Elastic prior, rigid prior and skull. Where u_B is given none is there: u_I follows from it, λ and μ."""
+    """Elastic prior, rigid prior, barrier and skull. Where u_B is given none is there: u_I follows from it, λ and μ."""
     terms: Terms = {}
     if not len(sampled):
         return terms
@@ -185,6 +186,8 @@ def _priors(
     terms["elastic"] = LoadPrior.on(mesh, determinant) if loads else BoltzmannPrior(determinant)
     if model.rigid_sd is not None:
         terms["rigid"] = RigidPrior(jnp.asarray(rigid_modes(mesh.points[sampled])), jnp.asarray(model.rigid_sd))
+    if model.least_volume:
+        terms["barrier"] = Barrier(jnp.asarray(model.least_volume))
     if skull is not None:
         hard = Skull(skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled]))
         soft = SoftSkull(hard, jnp.asarray(sampled), jnp.asarray(model.skull_width))

@@ -11,7 +11,7 @@ from bayesreg.report.verdict import number, part
 
 def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
     """Say what the standard deviations hold besides independent noise, by how much, and why."""
-    return [*_correlated(manifest), *_outliers(manifest), *_mesh(manifest)]
+    return [*_correlated(manifest), *_outliers(manifest), *_mesh(manifest), *_folds(manifest)]
 
 
 def _correlated(manifest: Mapping[str, Any]) -> list[str]:
@@ -36,6 +36,16 @@ def _outliers(manifest: Mapping[str, Any]) -> list[str]:
     return [
         f"A residual far beyond the others counts for little (Student’s t with ν = {number(nu)}): a part of the images "
         "that has no counterpart widens the intervals there, and pulls little."
+    ]
+
+
+def _folds(manifest: Mapping[str, Any]) -> list[str]:
+    share = part(manifest, "inverted_share_of_draws")
+    if not share:
+        return []
+    return [
+        f"In the draws, {number(100 * share, 2)} % of the tetrahedra are inside out, as no tissue can be: near them "
+        "the intervals hold what is impossible. A barrier (model.least_volume: 0.1) keeps draws from there."
     ]
 
 

@@ -19,11 +19,12 @@ from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.run import Samples
+from bayesreg.inference.draws.blocks import Blocks
 from bayesreg.inference.draws.diagnostics import Convergence
 from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.inference.target import clearance
 from bayesreg.io.records import Inputs
-from bayesreg.mesh import signed_volumes
+from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.blocks import Values
 from bayesreg.model.options import OF_IMAGES
@@ -102,6 +103,7 @@ def manifest(
         "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
         "contact_nodes": _contact_nodes(inputs, posterior, samples),
         "inverted_elements": _inverted_elements(posterior, samples),
+        "inverted_share_of_draws": inverted_share(posterior.mesh, samples.blocks),
         "solver": {
             "failed": int(tally.solver_failed.sum()),
             "iterations_mean": float(tally.solver_iterations.sum()) / steps,
@@ -174,6 +176,17 @@ def _extreme(figures: Any, choose: Callable[[np.ndarray], float]) -> float | Non
 def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
     mesh = posterior.mesh
     return int((signed_volumes(mesh.points + samples.u_mean, mesh.cells) <= 0).sum())
+
+
+def inverted_share(mesh: TetMesh, blocks: Blocks) -> float | None:
+    """The share of tetrahedra that are inside out, over all draws; None where not every node is sampled."""
+    shares = []
+    for block in blocks:
+        if block["u_boundary"].shape[2] < len(mesh.points):
+            return None
+        draws = block["u_boundary"].reshape(-1, *mesh.points.shape)
+        shares += [float((signed_volumes(mesh.points + u, mesh.cells) <= 0).mean()) for u in draws]
+    return float(np.mean(shares))
 
 
 def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:

@@ -6,13 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse
 
 from bayesreg.fem.determinant import (
     BLOCKS_BELOW,
     band_layout,
     band_log_determinant,
+    bandwidth,
     log_determinant,
     log_pseudo_determinant,
+    order_by_neighbours,
     schur_determinant,
 )
 from bayesreg.fem.elasticity import lame_entries
@@ -142,3 +145,24 @@ def test_two_parts_that_share_one_edge_have_no_normaliser():
     hinged = TetMesh.from_arrays(points, np.array(cells), np.zeros(2, int), ("gm",))
     with pytest.raises(ValueError, match="no normaliser on this mesh"):
         schur_determinant(hinged, np.arange(6), NOTHING)
+
+
+def graph_of(*cells):
+    """Nodes 0, 1, … as neighbours where they share a cell."""
+    cells = np.array(cells)
+    pairs = np.repeat(cells, cells.shape[1], axis=1).ravel(), np.tile(cells, cells.shape[1]).ravel()
+    return scipy.sparse.csr_matrix((np.ones(len(pairs[0])), pairs))
+
+
+def test_a_scrambled_chain_is_put_in_order():
+    """Of a chain of tetrahedra, each of four nodes in a row, the narrowest band is three wide."""
+    names = np.random.default_rng(0).permutation(40)
+    graph = graph_of(*(names[i : i + 4] for i in range(37)))
+    assert bandwidth(graph, order_by_neighbours(graph)) == 3
+
+
+def test_two_parts_are_put_in_order_one_after_the_other():
+    graph = graph_of((0, 2, 4, 6), (1, 3, 5, 7))
+    order = order_by_neighbours(graph)
+    assert sorted(order) == list(range(8))
+    assert bandwidth(graph, order) == 3

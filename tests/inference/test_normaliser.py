@@ -26,7 +26,7 @@ from bayesreg.inference.gaussian.normaliser import (
     smooth_coordinates,
 )
 from bayesreg.inference.gaussian.whitened import setup_about
-from bayesreg.inference.kernel import Info
+from bayesreg.inference.kernel import Info, together
 from bayesreg.inference.layout import slices
 from bayesreg.inference.samplers.hamiltonian import hmc
 from bayesreg.inference.samplers.settings import Hmc
@@ -192,3 +192,11 @@ def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     )
     assert true.std() > 1
     assert (true - found).std() < 0.05
+
+
+def test_several_transitions_are_told_of_together():
+    flags, counts = jnp.array([False, True]), jnp.array([3, 4])
+    found = together(Info(jnp.array([0.5, 1.0]), flags, ~flags, counts, flags & ~flags, counts, 0 * counts))
+    assert found.acceptance_rate == 0.75
+    assert (bool(found.outside_support), bool(found.solver_failed), bool(found.diverging)) == (True, True, False)
+    assert (int(found.solver_iterations), int(found.gradients), int(found.densities)) == (7, 7, 0)

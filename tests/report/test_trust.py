@@ -28,6 +28,11 @@ def test_what_widens_the_intervals_is_told_with_its_size():
     assert "0.080 mm" in mesh
 
 
+def test_inverted_tetrahedra_of_the_draws_are_told():
+    assert any("0.030 % of the tetrahedra" in text for text in explain_intervals({"inverted_share_of_draws": 3e-4}))
+    assert explain_intervals({"inverted_share_of_draws": 0.0}) == []
+
+
 def test_nothing_is_told_of_what_a_run_does_not_have():
     assert explain_intervals({}) == []
     independent = MANIFEST | {"independent_points": {"images": 100_000.0}, "model": {"similarity": "ssd"}}

@@ -1,0 +1,74 @@
+"""The barrier against inverted tetrahedra: closed forms, and a search that landmarks pull through a face."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import bayesreg as br
+from bayesreg.fem.elements import elements_of
+from bayesreg.inference.gaussian.mode_search import find_mode
+from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.mesh import signed_volumes
+from bayesreg.model.terms.barrier import LINEAR_BELOW, WIDTH, Barrier, volume_shares
+from bayesreg.model.terms.landmarks import Landmarks
+from tests.phantoms import box_mesh
+
+
+def squeezed(share):
+    """log of the barrier of 0.1 at one tetrahedron that is left with this share of its volume."""
+    return Barrier(jnp.asarray(0.1)).log_of(jnp.reshape(share, 1))
+
+
+def build(mesh, fixed, moving, least_volume):
+    marks = Landmarks(fixed, moving, sd=0.1)
+    model = br.ModelConfig(sampled="all", least_volume=least_volume, fixed={"lam": 1.0, "mu": 1.0})
+    return br.build_posterior(mesh=mesh, observations=[marks], model=model)
+
+
+def test_shares_are_those_of_the_volumes():
+    mesh = box_mesh()
+    u = np.random.default_rng(0).normal(scale=5.0, size=mesh.points.shape)
+    found = volume_shares(elements_of(mesh), jnp.asarray(u))
+    moved = signed_volumes(mesh.points + u, mesh.cells)
+    assert (moved < 0).any()
+    np.testing.assert_allclose(found, moved / mesh.volumes, rtol=1e-9, atol=1e-12)
+
+
+def test_it_is_silent_above_the_least_volume_and_steep_below():
+    assert squeezed(0.1001) == 0
+    assert squeezed(1.5) == 0
+    assert squeezed(0.05) == pytest.approx(-0.5 * (np.log(2) / WIDTH) ** 2)
+    assert squeezed(0.0) < -187
+    assert squeezed(-1.0) < squeezed(0.0)
+
+
+def test_it_is_smooth_where_its_linear_part_begins():
+    above, below = (0.1 * LINEAR_BELOW + step for step in (1e-9, -1e-9))
+    for function in (squeezed, jax.grad(squeezed)):
+        assert float(function(above)) == pytest.approx(float(function(below)), rel=1e-5)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.1])
+def test_the_mode_has_no_inverted_tetrahedron(least):
+    """Landmarks that pull a node through the opposite faces; without the barrier it goes there."""
+    mesh = box_mesh()
+    middle = int(np.argmin(np.linalg.norm(mesh.points - mesh.points.mean(axis=0), axis=1)))
+    rest = mesh.boundary[mesh.boundary != middle]
+    fixed = mesh.points[np.append(rest, middle)]
+    moving = fixed.copy()
+    moving[-1] += 1.5 * (mesh.points[rest[0]] - mesh.points[middle])
+    posterior = build(mesh, fixed, moving, least)
+    start = np.asarray(flat_position(posterior, posterior.data, posterior.estimands(posterior.reference())))
+    mode = unravel(posterior)(jnp.asarray(find_mode(posterior, start)))
+    u = np.asarray(posterior.constrain(mode)["u_boundary"])
+    assert (signed_volumes(mesh.points + u, mesh.cells).min() > 0) == bool(least)
+
+
+def test_the_preset_has_it_and_it_is_refused_outside_its_range():
+    assert br.ModelConfig(preset="registration").least_volume > 0
+    assert isinstance(build(box_mesh(), box_mesh().points, box_mesh().points, 0.1).data.terms["barrier"], Barrier)
+    with pytest.raises(ValueError, match="less than 1"):
+        br.ModelConfig(least_volume=1.0)
