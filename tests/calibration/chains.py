@@ -30,7 +30,7 @@ BATCH = 20
 # Rows of "u_boundary" that a sampler which moves single nodes moves alone.
 ALONE = np.array([0, 16])
 
-PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic")
+PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load")
 
 Estimands = dict[str, Any]
 
@@ -39,7 +39,7 @@ def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
     """What is looked at: parameters, some displacements, E_s and the log density."""
     labels, blocks = posterior.variables.entry_names, posterior.data.blocks
     entries = [f"{name} {labels[i]}" for name in LAME for i in blocks[name].free.index]
-    warm = [name for name in PARAMETERS if name not in LAME and blocks[name].is_sampled]
+    warm = [name for name in PARAMETERS if name not in LAME and name in blocks and blocks[name].is_sampled]
     nodes = [f"u{posterior.sampled[node]} {axis}" for node in NODES for axis in "xyz"]
     return (*entries, *warm, *nodes, "E_s", "log p")
 

@@ -1,9 +1,11 @@
 """The model as a simulator: parameters and displacements from the prior, the fixed image at the quadrature points.
 
 (λ, μ, T_s, T_r) come from their priors; u_B from the Gaussian of precision S / T_r, S the Schur complement of K, and
-that of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of variance
-T_s / (2 w_q). The skull belongs to the likelihood: a draw with a node in it is rejected whole, (λ, μ, u) together. The
-prior is drawn by the oracle's matrices and NumPy, and shares no code with the density under test.
+that of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of the squared scale
+T_s / (2 w_q). With random loads, whose sizes come from their priors, the displacements of all nodes have the precision
+K D⁻¹ K in place of S / T_r, and the noise is Student's t. The skull belongs to the likelihood: a draw with a node in it
+is rejected whole, (λ, μ, u) together. The prior is drawn by the oracle's matrices and NumPy, and shares no code with
+the density under test.
 """
 
 from __future__ import annotations
@@ -26,6 +28,10 @@ LAME = ("lam", "mu")
 # Displacements of about half a millimetre in a box of 20 mm, seen through noise of sd 0.014 in a picture of contrast
 # one whose waves are too long for several modes; the wall is met by two draws of three.
 RIGID_SD, T_SIMILARITY, T_ELASTIC = 0.3, 0.008, 3.0
+# Of the same size inside, and at the surface.
+BODY_LOAD, SURFACE_LOAD = 0.25, 0.6
+DEGREES_OF_FREEDOM = 4.0
+LOG_SD = 0.5
 PRIOR = {"alpha": 3.0, "beta": 3.0, "high": 4.0}
 WALL = 20.8
 
@@ -39,25 +45,43 @@ class Variant(NamedTuple):
         Whether a flat skull stands one millimetre beyond a face of the box.
     temperatures : bool
         Whether T_s and T_r are inferred; μ of one tissue is then known.
+    loads : bool
+        Random loads on all nodes in place of exp(−E_r / T_r), and Student's t noise; their sizes and T_s are inferred,
+        and μ of one tissue is known.
     """
 
     skull: bool = False
     temperatures: bool = False
+    loads: bool = False
+
+    @property
+    def inferred(self) -> dict[str, float]:
+        """The medians of the scales that have a log-normal prior."""
+        if self.loads:
+            return {"t_similarity": T_SIMILARITY, "body_load": BODY_LOAD, "surface_load": SURFACE_LOAD}
+        return {"t_similarity": T_SIMILARITY, "t_elastic": T_ELASTIC} if self.temperatures else {}
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """Those whose displacements are sampled."""
+        return np.arange(len(MESH.points)) if self.loads else MESH.boundary
 
     @property
     def options(self) -> dict[str, Any]:
         """Of `ModelConfig`."""
-        known = T_SIMILARITY, T_ELASTIC
-        inferred = tuple({"median": value, "log_sd": 0.5} for value in known)
-        t_similarity, t_elastic = inferred if self.temperatures else known
+        elastic = {"t_elastic": T_ELASTIC}
+        if self.loads:
+            elastic = {"elastic_prior": "loads", "sampled": "all", "similarity": "student_t",
+                       "degrees_of_freedom": DEGREES_OF_FREEDOM}  # fmt: skip
         return {
-            "fixed": {"mu": {"gm": 2.0}} if self.temperatures else {},
+            "fixed": {"mu": {"gm": 2.0}} if self.inferred else {},
             "priors": dict.fromkeys(LAME, PRIOR),
-            "t_similarity": t_similarity,
-            "t_elastic": t_elastic,
+            "t_similarity": T_SIMILARITY,
             "normalised": True,
             "interpolation": "cubic",
             "rigid_sd": RIGID_SD,
+            **elastic,
+            **{name: {"median": median, "log_sd": LOG_SD} for name, median in self.inferred.items()},
         }
 
 
@@ -65,6 +89,7 @@ VARIANTS = {
     "no skull": Variant(),
     "skull": Variant(skull=True),
     "temperatures": Variant(temperatures=True),
+    "loads": Variant(loads=True),
 }
 
 
@@ -101,31 +126,47 @@ class Simulator:
             found[name] = np.stack(of_tissue)
         return found
 
+    def stiffness(self, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
+        """K of all nodes, (3n, 3n)."""
+        return np.tensordot(lam, self.unit_stiffness["lam"], 1) + np.tensordot(mu, self.unit_stiffness["mu"], 1)
+
+    def elastic_precision(self, values: dict[str, Any]) -> np.ndarray:
+        """The precision of the displacements of the sampled nodes but for rigid motions, which it leaves free."""
+        if not self.variant.loads:
+            return self.schur_complement(values["lam"], values["mu"]) / values.get("t_elastic", T_ELASTIC)
+        K, variances = self.stiffness(values["lam"], values["mu"]), np.zeros(len(MESH.points))
+        for cell in MESH.cells:
+            variances[cell] += values["body_load"] ** 2 * paper.volume(MESH.points[cell]) / 4
+        for a, b, c in MESH.boundary_faces:
+            side, other = MESH.points[b] - MESH.points[a], MESH.points[c] - MESH.points[a]
+            variances[[a, b, c]] += values["surface_load"] ** 2 * np.linalg.norm(np.cross(side, other)) / 6
+        return K @ (K / np.repeat(variances, 3)[:, None])
+
     def schur_complement(self, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
         """S of the boundary, (3b, 3b)."""
-        K = np.tensordot(lam, self.unit_stiffness["lam"], 1) + np.tensordot(mu, self.unit_stiffness["mu"], 1)
+        K = self.stiffness(lam, mu)
         boundary = (3 * MESH.boundary[:, None] + np.arange(3)).ravel()
         interior = np.setdiff1d(np.arange(len(K)), boundary)
         coupling = K[np.ix_(interior, boundary)]
         return K[np.ix_(boundary, boundary)] - coupling.T @ np.linalg.solve(K[np.ix_(interior, interior)], coupling)
 
-    def draw_displacement(self, rng: np.random.Generator, lam: np.ndarray, mu: np.ndarray, t_elastic: float) -> Any:
-        """u_B of the untruncated Gaussian prior, (b, 3) in mm."""
-        rigid = paper.rigid_modes(MESH.points[MESH.boundary]) / (RIGID_SD * np.sqrt(len(MESH.boundary)))
-        precision = self.schur_complement(lam, mu) / t_elastic + rigid @ rigid.T
+    def draw_displacement(self, rng: np.random.Generator, values: dict[str, Any]) -> Any:
+        """The sampled nodes' of the untruncated Gaussian prior, (b, 3) in mm."""
+        nodes = self.variant.nodes
+        rigid = paper.rigid_modes(MESH.points[nodes]) / (RIGID_SD * np.sqrt(len(nodes)))
+        precision = self.elastic_precision(values) + rigid @ rigid.T
         factor = np.linalg.cholesky(precision)
         return solve_triangular(factor, rng.normal(size=len(factor)), lower=True, trans=1).reshape(-1, 3)
 
     def draw_parameters(self, rng: np.random.Generator) -> dict[str, Any]:
-        """λ, μ (all entries) and the temperatures of the prior."""
+        """λ, μ (all entries) and the scales of the prior."""
         values: dict[str, Any] = {}
         for name in LAME:
             free = self.posterior.data.blocks[name].free.index
             values[name] = np.array(self.posterior.reference()[name])
             values[name][free] = PRIOR["high"] * rng.beta(PRIOR["alpha"], PRIOR["beta"], len(free))
-        if self.variant.temperatures:
-            values["t_similarity"] = T_SIMILARITY * np.exp(0.5 * rng.normal())
-            values["t_elastic"] = T_ELASTIC * np.exp(0.5 * rng.normal())
+        for name, median in self.variant.inferred.items():
+            values[name] = median * np.exp(LOG_SD * rng.normal())
         return values
 
     def draw_prior(self, rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
@@ -133,7 +174,7 @@ class Simulator:
         draws: list[dict[str, Any]] = []
         while len(draws) < count:
             values = self.draw_parameters(rng)
-            u = self.draw_displacement(rng, values["lam"], values["mu"], values.get("t_elastic", T_ELASTIC))
+            u = self.draw_displacement(rng, values)
             if not self.variant.skull or (MESH.points[MESH.boundary, 0] + u[:, 0] <= WALL).all():
                 blocks = self.posterior.data.blocks
                 values |= {name: values[name][blocks[name].free.index] for name in LAME}
@@ -145,8 +186,10 @@ def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> A
     """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
     u, images = posterior.evaluate_estimands(without_normaliser(posterior, data), estimands).u, data.terms["images"]
     t_similarity = estimands.get("t_similarity", data.blocks["t_similarity"].reference())
-    sd = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
-    return images.predicted(u) + sd * jax.random.normal(key, sd.shape)
+    scale = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
+    if posterior.options.similarity == "student_t":
+        return images.predicted(u) + scale * jax.random.t(key, DEGREES_OF_FREEDOM, scale.shape)
+    return images.predicted(u) + scale * jax.random.normal(key, scale.shape)
 
 
 def observing(data: Any, fixed_values: Any) -> Any:

@@ -42,10 +42,25 @@ def test_displacements_have_the_pseudo_inverse_for_covariance():
     expected = T_ELASTIC * np.linalg.pinv(S, 1e-9, hermitian=True)
     expected += len(MESH.boundary) * RIGID_SD**2 * modes @ modes.T
     rng, count = np.random.default_rng(0), 2000
-    draws = np.stack([simulator().draw_displacement(rng, LAM, MU, T_ELASTIC).ravel() for _ in range(count)])
+    draws = np.stack([simulator().draw_displacement(rng, {"lam": LAM, "mu": MU}).ravel() for _ in range(count)])
     white = np.linalg.solve(np.linalg.cholesky(expected), draws.T)
     z = (white @ white.T / count - np.eye(len(white))) * np.sqrt(count) / np.sqrt(1 + np.eye(len(white)))
     assert abs(z).max() < 4.9
+    assert (z**2).mean() == pytest.approx(1, abs=0.1)
+
+
+def test_displacements_by_random_loads_have_the_pseudo_inverse_for_covariance():
+    """(K D⁻¹ K)⁺ of the software's own matrices, and the rigid motions."""
+    posterior, values = simulator("loads").posterior, {"lam": LAM, "mu": MU, "body_load": 0.03, "surface_load": 0.02}
+    variances = np.repeat(np.asarray(posterior.data.terms["elastic"].variances(values)), 3)
+    K, modes = stiffness(MESH, LAM, MU).toarray(), rigid_modes(MESH.points)
+    expected = np.linalg.pinv(K @ np.diag(1 / variances) @ K, 1e-9, hermitian=True)
+    expected += len(MESH.points) * RIGID_SD**2 * modes @ modes.T
+    rng, count = np.random.default_rng(0), 2000
+    draws = np.stack([simulator("loads").draw_displacement(rng, values).ravel() for _ in range(count)])
+    white = np.linalg.solve(np.linalg.cholesky(expected), draws.T)
+    z = (white @ white.T / count - np.eye(len(white))) * np.sqrt(count) / np.sqrt(1 + np.eye(len(white)))
+    assert abs(z).max() < 5.1
     assert (z**2).mean() == pytest.approx(1, abs=0.1)
 
 
