@@ -70,7 +70,7 @@ class StopConfig(Section):
     max_steps: Count = 10_000
     """Steps per chain, thinned ones included."""
     max_minutes: Positive | None = None
-    """Minutes of sampling."""
+    """Minutes of sampling, the search for the mode and the warm-up included."""
 
 
 class DistributedConfig(Section):

@@ -155,11 +155,12 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs, observations)
         provenance["observations"] = _fingerprint(posterior, observations)
+        searching = time.perf_counter()
         posterior = _temper(config, inputs, posterior, say)
         provenance["independent_points"] = posterior.independent_points
-        reached = _first(config, inputs, posterior, out, progress)
+        reached = _first(config, inputs, posterior, out, progress, time.perf_counter() - searching)
         inputs = with_initial(inputs, config)
-        store_inputs(out, inputs, with_unsampled(provenance, began))
+        store_inputs(out, inputs, with_unsampled(provenance, began + float(reached[0].seconds)))
     _save_state(out, *reached)
     say(_describe_mesh(inputs))
     wait(BEGUN)
@@ -246,12 +247,18 @@ def _temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[
     return found
 
 
-def _first(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
-    """The chains before their first step; InputError where one cannot start."""
+def _first(
+    config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool, seconds: float = 0.0
+) -> Reached:
+    """The chains before their first step; InputError where one cannot start.
+
+    What was spent on the way there before, `seconds`, counts as sampling.
+    """
     options, start = config.sampler, start_of(config, inputs, posterior)
     found = first_checkpoint(
         posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
     )
+    found = found._replace(seconds=found.seconds + seconds)
     return found, checkpoints.StoredBlocks(out, 0, writes=is_first())
 
 

@@ -141,7 +141,7 @@ def accuracy(rows: Iterable[Row]) -> str:
         [
             f"{row.pair.kind}, seed {row.pair.seed}, bias {row.pair.bias:g}: {row.scores['unregistered_mean']:.2f} mm",
             row.method,
-            *(f"{value:.2f}" for value in row.scores["error"]),
+            *(f"{value:.3f}" for value in row.scores["error"]),
             *(f"{row.scores[tissue][0]:.2f}" for tissue in ("gm", "wm", "csf")),
             f"{row.scores['folded_share']:.2%}",
             minutes(row.times["seconds"]),

@@ -40,7 +40,7 @@ def test_tables():
         table.Row(PAIR, "Demons", SCORES, {"seconds": 90.0, "processor_seconds": 150.0}, None),
     ]
     named = "sag, seed 11, bias 0.15: 2.26 mm"
-    errors = "0.23 | 0.56 | 5.22 | 0.21 | 0.27 | 0.24 | 0.12%"
+    errors = "0.234 | 0.561 | 5.220 | 0.21 | 0.27 | 0.24 | 0.12%"
     assert table.accuracy(rows).splitlines()[2:] == [
         f"| {named} | bayesreg | {errors} | 20.0 |  |",
         f"| {named} | Demons | {errors} | 1.5 | 2.5 |",

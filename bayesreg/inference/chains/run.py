@@ -129,14 +129,15 @@ def sample(
         if value < 1:
             raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
+    began = time.perf_counter()
     if resume is None:
         posterior = temper_target(posterior, chains, seed, start)
     elif posterior.mode_search is not None and posterior.mode_search.tempering is not None:
         raise InputError("these draws are of a tempered posterior: resume them with the posterior of their samples")
     chosen = choose_sampler(sampler, posterior, **settings)
-    began = time.perf_counter()
     if resume is None:
-        checkpoint = from_first(first_checkpoint(posterior, sampler, chains, seed, start, **settings))
+        checkpoint = first_checkpoint(posterior, sampler, chains, seed, start, **settings)
+        checkpoint = from_first(checkpoint._replace(seconds=np.array(time.perf_counter() - began)))
         blocks: Blocks = []
         began = time.perf_counter()
     else:
