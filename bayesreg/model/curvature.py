@@ -337,6 +337,8 @@ def _assemble(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
     """Σ_q C_q N_a N_b, and g gᵀ of groups: a curvature in the places of points as one in all nodes."""
     curvature = np.asarray(points.matrices)
     count = len(curvature)
+    if not count:
+        return scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
     weights = np.broadcast_to(np.asarray(points.weights)[:, None], (count, 3, 4))
     columns = 3 * np.asarray(points.nodes)[:, None] + np.arange(3)[:, None]
     shape, starts = (3 * count, 3 * nodes), np.arange(0, 12 * count + 1, 4)

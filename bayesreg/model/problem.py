@@ -14,6 +14,7 @@ from scipy.special import betaln
 from bayesreg.distance import MARGIN, shared_distance
 from bayesreg.fem.determinant import schur_determinant
 from bayesreg.fem.elasticity import rigid_modes
+from bayesreg.fem.elements import elements_of
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.operators import sparse_operator
 from bayesreg.image import Image
@@ -187,7 +188,7 @@ def _priors(
     if model.rigid_sd is not None:
         terms["rigid"] = RigidPrior(jnp.asarray(rigid_modes(mesh.points[sampled])), jnp.asarray(model.rigid_sd))
     if model.least_volume:
-        terms["barrier"] = Barrier(jnp.asarray(model.least_volume))
+        terms["barrier"] = Barrier(jnp.asarray(model.least_volume), elements_of(mesh))
     if skull is not None:
         hard = Skull(skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled]))
         soft = SoftSkull(hard, jnp.asarray(sampled), jnp.asarray(model.skull_width))

@@ -12,14 +12,15 @@ from bayesreg.fem.elements import elements_of
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.mesh import signed_volumes
-from bayesreg.model.terms.barrier import LINEAR_BELOW, WIDTH, Barrier, volume_shares
+from bayesreg.model.curvature import _assemble
+from bayesreg.model.terms.barrier import QUADRATIC_BELOW, WIDTH, Barrier, cost, volume_shares
 from bayesreg.model.terms.landmarks import Landmarks
 from tests.phantoms import box_mesh
 
 
 def squeezed(share):
     """log of the barrier of 0.1 at one tetrahedron that is left with this share of its volume."""
-    return Barrier(jnp.asarray(0.1)).log_of(jnp.reshape(share, 1))
+    return -cost(jnp.asarray(share / 0.1))
 
 
 def build(mesh, fixed, moving, least_volume):
@@ -41,14 +42,29 @@ def test_it_is_silent_above_the_least_volume_and_steep_below():
     assert squeezed(0.1001) == 0
     assert squeezed(1.5) == 0
     assert squeezed(0.05) == pytest.approx(-0.5 * (np.log(2) / WIDTH) ** 2)
-    assert squeezed(0.0) < -187
+    assert squeezed(0.0) < -237
     assert squeezed(-1.0) < squeezed(0.0)
 
 
-def test_it_is_smooth_where_its_linear_part_begins():
-    above, below = (0.1 * LINEAR_BELOW + step for step in (1e-9, -1e-9))
-    for function in (squeezed, jax.grad(squeezed)):
+def test_it_is_smooth_where_its_quadratic_part_begins():
+    above, below = (0.1 * QUADRATIC_BELOW + step for step in (1e-9, -1e-9))
+    for function in (squeezed, jax.grad(squeezed), jax.grad(jax.grad(squeezed))):
         assert float(function(above)) == pytest.approx(float(function(below)), rel=1e-5)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.9, 1.3])
+def test_its_curvature_is_that_of_the_linearised_volumes(shift):
+    """None of the volumes below the least, some, and some inverted: the Hessian where J is linear in u."""
+    mesh = box_mesh()
+    barrier = build(mesh, mesh.points, mesh.points, 0.1).data.terms["barrier"]
+    u = np.random.default_rng(1).normal(scale=0.1, size=mesh.points.shape)
+    one, *others = mesh.cells[len(mesh.cells) // 2]
+    u[one] += shift * (mesh.points[others].mean(axis=0) - mesh.points[one])
+    shares, push = jax.linearize(lambda u: volume_shares(barrier.elements, u), jnp.asarray(u))
+    assert (np.asarray(shares) < 0.1).any() == bool(shift)
+    curved = jax.hessian(lambda step: cost((shares + push(step)) / 0.1).sum())(jnp.zeros_like(u))
+    found = _assemble(len(u), barrier.gauss_newton(jnp.asarray(u), {})).toarray()
+    np.testing.assert_allclose(found, curved.reshape(found.shape), rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("least", [0.0, 0.1])

@@ -144,7 +144,11 @@ def _improve_hyperparameters(
         return Found(flat, 0.0)
     estimands = estimands_at(target, target.data, jnp.asarray(flat))
     curvature = target.mode_search.curvature(target.data, estimands).gauss_newton
-    return maximise_evidence(target, flat, curvature, units)
+    found = maximise_evidence(target, flat, curvature, units)
+    # To second order the displacements may go too far: where the density itself is lower for that, they rest.
+    data, resting = without_normaliser(target, target.data), np.where(mark_hyperparameters(target), found.flat, flat)
+    higher = height_and_slope(target, data, found.flat)[0] >= height_and_slope(target, data, resting)[0]
+    return found if higher else found._replace(flat=resting)
 
 
 def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:

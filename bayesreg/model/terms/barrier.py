@@ -4,32 +4,38 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from bayesreg.fem.elements import Elements, displacement_gradient
+from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
+from bayesreg.model.terms.term import PointCurvature, SharedCurvature
 from bayesreg.types import AnyArray, Scalar
 
 # Standard deviation of the logarithm of a share below the least: 0.9 of the least costs 0.14, half of it 6.
 WIDTH = 0.2
-# Below this share of the least volume the barrier goes on linearly: a search may come from a place behind it.
-LINEAR_BELOW = 0.05
+# Below this share of the least volume the barrier goes on to second order: a search may come from a place behind it.
+QUADRATIC_BELOW = 0.05
 
 
 class Barrier(NamedTuple):
     """exp(−½ Σ (ln(J / least) / WIDTH)²) over the tetrahedra with J < least, J = det(I + ∇u) the share of volume left.
 
     With J its cost goes up to 112 and on, more steeply than any pair of images pulls: an inverted tetrahedron, J ≤ 0,
-    has e^−187 of the density or less.
+    has e^−237 of the density or less.
 
     Attributes
     ----------
     least : scalar
         Between 0 and 1.
+    elements : Elements
     """
 
     least: Scalar
+    elements: Elements
 
     @property
     def name(self) -> str:
@@ -38,16 +44,37 @@ class Barrier(NamedTuple):
 
     def log(self, state: State) -> Scalar:
         """The log density up to a constant."""
-        return self.log_of(volume_shares(state.elements, state.u))
+        return -cost(volume_shares(self.elements, state.u) / self.least).sum()
 
-    def log_of(self, shares: Float[AnyArray, "cells"]) -> Scalar:
-        """The log density where the tetrahedra are left with these shares of their volumes."""
-        share = shares / self.least
-        inside = jnp.clip(share, LINEAR_BELOW, 1.0)
-        depth = jnp.log(inside) / WIDTH
-        # The tangent where the linear part begins.
-        beyond = jnp.minimum(share - inside, 0.0) * depth / (WIDTH * inside)
-        return -(0.5 * depth**2 + beyond).sum()
+    def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """Second derivative of the cost times ∇J ∇Jᵀ of every tetrahedron below the least volume, 1/mm²."""
+        gradient = np.stack([np.stack(row) for row in displacement_gradient(self.elements.derivative, jnp.asarray(u))])
+        shares = np.asarray(volume_shares(self.elements, jnp.asarray(u)) / self.least)
+        below = np.flatnonzero(shares < 1)
+        F = np.eye(3) + np.moveaxis(gradient[..., below], -1, 0)
+        # Row k of the cofactors is ∂J/∂F_k, and F_kj changes by ∂N_a/∂x_j with u_k of node a.
+        cofactors = np.stack([np.cross(F[:, (k + 1) % 3], F[:, (k + 2) % 3]) for k in range(3)], axis=1)
+        by_node = np.einsum("ckj,ajc->cak", cofactors, np.asarray(self.elements.gradients)[..., below])
+        bending = np.asarray(jax.vmap(jax.grad(jax.grad(cost)))(jnp.asarray(shares[below]))) / float(self.least) ** 2
+        vectors = np.sqrt(bending)[:, None, None] * by_node
+        nodes = np.asarray(self.elements.cells)[:, below].T.reshape(-1, 1)
+        own = np.broadcast_to(np.eye(4)[0], (len(nodes), 4))
+        shared = SharedCurvature(np.repeat(np.arange(len(below)), 4), vectors.reshape(1, -1, 3), np.ones(1))
+        return PointCurvature(np.broadcast_to(nodes, own.shape), own, np.zeros((len(nodes), 3, 3)), shared)
+
+    def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
+        """Nothing: beside Gauss and Newton's part that of the slope is smaller by J, which is below the least."""
+        found = self.gauss_newton(u, values)
+        return found._replace(shared=None)
+
+
+def cost(share: AnyArray) -> AnyArray:
+    """½ (ln(share) / WIDTH)² below 1, the share of the least volume being so small; to second order from there on."""
+    inside = jnp.clip(share, QUADRATIC_BELOW, 1.0)
+    depth = jnp.log(inside) / WIDTH
+    slope, bending = depth / (WIDTH * inside), (1 / WIDTH - depth) / (WIDTH * inside**2)
+    beyond = jnp.minimum(share - inside, 0.0)
+    return 0.5 * depth**2 + slope * beyond + 0.5 * bending * beyond**2
 
 
 def volume_shares(elements: Elements, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "cells"]:
