@@ -9,6 +9,9 @@ import pytest
 
 import bayesreg as br
 from bayesreg.fem.elements import elements_of
+from bayesreg.inference.gaussian import mode_search
+from bayesreg.inference.gaussian.evidence import maximise_evidence
+from bayesreg.inference.gaussian.hierarchy import mark_hyperparameters
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.mesh import signed_volumes
@@ -88,3 +91,28 @@ def test_the_preset_has_it_and_it_is_refused_outside_its_range():
     assert isinstance(build(box_mesh(), box_mesh().points, box_mesh().points, 0.1).data.terms["barrier"], Barrier)
     with pytest.raises(ValueError, match="less than 1"):
         br.ModelConfig(least_volume=1.0)
+
+
+@pytest.mark.parametrize("wild", [1e3, np.nan])
+def test_displacements_that_the_evidence_takes_too_far_rest(wild, monkeypatch):
+    """The search ends where it ends without such a step."""
+    mesh = box_mesh()
+    marks = mesh.points[::2]
+    landmarks = Landmarks(marks, marks + np.random.default_rng(0).normal(size=marks.shape), sd=0.5)
+    model = br.ModelConfig(
+        sampled="all", least_volume=0.1, normalised=True, t_elastic={"median": 10.0}, fixed={"lam": 1.0, "mu": 1.0}
+    )
+    posterior = br.build_posterior(mesh=mesh, observations=[landmarks], model=model)
+    start = np.asarray(flat_position(posterior, posterior.data, posterior.estimands(posterior.reference())))
+    expected, searches = find_mode(posterior, start), []
+
+    def go_too_far(target, flat, *rest):
+        found = maximise_evidence(target, flat, *rest)
+        searches.append(found)
+        away = wild * np.random.default_rng(1).normal(size=flat.shape)
+        far = np.where(mark_hyperparameters(target), found.flat, found.flat + away)
+        return found._replace(flat=far) if len(searches) == 1 else found
+
+    monkeypatch.setattr(mode_search, "maximise_evidence", go_too_far)
+    np.testing.assert_allclose(find_mode(posterior, start), expected, atol=0.02)
+    assert len(searches) > 1
