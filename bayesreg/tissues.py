@@ -6,7 +6,7 @@ The only place besides the datasets (`bayesreg.io.datasets`) where tissues are n
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 
@@ -49,6 +49,8 @@ PAPER_MU: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 1.0, 1.0), strict=True))
 # λ and μ where nothing is said (the literature's λ/μ is about 24), and those of a fluid.
 SOLID = {"lam": 10.0, "mu": 1.0}
 FLUID = 0.01
+# In a label table, what is no part of the organ.
+BACKGROUND = "background"
 
 
 def is_fluid(name: str) -> bool:
@@ -77,3 +79,8 @@ def tissue_of_unit_mu(names: Sequence[str]) -> str:
 def usual_value(parameter: str, name: str) -> float:
     """λ ("lam") or μ ("mu") of a tissue where nothing is said."""
     return FLUID if is_fluid(name) else SOLID[parameter]
+
+
+def tissue_names(table: Iterable[str]) -> tuple[str, ...]:
+    """The names of a label table that are those of tissues, in its order."""
+    return tuple(name for name in table if name != BACKGROUND)

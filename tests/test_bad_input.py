@@ -75,9 +75,15 @@ BALL = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0) < 8
         ),
         ("labels", lambda f: save(f / "bad.nii.gz", BALL), "holds no label"),
         ("labels", lambda f: save(f / "bad.nii.gz", BALL * 0.5), "not integers"),
-        ("labels", lambda f: save(f / "bad.nii.gz", np.arange(729).reshape(9, 9, 9) % 4), "grid"),
+        ("labels", lambda f: save(f / "bad.nii.gz", np.arange(729).reshape(9, 9, 9) % 4), "covers 5% of the fixed"),
         ("intracranial", lambda f: save(f / "bad.nii.gz", two_parts()), "2 separate parts"),
-        ("intracranial", lambda f: save(f / "bad.nii.gz", np.zeros(SHAPE)), "empty"),
+        ("intracranial", lambda f: save(f / "bad.nii.gz", np.zeros(SHAPE)), "the value 0 everywhere"),
+        (
+            "intracranial",
+            lambda f: save(f / "bad.nii.gz", 100 * np.random.default_rng(0).random(SHAPE)),
+            "probabilities",
+        ),
+        ("labels", lambda f: save(f / "bad.nii.gz", np.arange(24**3).reshape(SHAPE) % 5), "does not list: 4 (177 ml)"),
         ("intracranial", lambda f: f / "gone.nii.gz", "no such file"),
     ],
 )

@@ -11,13 +11,14 @@ from bayesreg.config.values import (
     ByTissue,
     Direction,
     FoundFile,
+    FoundImage,
     Labels,
     LabelTable,
     NotNegative,
     Positive,
     Section,
 )
-from bayesreg.tissues import BRAIN, PAPER_LAM, PAPER_MU
+from bayesreg.tissues import BRAIN, PAPER_LAM, PAPER_MU, tissue_names
 
 
 class Mni152Data(Section):
@@ -52,23 +53,23 @@ class FilesData(Section):
     """An organ of one's own; both images are in one world space (aligned beforehand)."""
 
     source: Literal["files"]
-    fixed: FoundFile | None = None
-    """Pre-operative image; null where only other observations are to be used."""
-    moving: Annotated[FoundFile | None, Field(validate_default=True)] = None
+    fixed: FoundImage | None = None
+    """Pre-operative image, a file or a DICOM folder; null where only other observations are to be used."""
+    moving: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Intra-operative image."""
     labels: Annotated[FoundFile | None, Field(validate_default=True)] = None
-    """Tissue labels of the fixed image, on its grid; null takes the tissues of mesh.file."""
+    """Tissue labels of the fixed image; null takes the tissues of mesh.file."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
-    """Values of the label file by tissue: any names, any number of them."""
+    """Values of the label file by tissue: any names, any number of them; background is what belongs to no tissue."""
     intracranial: FoundFile | None = None
-    """Image that is not zero where the organ may go; without it nothing bounds the motion."""
+    """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion."""
     same_contrast: StrictBool = True
     """Scale the intensities of both images by one common scale."""
 
     @property
     def tissues(self) -> tuple[str, ...] | None:
         """Names of the tissues; None where only the mesh knows them."""
-        return None if self.label_table is None else tuple(self.label_table)
+        return None if self.label_table is None else tissue_names(self.label_table)
 
     @field_validator("moving")
     @classmethod

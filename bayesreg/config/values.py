@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -13,12 +14,21 @@ from bayesreg.types import DATA_FOLDER
 
 
 def _find_file(value: object, info: ValidationInfo) -> Path:
+    return _find(value, info, Path.is_file)
+
+
+def _find_image(value: object, info: ValidationInfo) -> Path:
+    """A file, or a folder with a DICOM series."""
+    return _find(value, info, Path.exists)
+
+
+def _find(value: object, info: ValidationInfo, serves: Callable[[Path], bool]) -> Path:
     if not isinstance(value, str | Path) or not str(value):
         raise ValueError("expected the path of a file")
     folders = (info.context or {}).get("folders", ()) or search_folders()
     places = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
     for place in places:
-        if place.is_file():
+        if serves(place):
             return place
     hint = "" if Path(value).is_absolute() or os.environ.get(DATA_FOLDER) else f" (and {DATA_FOLDER} is not set)"
     raise ValueError(f"no such file; looked for {' and '.join(map(str, places))}{hint}")
@@ -71,6 +81,7 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 Label = Annotated[int, Field(strict=True)]
 Labels = Annotated[tuple[Label, ...], BeforeValidator(_as_list), Field(min_length=1)]
 FoundFile = Annotated[Path, BeforeValidator(_find_file)]
+FoundImage = Annotated[Path, BeforeValidator(_find_image)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=2)]
 Range = Annotated[tuple[Fraction, Fraction], BeforeValidator(_as_pair), AfterValidator(_ascending)]
 Direction = Annotated[tuple[Number, Number, Number], AfterValidator(_unit)]

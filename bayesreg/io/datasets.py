@@ -13,8 +13,18 @@ import numpy as np
 
 from bayesreg.image import Image
 from bayesreg.io.domain import main_part
-from bayesreg.io.volumes import LabelTable, check_same_grid, check_same_space, load_image, load_labels
-from bayesreg.tissues import BRAIN
+from bayesreg.io.readers import corners_apart, other_form
+from bayesreg.io.volumes import (
+    SAME_GRID,
+    LabelTable,
+    check_same_grid,
+    check_same_space,
+    load_image,
+    load_labels,
+    load_mask,
+    on_grid_of,
+)
+from bayesreg.tissues import BRAIN, tissue_names
 from bayesreg.types import DATA_FOLDER, InputError
 
 __all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152"]
@@ -116,26 +126,39 @@ def from_files(
     image_path : path, optional
         The fixed image.
     labels_path : path
-        Tissue labels on its grid.
+        Tissue labels; on another grid than its own the nearest is taken.
     label_table : mapping
         Label values of every tissue by its name, in the order that the mesh will have.
     intracranial_path : path, optional
-        Image on the same grid that is not zero where the organ may be.
+        Mask of where the organ may be (`load_mask`), likewise.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, the table names labels that are absent, or the grids differ.
+        If a file is missing or unreadable, a tissue of the table is absent, a label is not listed, or the grids lie
+        apart or are one by the other form of a header alone.
     """
-    tissue, image = load_labels(labels_path, label_table), None
+    tissue, image = load_labels(labels_path, label_table, unlisted="refused"), None
     if image_path is not None:
         image = load_image(image_path)
-        check_same_grid(image, tissue, ("fixed", "label"))
+        tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"))
     if intracranial_path is None:
-        return Anatomy(image, tissue, None, tuple(label_table))
-    mask = load_image(intracranial_path)
-    check_same_grid(tissue, mask, ("label", "intracranial"))
-    return Anatomy(image, tissue, mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)), tuple(label_table))
+        return Anatomy(image, tissue, None, tissue_names(label_table))
+    mask = _on_grid(tissue, labels_path, load_mask(intracranial_path), intracranial_path, ("label", "intracranial"))
+    return Anatomy(image, tissue, mask, tissue_names(label_table))
+
+
+def _on_grid(grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]) -> Image:
+    """`on_grid_of`; InputError where they share a grid by the form of a header that was not taken."""
+    for other, taken, source in ((other_form(grid_path), image, grid_path), (other_form(path), grid, path)):
+        if other is None or grid.shape != image.shape:
+            continue
+        if corners_apart(other, np.asarray(taken.affine), grid.shape) <= SAME_GRID * grid.voxel_sizes.min():
+            raise InputError(
+                f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "
+                "s-form, which is taken; write the right one of the two forms into both"
+            )
+    return on_grid_of(grid, image, names)
 
 
 def _from_nibabel(source: nib.Nifti1Image) -> Image:

@@ -1,4 +1,4 @@
-"""Displacements from files: of the nodes of a mesh (.npz, .vtu), or a field on a grid (.nii, .nii.gz)."""
+"""Displacements from files: of the nodes of a mesh (.npz, .vtu), or a field on a grid."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.io.atomic import load_arrays
-from bayesreg.io.volumes import load_displacement
+from bayesreg.io.fields import SUFFIXES, load_displacement
 from bayesreg.mesh import TetMesh
 from bayesreg.types import InputError
 
@@ -54,7 +54,7 @@ def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarr
 
 
 def require_displacement(path: Path) -> None:
-    """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid (.nii, .nii.gz)."""
+    """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid (`SUFFIXES`)."""
     load_displacement(path) if _is_volume(path) else read_displacement(path)
 
 
@@ -64,7 +64,7 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
     Parameters
     ----------
     path : path
-        A field (.nii, .nii.gz) as `bayesreg.io.volumes.save_displacement` and ITK write it is interpolated linearly.
+        A field on a grid (`bayesreg.io.fields.load_displacement`) is interpolated linearly.
     mesh : TetMesh
 
     Raises
@@ -96,7 +96,7 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
 
 
 def _is_volume(path: Path) -> bool:
-    return path.name.endswith((".nii", ".nii.gz"))
+    return path.name.endswith(SUFFIXES)
 
 
 def _point_data(path: Path) -> dict[str, np.ndarray]:

@@ -13,10 +13,11 @@ from jaxtyping import Float
 
 from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
 from bayesreg.io.displacements import read_point_data
+from bayesreg.io.fields import save_displacement
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.points import PointPairs
 from bayesreg.io.records import Inputs, Predicted, Run, Truth
-from bayesreg.io.volumes import load_image, save_displacement, save_image
+from bayesreg.io.volumes import load_image, save_image
 from bayesreg.types import AnyArray, InputError
 
 BODIES = "bodies.json"

@@ -1,31 +1,36 @@
-"""Volumes in files: images, tissue labels and displacement fields, world RAS mm throughout."""
+"""Images, masks and tissue labels in files, world RAS mm throughout."""
 
 from __future__ import annotations
 
 import logging
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import nibabel as nib
 import numpy as np
-from jaxtyping import Float
-from nibabel.filebasedimages import ImageFileError
-from nibabel.spatialimages import HeaderDataError, SpatialImage
+from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
+from bayesreg.io.readers import corners_apart, read_volume
+from bayesreg.tissues import BACKGROUND, tissue_names
 from bayesreg.types import AnyArray, InputError
 
 LabelTable = Mapping[str, int | Sequence[int]]
 
-VECTOR_INTENT = 1007
+# Grids are one where no corner lies further apart than this share of a voxel.
+SAME_GRID = 0.1
+# Labels that are stored as floating-point numbers lie this near to integers.
+ROUNDING = 0.05
+# Probabilities that were interpolated by splines overshoot by no more.
+OVERSHOOT = 0.5
 
 _log = logging.getLogger(__name__)
 
 
 def load_image(path: str | Path) -> Image:
-    """Read a 3D image (NIfTI, or whatever else nibabel reads).
+    """Read a 3D image: NIfTI, MGZ, NRRD, MetaImage, a folder with one DICOM series, or what else nibabel reads.
 
     Parameters
     ----------
@@ -42,14 +47,39 @@ def load_image(path: str | Path) -> Image:
         If there is no such file, it is not an image or damaged, has more or fewer than three axes, holds
         values that are not real and finite, or its affine is singular.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"image {path}: there is no such file")
-    source = _open(path)
+    volume = read_volume(path)
     try:
-        return Image(_voxels(source, path), source.affine)
+        return Image(_one_real(volume.voxels), volume.affine)
     except ValueError as error:
         raise InputError(f"image {path}: {error}") from error
+
+
+def load_mask(path: str | Path) -> Image:
+    """Read a mask: of two values the greater is inside; of probabilities what is at least 0.5, and the log says so.
+
+    Returns
+    -------
+    Image
+        uint8, 1 inside.
+
+    Raises
+    ------
+    InputError
+        As in `load_image`; also if the file holds one value, or neither two values nor probabilities.
+    """
+    image = load_image(path)
+    voxels = np.asarray(image.voxels)
+    low, high = voxels.min(), voxels.max()
+    if low == high:
+        raise InputError(f"mask {path} has the value {low:g} everywhere; expected two values")
+    if ((voxels == low) | (voxels == high)).all():
+        return image.with_voxels((voxels == high).astype(np.uint8))
+    if low < -OVERSHOOT or not 0.5 < high <= 1 + OVERSHOOT:
+        raise InputError(
+            f"mask {path} has more than two values, from {low:g} to {high:g}; expected two values, or probabilities"
+        )
+    _log.warning("mask %s has values from %.3g to %.3g; what is at least 0.5 is inside", path, low, high)
+    return image.with_voxels((voxels >= 0.5).astype(np.uint8))
 
 
 def save_image(image: Image, path: str | Path) -> None:
@@ -67,17 +97,20 @@ def save_image(image: Image, path: str | Path) -> None:
     InputError
         If the path ends otherwise, or its folder does not exist.
     """
-    _write(_storable(np.asarray(image.voxels)), image.affine, Path(path))
+    write_nifti(_storable(np.asarray(image.voxels)), image.affine, Path(path))
 
 
-def load_labels(path: str | Path, table: LabelTable) -> Image:
+def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside", "refused"] = "outside") -> Image:
     """Read a label file as tissue indices.
 
     Parameters
     ----------
     path : path
     table : mapping
-        Tissue name to the value, or values, that stand for it in the file; the order gives the indices.
+        Tissue name to the value, or values, that stand for it in the file; the order gives the indices. What stands for
+        `BACKGROUND` is no tissue.
+    unlisted : {"outside", "refused"}
+        Labels that are neither zero nor in the table are no tissue, or refused.
 
     Returns
     -------
@@ -87,79 +120,83 @@ def load_labels(path: str | Path, table: LabelTable) -> Image:
     Raises
     ------
     InputError
-        As in `load_image`; also if the file holds values that are not integers, or a value of the table is
-        absent from it or belongs to two tissues.
+        As in `load_image`; also if the file holds values that are not integers, none of the values of a tissue or one
+        that is not listed, or if a value belongs to two tissues.
     """
     image = load_image(path)
-    if not np.array_equal(image.voxels, np.rint(image.voxels)):
+    voxels = np.rint(image.voxels)
+    away = float(np.abs(voxels - image.voxels).max())
+    if away > ROUNDING:
         raise InputError(f"label file {path} holds values that are not integers; is it an intensity image?")
+    if away:
+        _log.warning("label file %s holds values up to %.2g from an integer; they are rounded", path, away)
     values = {name: np.atleast_1d(np.asarray(entry, int)).tolist() for name, entry in table.items()}
-    _check_table(values, np.unique(image.voxels).astype(int).tolist(), path)
+    present, counts = np.unique(voxels.astype(int), return_counts=True)
+    _check_table(values, present.tolist(), path)
+    listed = {0, *(value for entry in values.values() for value in entry)}
+    millilitres = {
+        int(value): count * image.voxel_volume / 1e3
+        for value, count in zip(present, counts, strict=True)
+        if value not in listed
+    }
+    if millilitres and unlisted == "refused":
+        shown = ", ".join(f"{value} ({volume:.3g} ml)" for value, volume in millilitres.items())
+        raise InputError(
+            f"label file {path} holds labels that the table does not list: {shown}. Add each to a tissue of the table, "
+            f"give it one of its own, or list it under {BACKGROUND} if it does not belong to the organ"
+        )
     tissue = np.zeros(image.shape, np.int8)
-    for index, entry in enumerate(values.values(), start=1):
-        tissue[np.isin(image.voxels, entry)] = index
+    for index, name in enumerate(tissue_names(table), start=1):
+        tissue[np.isin(voxels, values[name])] = index
     return image.with_voxels(tissue)
 
 
-def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affine: Float[AnyArray, "4 4"]) -> None:
-    """Write a displacement field that ITK, ANTs and nitransforms read as a resampling transform.
-
-    Parameters
-    ----------
-    path : path
-        Ends in .nii or .nii.gz.
-    field : (X, Y, Z, 3) array
-        Displacement at every voxel centre, mm, world RAS. The file holds it as (X, Y, Z, 1, 3) with intent
-        1007 (vector), its values in LPS.
-    affine : (4, 4) array
-        Voxel index to world RAS, mm.
-    """
-    lps = np.asarray(field, np.float32) * np.array([-1, -1, 1], np.float32)
-    _write(lps[:, :, :, None], affine, Path(path), intent=VECTOR_INTENT)
-
-
-def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
-    """Read a displacement field as `save_displacement` and ITK write it; the inverse of `save_displacement`.
-
-    Returns
-    -------
-    three Images
-        Components along x, y and z, mm, world RAS.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, it is no image or damaged, or has another shape than (X, Y, Z, 1, 3).
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"displacement field {path}: there is no such file")
-    source = _open(path)
-    if source.shape[3:] != (1, 3):
-        raise InputError(
-            f"{path} is no displacement field: expected the shape (X, Y, Z, 1, 3), vectors in mm, got {source.shape}"
-        )
-    try:
-        x, y, z = np.moveaxis(np.asarray(source.dataobj, float)[:, :, :, 0], -1, 0)
-        return Image(-x, source.affine), Image(-y, source.affine), Image(z, source.affine)
-    except (OSError, EOFError, zlib.error, ValueError) as error:
-        raise InputError(f"displacement field {path}: {error}") from error
-
-
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
-    """Raise InputError unless two images share their grid (corners within a hundredth of a voxel)."""
+    """Raise InputError unless two images share their grid (corners within a tenth of a voxel)."""
     if a.shape != b.shape:
         raise InputError(
             f"the {names[0]} and the {names[1]} image must share one grid, but have shapes {a.shape} and {b.shape}; "
             "resample one onto the other"
         )
-    corners = np.stack(np.meshgrid(*((0.0, n - 1.0) for n in a.shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    apart = np.linalg.norm(a.voxel_to_world(corners) - b.voxel_to_world(corners), axis=1).max()
-    if apart > 0.01 * a.voxel_sizes.min():
+    apart = corners_apart(a.affine, b.affine, a.shape)
+    if apart > SAME_GRID * a.voxel_sizes.min():
         raise InputError(
             f"the {names[0]} and the {names[1]} image must share one grid, but their affines place corners up to "
             f"{apart:.3g} mm apart; resample one onto the other"
         )
+
+
+def on_grid_of(grid: Image, image: Image, names: tuple[str, str] = ("first", "second")) -> Image:
+    """Labels or a mask on the grid of another image: as they are, or by the nearest voxel, and the log says so.
+
+    Parameters
+    ----------
+    grid : Image
+    image : Image
+        Beyond its own grid it counts as zero.
+    names : pair of str
+        What to call them in a message.
+
+    Raises
+    ------
+    InputError
+        If the two hardly overlap in world space.
+    """
+    try:
+        check_same_grid(grid, image)
+        return grid.with_voxels(image.voxels)
+    except InputError:
+        check_same_space(grid, image, names)
+    between = image.to_voxel @ grid.affine
+    found = ndimage.affine_transform(
+        np.asarray(image.voxels), between[:3, :3], between[:3, 3], grid.shape, order=0, mode="constant"
+    )
+    reordered = np.allclose(between, np.rint(between), atol=SAME_GRID / max(grid.shape))
+    if not (reordered and round(abs(np.linalg.det(between))) == 1):
+        _log.warning(
+            "the %s image lies on another grid than the %s one; the nearest voxel is taken", names[1], names[0]
+        )
+    return grid.with_voxels(found)
 
 
 def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "second"), least: float = 0.1) -> None:
@@ -183,31 +220,30 @@ def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "sec
         )
 
 
-def _open(path: Path) -> SpatialImage:
-    try:
-        source = nib.load(path)
-    except (ImageFileError, HeaderDataError, OSError, EOFError, zlib.error) as error:
-        raise InputError(f"image {path} cannot be read: {error}") from error
-    if not isinstance(source, SpatialImage) or source.affine is None:
-        raise InputError(f"{path} holds no image on a grid, but {type(source).__name__}")
-    if isinstance(source, nib.Nifti1Image) and not (source.header["sform_code"] or source.header["qform_code"]):
-        _log.warning("%s says nothing of its orientation (sform and qform code 0); taken to be centred", path)
-    return source
+def write_nifti(voxels: np.ndarray, affine: AnyArray, path: Path, intent: int | None = None) -> None:
+    """Write voxels as NIfTI, mm, all of it or nothing; InputError as in `save_image`."""
+    if not path.name.endswith((".nii", ".nii.gz")):
+        raise InputError(f"{path} must end in .nii or .nii.gz")
+    if not path.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
+    image = nib.Nifti1Image(voxels, np.asarray(affine, float), dtype=voxels.dtype)
+    image.header.set_xyzt_units("mm")
+    if intent is not None:
+        image.header.set_intent(intent)
+    with replacing(path) as temporary:
+        nib.save(image, temporary)
 
 
-def _voxels(source: SpatialImage, path: Path) -> np.ndarray:
-    shape = source.shape
+def _one_real(voxels: np.ndarray) -> np.ndarray:
+    """Three axes of native numbers; InputError where there are others."""
+    shape = voxels.shape
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
     if len(shape) != 3:
-        raise InputError(f"expected a 3D image, got shape {source.shape}; take out one volume beforehand")
-    try:
-        voxels = np.array(np.asarray(source.dataobj)).reshape(shape)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"the file is cut short or damaged ({error})") from error
+        raise InputError(f"expected a 3D image, got shape {voxels.shape}; take out one volume beforehand")
     if voxels.dtype.kind not in "iufb":
         raise InputError(f"expected one real number per voxel, got {voxels.dtype}")
-    return voxels.astype(voxels.dtype.newbyteorder("="), copy=False)
+    return voxels.reshape(shape).astype(voxels.dtype.newbyteorder("="), copy=False)
 
 
 def _storable(voxels: np.ndarray) -> np.ndarray:
@@ -221,19 +257,6 @@ def _storable(voxels: np.ndarray) -> np.ndarray:
     return voxels
 
 
-def _write(voxels: np.ndarray, affine: AnyArray, path: Path, intent: int | None = None) -> None:
-    if not path.name.endswith((".nii", ".nii.gz")):
-        raise InputError(f"{path} must end in .nii or .nii.gz")
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
-    image = nib.Nifti1Image(voxels, np.asarray(affine, float), dtype=voxels.dtype)
-    image.header.set_xyzt_units("mm")
-    if intent is not None:
-        image.header.set_intent(intent)
-    with replacing(path) as temporary:
-        nib.save(image, temporary)
-
-
 def _check_table(values: dict[str, list[int]], present: list[int], path: str | Path) -> None:
     owner: dict[int, str] = {}
     for name, entry in values.items():
@@ -243,11 +266,16 @@ def _check_table(values: dict[str, list[int]], present: list[int], path: str | P
             if value in owner:
                 raise InputError(f"label {value} stands for both {owner[value]} and {name} in the label table")
             owner[value] = name
-    absent = {value: name for value, name in owner.items() if value not in present}
+    absent = [value for value in owner if value not in present]
+    empty = [name for name in tissue_names(values) if not set(values[name]) & set(present)]
+    shown = ", ".join(map(str, present[:30])) + (", …" if len(present) > 30 else "")
+    if empty:
+        listed = ", ".join(f"{name} ({', '.join(map(str, values[name]))})" for name in empty)
+        raise InputError(f"label file {path} holds no label of {listed}; it holds {shown}")
     if absent:
-        listed = ", ".join(f"{value} ({name})" for value, name in absent.items())
-        shown = ", ".join(map(str, present[:30])) + (", …" if len(present) > 30 else "")
-        raise InputError(f"label file {path} holds no label {listed}; it holds {shown}")
+        _log.info(
+            "label file %s lacks %s of the table, which its tissues do without", path, ", ".join(map(str, absent))
+        )
 
 
 def _centre(image: Image) -> list[float]:

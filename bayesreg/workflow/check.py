@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ from bayesreg.config import Config, load_config
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.run import sample
 from bayesreg.inference.draws.blocks import Block
+from bayesreg.workflow.appraisal import Likeness
 from bayesreg.workflow.assembly import posterior_of, start_of
 from bayesreg.workflow.preparation import prepared_inputs
 
@@ -43,6 +45,7 @@ def check(config: str | Path | Config) -> Check:
         device_bytes=device,
         draws_bytes=draws * options.chains * numbers * 8,
         preparation=provenance["timings"],
+        appraisal=provenance["appraisal"],
     )
 
 
@@ -58,17 +61,41 @@ class Check:
     device_bytes: int
     draws_bytes: int
     preparation: dict[str, float]
+    appraisal: dict[str, Any]
 
     @property
     def text(self) -> str:
         """The estimate in words."""
         preparation = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.preparation.items())
-        return (
-            "The configuration is sound.\n"
-            f"  mesh      {self.nodes} nodes, {self.cells} elements, {self.sampled} nodes sampled\n"
-            f"  prepared  {preparation}\n"
-            f"  speed     about {self.steps_per_second:.0f} steps per second and chain\n"
-            f"  time      {self.hours:.1f} h for all the steps that stop.max_steps allows\n"
-            f"  memory    {self.device_bytes / 1e6:.0f} MB on the device, whatever the number of draws; "
-            f"{self.draws_bytes / 1e6:.0f} MB of draws on the host at most"
+        beware = self.appraisal.get("beware", [])
+        return "\n".join(
+            [
+                "The configuration can be run, but beware:" if beware else "The configuration is sound.",
+                *(f"  - {sentence}" for sentence in beware),
+                *_describe(self.appraisal),
+                f"  mesh      {self.nodes} nodes, {self.cells} elements, {self.sampled} nodes sampled",
+                f"  prepared  {preparation}",
+                f"  speed     about {self.steps_per_second:.0f} steps per second and chain",
+                f"  time      {self.hours:.1f} h for all the steps that stop.max_steps allows",
+                f"  memory    {self.device_bytes / 1e6:.0f} MB on the device, whatever the number of draws; "
+                f"{self.draws_bytes / 1e6:.0f} MB of draws on the host at most",
+            ]
         )
+
+
+def _describe(appraisal: dict[str, Any]) -> list[str]:
+    """The labels and the images in two lines."""
+    lines = []
+    if appraisal.get("millilitres"):
+        parts = (
+            f"{name} {inside:.0f}" + (f" ({outside:.0f} outside)" if outside >= 0.5 else "")
+            for name, (inside, outside) in appraisal["millilitres"].items()
+        )
+        lines.append(f"  tissues   {', '.join(parts)} ml in the region to mesh")
+    if appraisal.get("likeness"):
+        likeness = Likeness(**appraisal["likeness"])
+        lines.append(
+            f"  images    correlation {likeness.correlation:.2f}, normalised mutual information "
+            f"{likeness.mutual_information:.2f}, {likeness.on_grid:.0%} of the region on the moving grid"
+        )
+    return lines

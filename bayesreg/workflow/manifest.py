@@ -58,7 +58,7 @@ def manifest(
         Values of all blocks at the mean of the draws.
     judged : Convergence
     provenance : dict
-        "timings" (s) of the preparation, and what is known of a synthetic "pair".
+        "timings" (s) of the preparation, what is known of a synthetic "pair", and the "appraisal" of labels and images.
     began : float
         `time.perf_counter()` when the run began, put back by what processes that were cut off have spent.
     """
@@ -83,6 +83,7 @@ def manifest(
             "total": time.perf_counter() - began,
         },
         "pair": provenance["pair"],
+        "appraisal": provenance.get("appraisal", {}),
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
         "model": _model(config, posterior),
         "observations": describe_observations(posterior, mean),

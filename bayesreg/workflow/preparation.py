@@ -16,7 +16,7 @@ from bayesreg.config.observations import LandmarksSection
 from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
-from bayesreg.image import Image, robust_scale
+from bayesreg.image import Image, IntensityScale, robust_scale
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
 from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
@@ -24,12 +24,13 @@ from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Inputs, Truth
-from bayesreg.io.volumes import load_image
+from bayesreg.io.volumes import load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.options import require_default_image_options
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.types import InputError
+from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.prediction import require_inside
 
 PROVENANCE = Path("inputs") / "provenance.json"
@@ -45,11 +46,14 @@ class Prepared(NamedTuple):
         Seconds for "anatomy", "mesh" and "pair".
     pair : dict
         What is known of a synthetic pair besides its truth; empty for files.
+    appraisal : Appraisal or None
+        What labels and images are like; None without labels.
     """
 
     inputs: Inputs
     timings: dict[str, float]
     pair: dict[str, object]
+    appraisal: Appraisal | None = None
 
 
 def prepare(config: Config) -> Prepared:
@@ -78,6 +82,7 @@ def prepare(config: Config) -> Prepared:
     clock.lap("anatomy")
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, names=anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
+    appraisal = _appraise(config, anatomy, domain, moving)
     mesh = _mesh(anatomy, domain, config.mesh)
     clock.lap("mesh")
     _require_start(config, mesh)
@@ -86,7 +91,7 @@ def prepare(config: Config) -> Prepared:
         images = _scale(config.data, domain, anatomy.image, moving)
         boundary = _known_boundary(config, mesh, None)
         inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary, points=points)
-        return Prepared(inputs, clock.laps, {})
+        return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
     fixed = robust_scale(anatomy.image, domain.voxels != 0)(anatomy.image)
     pair = _pair(config, fixed, anatomy, domain, skull, mesh)
@@ -96,16 +101,14 @@ def prepare(config: Config) -> Prepared:
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
     boundary = _known_boundary(config, mesh, truth)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
-    return Prepared(inputs, clock.laps, _describe(config, pair))
+    return Prepared(inputs, clock.laps, _describe(config, pair), appraisal)
 
 
 def _skull(intracranial: Path | None) -> Image | None:
     """Where no sampled node may go, from a mask of where the organ may be."""
     if intracranial is None:
         return None
-    mask = load_image(intracranial)
-    inside = without_ridges(mask.with_voxels((np.asarray(mask.voxels) != 0).astype(np.uint8)))
-    return _as_stored(forbidden(inside))
+    return _as_stored(forbidden(without_ridges(load_mask(intracranial))))
 
 
 def _points(config: Config) -> dict[str, PointPairs]:
@@ -123,15 +126,31 @@ def _points(config: Config) -> dict[str, PointPairs]:
     return found
 
 
+def _appraise(config: Config, anatomy: Anatomy, domain: Image, moving: Image | None) -> Appraisal:
+    """What is told of labels and images before the mesh is built."""
+    pair = None if anatomy.image is None or moving is None else (anatomy.image, moving)
+    one_scale = isinstance(config.data, FilesData) and config.data.same_contrast and config.model.intensity_map is None
+    return appraise(anatomy.tissue, domain, anatomy.names, pair, one_scale)
+
+
 def _scale(
     data: FilesData, domain: Image, fixed: Image | None, moving: Image | None
 ) -> tuple[Image | None, Image | None]:
     """Both images on one scale of intensities, or each on its own."""
     if fixed is None or moving is None:
         return None, None
-    scale = robust_scale(fixed, domain.voxels != 0)
-    own_scale = scale if data.same_contrast else robust_scale(moving, _within(domain, moving))
+    scale = _scale_of("fixed", fixed, domain.voxels != 0)
+    # Also where it goes unused: a constant image is told by its name.
+    own_scale = _scale_of("moving", moving, _within(domain, moving))
+    own_scale = scale if data.same_contrast else own_scale
     return _as_stored(scale(fixed)), _as_stored(own_scale(moving))
+
+
+def _scale_of(name: str, image: Image, mask: np.ndarray) -> IntensityScale:
+    try:
+        return robust_scale(image, mask)
+    except InputError as error:
+        raise InputError(f"the {name} image within the organ: {error}") from error
 
 
 def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:
@@ -151,7 +170,8 @@ def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[I
         require_default_image_options(config.model)
     prepared = prepare(config)
     require_inside(prepared.inputs.mesh, config.report.places)
-    return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair}
+    appraisal = {} if prepared.appraisal is None else prepared.appraisal.as_json()
+    return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair, "appraisal": appraisal}
 
 
 def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:

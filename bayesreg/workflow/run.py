@@ -152,6 +152,8 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         if config.has_images and not config.compares_images:
             say("the images are shown and not compared: observations does not name them ({kind: images})")
         inputs, provenance = prepared_inputs(config, observations)
+        for sentence in provenance["appraisal"].get("beware", ()):
+            say(f"beware: {sentence}")
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
         posterior = posterior_of(config, inputs, observations)
         provenance["observations"] = _fingerprint(posterior, observations)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage as ndi
 
-from bayesreg.io.volumes import save_displacement
+from bayesreg.io.fields import save_displacement
 from tests.external.make_pair import CSF, GM, WM, hexahedron, make_pair, slices_about
 from tests.external.score import read_truth, score
 

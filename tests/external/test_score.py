@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from bayesreg.io.volumes import save_displacement
+from bayesreg.io.fields import save_displacement
 from tests.external.score import Truth, compare, determinant, read_field
 
 SHAPE = (12, 10, 8)

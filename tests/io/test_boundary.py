@@ -9,7 +9,7 @@ import SimpleITK
 
 import bayesreg as br
 from bayesreg.io.displacements import read_boundary
-from bayesreg.io.volumes import load_displacement, save_displacement
+from bayesreg.io.fields import load_displacement, save_displacement
 from bayesreg.model.warp import nodal_field_on_grid
 from tests.phantoms import ball_mesh, rotated_affine
 

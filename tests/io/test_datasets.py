@@ -102,11 +102,25 @@ class TestFromFiles:
         assert from_files(files["t1"], files["labels"], OWN_TABLE).intracranial is None
 
     def test_takes_any_tissues_in_the_order_of_the_table(self, files):
-        anatomy = from_files(files["t1"], files["labels"], {"tumour": 13, "gm": 12})
+        anatomy = from_files(files["t1"], files["labels"], {"tumour": 13, "gm": 12, "background": 11})
         assert anatomy.names == ("tumour", "gm")
         assert anatomy.tissue.voxels[2, 2, 2] == 1
 
-    def test_refuses_labels_on_another_grid(self, files, tmp_path):
-        nib.save(nib.Nifti1Image(np.zeros((6, 6, 6)), np.eye(4)), tmp_path / "other.nii")
-        with pytest.raises(ValueError, match="the fixed and the label image must share one grid"):
-            from_files(tmp_path / "other.nii", files["labels"], OWN_TABLE)
+    def test_refuses_a_label_that_is_not_listed(self, files):
+        with pytest.raises(ValueError, match=r"does not list: 11 \(0.008 ml\)"):
+            from_files(files["t1"], files["labels"], {"gm": 12, "wm": 13})
+
+    def test_takes_labels_on_another_grid(self, files, tmp_path):
+        nib.save(nib.Nifti1Image(np.zeros((12, 12, 12)), np.diag([1.0, 1, 1, 1])), tmp_path / "fine.nii")
+        anatomy = from_files(tmp_path / "fine.nii", files["labels"], OWN_TABLE, files["inside"])
+        check_same_grid(anatomy.image, anatomy.tissue)
+        check_same_grid(anatomy.image, anatomy.intracranial)
+        assert set(np.unique(anatomy.tissue.voxels)) == {0, 1, 2, 3}
+
+    def test_tells_of_a_grid_that_is_one_by_the_other_form(self, files, tmp_path):
+        source = nib.Nifti1Image(np.zeros((6, 6, 6)), None)
+        source.set_sform(np.diag([2.2, 2.0, 2.0, 1.0]), 4)
+        source.set_qform(np.diag([2.0, 2.0, 2.0, 1.0]), 1)
+        nib.save(source, tmp_path / "t1.nii")
+        with pytest.raises(ValueError, match=r"share one grid by the q-form of .*t1\.nii, but not by its s-form"):
+            from_files(tmp_path / "t1.nii", files["labels"], OWN_TABLE)

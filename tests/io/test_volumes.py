@@ -6,6 +6,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 import SimpleITK
+from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.volumes import (
@@ -13,7 +14,8 @@ from bayesreg.io.volumes import (
     check_same_space,
     load_image,
     load_labels,
-    save_displacement,
+    load_mask,
+    on_grid_of,
     save_image,
 )
 from tests.test_image import AFFINES, affine_of
@@ -190,10 +192,27 @@ class TestLoadLabels:
         tissue = load_labels(write(tmp_path / "a.nii", self.voxels.astype(np.float32)), TABLE)
         np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
 
-    def test_names_absent_labels_and_those_present(self, tmp_path):
+    def test_names_absent_tissues_and_the_labels_present(self, tmp_path):
         path = write(tmp_path / "a.nii", self.voxels)
-        with pytest.raises(ValueError, match=r"no label 7 \(gm\), 41 \(wm\); it holds 0, 1, 2, 3, 8, 9"):
-            load_labels(path, {"csf": 1, "gm": (2, 7), "wm": 41})
+        with pytest.raises(ValueError, match=r"no label of wm \(41, 42\); it holds 0, 1, 2, 3, 8, 9"):
+            load_labels(path, {"csf": 1, "gm": (2, 7), "wm": (41, 42)})
+
+    def test_a_table_may_serve_a_cohort(self, tmp_path):
+        tissue = load_labels(write(tmp_path / "a.nii", self.voxels), TABLE | {"gm": (2, 8, 77)})
+        np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
+
+    @pytest.mark.parametrize("away", [7e-10, 0.02])
+    def test_rounds_what_is_nearly_whole_and_says_so(self, tmp_path, caplog, away):
+        tissue = load_labels(write(tmp_path / "a.nii", self.voxels + away), TABLE)
+        np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
+        assert "they are rounded" in caplog.text
+
+    def test_what_is_not_listed_is_refused_or_named_background(self, tmp_path):
+        path = write(tmp_path / "a.nii", self.voxels, np.diag([10.0, 10, 10, 1]))
+        with pytest.raises(ValueError, match=r"does not list: 9 \(1 ml\).*list it under background"):
+            load_labels(path, TABLE, unlisted="refused")
+        tissue = load_labels(path, TABLE | {"background": 9}, unlisted="refused")
+        np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
 
     def test_refuses_a_value_with_two_meanings(self, tmp_path):
         with pytest.raises(ValueError, match="label 2 stands for both gm and wm"):
@@ -208,27 +227,28 @@ class TestLoadLabels:
             load_labels(write(tmp_path / "a.nii", np.linspace(0, 1, 8).reshape(2, 2, 2)), TABLE)
 
 
-class TestDisplacement:
-    vector = np.array([1.5, -2.0, 4.0])
+class TestLoadMask:
+    ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0) < 6
 
-    def test_file_holds_lps_vectors(self, tmp_path):
-        save_displacement(tmp_path / "u.nii.gz", np.tile(self.vector, (*SHAPE, 1)), np.eye(4))
-        source = nib.load(tmp_path / "u.nii.gz")
-        assert source.shape == (*SHAPE, 1, 3)
-        assert source.header["intent_code"] == 1007
-        np.testing.assert_allclose(np.asarray(source.dataobj)[0, 0, 0, 0], (-1.5, 2.0, 4.0))
+    @pytest.mark.parametrize("values", [(0, 1), (0, 255), (1, 2), (-3.5, -1.5)])
+    def test_of_two_values_the_greater_is_inside(self, tmp_path, values):
+        found = load_mask(write(tmp_path / "a.nii", np.where(self.ball, values[1], values[0]).astype(np.float32)))
+        np.testing.assert_array_equal(found.voxels, self.ball)
+        assert found.voxels.dtype == np.uint8
 
-    @pytest.mark.parametrize("affine", RIGID.values(), ids=RIGID.keys())
-    def test_simpleitk_moves_points_by_it(self, tmp_path, affine):
-        grid = Image(np.zeros(SHAPE), affine)
-        field = self.vector + 0.05 * grid.grid_points() @ np.array([[1.0, 2, 0], [0, -1, 1], [0.5, 0, 1]])
-        save_displacement(tmp_path / "u.nii.gz", field, affine)
-        source = SimpleITK.ReadImage(str(tmp_path / "u.nii.gz"), SimpleITK.sitkVectorFloat64)
-        transform = SimpleITK.DisplacementFieldTransform(source)
-        flip = np.array([-1, -1, 1])
-        point = grid.voxel_to_world(np.array([2.0, 3.0, 1.0]))
-        moved = np.array(transform.TransformPoint(tuple((point * flip).tolist()))) * flip
-        np.testing.assert_allclose(moved - point, field[2, 3, 1], atol=1e-4)
+    @pytest.mark.parametrize("order", [1, 3])
+    def test_probabilities_are_cut_at_a_half(self, tmp_path, caplog, order):
+        """Smoothed, or resampled by a spline, which overshoots."""
+        soft = ndimage.shift(self.ball.astype(float), 0.3, order=order)
+        soft = ndimage.gaussian_filter(soft, 0.7) if order == 1 else soft
+        found = load_mask(write(tmp_path / "a.nii", soft.astype(np.float32)))
+        assert found.voxels.sum() == pytest.approx(self.ball.sum(), rel=0.05)
+        assert "at least 0.5 is inside" in caplog.text
+
+    @pytest.mark.parametrize("voxels", [np.arange(8.0), np.linspace(0, 0.4, 8), np.linspace(0, 100, 8)])
+    def test_anything_else_is_refused(self, tmp_path, voxels):
+        with pytest.raises(ValueError, match="expected two values, or probabilities"):
+            load_mask(write(tmp_path / "a.nii", voxels.reshape(2, 2, 2)))
 
 
 class TestSameGrid:
@@ -251,3 +271,26 @@ class TestSameSpace:
     def test_refuses_images_apart(self):
         with pytest.raises(ValueError, match=r"the moving image covers 0% of the fixed one.*\[-18.0, 9.5, 4.5\]"):
             check_same_space(some_image(), some_image(affine_of(origin=(500.0, 0, 0))), ("fixed", "moving"))
+
+
+class TestOnGridOf:
+    def test_another_order_of_axes_is_the_same_voxels(self, caplog):
+        image = some_image()
+        turned = Image(image.voxels.transpose(2, 0, 1)[::-1], image.affine @ TURNED)
+        np.testing.assert_array_equal(on_grid_of(image, turned).voxels, image.voxels)
+        assert not caplog.records
+
+    def test_takes_the_nearest_voxel_and_says_so(self, caplog):
+        image = some_image()
+        fine = Image(np.kron(image.voxels, np.ones((3, 3, 3))), image.affine @ THIRDS)
+        np.testing.assert_array_equal(on_grid_of(image, fine, ("fixed", "label")).voxels, image.voxels)
+        assert "the label image lies on another grid than the fixed one" in caplog.text
+
+    def test_refuses_images_apart(self):
+        with pytest.raises(ValueError, match="covers 0%"):
+            on_grid_of(some_image(), some_image(affine_of(origin=(500.0, 0, 0))))
+
+
+# Voxels of (z reversed, x, y), and of thirds, as voxels of the image.
+TURNED = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, SHAPE[2] - 1], [0, 0, 0, 1.0]])
+THIRDS = np.array([[1 / 3, 0, 0, -1 / 3], [0, 1 / 3, 0, -1 / 3], [0, 0, 1 / 3, -1 / 3], [0, 0, 0, 1.0]])

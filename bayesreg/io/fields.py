@@ -1,0 +1,110 @@
+"""Displacement fields on a grid, in files, by the conventions of those who write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.image import Image
+from bayesreg.io.readers import Volume, from_itk, read_volume
+from bayesreg.io.volumes import write_nifti
+from bayesreg.types import AnyArray, InputError
+
+SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".h5", ".tfm")
+TRANSFORM_SUFFIXES = (".h5", ".tfm")
+# Codes of NIfTI's intents: displacement vectors, as FreeSurfer has them in RAS; vectors, as ITK has them in LPS; and
+# FSL's, in coordinates of its own.
+DISPLACEMENT_INTENT, VECTOR_INTENT, FSL_INTENTS = 1006, 1007, range(2001, 2020)
+TO_RAS = np.array([-1.0, -1.0, 1.0])
+
+
+def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affine: Float[AnyArray, "4 4"]) -> None:
+    """Write a displacement field that ITK, ANTs and nitransforms read as a resampling transform.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .nii or .nii.gz.
+    field : (X, Y, Z, 3) array
+        Displacement at every voxel centre, mm, world RAS. The file holds it as (X, Y, Z, 1, 3) with intent
+        1007 (vector), its values in LPS.
+    affine : (4, 4) array
+        Voxel index to world RAS, mm.
+    """
+    lps = np.asarray(field, np.float32) * TO_RAS.astype(np.float32)
+    write_nifti(lps[:, :, :, None], affine, Path(path), intent=VECTOR_INTENT)
+
+
+def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
+    """Read a displacement field; the inverse of `save_displacement`.
+
+    A NIfTI header tells who has written it. ITK and ANTs (intent 1007, or none) have displacements in LPS; FreeSurfer
+    (intent 1006) and NiftyReg ("NREG_TRANS", first parameter 1) have them in RAS; SPM (named "Mapping") and NiftyReg
+    (first parameter 0) have the places in RAS where the voxels go, from which the displacement is taken. NRRD,
+    MetaImage and ITK's transforms (.h5, .tfm) hold LPS.
+
+    Parameters
+    ----------
+    path : path
+        Vectors in mm, of shape (X, Y, Z, 1, 3) or (X, Y, Z, 3).
+
+    Returns
+    -------
+    three Images
+        Components along x, y and z, mm, world RAS.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is no field or damaged, or is of a kind that is not known.
+    """
+    path = Path(path)
+    volume = _transform_field(path) if path.name.endswith(TRANSFORM_SUFFIXES) else read_volume(path)
+    shape = volume.voxels.shape
+    if shape[3:] not in ((1, 3), (3,)):
+        raise InputError(
+            f"{path} is no displacement field: expected the shape (X, Y, Z, 1, 3) or (X, Y, Z, 3), vectors in mm, got "
+            f"{shape}"
+        )
+    vectors = np.asarray(volume.voxels, float).reshape(*shape[:3], 3)
+    try:
+        grid = Image(np.zeros(shape[:3], np.int8), volume.affine)
+        x, y, z = np.moveaxis(_displacements(vectors, grid, volume, path), -1, 0)
+        return grid.with_voxels(x), grid.with_voxels(y), grid.with_voxels(z)
+    except ValueError as error:
+        raise InputError(f"displacement field {path}: {error}") from error
+
+
+def _displacements(
+    vectors: Float[np.ndarray, "X Y Z 3"], grid: Image, volume: Volume, path: Path
+) -> Float[np.ndarray, "X Y Z 3"]:
+    """In world RAS, mm, by what the header says of the vectors."""
+    if volume.header is None or "intent_code" not in volume.header:
+        return vectors * TO_RAS
+    code, name = int(volume.header["intent_code"]), str(volume.header.get_intent("code")[2])
+    first = float(volume.header["intent_p1"])
+    if code in FSL_INTENTS:
+        raise InputError("FSL's fields and coefficients are in coordinates of its own; convert it to ITK's convention")
+    if name.startswith("NREG"):
+        if name != "NREG_TRANS" or first not in (0, 1):
+            raise InputError(f"NiftyReg's {name} of kind {first:g} is no field of positions or displacements")
+        return vectors if first == 1 else vectors - grid.grid_points()
+    if name == "Mapping":
+        return vectors - grid.grid_points()
+    return vectors if code == DISPLACEMENT_INTENT else vectors * TO_RAS
+
+
+def _transform_field(path: Path) -> Volume:
+    """The displacement field of one of ITK's transforms."""
+    import SimpleITK
+
+    if not path.is_file():
+        raise InputError(f"displacement field {path}: there is no such file")
+    try:
+        transform = SimpleITK.ReadTransform(str(path))
+        field = SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
+    except RuntimeError as error:
+        raise InputError(f"{path} holds no displacement field of ITK's: {str(error).splitlines()[-1]}") from error
+    return from_itk(field)

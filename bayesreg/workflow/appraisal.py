@@ -1,0 +1,158 @@
+"""What can be said of a pair of images and its labels before any search: overlap, likeness, scale, millilitres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.image import Image
+from bayesreg.tissues import is_fluid, label_of
+
+# Voxels that are looked at; bins of each image in the joint histogram.
+VOXELS, BINS = 200_000, 32
+# Aligned images of one contrast correlate by more: by 0.62 where tissue has moved by 4 mm in the mean and 10 at most.
+ALIKE = 0.5
+# Scales of intensities that differ by a greater factor are no accident.
+SCALES = 2.0
+# Shares that are worth a sentence: of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
+BEYOND, LEFT_OUT = 0.01, 0.05
+
+
+class Appraisal(NamedTuple):
+    """What is known of a pair before any search.
+
+    Attributes
+    ----------
+    millilitres : mapping
+        By tissue, inside and outside of Ω.
+    likeness : Likeness or None
+        None without a pair of images from files.
+    beware : tuple of str
+        What a user should know, a sentence each.
+    """
+
+    millilitres: Mapping[str, tuple[float, float]]
+    likeness: Likeness | None
+    beware: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """As mappings and lists, for files."""
+        likeness = None if self.likeness is None else self.likeness._asdict()
+        return {"millilitres": dict(self.millilitres), "likeness": likeness, "beware": list(self.beware)}
+
+
+class Likeness(NamedTuple):
+    """How alike two images are in Ω as they lie.
+
+    Attributes
+    ----------
+    correlation : float
+        Pearson's.
+    mutual_information : float
+        2 I / (H_fixed + H_moving), from 0 to 1.
+    scale_ratio : float
+        Range of the moving image over that of the fixed one, between the 0.5 and 99.5 % quantiles.
+    on_grid : float
+        The share of Ω that lies on the grid of the moving image.
+    """
+
+    correlation: float
+    mutual_information: float
+    scale_ratio: float
+    on_grid: float
+
+    def sentences(self, one_scale: bool) -> list[str]:
+        """What a user should know; nothing where all is well. `one_scale`: both images are on one scale."""
+        found = []
+        if self.on_grid < 1 - BEYOND:
+            found.append(
+                f"{1 - self.on_grid:.0%} of the organ lies beyond the grid of the moving image, where nothing is seen."
+            )
+        if self.correlation < -ALIKE / 2:
+            found.append(
+                f"Bright and dark change places between the images (correlation {self.correlation:.2f}): they are not "
+                "of one contrast; choose model.similarity: lncc."
+            )
+        elif self.correlation < ALIKE:
+            found.append(
+                f"The images are hardly alike as they lie: correlation {self.correlation:.2f}, normalised mutual "
+                f"information {self.mutual_information:.2f}. If they are of one contrast, they are not aligned, or the "
+                "axes of one are mistaken; if they are not, choose model.similarity: lncc."
+            )
+        if one_scale and not 1 / SCALES < self.scale_ratio < SCALES:
+            found.append(
+                f"The intensities of the moving image range {self.scale_ratio:.2g} times as far as those of the fixed "
+                "one; data.same_contrast: false scales each on its own."
+            )
+        return found
+
+
+def appraise(
+    tissue: Image, domain: Image, names: tuple[str, ...], pair: tuple[Image, Image] | None, one_scale: bool
+) -> Appraisal:
+    """Appraise labels and, where there is one, a pair of images (fixed, moving); see `Likeness.sentences`."""
+    millilitres = measure_tissues(tissue, domain, names)
+    likeness = None if pair is None else compare_images(*pair, domain)
+    told = [] if likeness is None else likeness.sentences(one_scale)
+    return Appraisal(millilitres, likeness, (*explain_left_out(millilitres), *told))
+
+
+def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
+    """Compare two images in Ω, at up to `VOXELS` of its voxels evenly spread.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+        On grids of their own in one world space.
+    domain : Image
+        Not zero in Ω, on the grid of the fixed image.
+    """
+    inside = np.argwhere(np.asarray(domain.voxels) != 0)
+    inside = inside[:: max(1, len(inside) // VOXELS)]
+    places = domain.voxel_to_world(inside)
+    seen = np.asarray(moving.contains(places))
+    if seen.sum() < 2:
+        return Likeness(0.0, 0.0, 1.0, float(seen.mean()))
+    one = np.asarray(fixed.voxels, float)[tuple(inside[seen].T)]
+    other = np.asarray(moving.interpolate(places[seen]))
+    ranges = [np.subtract(*np.quantile(values, (0.995, 0.005))) for values in (one, other)]
+    if min(ranges) <= 0:
+        return Likeness(0.0, 0.0, 1.0, float(seen.mean()))
+    correlation = float(np.corrcoef(one, other)[0, 1])
+    return Likeness(correlation, _mutual_information(one, other), float(ranges[1] / ranges[0]), float(seen.mean()))
+
+
+def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Millilitres of every tissue inside and outside of Ω, both on one grid."""
+    voxels, inside = np.asarray(tissue.voxels), np.asarray(domain.voxels) != 0
+    millilitre = tissue.voxel_volume / 1e3
+    counted = ((voxels == index) for index in range(1, len(names) + 1))
+    return {
+        name: (float((own & inside).sum() * millilitre), float((own & ~inside).sum() * millilitre))
+        for name, own in zip(names, counted, strict=True)
+    }
+
+
+def explain_left_out(millilitres: Mapping[str, tuple[float, float]]) -> list[str]:
+    """A sentence on every solid tissue of which Ω leaves out more than `LEFT_OUT`."""
+    return [
+        f"{outside:.0f} of {inside + outside:.0f} ml of {label_of(name)} lie outside the region to mesh, which leaves "
+        "them out."
+        for name, (inside, outside) in millilitres.items()
+        if not is_fluid(name) and outside > LEFT_OUT * (inside + outside)
+    ]
+
+
+def _mutual_information(one: Float[np.ndarray, "points"], other: Float[np.ndarray, "points"]) -> float:
+    bounds = [np.quantile(values, (0.005, 0.995)) for values in (one, other)]
+    joint, _, _ = np.histogram2d(np.clip(one, *bounds[0]), np.clip(other, *bounds[1]), bins=BINS)
+    entropies = [_entropy(joint.sum(axis=1)), _entropy(joint.sum(axis=0)), _entropy(joint.ravel())]
+    return float(2 * (entropies[0] + entropies[1] - entropies[2]) / (entropies[0] + entropies[1]))
+
+
+def _entropy(counts: Float[np.ndarray, "bins"]) -> float:
+    shares = counts[counts > 0] / counts.sum()
+    return float(-(shares * np.log(shares)).sum())

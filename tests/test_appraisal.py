@@ -1,0 +1,73 @@
+"""What is said of a pair before any search: each way in which it can be wrong has its sentence."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.workflow.appraisal import appraise, compare_images
+
+AFFINE = np.diag([2.0, 2.0, 2.0, 1.0])
+SHAPE = (60, 50, 40)
+RADIUS = np.linalg.norm((np.indices(SHAPE).T - (29.5, 24.5, 19.5)) / (26, 20, 16), axis=-1).T
+DOMAIN = Image((RADIUS < 1).astype(np.uint8), AFFINE)
+TISSUE = Image(np.where(RADIUS < 0.5, 2, 1) * np.asarray(DOMAIN.voxels, np.int8), AFFINE)
+TEXTURE = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=SHAPE), 3.0)
+FIXED = Image(TEXTURE / TEXTURE.std() + 3 * (RADIUS < 0.5), AFFINE)
+
+
+def moved_by(millimetres):
+    affine = AFFINE.copy()
+    affine[0, 3] = millimetres
+    return Image(FIXED.voxels, affine)
+
+
+def told(moving, one_scale=True):
+    return " ".join(appraise(TISSUE, DOMAIN, ("gm", "wm"), (FIXED, moving), one_scale).beware)
+
+
+@pytest.mark.parametrize(
+    "moving", [FIXED, moved_by(3.0), FIXED.with_voxels(1.5 * FIXED.voxels + 300)], ids=["same", "near", "scaled"]
+)
+def test_a_sound_pair_has_no_sentence(moving):
+    assert told(moving) == ""
+
+
+@pytest.mark.parametrize(
+    ("moving", "sentence"),
+    [
+        (Image(FIXED.voxels.transpose(2, 1, 0)[::-1], AFFINE), "axes of one are mistaken"),
+        (moved_by(60.0), "they are not aligned"),
+        (FIXED.with_voxels(-FIXED.voxels), "Bright and dark change places"),
+        (Image(FIXED.voxels[:, :, :20], AFFINE), "50% of the organ lies beyond the grid of the moving image"),
+        (FIXED.with_voxels(4 * FIXED.voxels + 300), "range 4 times as far"),
+    ],
+    ids=["axes", "moved", "inverted", "slab", "scale"],
+)
+def test_each_fault_has_its_sentence(moving, sentence):
+    assert sentence in told(moving)
+
+
+def test_scales_of_their_own_may_differ():
+    assert told(FIXED.with_voxels(4 * FIXED.voxels + 300), one_scale=False) == ""
+
+
+def test_likeness_of_what_it_is_known_for():
+    likeness = compare_images(FIXED, FIXED, DOMAIN)
+    assert likeness.correlation == pytest.approx(1)
+    assert likeness.mutual_information == pytest.approx(1)
+    assert likeness.scale_ratio == pytest.approx(1)
+    noise = FIXED.with_voxels(np.random.default_rng(1).normal(size=SHAPE))
+    assert abs(compare_images(FIXED, noise, DOMAIN).correlation) < 0.03
+    assert compare_images(FIXED, noise, DOMAIN).mutual_information < 0.02
+
+
+def test_tissue_outside_the_region_is_told_in_millilitres():
+    smaller = DOMAIN.with_voxels((RADIUS < 0.9).astype(np.uint8))
+    found = appraise(TISSUE, smaller, ("gm", "wm"), None, one_scale=True)
+    inside, outside = found.millilitres["gm"]
+    assert inside + outside == pytest.approx((TISSUE.voxels == 1).sum() * 8 / 1000)
+    assert found.millilitres["wm"][1] == 0
+    assert found.beware == (
+        f"{outside:.0f} of {inside + outside:.0f} ml of GM lie outside the region to mesh, which leaves them out.",
+    )
