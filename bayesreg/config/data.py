@@ -60,7 +60,7 @@ class FilesData(Section):
     labels: Annotated[FoundFile | None, Field(validate_default=True)] = None
     """Tissue labels of the fixed image; null takes the tissues of mesh.file."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
-    """Values of the label file by tissue: any names, any number of them; background is what belongs to no tissue."""
+    """Values of the label file by tissue, background being what belongs to none; or fast, freesurfer or brainweb."""
     intracranial: FoundFile | None = None
     """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion."""
     same_contrast: StrictBool = True

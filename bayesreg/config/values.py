@@ -10,6 +10,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
+from bayesreg.label_tables import TABLES
 from bayesreg.types import DATA_FOLDER
 
 
@@ -105,7 +106,16 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
     return table
 
 
-LabelTable = Annotated[dict[str, Labels], AfterValidator(_table)]
+def _named_table(value: object) -> object:
+    """The table of a program by its name; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    if value not in TABLES:
+        raise ValueError(f"there is no label table {value!r}; expected {', '.join(TABLES)}, or labels by tissue")
+    return dict(TABLES[value])
+
+
+LabelTable = Annotated[dict[str, Labels], AfterValidator(_table), BeforeValidator(_named_table)]
 ByTissue = dict[str, Positive]
 
 

@@ -24,12 +24,12 @@ from bayesreg.io.volumes import (
     load_mask,
     on_grid_of,
 )
+from bayesreg.label_tables import TABLES
 from bayesreg.tissues import BRAIN, tissue_names
 from bayesreg.types import DATA_FOLDER, InputError
 
 __all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152"]
 
-BRAINWEB_TABLE: dict[str, tuple[int, ...]] = dict(zip(BRAIN, ((1,), (2, 8), (3,)), strict=True))
 BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
 # How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
 MNI152_SKULL = 3.0
@@ -106,7 +106,7 @@ def brainweb(
     """
     labels_path = _data_file(labels_path, "brainweb_crisp_1mm.nii.gz")
     t1 = load_image(_data_file(t1_path, "colin27_t1_1mm_unedited.nii.gz"))
-    tissue = load_labels(labels_path, BRAINWEB_TABLE)
+    tissue = load_labels(labels_path, TABLES["brainweb"])
     check_same_grid(t1, tissue, ("T1", "label"))
     inside = load_labels(labels_path, {"intracranial": tuple(intracranial_labels)})
     mask = main_part(np.asarray(inside.voxels) != 0, "intracranial mask")
