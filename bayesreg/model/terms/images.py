@@ -36,6 +36,8 @@ NOTHING: Values = MappingProxyType({})
 class ImagePair:
     """Two images; how they are compared, and what their contrasts may be, stands in `ModelConfig.similarity`.
 
+    Points that rest beyond the grid of the moving image say nothing.
+
     Attributes
     ----------
     fixed, moving : Image
@@ -73,7 +75,7 @@ class ImagePair:
         of_pair = "" if self.name == "images" else f" of {self.name!r}"
         require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
         require_overlap(mesh, self.moving, f"moving image{of_pair}")
-        quadrature = quadrature_of(mesh, self.fixed, model)
+        quadrature = seen_points(mesh, quadrature_of(mesh, self.fixed, model), self.moving)
         positions = quadrature.positions(mesh)
         smooth = self.smoothed_as(model)
         moving = smooth.moving.interpolator(model.interpolation)
@@ -106,7 +108,7 @@ class ImagePair:
 
     def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
         """The term with the images compared at four points of every tetrahedron, without a shading."""
-        quadrature = gauss_quadrature(mesh, "gauss4")
+        quadrature = seen_points(mesh, gauss_quadrature(mesh, "gauss4"), self.moving)
         positions = quadrature.positions(mesh)
         return term._replace(
             similarity=term.similarity.at(positions),
@@ -409,3 +411,15 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
     if model.most_points is not None and len(kept) > model.most_points:
         kept = np.sort(np.random.default_rng(0).choice(kept, model.most_points, replace=False))
     return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))
+
+
+def seen_points(mesh: TetMesh, quadrature: Quadrature, moving: Image) -> Quadrature:
+    """The points that rest on the grid of the moving image: what lies beyond it has not been seen.
+
+    Which points count must not depend on the displacement: a posterior could do without those that do not fit.
+    """
+    seen = moving.contains(quadrature.positions(mesh))
+    if seen.all():
+        return quadrature
+    kept = (np.asarray(part)[seen] for part in (quadrature.cells, quadrature.barycentric, quadrature.weights))
+    return quadrature_at(mesh, *kept)
