@@ -44,6 +44,18 @@ app = typer.Typer(
 )
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]
+FixedImage = Annotated[Path, typer.Argument(metavar="FIXED", help="Pre-operative image, a file or a DICOM folder.")]
+MovingImage = Annotated[Path, typer.Argument(metavar="MOVING", help="Intra-operative image.")]
+LabelFile = Annotated[Path, typer.Option("--labels", metavar="FILE", help="Tissue labels of FIXED.")]
+Table = Annotated[
+    str | None,
+    typer.Option(
+        "--table",
+        metavar="NAME|FILE",
+        help="Label table: fast, freesurfer, brainweb, or a YAML file; recognised if left out.",
+    ),
+]
+Mask = Annotated[Path | None, typer.Option("--intracranial", metavar="FILE", help="Mask of where the organ may go.")]
 OutFolder = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
 RunFolders = Annotated[list[Path], typer.Argument(metavar="DIR DIR...", help="Folders of two or more runs.")]
@@ -92,13 +104,27 @@ def run(
         from bayesreg.inference.chains.devices import join
 
         join(**settings.distributed.model_dump())
-    from bayesreg.workflow.run import run
+    _sample(settings, out, resume, quiet)
 
-    result = run(settings, out, resume=resume, progress=not quiet)
-    typer.echo(f"Report: {Path(result.folder) / 'report.html'}")
-    if result.converged is False:
-        typer.echo("Not converged; the results are written, and the report says how far it came.")
-        raise typer.Exit(NOT_CONVERGED)
+
+@app.command()
+def register(
+    fixed: FixedImage,
+    moving: MovingImage,
+    out: OutFolder,
+    labels: LabelFile,
+    table: Table = None,
+    intracranial: Mask = None,
+    overrides: Overrides = None,
+    resume: Resume = False,
+    quiet: Quiet = False,
+) -> None:
+    """Sample the posterior of a pair in files, without a configuration; DIR/config.yaml holds the one that was used."""
+    from bayesreg.workflow.register import understand
+
+    understood = understand(fixed, moving, labels, table, intracranial, overrides or ())
+    typer.echo("\n".join(understood.lines))
+    _sample(understood.config, out, resume, quiet)
 
 
 @app.command()
@@ -187,3 +213,14 @@ def schema() -> None:
 def main() -> None:
     """Entry point of the `bayesreg` command."""
     app()
+
+
+def _sample(config: Any, out: Path, resume: bool, quiet: bool) -> None:
+    """Run a configuration, name the report, and end with the status of its convergence."""
+    from bayesreg.workflow.run import run
+
+    result = run(config, out, resume=resume, progress=not quiet)
+    typer.echo(f"Report: {Path(result.folder) / 'report.html'}")
+    if result.converged is False:
+        typer.echo("Not converged; the results are written, and the report says how far it came.")
+        raise typer.Exit(NOT_CONVERGED)

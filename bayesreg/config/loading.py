@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,12 +54,38 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     ConfigError
         Naming every error with its place, the value and what was expected.
     """
-    document = _override(_read(Path(path), ()), overrides)
+    return _validated(_override(_read(Path(path), ()), overrides), f"the configuration {path}")
+
+
+def make_config(sections: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
+    """Complete and check a configuration that is in no file.
+
+    Parameters
+    ----------
+    sections : mapping
+        What a file would hold.
+    overrides : sequence of str
+        As in `load_config`.
+
+    Raises
+    ------
+    ConfigError
+        As `load_config`.
+    """
+    return _validated(_override(_Document(dict(sections), {}, ()), overrides), "what was asked for")
+
+
+def read_mapping(path: str | Path) -> dict[str, Any]:
+    """The keys and values of a YAML file; ConfigError if it holds none."""
+    return _read(Path(path), ()).data
+
+
+def _validated(document: _Document, title: str) -> Config:
     try:
         return Config.model_validate(document.data, context={"folders": search_folders(*document.folders)})
     except ValidationError as error:
         reasons = explain(error, Config, document.data, document.origins)
-        raise ConfigError(f"the configuration {path} cannot be run:\n{reasons}") from None
+        raise ConfigError(f"{title} cannot be run:\n{reasons}") from None
 
 
 def resolved_yaml(config: Config) -> str:

@@ -1,0 +1,89 @@
+"""`bayesreg register`: what it understands of paths alone, and what it says before it begins."""
+
+from types import SimpleNamespace
+
+import nibabel as nib
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bayesreg.cli import app
+from bayesreg.label_tables import TABLES
+
+SHAPE = (24, 20, 16)
+
+
+@pytest.fixture
+def register(tmp_path, monkeypatch):
+    """Calls the command with files of a pair; what it would run is kept in `calls`."""
+    calls = []
+
+    def run(config, out, resume=False, progress=True):
+        calls.append((config, out, resume, progress))
+        return SimpleNamespace(converged=True, folder=out)
+
+    monkeypatch.setattr("bayesreg.workflow.run.run", run)
+    voxels = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
+    labels = (np.arange(np.prod(SHAPE)).reshape(SHAPE) % 4).astype(np.uint8)
+    for name, content in {
+        "fixed": voxels,
+        "moving": voxels,
+        "labels": labels,
+        "odd": labels * 30,
+        "mask": labels > 0,
+    }.items():
+        nib.save(
+            nib.Nifti1Image(content.astype(np.float32), np.diag([1.0, 1.0, 2.5, 1.0])), tmp_path / f"{name}.nii.gz"
+        )
+
+    def call(*arguments):
+        given = [str(tmp_path / f"{name}.nii.gz") for name in ("fixed", "moving")]
+        return CliRunner().invoke(app, ["register", *given, *arguments, "-o", str(tmp_path / "out")])
+
+    return SimpleNamespace(call=call, calls=calls, path=lambda name: str(tmp_path / f"{name}.nii.gz"), folder=tmp_path)
+
+
+def test_paths_are_enough_and_what_was_understood_is_said_first(register):
+    result = register.call("--labels", register.path("labels"), "--intracranial", register.path("mask"))
+    assert result.exit_code == 0, result.output
+    config, out, _, progress = register.calls[0]
+    assert (out, progress) == (register.folder / "out", True)
+    assert config.data.label_table == TABLES["fast"]
+    assert str(config.data.intracranial) == register.path("mask")
+    assert config.model.preset == "registration"
+    lines = result.output.splitlines()
+    assert lines[0].endswith("fixed.nii.gz: 24 × 20 × 16 voxels of 1 × 1 × 2.5 mm")
+    assert "fast, which fits the values: csf 1; gm 2; wm 3" in result.output
+    assert lines[-1] == f"Report: {register.folder / 'out' / 'report.html'}"
+
+
+def test_a_table_is_named_or_lies_in_a_file(register):
+    (register.folder / "table.yaml").write_text("{csf: 30, brain: [60, 90]}")
+    result = register.call("--labels", register.path("odd"), "--table", str(register.folder / "table.yaml"), "-q")
+    assert result.exit_code == 0, result.output
+    assert register.calls[0][0].data.tissues == ("csf", "brain")
+    assert register.call("--labels", register.path("labels"), "--table", "brainweb").exit_code == 0
+    assert register.calls[1][0].data.label_table == TABLES["brainweb"]
+
+
+def test_options_are_set_as_in_run(register):
+    register.call("--labels", register.path("labels"), "--set", "stop.max_minutes=3", "--set", "model.similarity=lncc",
+                  "--set", "model.intensity_map=null")  # fmt: skip
+    config = register.calls[0][0]
+    assert (config.stop.max_minutes, config.model.similarity) == (3, "lncc")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["odd"], "no label table fits the labels in"),
+        (["odd", "--table", "fats"], "--table fats: neither a file nor one of fast, freesurfer, brainweb"),
+        (["gone"], "there is no such file"),
+        (["labels", "--set", "stop.max_hours=3"], "what was asked for cannot be run"),
+    ],
+)
+def test_a_mistake_is_one_message(register, arguments, part):
+    result = register.call("--labels", register.path(arguments[0]), *arguments[1:])
+    assert result.exit_code == 2, result.output
+    assert part in result.stderr
+    assert not register.calls
