@@ -14,6 +14,9 @@ from bayesreg.io.fields import SUFFIXES, load_displacement
 from bayesreg.mesh import TetMesh
 from bayesreg.types import InputError
 
+# A field ends where zeros beside a place take away more than this of it, mm.
+ENDS = 0.25
+
 
 def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
     """Named nodal arrays of a mesh file; InputError where one is missing."""
@@ -71,7 +74,7 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
     ------
     InputError
         If the file holds no displacement or one for another mesh, the field's grid does not reach the boundary,
-        or the field ends there: it is zero on one side.
+        or the field ends there: it jumps to zero.
     """
     if not _is_volume(path):
         return read_displacement(path, mesh)[mesh.boundary]
@@ -84,15 +87,17 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
             f"they lie off its grid, the first at {places[off_grid][0].round(1).tolist()} mm"
         )
     defined = components[0].with_voxels(np.any([np.asarray(one.voxels) != 0 for one in components], axis=0) * 1.0)
-    share = np.asarray(defined.interpolate(places))
-    ends = (share > 1e-9) & (share < 1 - 1e-9)
+    found = np.stack([np.asarray(one.interpolate(places)) for one in components], axis=1)
+    # Zeros beside a place halve what is interpolated there, unless the field itself goes to zero.
+    share = np.maximum(np.asarray(defined.interpolate(places)), 1e-9)
+    ends = np.linalg.norm(found, axis=1) * (1 - share) / share > ENDS
     if ends.any():
         raise InputError(
             f"the displacement field {path} ends at {int(ends.sum())} of the {len(places)} boundary nodes: it is zero "
             f"in voxels beside them, first at {places[ends][0].round(1).tolist()} mm, as where it is known inside the "
             "organ alone; give one that goes on beyond the boundary, or a run's mesh.vtu"
         )
-    return np.stack([np.asarray(one.interpolate(places)) for one in components], axis=1)
+    return found
 
 
 def _is_volume(path: Path) -> bool:

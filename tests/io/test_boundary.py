@@ -62,6 +62,19 @@ def test_a_field_that_ends_at_the_boundary_is_refused(tmp_path):
         read_boundary(tmp_path / "mean.nii.gz", MESH)
 
 
+def test_a_field_that_goes_to_zero_by_itself_is_taken(tmp_path):
+    """A base that rests: zero below some height, and from there on growing with it."""
+    image = grid()
+
+    def rising(points):
+        return np.maximum(points @ [0.0, 0.0, 0.02], 0.0)[..., None] * SHIFT
+
+    save_displacement(tmp_path / "u.nii.gz", rising(image.grid_points()), image.affine)
+    expected = rising(MESH.points[MESH.boundary])
+    assert (expected == 0).any()
+    np.testing.assert_allclose(read_boundary(tmp_path / "u.nii.gz", MESH), expected, atol=0.1)
+
+
 def test_a_field_on_a_smaller_grid_is_refused(tmp_path):
     image = grid(margin=-15.0)
     save_displacement(tmp_path / "small.nii.gz", affine_field(image.grid_points()), image.affine)
