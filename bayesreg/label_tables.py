@@ -34,11 +34,14 @@ TABLES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
 }
 
 
+# Labels by which a table is known: others have some of its values, too.
+_MARKS = {"fast": {1, 2, 3}, "freesurfer": {2, 3, 41, 42}, "brainweb": {1, 2, 3, 8}}
+
+
 def recognise_table(values: Iterable[int]) -> str | None:
-    """The first table that lists all of some values of a label file, zero aside, and has each of its tissues there."""
+    """The first table that lists all of some values of a label file, zero aside, and whose marks are among them."""
     found = set(values) - {0}
     for name, table in TABLES.items():
-        tissues = [entry for tissue, entry in table.items() if tissue != BACKGROUND]
-        if found <= {value for entry in table.values() for value in entry} and all(found & set(one) for one in tissues):
+        if _MARKS[name] <= found <= {value for entry in table.values() for value in entry}:
             return name
     return None

@@ -22,12 +22,12 @@ def moved_by(millimetres):
     return Image(FIXED.voxels, affine)
 
 
-def told(moving, one_scale=True):
-    return " ".join(appraise(TISSUE, DOMAIN, ("gm", "wm"), (FIXED, moving), one_scale).beware)
+def told(moving, **options):
+    return " ".join(appraise(TISSUE, DOMAIN, ("gm", "wm"), (FIXED, moving), **options).beware)
 
 
 @pytest.mark.parametrize(
-    "moving", [FIXED, moved_by(3.0), FIXED.with_voxels(1.5 * FIXED.voxels + 300)], ids=["same", "near", "scaled"]
+    "moving", [FIXED, moved_by(3.0), FIXED.with_voxels(1.5 * FIXED.voxels + 0.5)], ids=["same", "near", "scaled"]
 )
 def test_a_sound_pair_has_no_sentence(moving):
     assert told(moving) == ""
@@ -41,8 +41,10 @@ def test_a_sound_pair_has_no_sentence(moving):
         (FIXED.with_voxels(-FIXED.voxels), "Bright and dark change places"),
         (Image(FIXED.voxels[:, :, :20], AFFINE), "50% of the organ lies beyond the grid of the moving image"),
         (FIXED.with_voxels(4 * FIXED.voxels + 300), "range 4 times as far"),
+        (FIXED.with_voxels(FIXED.voxels + 300), "ranges from them"),
+        (FIXED.with_voxels(np.zeros(SHAPE)), "hardly alike"),
     ],
-    ids=["axes", "moved", "inverted", "slab", "scale"],
+    ids=["axes", "moved", "inverted", "slab", "scale", "offset", "constant"],
 )
 def test_each_fault_has_its_sentence(moving, sentence):
     assert sentence in told(moving)
@@ -50,6 +52,10 @@ def test_each_fault_has_its_sentence(moving, sentence):
 
 def test_scales_of_their_own_may_differ():
     assert told(FIXED.with_voxels(4 * FIXED.voxels + 300), one_scale=False) == ""
+
+
+def test_contrasts_of_their_own_may_differ():
+    assert told(FIXED.with_voxels(-FIXED.voxels), one_contrast=False, one_scale=False) == ""
 
 
 def test_likeness_of_what_it_is_known_for():
@@ -64,10 +70,10 @@ def test_likeness_of_what_it_is_known_for():
 
 def test_tissue_outside_the_region_is_told_in_millilitres():
     smaller = DOMAIN.with_voxels((RADIUS < 0.9).astype(np.uint8))
-    found = appraise(TISSUE, smaller, ("gm", "wm"), None, one_scale=True)
+    found = appraise(TISSUE, smaller, ("gm", "wm"), None)
     inside, outside = found.millilitres["gm"]
     assert inside + outside == pytest.approx((TISSUE.voxels == 1).sum() * 8 / 1000)
     assert found.millilitres["wm"][1] == 0
     assert found.beware == (
-        f"{outside:.0f} of {inside + outside:.0f} ml of GM lie outside the region to mesh, which leaves them out.",
+        f"{outside:.3g} of {inside + outside:.3g} ml of GM lie outside the region to mesh, which leaves them out.",
     )

@@ -27,6 +27,9 @@ def test_every_value_has_one_tissue(table):
         ([0, *SYNTHSEG], "freesurfer"),
         ([0, 1, 2, 3, 77777], None),
         ([0, 1], None),
+        # Atropos: CSF, GM, WM, deep GM, brainstem, cerebellum.
+        (range(7), None),
+        ([2, 3, 4], None),
     ],
 )
 def test_a_table_is_recognised_by_the_values(values, name):

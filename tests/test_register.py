@@ -73,6 +73,13 @@ def test_options_are_set_as_in_run(register):
     assert (config.stop.max_minutes, config.model.similarity) == (3, "lncc")
 
 
+def test_what_is_said_is_what_was_set(register):
+    result = register.call("--labels", register.path("labels"), "--set", f"data.intracranial={register.path('mask')}",
+                           "--set", "data.label_table={csf: 1, gm: [2, 3]}")  # fmt: skip
+    assert f"mask        {register.path('mask')}" in result.output
+    assert "csf 1; gm 2, 3" in result.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

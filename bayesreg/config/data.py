@@ -57,11 +57,11 @@ class FilesData(Section):
     """Pre-operative image, a file or a DICOM folder; null where only other observations are to be used."""
     moving: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Intra-operative image."""
-    labels: Annotated[FoundFile | None, Field(validate_default=True)] = None
+    labels: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Tissue labels of the fixed image; null takes the tissues of mesh.file."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
     """Values of the label file by tissue, background being what belongs to none; or fast, freesurfer or brainweb."""
-    intracranial: FoundFile | None = None
+    intracranial: FoundImage | None = None
     """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion."""
     same_contrast: StrictBool = True
     """Scale the intensities of both images by one common scale."""

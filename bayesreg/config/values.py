@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from bayesreg.label_tables import TABLES
+from bayesreg.tissues import BACKGROUND, tissue_names
 from bayesreg.types import DATA_FOLDER
 
 
@@ -92,13 +93,19 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
     """Refuse names that are none, the background, and a label of two tissues."""
     if not table:
         raise ValueError("expected at least one tissue with its labels, such as liver: 1")
+    if not 0 < len(tissue_names(table)) < 128:
+        raise ValueError("expected at least one tissue besides the background, and at most 127")
     owners: dict[int, str] = {}
     for name, labels in table.items():
+        if name.lower() == BACKGROUND and name != BACKGROUND:
+            raise ValueError(f"{name!r} is no name of a tissue; what belongs to none is {BACKGROUND}, in small letters")
         if not name.isidentifier():
             raise ValueError(f"{name!r} is no name of a tissue; expected letters, digits and _, such as left_lobe")
         if name == "all":
             raise ValueError("all stands for all tissues; expected another name")
         for label in labels:
+            if abs(label) >= 2**31:
+                raise ValueError(f"label {label} of {name} has more than 32 bits")
             if label == 0:
                 raise ValueError(f"label 0 is the background, and cannot belong to {name}")
             if owners.setdefault(label, name) != name:

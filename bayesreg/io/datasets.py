@@ -142,6 +142,9 @@ def from_files(
     if image_path is not None:
         image = load_image(image_path)
         tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"))
+        names, present = tissue_names(label_table), np.unique(tissue.voxels)
+        if lost := [name for index, name in enumerate(names, start=1) if index not in present]:
+            raise InputError(f"no voxel of {' and '.join(lost)} in {labels_path} lies on the grid of {image_path}")
     if intracranial_path is None:
         return Anatomy(image, tissue, None, tissue_names(label_table))
     mask = _on_grid(tissue, labels_path, load_mask(intracranial_path), intracranial_path, ("label", "intracranial"))

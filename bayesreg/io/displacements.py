@@ -101,7 +101,7 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
 
 
 def _is_volume(path: Path) -> bool:
-    return path.name.endswith(SUFFIXES)
+    return path.name.lower().endswith(SUFFIXES)
 
 
 def _point_data(path: Path) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import nibabel as nib
 import numpy as np
 from jaxtyping import Float
 
@@ -61,13 +62,15 @@ def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
         If there is no such file, it is no field or damaged, or is of a kind that is not known.
     """
     path = Path(path)
-    volume = _transform_field(path) if path.name.endswith(TRANSFORM_SUFFIXES) else read_volume(path)
+    volume = _transform_field(path) if path.name.lower().endswith(TRANSFORM_SUFFIXES) else read_volume(path)
     shape = volume.voxels.shape
     if shape[3:] not in ((1, 3), (3,)):
         raise InputError(
             f"{path} is no displacement field: expected the shape (X, Y, Z, 1, 3) or (X, Y, Z, 3), vectors in mm, got "
             f"{shape}"
         )
+    if volume.voxels.dtype.kind not in "iuf":
+        raise InputError(f"{path} is no displacement field: expected real numbers, mm, got {volume.voxels.dtype}")
     vectors = np.asarray(volume.voxels, float).reshape(*shape[:3], 3)
     try:
         grid = Image(np.zeros(shape[:3], np.int8), volume.affine)
@@ -81,7 +84,7 @@ def _displacements(
     vectors: Float[np.ndarray, "X Y Z 3"], grid: Image, volume: Volume, path: Path
 ) -> Float[np.ndarray, "X Y Z 3"]:
     """In world RAS, mm, by what the header says of the vectors."""
-    if volume.header is None or "intent_code" not in volume.header:
+    if not isinstance(volume.header, nib.Nifti1Header):
         return vectors * TO_RAS
     code, name = int(volume.header["intent_code"]), str(volume.header.get_intent("code")[2])
     first = float(volume.header["intent_p1"])
@@ -106,5 +109,5 @@ def _transform_field(path: Path) -> Volume:
         transform = SimpleITK.ReadTransform(str(path))
         field = SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
     except RuntimeError as error:
-        raise InputError(f"{path} holds no displacement field of ITK's: {str(error).splitlines()[-1]}") from error
+        raise InputError(f"{path} holds no displacement field as ITK writes it, or is damaged") from error
     return from_itk(field)

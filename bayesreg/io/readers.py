@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import logging
-import zlib
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,15 +17,28 @@ from nibabel.spatialimages import SpatialImage
 from bayesreg.types import InputError
 
 # What SimpleITK reads and nibabel does not.
-ITK_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd", ".dcm", ".gipl", ".gipl.gz")
+ITK_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 # Millimetres per unit of a NIfTI header; files that name none hold millimetres.
 MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "micron": 1e-3, "meter": 1e3}
 # World RAS and ITK's LPS differ in the signs of x and y.
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-# Two forms of a header say the same where they place no corner further apart than this share of a voxel.
-SAME_FORM = 0.1
+# Two forms of a header say the same where they place no corner further apart than this share of a voxel, and slices of
+# a series are evenly spaced where none lies further than this share of their distance from its place.
+SAME_FORM, EVEN = 0.1, 0.02
+# How far rounding may take a unit quaternion's square above one.
+ROUNDED = 1e-5
 
 _log = logging.getLogger(__name__)
+
+
+class _LaxHeader(nib.Nifti1Header):
+    quaternion_threshold = np.float64(-ROUNDED)
+
+
+class _LaxNifti(nib.Nifti1Image):
+    """NIfTI whose quaternion may be rounded up, which nibabel's own refuses."""
+
+    header_class = _LaxHeader
 
 
 class Volume(NamedTuple):
@@ -36,22 +50,35 @@ class Volume(NamedTuple):
         The file's scale of intensities applied. Components of vectors are the last axis.
     affine : (4, 4) array
         Voxel index to world RAS, mm.
-    other_affine : (4, 4) array or None
-        What the q-form of the header says, where it says something else than the s-form, which is the affine.
     header : object
         That of nibabel; None where SimpleITK has read the file.
     """
 
     voxels: np.ndarray
     affine: Float[np.ndarray, "4 4"]
-    other_affine: Float[np.ndarray, "4 4"] | None = None
     header: Any = None
+
+
+class _Forms(NamedTuple):
+    """Where the voxels of a file lie.
+
+    Attributes
+    ----------
+    affine : (4, 4) array
+        Voxel index to world RAS, mm.
+    other : (4, 4) array or None
+        The q-form of the header, where it says something else than the s-form, which is taken.
+    remarks : list of str
+        What a user should know.
+    """
+
+    affine: Float[np.ndarray, "4 4"]
+    other: Float[np.ndarray, "4 4"] | None
+    remarks: list[str]
 
 
 def read_volume(path: str | Path) -> Volume:
     """Read a volume: NIfTI, MGZ and what else nibabel knows, NRRD, MetaImage and DICOM by SimpleITK.
-
-    A NIfTI file whose header nibabel refuses is read by SimpleITK, and the log says so.
 
     Parameters
     ----------
@@ -61,34 +88,29 @@ def read_volume(path: str | Path) -> Volume:
     Raises
     ------
     InputError
-        If there is no such file, or neither library can read it.
+        If there is no such file, it cannot be read, is damaged or cut short, or a series has gaps.
     """
     path = Path(path)
-    if path.is_dir():
+    if _is_folder(path):
         return _read_dicom(path)
-    if not path.is_file():
-        raise InputError(f"image {path}: there is no such file")
-    if path.name.lower().endswith(ITK_SUFFIXES):
+    if is_itk(path):
         return _read_by_itk(path)
-    try:
-        source = _open(path)
-    except InputError as refused:
-        if not path.name.endswith((".nii", ".nii.gz")):
-            raise
-        try:
-            found = _read_by_itk(path)
-        except InputError:
-            raise refused from None
-        _log.warning("%s: nibabel refuses its header, so that SimpleITK has read it (%s)", path, refused)
-        return found
-    affine, other = _affine(source, path)
-    return Volume(_voxels(source, path), affine, other, source.header)
+    source = _open(path)
+    forms = _forms(source)
+    for remark in forms.remarks:
+        _log.warning("%s: %s", path, remark)
+    return Volume(_voxels(source, path), forms.affine, source.header)
 
 
 def other_form(path: str | Path) -> Float[np.ndarray, "4 4"] | None:
     """The q-form of a NIfTI header, where it says something else than the s-form, which is taken; without voxels."""
     path = Path(path)
-    return _affine(_open(path), path)[1] if path.name.endswith((".nii", ".nii.gz")) else None
+    return None if _is_folder(path) or is_itk(path) else _forms(_open(path)).other
+
+
+def is_itk(path: Path) -> bool:
+    """Tell whether SimpleITK reads a file, by its name."""
+    return path.name.lower().endswith(ITK_SUFFIXES)
 
 
 def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], shape: tuple[int, ...]) -> float:
@@ -97,54 +119,98 @@ def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]
     return float(np.linalg.norm(corners @ (one - other)[:3, :3].T + (one - other)[:3, 3], axis=1).max())
 
 
+def _is_folder(path: Path) -> bool:
+    """Tell a folder from a file; InputError where there is neither, or it may not be read."""
+    try:
+        folder, there = path.is_dir(), path.exists()
+    except OSError as error:
+        raise InputError(f"image {path}: {error.strerror}") from error
+    if not there:
+        raise InputError(f"image {path}: there is no such file")
+    if not os.access(path, os.R_OK):
+        raise InputError(f"image {path} may not be read; see its permissions")
+    return folder
+
+
 def _open(path: Path) -> SpatialImage:
     try:
-        source = nib.load(path)
+        try:
+            source = nib.load(path)
+        except ValueError as error:
+            if "w2 should be positive" not in str(error):
+                raise
+            source = _LaxNifti.from_filename(path)
     except Exception as error:  # Its readers have no common class of errors.
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"image {path} cannot be read: {reason}") from error
+        raise InputError(f"image {path} cannot be read: {_first_line(error)}") from error
     if not isinstance(source, SpatialImage) or source.affine is None:
         raise InputError(f"{path} holds no image on a grid, but {type(source).__name__}")
-    if 0 in source.shape:
+    if 0 in _shape(source):
         raise InputError(f"image {path} cannot be read: its header gives the shape {source.shape}")
     return source
 
 
-def _affine(source: SpatialImage, path: Path) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None]:
-    """Voxel index to world, mm, and the other form of a NIfTI header where it says something else."""
-    affine, other = np.asarray(source.affine, float), None
+def _shape(source: SpatialImage) -> tuple[int, ...]:
+    """The shape that a header gives; trailing zeros, which some programs write, are no axes."""
+    shape = tuple(map(int, source.shape))
+    while len(shape) > 3 and shape[-1] == 0:
+        shape = shape[:-1]
+    return shape
+
+
+def _forms(source: SpatialImage) -> _Forms:
+    affine = np.asarray(source.affine, float)
     if not isinstance(source, nib.Nifti1Pair):
-        if isinstance(source, nib.AnalyzeImage):
-            _log.warning("%s is an Analyze file, which does not tell left from right; %s", path, _x_runs(affine))
-        return affine, None
-    header = source.header
+        analyze = f"an Analyze file does not tell left from right; {_x_runs(affine)}"
+        return _Forms(affine, None, [analyze] if isinstance(source, nib.AnalyzeImage) else [])
+    header, remarks, other = source.header, [], None
     if not (header["sform_code"] or header["qform_code"]):
-        _log.warning("%s says nothing of its orientation (sform and qform code 0); taken to be centred, and %s",
-                     path, _x_runs(affine))  # fmt: skip
+        remarks.append(f"it says nothing of its orientation (sform and qform code 0); centred, and {_x_runs(affine)}")
     elif header["sform_code"] and header["qform_code"]:
-        affine, other = _choose_form(affine, np.asarray(header.get_qform(), float), source.shape, path)
-    unit = header.get_xyzt_units()[0]
+        affine, other, told = _choose_form(affine, _qform(header), _shape(source))
+        remarks += told
+    unit, known = _unit(header)
+    if not known:
+        remarks.append("its header has an unknown unit; taken to be mm")
     if MILLIMETRES[unit] != 1:
-        _log.warning("%s: its header is in units of a %s, converted to mm", path, unit)
+        remarks.append(f"its header is in units of a {unit}, converted to mm")
     scale = np.diag([*[MILLIMETRES[unit]] * 3, 1.0])
-    return scale @ affine, None if other is None else scale @ other
+    return _Forms(scale @ affine, None if other is None else scale @ other, remarks)
+
+
+def _unit(header: Any) -> tuple[str, bool]:
+    """The unit of lengths, and whether its code is known."""
+    try:
+        return str(header.get_xyzt_units()[0]), True
+    except KeyError:
+        return "unknown", False
+
+
+def _qform(header: Any) -> Float[np.ndarray, "4 4"] | None:
+    """The q-form; None where it has no inverse."""
+    try:
+        found = np.asarray(header.get_qform(), float)
+    except ValueError:
+        return None
+    return found if _is_regular(found) else None
+
+
+def _is_regular(affine: Float[np.ndarray, "4 4"]) -> bool:
+    return bool(np.isfinite(affine).all() and np.linalg.matrix_rank(affine[:3, :3]) == 3)
 
 
 def _choose_form(
-    sform: Float[np.ndarray, "4 4"], qform: Float[np.ndarray, "4 4"], shape: tuple[int, ...], path: Path
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None]:
+    sform: Float[np.ndarray, "4 4"], qform: Float[np.ndarray, "4 4"] | None, shape: tuple[int, ...]
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None, list[str]]:
     """The s-form and, where it differs, the q-form; the q-form alone where the s-form has no inverse."""
-    if np.linalg.matrix_rank(sform[:3, :3]) < 3:
-        _log.warning("%s: its s-form is singular, and its q-form is taken", path)
-        return qform, None
+    if qform is None:
+        return sform, None, []
+    if not _is_regular(sform):
+        return qform, None, ["its s-form has no inverse, and its q-form is taken"]
     apart = corners_apart(sform, qform, shape)
     if apart <= SAME_FORM * np.linalg.norm(sform[:3, :3], axis=0).min():
-        return sform, None
-    _log.warning(
-        "%s: its s-form and its q-form place corners up to %.3g mm apart; the s-form is taken. If the q-form is right, "
-        "write it into both", path, apart,
-    )  # fmt: skip
-    return sform, qform
+        return sform, None, []
+    told = f"its s-form and its q-form place corners up to {apart:.3g} mm apart; the s-form is taken"
+    return sform, qform, [f"{told}. If the q-form is right, write it into both"]
 
 
 def _x_runs(affine: Float[np.ndarray, "4 4"]) -> str:
@@ -153,39 +219,105 @@ def _x_runs(affine: Float[np.ndarray, "4 4"]) -> str:
 
 def _voxels(source: SpatialImage, path: Path) -> np.ndarray:
     data: Any = source.dataobj
-    least = getattr(source.header, "single_vox_offset", 0)
-    if isinstance(source, nib.Nifti1Image) and data.offset < least:
-        # A single file begins with its header, whatever an offset of 0 says.
-        data = ArrayProxy(str(path), (data.shape, data.dtype, least, data.slope, data.inter))
-        _log.warning("%s: its voxels are said to begin inside the header; read from byte %d on", path, least)
+    shape = _shape(source)
+    if isinstance(source, nib.Nifti1Image):
+        least = source.header.single_vox_offset
+        if data.offset < least:
+            # A single file begins with its header, whatever an offset of 0 says.
+            _log.warning("%s: its voxels are said to begin inside the header; read from byte %d on", path, least)
+        if data.offset < least or shape != source.shape:
+            data = ArrayProxy(str(path), (shape, data.dtype, max(data.offset, least), data.slope, data.inter))
     try:
+        if path.name.lower().endswith(".gz"):
+            _require_whole(path)
         return np.array(np.asarray(data))
-    except (OSError, EOFError, zlib.error, ValueError) as error:
-        raise InputError(f"image {path}: the file is cut short or damaged ({error})") from error
+    except Exception as error:  # As above.
+        raise InputError(f"image {path}: the file is cut short or damaged ({_first_line(error)})") from error
+
+
+def _require_whole(path: Path) -> None:
+    """Read a compressed file to its end, where its checksum stands; an error of gzip or zlib if it is damaged."""
+    with gzip.open(path) as file:
+        while file.read(2**22):
+            pass
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error).strip() else type(error).__name__
 
 
 def _read_by_itk(path: Path) -> Volume:
     import SimpleITK
 
     try:
-        return from_itk(SimpleITK.ReadImage(str(path)))
+        image = SimpleITK.ReadImage(str(path))
     except RuntimeError as error:
-        raise InputError(f"image {path} cannot be read: {_reason(error)}") from error
+        raise InputError(
+            f"image {path} cannot be read: SimpleITK finds it damaged, cut short or of another kind"
+        ) from error
+    if path.name.lower().endswith(".dcm") and image.GetSize()[-1] == 1:
+        raise InputError(f"image {path} is one slice; give the folder that holds its series, and nothing else")
+    if path.name.lower().endswith((".nrrd", ".nhdr")) and "NRRD_space" not in image.GetMetaDataKeys():
+        _log.warning("%s: it says nothing of its space; taken to be LPS, mm", path)
+    return from_itk(image)
 
 
 def _read_dicom(folder: Path) -> Volume:
+    """A series whose slices are evenly spaced; a gantry tilt becomes a shear of the affine."""
     import SimpleITK
 
     series = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if len(series) != 1:
         listed = f": {', '.join(series)}" if series else ""
         raise InputError(f"the folder {folder} holds {len(series)} DICOM series{listed}; expected one")
+    names = SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
+    if left := sorted({str(path) for path in folder.glob("*.dcm")} - set(names)):
+        raise InputError(
+            f"{left[0]} cannot be read as part of the DICOM series in its folder; mend it, or take it away"
+        )
+    volume = _series(names, folder)
+    if len(names) == 1:
+        return volume
+    places = np.array([_position(name) for name in names])
+    step = (places[-1] - places[0]) / (len(places) - 1)
+    away = np.linalg.norm(places - places[0] - np.arange(len(places))[:, None] * step, axis=1).max()
+    length = np.linalg.norm(step)
+    if volume.voxels.shape[2] != len(places) or length == 0 or away > EVEN * length:
+        raise InputError(
+            f"the {len(places)} slices in {folder} are not evenly spaced: one lies {away:.3g} mm from its place, at "
+            f"{length:.3g} mm a step. A slice is missing or there twice, or there are several images"
+        )
+    affine = volume.affine.copy()
+    affine[:3, 2], affine[:3, 3] = LPS[:3, :3] @ step, LPS[:3, :3] @ places[0]
+    return volume._replace(affine=affine)
+
+
+def _series(names: tuple[str, ...], folder: Path) -> Volume:
+    import SimpleITK
+
     reader = SimpleITK.ImageSeriesReader()
-    reader.SetFileNames(SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0]))
+    reader.SetFileNames(names)
+    # What it warns of is checked here.
+    warns = SimpleITK.ProcessObject.GetGlobalWarningDisplay()
+    SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
     try:
         return from_itk(reader.Execute())
     except RuntimeError as error:
-        raise InputError(f"the DICOM series in {folder} cannot be read: {_reason(error)}") from error
+        raise InputError(
+            f"the DICOM series in {folder} cannot be read: a slice is damaged or of another size"
+        ) from error
+    finally:
+        SimpleITK.ProcessObject.SetGlobalWarningDisplay(warns)
+
+
+def _position(name: str) -> Float[np.ndarray, "3"]:
+    """Where the first voxel of a slice lies, LPS, mm."""
+    import SimpleITK
+
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(name)
+    reader.ReadImageInformation()
+    return np.array(reader.GetOrigin())
 
 
 def from_itk(image: Any) -> Volume:
@@ -193,17 +325,11 @@ def from_itk(image: Any) -> Volume:
     import SimpleITK
 
     dimension = image.GetDimension()
-    direction = np.reshape(image.GetDirection(), (dimension, dimension))[:3, :3]
-    affine = np.eye(4)
     size = min(dimension, 3)
-    affine[:size, :size] = direction * np.array(image.GetSpacing()[:3])
-    affine[:size, 3] = image.GetOrigin()[:3]
+    affine = np.eye(4)
+    direction = np.reshape(image.GetDirection(), (dimension, dimension))[:size, :size]
+    affine[:size, :size] = direction * np.array(image.GetSpacing()[:size])
+    affine[:size, 3] = image.GetOrigin()[:size]
     array = SimpleITK.GetArrayFromImage(image)
     axes = (*range(dimension - 1, -1, -1), *range(dimension, array.ndim))
     return Volume(np.ascontiguousarray(array.transpose(axes)), LPS @ affine)
-
-
-def _reason(error: RuntimeError) -> str:
-    """The last line of ITK's message, which says what was wrong."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__

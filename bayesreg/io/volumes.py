@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -70,6 +70,8 @@ def load_mask(path: str | Path) -> Image:
     image = load_image(path)
     voxels = np.asarray(image.voxels)
     low, high = voxels.min(), voxels.max()
+    if ((voxels == low) | (voxels == high)).all() and high <= 0 and low < high:
+        raise InputError(f"mask {path} has the values {low:g} and {high:g}; expected the greater, inside, above zero")
     if low == high:
         raise InputError(f"mask {path} has the value {low:g} everywhere; expected two values")
     if ((voxels == low) | (voxels == high)).all():
@@ -123,15 +125,9 @@ def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside"
         As in `load_image`; also if the file holds values that are not integers, none of the values of a tissue or one
         that is not listed, or if a value belongs to two tissues.
     """
-    image = load_image(path)
-    voxels = np.rint(image.voxels)
-    away = float(np.abs(voxels - image.voxels).max())
-    if away > ROUNDING:
-        raise InputError(f"label file {path} holds values that are not integers; is it an intensity image?")
-    if away:
-        _log.warning("label file %s holds values up to %.2g from an integer; they are rounded", path, away)
+    image = load_whole_numbers(path)
     values = {name: np.atleast_1d(np.asarray(entry, int)).tolist() for name, entry in table.items()}
-    present, counts = np.unique(voxels.astype(int), return_counts=True)
+    present, counts = np.unique(image.voxels, return_counts=True)
     _check_table(values, present.tolist(), path)
     listed = {0, *(value for entry in values.values() for value in entry)}
     millilitres = {
@@ -140,15 +136,44 @@ def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside"
         if value not in listed
     }
     if millilitres and unlisted == "refused":
-        shown = ", ".join(f"{value} ({volume:.3g} ml)" for value, volume in millilitres.items())
+        shown = shorten(f"{value} ({volume:.3g} ml)" for value, volume in millilitres.items())
         raise InputError(
             f"label file {path} holds labels that the table does not list: {shown}. Add each to a tissue of the table, "
             f"give it one of its own, or list it under {BACKGROUND} if it does not belong to the organ"
         )
     tissue = np.zeros(image.shape, np.int8)
     for index, name in enumerate(tissue_names(table), start=1):
-        tissue[np.isin(voxels, values[name])] = index
+        tissue[np.isin(image.voxels, values[name])] = index
     return image.with_voxels(tissue)
+
+
+def load_whole_numbers(path: str | Path) -> Image:
+    """Read a label file as int32; values up to `ROUNDING` from an integer are rounded, and the log says so.
+
+    Raises
+    ------
+    InputError
+        As in `load_image`; also if it holds values further from integers, or beyond 32 bits.
+    """
+    image = load_image(path)
+    voxels = np.asarray(image.voxels)
+    if voxels.dtype.kind == "f":
+        rounded = np.rint(voxels)
+        away = float(np.abs(rounded - voxels).max())
+        if away > ROUNDING:
+            raise InputError(f"label file {path} holds values that are not integers; is it an intensity image?")
+        if away:
+            _log.warning("label file %s holds values up to %.2g from an integer; they are rounded", path, away)
+        voxels = rounded
+    if voxels.max() > np.iinfo(np.int32).max or voxels.min() < np.iinfo(np.int32).min:
+        raise InputError(f"label file {path} holds values up to {voxels.max()}; expected labels of at most 32 bits")
+    return image.with_voxels(voxels.astype(np.int32))
+
+
+def shorten(values: Iterable[object], most: int = 30) -> str:
+    """The first of some values, as text."""
+    listed = [str(value) for value in values]
+    return ", ".join(listed[:most]) + (", …" if len(listed) > most else "")
 
 
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
@@ -188,15 +213,19 @@ def on_grid_of(grid: Image, image: Image, names: tuple[str, str] = ("first", "se
     except InputError:
         check_same_space(grid, image, names)
     between = image.to_voxel @ grid.affine
-    found = ndimage.affine_transform(
-        np.asarray(image.voxels), between[:3, :3], between[:3, 3], grid.shape, order=0, mode="constant"
+    found = grid.with_voxels(
+        ndimage.affine_transform(
+            np.asarray(image.voxels), between[:3, :3], between[:3, 3], grid.shape, order=0, mode="grid-constant"
+        )
     )
-    reordered = np.allclose(between, np.rint(between), atol=SAME_GRID / max(grid.shape))
+    before, after = (np.count_nonzero(one.voxels) * one.voxel_volume / 1e3 for one in (image, found))
+    reordered = np.allclose(between, np.rint(between), atol=SAME_GRID / max(grid.shape)) and np.isclose(before, after)
     if not (reordered and round(abs(np.linalg.det(between))) == 1):
         _log.warning(
-            "the %s image lies on another grid than the %s one; the nearest voxel is taken", names[1], names[0]
-        )
-    return grid.with_voxels(found)
+            "the %s image lies on another grid than the %s one; the nearest voxel is taken, and of %.4g ml that are "
+            "not zero %.4g remain", names[1], names[0], before, after,
+        )  # fmt: skip
+    return found
 
 
 def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "second"), least: float = 0.1) -> None:

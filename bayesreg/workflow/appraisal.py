@@ -17,6 +17,8 @@ VOXELS, BINS = 200_000, 32
 ALIKE = 0.5
 # Scales of intensities that differ by a greater factor are no accident.
 SCALES = 2.0
+# Nor is a difference of the medians by more than this share of the range.
+OFFSET = 0.5
 # Shares that are worth a sentence: of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
 
@@ -55,6 +57,8 @@ class Likeness(NamedTuple):
         2 I / (H_fixed + H_moving), from 0 to 1.
     scale_ratio : float
         Range of the moving image over that of the fixed one, between the 0.5 and 99.5 % quantiles.
+    offset : float
+        Median of the moving image less that of the fixed one, over the range of the fixed one.
     on_grid : float
         The share of Ω that lies on the grid of the moving image.
     """
@@ -62,41 +66,55 @@ class Likeness(NamedTuple):
     correlation: float
     mutual_information: float
     scale_ratio: float
+    offset: float
     on_grid: float
 
-    def sentences(self, one_scale: bool) -> list[str]:
-        """What a user should know; nothing where all is well. `one_scale`: both images are on one scale."""
+    def sentences(self, one_contrast: bool, one_scale: bool) -> list[str]:
+        """What a user should know; nothing where all is well.
+
+        Parameters
+        ----------
+        one_contrast : bool
+            Whether the similarity takes both images to be of one contrast.
+        one_scale : bool
+            Whether both images are on one scale of intensities.
+        """
         found = []
         if self.on_grid < 1 - BEYOND:
             found.append(
                 f"{1 - self.on_grid:.0%} of the organ lies beyond the grid of the moving image, where nothing is seen."
             )
-        if self.correlation < -ALIKE / 2:
+        if one_contrast and self.correlation < -ALIKE / 2:
             found.append(
                 f"Bright and dark change places between the images (correlation {self.correlation:.2f}): they are not "
                 "of one contrast; choose model.similarity: lncc."
             )
-        elif self.correlation < ALIKE:
+        elif one_contrast and not self.correlation >= ALIKE:
             found.append(
                 f"The images are hardly alike as they lie: correlation {self.correlation:.2f}, normalised mutual "
                 f"information {self.mutual_information:.2f}. If they are of one contrast, they are not aligned, or the "
                 "axes of one are mistaken; if they are not, choose model.similarity: lncc."
             )
-        if one_scale and not 1 / SCALES < self.scale_ratio < SCALES:
+        if one_scale and (not 1 / SCALES < self.scale_ratio < SCALES or abs(self.offset) > OFFSET):
             found.append(
                 f"The intensities of the moving image range {self.scale_ratio:.2g} times as far as those of the fixed "
-                "one; data.same_contrast: false scales each on its own."
+                f"one, and lie {self.offset:+.2g} ranges from them; data.same_contrast: false scales each on its own."
             )
         return found
 
 
 def appraise(
-    tissue: Image, domain: Image, names: tuple[str, ...], pair: tuple[Image, Image] | None, one_scale: bool
+    tissue: Image,
+    domain: Image,
+    names: tuple[str, ...],
+    pair: tuple[Image, Image] | None,
+    one_contrast: bool = True,
+    one_scale: bool = True,
 ) -> Appraisal:
     """Appraise labels and, where there is one, a pair of images (fixed, moving); see `Likeness.sentences`."""
     millilitres = measure_tissues(tissue, domain, names)
     likeness = None if pair is None else compare_images(*pair, domain)
-    told = [] if likeness is None else likeness.sentences(one_scale)
+    told = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
     return Appraisal(millilitres, likeness, (*explain_left_out(millilitres), *told))
 
 
@@ -115,14 +133,16 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
     places = domain.voxel_to_world(inside)
     seen = np.asarray(moving.contains(places))
     if seen.sum() < 2:
-        return Likeness(0.0, 0.0, 1.0, float(seen.mean()))
+        return Likeness(0.0, 0.0, 1.0, 0.0, float(seen.mean()))
     one = np.asarray(fixed.voxels, float)[tuple(inside[seen].T)]
     other = np.asarray(moving.interpolate(places[seen]))
     ranges = [np.subtract(*np.quantile(values, (0.995, 0.005))) for values in (one, other)]
     if min(ranges) <= 0:
-        return Likeness(0.0, 0.0, 1.0, float(seen.mean()))
+        return Likeness(0.0, 0.0, 1.0, 0.0, float(seen.mean()))
     correlation = float(np.corrcoef(one, other)[0, 1])
-    return Likeness(correlation, _mutual_information(one, other), float(ranges[1] / ranges[0]), float(seen.mean()))
+    offset = (np.median(other) - np.median(one)) / ranges[0]
+    information = _mutual_information(one, other)
+    return Likeness(correlation, information, float(ranges[1] / ranges[0]), float(offset), float(seen.mean()))
 
 
 def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
@@ -139,7 +159,7 @@ def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dic
 def explain_left_out(millilitres: Mapping[str, tuple[float, float]]) -> list[str]:
     """A sentence on every solid tissue of which Ω leaves out more than `LEFT_OUT`."""
     return [
-        f"{outside:.0f} of {inside + outside:.0f} ml of {label_of(name)} lie outside the region to mesh, which leaves "
+        f"{outside:.3g} of {inside + outside:.3g} ml of {label_of(name)} lie outside the region to mesh, which leaves "
         "them out."
         for name, (inside, outside) in millilitres.items()
         if not is_fluid(name) and outside > LEFT_OUT * (inside + outside)

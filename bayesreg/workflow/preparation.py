@@ -129,8 +129,9 @@ def _points(config: Config) -> dict[str, PointPairs]:
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, moving: Image | None) -> Appraisal:
     """What is told of labels and images before the mesh is built."""
     pair = None if anatomy.image is None or moving is None else (anatomy.image, moving)
+    one_contrast = config.model.similarity != "lncc"
     one_scale = isinstance(config.data, FilesData) and config.data.same_contrast and config.model.intensity_map is None
-    return appraise(anatomy.tissue, domain, anatomy.names, pair, one_scale)
+    return appraise(anatomy.tissue, domain, anatomy.names, pair, one_contrast, one_scale and one_contrast)
 
 
 def _scale(

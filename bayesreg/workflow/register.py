@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 from bayesreg.config import Config, make_config, read_mapping
 from bayesreg.config.data import FilesData
 from bayesreg.image import Image
-from bayesreg.io.volumes import load_image
+from bayesreg.io.volumes import load_image, load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_table
 from bayesreg.types import InputError
 
@@ -57,25 +57,28 @@ def understand(
     InputError
         If a file is missing or unreadable, no table fits the labels, or an override is wrong.
     """
-    images = {"fixed": load_image(fixed), "moving": load_image(moving), "labels": load_image(labels)}
-    chosen, how = _choose_table(images["labels"], labels, table)
+    chosen, how = _choose_table(labels, table)
     paths = {"fixed": fixed, "moving": moving, "labels": labels, "intracranial": intracranial}
     files = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
     config = make_config({"data": {"source": "files", "label_table": chosen, **files}}, overrides)
-    assert isinstance(config.data, FilesData)
-    lines = [f"{name:<12}{paths[name]}: {_describe_grid(image)}" for name, image in images.items()]
-    tissues = "; ".join(f"{name} {_shorten(values)}" for name, values in (config.data.label_table or {}).items())
-    mask = "none: nothing bounds the motion" if intracranial is None else str(intracranial)
-    lines += [
-        f"{'table':<12}{how}: {tissues}",
-        f"{'mask':<12}{mask}",
-        f"{'pose':<12}as the headers say; only the deformation is looked for",
-        f"{'contrast':<12}compared by {config.model.similarity}; the model is preset {config.model.preset}",
-    ]
-    return Understood(config, tuple(lines))
+    return Understood(config, tuple(_describe(config, how)))
 
 
-def _choose_table(labels: Image, path: Path, table: str | None) -> tuple[Mapping[str, Any], str]:
+def _describe(config: Config, how: str) -> Iterator[str]:
+    """What a configuration, overrides included, says of its files; `how` its table was found."""
+    data = config.data
+    assert isinstance(data, FilesData)
+    for name in ("fixed", "moving", "labels"):
+        if (path := getattr(data, name)) is not None:
+            yield f"{name:<12}{path}: {_describe_grid(load_image(path))}"
+    tissues = "; ".join(f"{name} {shorten(values, 12)}" for name, values in (data.label_table or {}).items())
+    yield f"{'table':<12}{how}: {tissues}"
+    yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
+    yield f"{'pose':<12}as the headers say; only the deformation is looked for"
+    yield f"{'contrast':<12}compared by {config.model.similarity}; the model is preset {config.model.preset}"
+
+
+def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], str]:
     """A table, and where it is from."""
     if table is not None:
         if table in TABLES:
@@ -83,11 +86,11 @@ def _choose_table(labels: Image, path: Path, table: str | None) -> tuple[Mapping
         if not Path(table).is_file():
             raise InputError(f"--table {table}: neither a file nor one of {', '.join(TABLES)}")
         return read_mapping(table), table
-    values = np.unique(np.rint(labels.voxels)).astype(int).tolist()
+    values = np.unique(load_whole_numbers(labels).voxels).tolist()
     name = recognise_table(values)
     if name is None:
         raise InputError(
-            f"no label table fits the labels in {path} ({_shorten(values)}); give --table: {', '.join(TABLES)}, or a "
+            f"no label table fits the labels in {labels} ({shorten(values)}); give --table: {', '.join(TABLES)}, or a "
             "YAML file with labels by tissue, such as csf: [1]"
         )
     return TABLES[name], f"{name}, which fits the values"
@@ -97,8 +100,3 @@ def _describe_grid(image: Image) -> str:
     shape = " × ".join(map(str, image.shape))
     sizes = " × ".join(f"{size:.3g}" for size in image.voxel_sizes)
     return f"{shape} voxels of {sizes} mm"
-
-
-def _shorten(values: Sequence[int], most: int = 12) -> str:
-    """The first of some numbers."""
-    return ", ".join(map(str, values[:most])) + (", …" if len(values) > most else "")

@@ -117,10 +117,17 @@ class TestFromFiles:
         check_same_grid(anatomy.image, anatomy.intracranial)
         assert set(np.unique(anatomy.tissue.voxels)) == {0, 1, 2, 3}
 
-    def test_tells_of_a_grid_that_is_one_by_the_other_form(self, files, tmp_path):
-        source = nib.Nifti1Image(np.zeros((6, 6, 6)), None)
+    @pytest.mark.parametrize("suffix", ["nii", "nii.gz", "NII", "img"])
+    def test_tells_of_a_grid_that_is_one_by_the_other_form(self, files, tmp_path, suffix):
+        source = (nib.Nifti1Pair if suffix == "img" else nib.Nifti1Image)(np.zeros((6, 6, 6)), None)
         source.set_sform(np.diag([2.2, 2.0, 2.0, 1.0]), 4)
         source.set_qform(np.diag([2.0, 2.0, 2.0, 1.0]), 1)
-        nib.save(source, tmp_path / "t1.nii")
-        with pytest.raises(ValueError, match=r"share one grid by the q-form of .*t1\.nii, but not by its s-form"):
-            from_files(tmp_path / "t1.nii", files["labels"], OWN_TABLE)
+        source.to_filename(tmp_path / f"t1.{suffix.lower()}")
+        (tmp_path / f"t1.{suffix.lower()}").rename(tmp_path / f"t1.{suffix}")
+        with pytest.raises(ValueError, match=rf"share one grid by the q-form of .*t1\.{suffix}, but not by its s-form"):
+            from_files(tmp_path / f"t1.{suffix}", files["labels"], OWN_TABLE)
+
+    def test_refuses_a_tissue_that_the_image_does_not_reach(self, files, tmp_path):
+        nib.save(nib.Nifti1Image(np.zeros((6, 6, 3)), np.diag([2.0, 2.0, 2.0, 1.0])), tmp_path / "part.nii")
+        with pytest.raises(ValueError, match=r"no voxel of csf in .*labels\.nii lies on the grid of .*part\.nii"):
+            from_files(tmp_path / "part.nii", files["labels"], OWN_TABLE)

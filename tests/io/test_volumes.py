@@ -214,6 +214,16 @@ class TestLoadLabels:
         tissue = load_labels(path, TABLE | {"background": 9}, unlisted="refused")
         np.testing.assert_array_equal(tissue.voxels.ravel(), [0, 1, 2, 3, 2, 0, 0, 2])
 
+    def test_a_long_list_is_cut(self, tmp_path):
+        path = write(tmp_path / "a.nii", np.arange(1000, dtype=np.int16).reshape(10, 10, 10))
+        with pytest.raises(ValueError, match="does not list") as caught:
+            load_labels(path, TABLE, unlisted="refused")
+        assert len(str(caught.value)) < 1000
+
+    def test_refuses_labels_of_more_than_32_bits(self, tmp_path):
+        with pytest.raises(ValueError, match="at most 32 bits"):
+            load_labels(write(tmp_path / "a.nii", np.full((2, 2, 2), 2**63 + 5, np.uint64), dtype=np.uint64), TABLE)
+
     def test_refuses_a_value_with_two_meanings(self, tmp_path):
         with pytest.raises(ValueError, match="label 2 stands for both gm and wm"):
             load_labels(write(tmp_path / "a.nii", self.voxels), {"gm": 2, "wm": (2, 3)})
@@ -230,7 +240,7 @@ class TestLoadLabels:
 class TestLoadMask:
     ball = np.linalg.norm(np.indices((20, 20, 20)) - 9.5, axis=0) < 6
 
-    @pytest.mark.parametrize("values", [(0, 1), (0, 255), (1, 2), (-3.5, -1.5)])
+    @pytest.mark.parametrize("values", [(0, 1), (0, 255), (1, 2), (-3.5, 1.5)])
     def test_of_two_values_the_greater_is_inside(self, tmp_path, values):
         found = load_mask(write(tmp_path / "a.nii", np.where(self.ball, values[1], values[0]).astype(np.float32)))
         np.testing.assert_array_equal(found.voxels, self.ball)
@@ -244,6 +254,10 @@ class TestLoadMask:
         found = load_mask(write(tmp_path / "a.nii", soft.astype(np.float32)))
         assert found.voxels.sum() == pytest.approx(self.ball.sum(), rel=0.05)
         assert "at least 0.5 is inside" in caplog.text
+
+    def test_255_that_was_stored_as_signed_is_not_the_outside(self, tmp_path):
+        with pytest.raises(ValueError, match=r"the values -1 and 0; expected the greater, inside, above zero"):
+            load_mask(write(tmp_path / "a.nii", -self.ball.astype(np.int16)))
 
     @pytest.mark.parametrize("voxels", [np.arange(8.0), np.linspace(0, 0.4, 8), np.linspace(0, 100, 8)])
     def test_anything_else_is_refused(self, tmp_path, voxels):
@@ -285,6 +299,18 @@ class TestOnGridOf:
         fine = Image(np.kron(image.voxels, np.ones((3, 3, 3))), image.affine @ THIRDS)
         np.testing.assert_array_equal(on_grid_of(image, fine, ("fixed", "label")).voxels, image.voxels)
         assert "the label image lies on another grid than the fixed one" in caplog.text
+
+    def test_says_what_falls_off_a_grid_of_whole_voxels(self, caplog):
+        image = Image(np.ones((10, 10, 10), np.uint8), np.diag([10.0, 10, 10, 1]))
+        found = on_grid_of(Image(np.zeros((10, 10, 4)), image.affine), image)
+        assert found.voxels.all()
+        assert "of 1000 ml that are not zero 400 remain" in caplog.text
+
+    def test_half_a_voxel_at_the_border_is_on_the_grid(self):
+        image = Image(np.ones((10, 10, 10), np.uint8), np.eye(4))
+        shifted = np.eye(4)
+        shifted[:3, 3] = -0.45, 0.45, 0.0
+        assert on_grid_of(Image(np.zeros((10, 10, 10)), shifted), image).voxels.all()
 
     def test_refuses_images_apart(self):
         with pytest.raises(ValueError, match="covers 0%"):
