@@ -1,6 +1,7 @@
 """Files as users have them: other formats, and headers whose two forms, units or offsets are at odds."""
 
 import gzip
+import locale
 import struct
 
 import nibabel as nib
@@ -64,6 +65,8 @@ def dicom(folder, places=(0.0, 3.0, 6.0, 9.0), series="1.2.3.4", tilt=0.0):
     With a tilt each lies so much further along y, mm per mm.
     """
     folder.mkdir(exist_ok=True)
+    # GDCM's writer sets the locale of the process to C, which changes how Python reads text.
+    before = locale.setlocale(locale.LC_ALL)
     image = SimpleITK.Cast(itk_image(affine=SLICES), SimpleITK.sitkInt16)
     writer = SimpleITK.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
@@ -82,12 +85,15 @@ def dicom(folder, places=(0.0, 3.0, 6.0, 9.0), series="1.2.3.4", tilt=0.0):
             one.SetMetaData(tag, value)
         writer.SetFileName(str(folder / f"{(3 * number) % 7}_{number}.dcm"))
         writer.Execute(one)
+    locale.setlocale(locale.LC_ALL, before)
     return folder
 
 
 def test_a_dicom_folder(tmp_path):
     """LPS axes run to the left and backwards: in RAS the first voxel is at 0 and x and y fall."""
-    volume = read_volume(dicom(tmp_path / "series"))
+    folder, before = dicom(tmp_path / "series"), locale.setlocale(locale.LC_ALL)
+    volume = read_volume(folder)
+    assert locale.setlocale(locale.LC_ALL) == before
     np.testing.assert_array_equal(volume.voxels, VOXELS)
     np.testing.assert_allclose(volume.affine, np.diag([-2.0, -2.0, 3.0, 1.0]), atol=1e-6)
 
