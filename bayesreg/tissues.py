@@ -1,6 +1,7 @@
 """Facts about tissues that a name tells: the presets of brains, and neutral ones of all other names.
 
-The only place besides the datasets (`bayesreg.io.datasets`) where tissues are named.
+Besides the datasets (`bayesreg.io.datasets`) and label tables (`bayesreg.label_tables`) the only place where tissues
+are named.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], s
     if name is None:
         raise InputError(
             f"no label table fits the labels in {labels} ({shorten(values)}); give --table: {', '.join(TABLES)}, or a "
-            "YAML file with labels by tissue, such as csf: [1]"
+            "YAML file with labels by tissue, such as liver: [1]"
         )
     return TABLES[name], f"{name}, which fits the values"
 
