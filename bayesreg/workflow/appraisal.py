@@ -13,7 +13,7 @@ from bayesreg.tissues import is_fluid, label_of
 
 # Voxels that are looked at; bins of each image in the joint histogram.
 VOXELS, BINS = 200_000, 32
-# Aligned images of one contrast correlate by more: by 0.62 where tissue has moved by 4 mm in the mean and 10 at most.
+# Aligned images of one contrast correlate by more: by 0.53 where tissue has moved by 4 mm in the mean and 10 at most.
 ALIKE = 0.5
 # Scales of intensities that differ by a greater factor are no accident.
 SCALES = 2.0
