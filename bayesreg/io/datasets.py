@@ -13,12 +13,12 @@ import numpy as np
 
 from bayesreg.image import Image
 from bayesreg.io.domain import main_part
-from bayesreg.io.readers import corners_apart, other_form
+from bayesreg.io.readers import other_form
 from bayesreg.io.volumes import (
-    SAME_GRID,
     LabelTable,
     check_same_grid,
     check_same_space,
+    is_same_grid,
     load_image,
     load_labels,
     load_mask,
@@ -153,10 +153,9 @@ def from_files(
 
 def _on_grid(grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]) -> Image:
     """`on_grid_of`; InputError where they share a grid by the form of a header that was not taken."""
-    for other, taken, source in ((other_form(grid_path), image, grid_path), (other_form(path), grid, path)):
-        if other is None or grid.shape != image.shape:
-            continue
-        if corners_apart(other, np.asarray(taken.affine), grid.shape) <= SAME_GRID * grid.voxel_sizes.min():
+    for one, source, taken in ((grid, grid_path, image), (image, path, grid)):
+        other = other_form(source)
+        if other is not None and is_same_grid(Image(one.voxels, other), taken):
             raise InputError(
                 f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "
                 "s-form, which is taken; write the right one of the two forms into both"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+import SimpleITK
 from jaxtyping import Float
 
 from bayesreg.image import Image
@@ -101,8 +102,6 @@ def _displacements(
 
 def _transform_field(path: Path) -> Volume:
     """The displacement field of one of ITK's transforms."""
-    import SimpleITK
-
     if not path.is_file():
         raise InputError(f"displacement field {path}: there is no such file")
     try:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import nibabel as nib
 import numpy as np
+import SimpleITK
 from jaxtyping import Float
 from nibabel.arrayproxy import ArrayProxy
 from nibabel.spatialimages import SpatialImage
@@ -247,8 +248,6 @@ def _first_line(error: Exception) -> str:
 
 
 def _read_by_itk(path: Path) -> Volume:
-    import SimpleITK
-
     try:
         image = SimpleITK.ReadImage(str(path))
     except RuntimeError as error:
@@ -264,8 +263,6 @@ def _read_by_itk(path: Path) -> Volume:
 
 def _read_dicom(folder: Path) -> Volume:
     """A series whose slices are evenly spaced; a gantry tilt becomes a shear of the affine."""
-    import SimpleITK
-
     series = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if len(series) != 1:
         listed = f": {', '.join(series)}" if series else ""
@@ -293,8 +290,6 @@ def _read_dicom(folder: Path) -> Volume:
 
 
 def _series(names: tuple[str, ...], folder: Path) -> Volume:
-    import SimpleITK
-
     reader = SimpleITK.ImageSeriesReader()
     reader.SetFileNames(names)
     # What it warns of is checked here.
@@ -312,8 +307,6 @@ def _series(names: tuple[str, ...], folder: Path) -> Volume:
 
 def _position(name: str) -> Float[np.ndarray, "3"]:
     """Where the first voxel of a slice lies, LPS, mm."""
-    import SimpleITK
-
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(name)
     reader.ReadImageInformation()
@@ -322,8 +315,6 @@ def _position(name: str) -> Float[np.ndarray, "3"]:
 
 def from_itk(image: Any) -> Volume:
     """What an image of SimpleITK holds."""
-    import SimpleITK
-
     dimension = image.GetDimension()
     size = min(dimension, 3)
     affine = np.eye(4)

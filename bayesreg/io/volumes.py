@@ -70,11 +70,11 @@ def load_mask(path: str | Path) -> Image:
     image = load_image(path)
     voxels = np.asarray(image.voxels)
     low, high = voxels.min(), voxels.max()
-    if ((voxels == low) | (voxels == high)).all() and high <= 0 and low < high:
-        raise InputError(f"mask {path} has the values {low:g} and {high:g}; expected the greater, inside, above zero")
     if low == high:
         raise InputError(f"mask {path} has the value {low:g} everywhere; expected two values")
     if ((voxels == low) | (voxels == high)).all():
+        if high <= 0:
+            raise InputError(f"mask {path} has the values {low:g} and {high:g}; expected the greater above zero")
         return image.with_voxels((voxels == high).astype(np.uint8))
     if low < -OVERSHOOT or not 0.5 < high <= 1 + OVERSHOOT:
         raise InputError(
@@ -176,6 +176,12 @@ def shorten(values: Iterable[object], most: int = 30) -> str:
     return ", ".join(listed[:most]) + (", …" if len(listed) > most else "")
 
 
+def is_same_grid(a: Image, b: Image) -> bool:
+    """Tell whether two images share their grid (corners within a tenth of a voxel)."""
+    apart = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
+    return a.shape == b.shape and bool(apart <= SAME_GRID * a.voxel_sizes.min())
+
+
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
     """Raise InputError unless two images share their grid (corners within a tenth of a voxel)."""
     if a.shape != b.shape:
@@ -184,7 +190,7 @@ def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "seco
             "resample one onto the other"
         )
     apart = corners_apart(a.affine, b.affine, a.shape)
-    if apart > SAME_GRID * a.voxel_sizes.min():
+    if not is_same_grid(a, b):
         raise InputError(
             f"the {names[0]} and the {names[1]} image must share one grid, but their affines place corners up to "
             f"{apart:.3g} mm apart; resample one onto the other"
@@ -207,11 +213,9 @@ def on_grid_of(grid: Image, image: Image, names: tuple[str, str] = ("first", "se
     InputError
         If the two hardly overlap in world space.
     """
-    try:
-        check_same_grid(grid, image)
+    if is_same_grid(grid, image):
         return grid.with_voxels(image.voxels)
-    except InputError:
-        check_same_space(grid, image, names)
+    check_same_space(grid, image, names)
     between = image.to_voxel @ grid.affine
     found = grid.with_voxels(
         ndimage.affine_transform(

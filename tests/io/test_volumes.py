@@ -256,7 +256,7 @@ class TestLoadMask:
         assert "at least 0.5 is inside" in caplog.text
 
     def test_255_that_was_stored_as_signed_is_not_the_outside(self, tmp_path):
-        with pytest.raises(ValueError, match=r"the values -1 and 0; expected the greater, inside, above zero"):
+        with pytest.raises(ValueError, match=r"the values -1 and 0; expected the greater above zero"):
             load_mask(write(tmp_path / "a.nii", -self.ball.astype(np.int16)))
 
     @pytest.mark.parametrize("voxels", [np.arange(8.0), np.linspace(0, 0.4, 8), np.linspace(0, 100, 8)])
