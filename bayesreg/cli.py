@@ -46,7 +46,10 @@ app = typer.Typer(
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]
 FixedImage = Annotated[Path, typer.Argument(metavar="FIXED", help="Pre-operative image, a file or a DICOM folder.")]
 MovingImage = Annotated[Path, typer.Argument(metavar="MOVING", help="Intra-operative image.")]
-LabelFile = Annotated[Path, typer.Option("--labels", metavar="FILE", help="Tissue labels of FIXED.")]
+LabelFile = Annotated[
+    Path | None,
+    typer.Option("--labels", metavar="FILE", help="Tissue labels of FIXED; without them the organ is of one tissue."),
+]
 Table = Annotated[
     str | None,
     typer.Option(
@@ -56,6 +59,13 @@ Table = Annotated[
     ),
 ]
 Mask = Annotated[Path | None, typer.Option("--intracranial", metavar="FILE", help="Mask of where the organ may go.")]
+FixedIgnore = Annotated[
+    Path | None, typer.Option("--fixed-ignore", metavar="FILE", help="Mask: not zero where FIXED says nothing.")
+]
+MovingIgnore = Annotated[
+    Path | None,
+    typer.Option("--moving-ignore", metavar="FILE", help="Mask: not zero where MOVING says nothing, as in a cavity."),
+]
 OutFolder = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
 RunFolders = Annotated[list[Path], typer.Argument(metavar="DIR DIR...", help="Folders of two or more runs.")]
@@ -112,9 +122,11 @@ def register(
     fixed: FixedImage,
     moving: MovingImage,
     out: OutFolder,
-    labels: LabelFile,
+    labels: LabelFile = None,
     table: Table = None,
     intracranial: Mask = None,
+    fixed_ignore: FixedIgnore = None,
+    moving_ignore: MovingIgnore = None,
     overrides: Overrides = None,
     resume: Resume = False,
     quiet: Quiet = False,
@@ -122,7 +134,7 @@ def register(
     """Sample the posterior of a pair in files, without a configuration; DIR/config.yaml holds the one that was used."""
     from bayesreg.workflow.register import understand
 
-    understood = understand(fixed, moving, labels, table, intracranial, overrides or ())
+    understood = understand(fixed, moving, labels, table, intracranial, fixed_ignore, moving_ignore, overrides or ())
     typer.echo("\n".join(understood.lines))
     _sample(understood.config, out, resume, quiet)
 

@@ -146,6 +146,10 @@ class IntensityScale(NamedTuple):
         """The image with rescaled intensities; values outside [low, high] leave [0, 1] and are kept."""
         return image.with_voxels((np.asarray(image.voxels, float) - self.low) / (self.high - self.low))
 
+    def undo(self, image: Image) -> Image:
+        """The image with the intensities that it had."""
+        return image.with_voxels(np.asarray(image.voxels, float) * (self.high - self.low) + self.low)
+
 
 def robust_scale(image: Image, mask: Bool[np.ndarray, "X Y Z"] | None = None) -> IntensityScale:
     """Scale of the 0.5 % to 99.5 % quantiles of the intensities inside a mask.

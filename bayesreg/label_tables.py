@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from bayesreg.tissues import BACKGROUND
+from bayesreg.tissues import BACKGROUND, ORGAN
 
 # FreeSurfer's aseg and aparc+aseg (FreeSurferColorLUT.txt), and SynthSeg, which takes its values from there. Brainstem,
 # ventral diencephalon and optic chiasm are mixtures: the first and the last count as white matter.
@@ -31,11 +31,13 @@ TABLES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
     "freesurfer": _FREESURFER,
     # Collins 1998. Glial matter (8) counts as GM; fat, muscle, skin, skull and connective tissue are not of the brain.
     "brainweb": {"csf": (1,), "gm": (2, 8), "wm": (3,), BACKGROUND: (4, 5, 6, 7, 9)},
+    # A mask of the organ is a label file of one label.
+    "mask": {ORGAN: (1,)},
 }
 
 
 # Labels by which a table is known: others have some of its values, too.
-_MARKS = {"fast": {1, 2, 3}, "freesurfer": {2, 3, 41, 42}, "brainweb": {1, 2, 3, 8}}
+_MARKS = {"fast": {1, 2, 3}, "freesurfer": {2, 3, 41, 42}, "brainweb": {1, 2, 3, 8}, "mask": {1}}
 
 
 def recognise_table(values: Iterable[int]) -> str | None:

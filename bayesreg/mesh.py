@@ -72,6 +72,11 @@ class TetMesh:
         return signed_volumes(self.points, self.cells)
 
     @cached_property
+    def nodal_volumes(self) -> Float[np.ndarray, "nodes"]:
+        """A quarter of the tetrahedra about every node, mm³."""
+        return np.bincount(self.cells.ravel(), np.repeat(self.volumes / 4, 4), len(self.points))
+
+    @cached_property
     def boundary_faces(self) -> Int[np.ndarray, "faces 3"]:
         """Triangles that belong to exactly one tetrahedron, normals outwards."""
         faces = self.cells[:, FACES].reshape(-1, 3)

@@ -52,6 +52,8 @@ SOLID = {"lam": 10.0, "mu": 1.0}
 FLUID = 0.01
 # In a label table, what is no part of the organ.
 BACKGROUND = "background"
+# The one tissue of an organ without labels.
+ORGAN = "organ"
 
 
 def is_fluid(name: str) -> bool:

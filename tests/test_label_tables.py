@@ -4,7 +4,7 @@ import pytest
 
 from bayesreg.config.data import FilesData
 from bayesreg.label_tables import TABLES, recognise_table
-from bayesreg.tissues import BRAIN, tissue_names
+from bayesreg.tissues import BRAIN, ORGAN, tissue_names
 
 # What SynthSeg writes without a parcellation; FreeSurfer's aseg holds some more.
 SYNTHSEG = [2, 3, 4, 5, 7, 8, *range(10, 19), 24, 26, 28, 41, 42, 43, 44, 46, 47, *range(49, 55), 58, 60]
@@ -12,7 +12,7 @@ SYNTHSEG = [2, 3, 4, 5, 7, 8, *range(10, 19), 24, 26, 28, 41, 42, 43, 44, 46, 47
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
 def test_every_value_has_one_tissue(table):
-    assert tissue_names(table) == BRAIN
+    assert tissue_names(table) in (BRAIN, (ORGAN,))
     values = [value for entry in table.values() for value in entry]
     assert len(values) == len(set(values))
     assert 0 not in values
@@ -26,7 +26,8 @@ def test_every_value_has_one_tissue(table):
         ([0, *SYNTHSEG, 30, 31, 62, 63, 77, 85, *range(251, 256)], "freesurfer"),
         ([0, *SYNTHSEG], "freesurfer"),
         ([0, 1, 2, 3, 77777], None),
-        ([0, 1], None),
+        ([0, 1], "mask"),
+        ([0, 2], None),
         # Atropos: CSF, GM, WM, deep GM, brainstem, cerebellum.
         (range(7), None),
         ([2, 3, 4], None),

@@ -18,7 +18,7 @@ from bayesreg.config.values import (
     Positive,
     Section,
 )
-from bayesreg.tissues import BRAIN, PAPER_LAM, PAPER_MU, tissue_names
+from bayesreg.tissues import BRAIN, ORGAN, PAPER_LAM, PAPER_MU, tissue_names
 
 
 class Mni152Data(Section):
@@ -50,7 +50,7 @@ class BrainWebData(Section):
 
 
 class FilesData(Section):
-    """An organ of one's own; both images are in one world space (aligned beforehand)."""
+    """An organ of one's own."""
 
     source: Literal["files"]
     fixed: FoundImage | None = None
@@ -58,18 +58,29 @@ class FilesData(Section):
     moving: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Intra-operative image."""
     labels: Annotated[FoundImage | None, Field(validate_default=True)] = None
-    """Tissue labels of the fixed image; null takes the tissues of mesh.file."""
+    """Tissue labels of the fixed image; null takes the tissues of mesh.file, or one for all of the organ."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
     """Values of the label file by tissue, background being what belongs to none; or fast, freesurfer or brainweb."""
     intracranial: FoundImage | None = None
-    """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion."""
-    same_contrast: StrictBool = True
-    """Scale the intensities of both images by one common scale."""
+    """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion. Without
+    labels it is the organ, too."""
+    fixed_ignore: FoundImage | None = None
+    """Mask of where the fixed image says nothing, such as a tumour; not zero = ignored. On any grid, in its world."""
+    moving_ignore: FoundImage | None = None
+    """Mask of where the moving image says nothing, such as a cavity; not zero = ignored. On any grid, in its world."""
+    pose: Literal["auto", "fixed"] = "auto"
+    """auto: where the images do not lie on one another by their headers, a rigid motion is found first; fixed: as the
+    headers say. The rigid part of the displacement is sampled in either case."""
+    same_contrast: StrictBool | None = None
+    """true: one contrast on one scale of intensities; false: the fixed image is compared through a map of its
+    intensities; null finds out."""
 
     @property
     def tissues(self) -> tuple[str, ...] | None:
         """Names of the tissues; None where only the mesh knows them."""
-        return None if self.label_table is None else tissue_names(self.label_table)
+        if self.label_table is None:
+            return (ORGAN,) if self.fixed is not None else None
+        return tissue_names(self.label_table)
 
     @field_validator("moving")
     @classmethod
@@ -78,18 +89,18 @@ class FilesData(Section):
             raise ValueError("a pair of images needs both, fixed and moving")
         return moving
 
-    @field_validator("labels")
+    @field_validator("fixed_ignore", "moving_ignore")
     @classmethod
-    def _is_there_with_images(cls, labels: Path | None, info: ValidationInfo) -> Path | None:
-        if labels is None and info.data.get("fixed") is not None:
-            raise ValueError("missing; expected tissue labels of the fixed image")
-        return labels
+    def _has_an_image(cls, ignore: Path | None, info: ValidationInfo) -> Path | None:
+        if ignore is not None and "fixed" in info.data and info.data["fixed"] is None:
+            raise ValueError("there is no image of which a part could be ignored; expected null")
+        return ignore
 
     @field_validator("label_table")
     @classmethod
     def _belongs_to_labels(cls, table: LabelTable | None, info: ValidationInfo) -> LabelTable | None:
         if "labels" in info.data and (table is None) != (info.data["labels"] is None):
-            raise ValueError("labels and label_table belong together; give both, or neither and mesh.file")
+            raise ValueError("labels and label_table belong together; expected both, or neither")
         return table
 
 

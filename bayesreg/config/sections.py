@@ -200,8 +200,8 @@ class Config(Section):
     @classmethod
     def _is_there(cls, mesh: MeshConfig, info: ValidationInfo) -> MeshConfig:
         data = info.data.get("data")
-        if isinstance(data, FilesData) and data.labels is None and mesh.file is None:
-            raise _wrong("file", "missing: without data.labels nothing can be meshed; expected a .vtu file")
+        if isinstance(data, FilesData) and data.labels is None and data.fixed is None and mesh.file is None:
+            raise _wrong("file", "missing: without data.labels and images nothing can be meshed; expected a .vtu file")
         return mesh
 
     @field_validator("observations")

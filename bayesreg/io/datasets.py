@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import NamedTuple
 import edt
 import nibabel as nib
 import numpy as np
+import SimpleITK
 
 from bayesreg.image import Image
 from bayesreg.io.domain import main_part
@@ -25,12 +27,16 @@ from bayesreg.io.volumes import (
     on_grid_of,
 )
 from bayesreg.label_tables import TABLES
-from bayesreg.tissues import BRAIN, tissue_names
+from bayesreg.tissues import BRAIN, ORGAN, tissue_names
 from bayesreg.types import DATA_FOLDER, InputError
 
-__all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152"]
+__all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152", "without_labels"]
+
+_log = logging.getLogger(__name__)
 
 BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
+# Gaps in an organ that is found by its brightness are closed by a ball of this radius, mm.
+CLOSING = 3.0
 # How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
 MNI152_SKULL = 3.0
 
@@ -149,6 +155,47 @@ def from_files(
         return Anatomy(image, tissue, None, tissue_names(label_table))
     mask = _on_grid(tissue, labels_path, load_mask(intracranial_path), intracranial_path, ("label", "intracranial"))
     return Anatomy(image, tissue, mask, tissue_names(label_table))
+
+
+def without_labels(image_path: str | Path, mask_path: str | Path | None = None) -> Anatomy:
+    """An anatomy of one tissue: all that a mask holds, which then also bounds its motion, or what stands out.
+
+    Parameters
+    ----------
+    image_path : path
+        The fixed image.
+    mask_path : path, optional
+        Without it the organ is what is bright by Otsu's threshold (1979, "A threshold selection method from gray-level
+        histograms"): its largest part, closed by 3 mm and filled. The log says how much that is.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or unreadable, the grids lie apart, or nothing stands out.
+    """
+    image = load_image(image_path)
+    if mask_path is not None:
+        mask = _on_grid(image, image_path, load_mask(mask_path), mask_path, ("fixed", "intracranial"))
+        return Anatomy(image, mask.with_voxels(np.asarray(mask.voxels, np.int8)), mask, (ORGAN,))
+    inside = _outstanding(image)
+    _log.warning(
+        "there is neither a label file nor a mask: the organ is what is brighter than Otsu's threshold in %s, %.4g ml",
+        image_path, inside.sum() * image.voxel_volume / 1e3,
+    )  # fmt: skip
+    return Anatomy(image, image.with_voxels(inside.astype(np.int8)), None, (ORGAN,))
+
+
+def _outstanding(image: Image) -> np.ndarray:
+    """The largest bright part of an image, its gaps closed and its holes filled."""
+    voxels = SimpleITK.GetImageFromArray(np.asarray(image.voxels, np.float32).transpose(2, 1, 0))
+    radius = [max(round(CLOSING / size), 1) for size in image.voxel_sizes]
+    bright = SimpleITK.OtsuThreshold(SimpleITK.Median(voxels, [1] * 3), 0, 1)
+    parts = SimpleITK.RelabelComponent(SimpleITK.ConnectedComponent(bright))
+    closed = SimpleITK.BinaryMorphologicalClosing(parts == 1, radius, SimpleITK.sitkBall, 1.0, True)
+    found = SimpleITK.GetArrayFromImage(SimpleITK.BinaryFillhole(closed)).transpose(2, 1, 0) != 0
+    if not found.any():
+        raise InputError("nothing stands out in the fixed image; give labels of it, or a mask of the organ as labels")
+    return found
 
 
 def _on_grid(grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]) -> Image:

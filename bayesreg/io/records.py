@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.image import Image
+from bayesreg.image import Image, IntensityScale
 from bayesreg.io.points import PointPairs
 from bayesreg.mesh import TetMesh
+from bayesreg.pose import Pose
 from bayesreg.types import AnyArray
 
 
@@ -62,6 +63,14 @@ class Predicted(NamedTuple):
         World mm, in the fixed image.
     place_draws : (chains, draws, L, 3) array
         Displacement of the places, mm.
+    motion : (chains, draws, 6) array
+        The rigid part of the displacement of the whole mesh, the pose included: translation of its centre, mm, and
+        rotation about it, a vector in degrees, world RAS.
+    centre : (3,) array
+        That centre, mm, in the fixed image.
+    total_sd : (n, 3) array or None
+        Standard deviation of the displacement of every node along the axes of the moving image's world, mm; None where
+        there is no pose, and these axes are those of the fixed image.
     residual : (q,) array or None
         f − m(x + ū) at the quadrature points over the noise sd that T_s implies there. This and what follows up to
         `replicated` is None without images.
@@ -88,6 +97,9 @@ class Predicted(NamedTuple):
     place_names: np.ndarray
     place_points: AnyArray
     place_draws: AnyArray
+    motion: AnyArray
+    centre: AnyArray
+    total_sd: AnyArray | None = None
     residual: AnyArray | None = None
     residual_tissue: AnyArray | None = None
     discrepancies: np.ndarray | None = None
@@ -122,6 +134,35 @@ class Predicted(NamedTuple):
         return {name: value for name, value in self.known.items() if name in fields}
 
 
+class Matching(NamedTuple):
+    """How the moving image was brought beside the fixed one before the model saw it.
+
+    Attributes
+    ----------
+    pose : Pose
+        The moving image lies in the world of the fixed one by its inverse.
+    one_contrast : bool
+        Whether the intensities of both mean the same.
+    scale : IntensityScale or None
+        That of the moving image as the model sees it; None where it was made so.
+    """
+
+    pose: Pose = Pose.identity()
+    one_contrast: bool = True
+    scale: IntensityScale | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """As mappings and lists, for files."""
+        pose = np.asarray(self.pose.matrix).tolist()
+        return {"pose": pose, "one_contrast": self.one_contrast, "scale": self.scale and list(self.scale)}
+
+    @classmethod
+    def of_json(cls, given: Mapping[str, Any]) -> Matching:
+        """What `as_json` made."""
+        scale = None if given["scale"] is None else IntensityScale(*given["scale"])
+        return cls(Pose(np.array(given["pose"])), bool(given["one_contrast"]), scale)
+
+
 class Inputs(NamedTuple):
     """The inputs of a run, which a resumed run must find unchanged.
 
@@ -131,7 +172,7 @@ class Inputs(NamedTuple):
         The resolved configuration, YAML.
     mesh : TetMesh
     fixed, moving : Image or None
-        As the model saw them (one common intensity scale); None where no images were observed.
+        As the model saw them, in one world and on their scales of intensities; None where no images were observed.
     tissue : Image
         Tissue labels on a grid of the fixed space, 0 outside, 1 + index into `mesh.names` inside.
     skull : Image or None
@@ -140,7 +181,10 @@ class Inputs(NamedTuple):
     boundary : (b, 3) array or None
         Displacement of the boundary nodes, mm, where it is known and not sampled.
     points : mapping
-        Pairs of points that were observed, by the name of the observation.
+        Pairs of points that were observed, by the name of the observation, as they were given.
+    matching : Matching
+    fixed_ignore, moving_ignore : Image or None
+        Not zero where the image of that name says nothing, each in the world of the fixed image.
     """
 
     config: str
@@ -152,6 +196,9 @@ class Inputs(NamedTuple):
     truth: Truth | None = None
     boundary: AnyArray | None = None
     points: Mapping[str, PointPairs] = MappingProxyType({})
+    matching: Matching = Matching()
+    fixed_ignore: Image | None = None
+    moving_ignore: Image | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +207,7 @@ class Run:
 
     Attributes
     ----------
-    config, mesh, fixed, moving, tissue, skull, truth, boundary, points
+    config, mesh, fixed, moving, tissue, skull, truth, boundary, points, matching, fixed_ignore, moving_ignore
         As in `Inputs`.
     manifest : dict
         The content of run.json.
@@ -189,6 +236,9 @@ class Run:
     truth: Truth | None = None
     boundary: AnyArray | None = None
     points: Mapping[str, PointPairs] = field(default_factory=dict)
+    matching: Matching = field(default_factory=Matching)
+    fixed_ignore: Image | None = None
+    moving_ignore: Image | None = None
     metrics: dict[str, Any] | None = None
     predicted: Predicted | None = None
     bodies: list[dict[str, Any]] | None = None

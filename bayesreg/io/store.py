@@ -16,7 +16,7 @@ from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.points import PointPairs
-from bayesreg.io.records import Inputs, Predicted, Run, Truth
+from bayesreg.io.records import Inputs, Matching, Predicted, Run, Truth
 from bayesreg.io.volumes import load_image, save_image
 from bayesreg.types import AnyArray, InputError
 
@@ -48,7 +48,8 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
     folder = Path(folder)
     images = folder / "inputs"
     images.mkdir(parents=True, exist_ok=True)
-    names = [name for name in ("fixed", "moving", "tissue", "skull") if getattr(inputs, name) is not None]
+    every = ("fixed", "moving", "tissue", "skull", "fixed_ignore", "moving_ignore")
+    names = [name for name in every if getattr(inputs, name) is not None]
     # The compression lets other threads run.
     with ThreadPoolExecutor() as pool:
         list(pool.map(lambda name: save_image(getattr(inputs, name), images / f"{name}.nii.gz"), names))
@@ -59,6 +60,7 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
         save_arrays(images / "boundary.npz", {"u_boundary": inputs.boundary})
     if inputs.points:
         save_arrays(images / "points.npz", _points_as_arrays(inputs.points))
+    write_json(images / "matching.json", inputs.matching.as_json())
     save_mesh(inputs.mesh, folder / "mesh.vtu")
     write_text(folder / "config.yaml", inputs.config)
 
@@ -70,9 +72,9 @@ def read_inputs(folder: str | Path) -> Inputs:
     config = _require(folder, "config.yaml").read_text(encoding="utf-8")
     mesh = load_mesh(_require(folder, "mesh.vtu"))
     tissue = load_image(_require(folder, "inputs/tissue.nii.gz"))
-    fixed, moving, skull = (
+    fixed, moving, skull, fixed_ignore, moving_ignore = (
         load_image(path) if (path := images / f"{name}.nii.gz").exists() else None
-        for name in ("fixed", "moving", "skull")
+        for name in ("fixed", "moving", "skull", "fixed_ignore", "moving_ignore")
     )
     if (fixed is None) != (moving is None):
         raise InputError(
@@ -82,7 +84,10 @@ def read_inputs(folder: str | Path) -> Inputs:
     truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
     boundary = load_arrays(given, "run anew, into another folder")["u_boundary"] if given.exists() else None
     pairs = _points_of(load_arrays(points, "run anew, into another folder")) if points.exists() else {}
-    return Inputs(config, mesh, fixed, moving, tissue, skull, truth, boundary, pairs)
+    matching = Matching.of_json(read_json(_require(folder, "inputs/matching.json")))
+    return Inputs(
+        config, mesh, fixed, moving, tissue, skull, truth, boundary, pairs, matching, fixed_ignore, moving_ignore
+    )
 
 
 def _points_as_arrays(points: Mapping[str, PointPairs]) -> dict[str, AnyArray]:
@@ -120,7 +125,8 @@ def write_results(
     by_cell = {} if run.predicted is None else run.predicted.by_cell
     save_mesh(run.mesh, folder / "mesh.vtu", {"u_mean": run.u_mean, "u_sd": run.u_sd}, by_cell)
     if run.warped is not None:
-        save_image(run.warped, folder / "warped_mean.nii.gz")
+        scale = run.matching.scale
+        save_image(run.warped if scale is None else scale.undo(run.warped), folder / "warped_mean.nii.gz")
     affine = run.background.affine
     save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, affine)
     # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
@@ -146,6 +152,8 @@ def read_run(folder: str | Path) -> Run:
     inputs = read_inputs(folder)
     u_mean, u_sd = read_point_data(folder / "mesh.vtu", "u_mean", "u_sd")
     warped = None if inputs.moving is None else load_image(_require(folder, "warped_mean.nii.gz"))
+    if warped is not None and inputs.matching.scale is not None:
+        warped = inputs.matching.scale(warped)
     metrics = read_json(folder / "metrics.json") if (folder / "metrics.json").exists() else None
     known = folder / "predicted.npz"
     predicted = Predicted(**load_arrays(known, "run anew, into another folder")) if known.exists() else None

@@ -68,7 +68,11 @@ def build_posterior(
     """
     if not isinstance(mesh, TetMesh):
         raise InputError(f"build_posterior needs a mesh: a TetMesh; got {type(mesh).__name__}")
-    model, given = model or ModelConfig(), _observations(fixed, moving, observations)
+    model = model or ModelConfig()
+    given = [
+        one.in_one_contrast(mesh, model) if isinstance(one, ImagePair) else one
+        for one in _observations(fixed, moving, observations)
+    ]
     problem, sampled = problem_of(mesh, given, model, skull, reference)
     tempered = model.independent_points != "residual" or not any(isinstance(one, ImagePair) for one in given)
     posterior = Posterior(problem, mesh, model, sampled, {one.name: one for one in given}, tempered=tempered)

@@ -13,10 +13,15 @@ from jaxtyping import Float
 
 # Prior standard deviation of each coefficient, as a share of the root mean square of f.
 SHARE = 0.5
+# Functions are one where their parts by themselves are weaker than this share of the strongest.
+DEPENDENT = 1e-3
 
 
 def shading_basis(
-    values: Float[np.ndarray, "points"], positions: Float[np.ndarray, "points 3"], degree: int
+    values: Float[np.ndarray, "points"],
+    positions: Float[np.ndarray, "points 3"],
+    degree: int,
+    more: Float[np.ndarray, "points functions"] | None = None,
 ) -> Float[np.ndarray, "points coefficients"]:
     """The functions at the points.
 
@@ -28,9 +33,15 @@ def shading_basis(
         mm.
     degree : int
         Of the polynomial; zero leaves f and a constant.
+    more : (q, k) array, optional
+        Other functions, which may depend on these.
     """
     middle, half = (positions.max(axis=0) + positions.min(axis=0)) / 2, np.ptp(positions, axis=0) / 2
     x = (positions - middle) / half
     powers = [power for power in product(range(degree + 1), repeat=3) if sum(power) <= degree]
-    functions = [np.ones_like(values), *(values * np.prod(x**power, axis=1) for power in powers)]
-    return np.linalg.qr(np.stack(functions, axis=1))[0] * np.linalg.norm(values)
+    functions = np.stack([np.ones_like(values), *(values * np.prod(x**power, axis=1) for power in powers)], axis=1)
+    if more is None or not more.shape[1]:
+        return np.linalg.qr(functions)[0] * np.linalg.norm(values)
+    functions = np.concatenate([functions, more], axis=1)
+    basis, strength, _ = np.linalg.svd(functions / np.linalg.norm(functions, axis=0), full_matrices=False)
+    return basis[:, strength > DEPENDENT * strength[0]] * np.linalg.norm(values)

@@ -143,8 +143,10 @@ class LocalCorrelation(NamedTuple):
 
     def fit(self, pair: Intensities) -> LocalFit:
         """The best map in every window."""
-        weights = pair.weights
+        weights = pair.weights * pair.shares
         volume, *sums = self.windows.sums(weights[:, None] * jnp.stack([jnp.ones_like(weights), *pair[:2]], axis=1)).T
+        # A window that is not compared at all.
+        volume = jnp.maximum(volume, jnp.finfo(volume.dtype).tiny)
         f, m = (values - total / volume for values, total in zip(pair[:2], sums, strict=True))
         covariance, variance = self.windows.sums(jnp.stack([weights * f * m, weights * m**2], axis=1)).T / volume
         gain = covariance / (variance + self.ridge)
@@ -152,12 +154,12 @@ class LocalCorrelation(NamedTuple):
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Σ_k V_k (var_k(f) − cov_k(f, m)² / (var_k(m) + ridge)), at any temperature."""
-        return _energy(self, pair)
+        return _energy(self, pair._replace(weights=pair.weights * pair.shares, share=None))
 
-    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+    def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """The log normaliser of Gaussian noise in N − 2K dimensions, up to a constant."""
         lost = self.windows.number * jnp.log(jnp.pi * temperature)
-        return 0.5 * jnp.log(weights / (jnp.pi * temperature)).sum() + lost
+        return 0.5 * pair.shares @ jnp.log(pair.weights / (jnp.pi * temperature)) + lost
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """f − a m − b."""
@@ -165,7 +167,7 @@ class LocalCorrelation(NamedTuple):
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """`curvature` with residuals of zero, which is twice a² W less its projection on the maps of every window."""
-        return self._curvature(self.fit(pair), pair.weights, jnp.zeros_like(pair.fixed))
+        return self._curvature(self.fit(pair), pair.weights * pair.shares, jnp.zeros_like(pair.fixed))
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W the diagonal of w.
@@ -173,7 +175,7 @@ class LocalCorrelation(NamedTuple):
         It is the derivative of the slope −2 w a r, where r and a follow m.
         """
         found = self.fit(pair)
-        return self._curvature(found, pair.weights, found.residuals)
+        return self._curvature(found, pair.weights * pair.shares, found.residuals)
 
     def _curvature(
         self, found: LocalFit, weights: Float[AnyArray, "points"], residuals: Float[AnyArray, "points"]
@@ -192,7 +194,7 @@ class LocalCorrelation(NamedTuple):
         """Standard Normal numbers less what an affine map of m explains of them in each window."""
         scale = jnp.sqrt(pair.weights)
         noise = jax.random.normal(key, scale.shape) / scale
-        return scale * self.residuals(pair._replace(fixed=noise))
+        return scale * self.residuals(pair._replace(fixed=noise, share=None))
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> LocalCorrelation:
         """The similarity with windows of the same width at other points."""

@@ -29,16 +29,24 @@ class Intensities(NamedTuple):
         m(x_q + u(x_q)).
     weights : (q,) array
         Quadrature weights w_q, mm³. A point has noise of the squared scale T_s / (2 w_q).
+    share : (q,) array or None
+        Share of each point that is compared, from 0 to 1; None: all of every point.
     """
 
     fixed: Float[AnyArray, "points"]
     moving: Float[AnyArray, "points"]
     weights: Float[AnyArray, "points"]
+    share: Float[AnyArray, "points"] | None = None
 
     @property
     def differences(self) -> Float[AnyArray, "points"]:
         """f − m."""
         return self.fixed - self.moving
+
+    @property
+    def shares(self) -> Float[AnyArray, "points"]:
+        """The share of each point that is compared."""
+        return jnp.ones_like(self.weights) if self.share is None else self.share
 
 
 class ValueCurvature(NamedTuple):
@@ -74,7 +82,7 @@ class Pointwise:
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """The curvature of eq. (1), 2 w."""
-        return ValueCurvature(2 * pair.weights)
+        return ValueCurvature(2 * pair.weights * pair.shares)
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """∂²E_s/∂m_q²: the Hessian is diagonal."""
@@ -114,11 +122,11 @@ class SumOfSquaredDifferences(Pointwise):
         """Σ_q w_q (f − m)², at any temperature."""
         # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
         # and then redo the index arithmetic for each of its taps.
-        return pair.weights @ pair.differences**2
+        return (pair.weights * pair.shares) @ pair.differences**2
 
-    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+    def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Σ_q −½ log(2π σ_q²)."""
-        return 0.5 * jnp.log(weights / (jnp.pi * temperature)).sum()
+        return 0.5 * pair.shares @ jnp.log(pair.weights / (jnp.pi * temperature))
 
     def variance(self) -> Scalar:
         """One."""
@@ -158,7 +166,7 @@ class StudentT(Pointwise):
         nu = self.degrees_of_freedom
         surprise = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
         # A product of vectors, as in eq. (1).
-        return temperature * (nu + 1) / 2 * (jnp.ones_like(surprise) @ surprise)
+        return temperature * (nu + 1) / 2 * (pair.shares @ surprise)
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """2 w (ν + 1)/(ν + 3) times the weights (ν + 1)/(ν + z²) of iteratively reweighted least squares.
@@ -168,13 +176,13 @@ class StudentT(Pointwise):
         """
         nu = self.degrees_of_freedom
         squares = 2 * pair.weights * pair.differences**2 / temperature
-        return ValueCurvature(2 * pair.weights * (nu + 1) ** 2 / ((nu + 3) * (nu + squares)))
+        return ValueCurvature(2 * pair.weights * pair.shares * (nu + 1) ** 2 / ((nu + 3) * (nu + squares)))
 
-    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
+    def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""
         nu = self.degrees_of_freedom
         shape = gammaln((nu + 1) / 2) - gammaln(nu / 2)
-        return (shape + 0.5 * jnp.log(2 * weights / (jnp.pi * nu * temperature))).sum()
+        return pair.shares @ (shape + 0.5 * jnp.log(2 * pair.weights / (jnp.pi * nu * temperature)))
 
     def variance(self) -> Scalar:
         """ν / (ν − 2)."""

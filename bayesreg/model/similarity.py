@@ -28,8 +28,8 @@ class Similarity(Protocol):
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, mm³ times squared intensity."""
 
-    def log_normaliser(self, weights: Float[AnyArray, "points"], temperature: Scalar) -> Scalar:
-        """−log Z_s, with which exp(−E_s / T_s) is a density of the residuals."""
+    def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
+        """−log Z_s, with which exp(−E_s / T_s) is a density of the residuals of what is compared."""
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """The part of f that noise explains."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.image import Image
+from bayesreg.model.contrast import explained_shares
 from bayesreg.tissues import is_fluid, label_of
 
 # Voxels that are looked at; bins of each image in the joint histogram.
@@ -19,6 +20,10 @@ ALIKE = 0.5
 SCALES = 2.0
 # Nor is a difference of the medians by more than this share of the range.
 OFFSET = 0.5
+# Images are of one contrast where a straight line explains this share of what any map of intensities does.
+STRAIGHT = 0.8
+# Of a smaller share nothing can be told.
+UNLIKE = 0.02
 # Shares that are worth a sentence: of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
 
@@ -34,16 +39,20 @@ class Appraisal(NamedTuple):
         None without a pair of images from files.
     beware : tuple of str
         What a user should know, a sentence each.
+    notes : tuple of str
+        What was found and chosen, a line each.
     """
 
     millilitres: Mapping[str, tuple[float, float]]
     likeness: Likeness | None
     beware: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """As mappings and lists, for files."""
         likeness = None if self.likeness is None else self.likeness._asdict()
-        return {"millilitres": dict(self.millilitres), "likeness": likeness, "beware": list(self.beware)}
+        told = {"beware": list(self.beware), "notes": list(self.notes)}
+        return {"millilitres": dict(self.millilitres), "likeness": likeness, **told}
 
 
 class Likeness(NamedTuple):
@@ -61,6 +70,9 @@ class Likeness(NamedTuple):
         Median of the moving image less that of the fixed one, over the range of the fixed one.
     on_grid : float
         The share of Ω that lies on the grid of the moving image.
+    line_share, map_share : float
+        Shares of the variance of the moving image that a straight line of the fixed one's intensities explains,
+        negative where it falls, and that the best map of them explains.
     """
 
     correlation: float
@@ -68,6 +80,18 @@ class Likeness(NamedTuple):
     scale_ratio: float
     offset: float
     on_grid: float
+    line_share: float = 0.0
+    map_share: float = 0.0
+
+    @property
+    def is_one_contrast(self) -> bool:
+        """Whether a rising line explains nearly what any map does, or no map explains anything."""
+        return self.map_share < UNLIKE or self.line_share >= STRAIGHT * self.map_share
+
+    @property
+    def is_one_scale(self) -> bool:
+        """Whether the intensities of both run over nearly one range."""
+        return 1 / SCALES < self.scale_ratio < SCALES and abs(self.offset) <= OFFSET
 
     def sentences(self, one_contrast: bool, one_scale: bool) -> list[str]:
         """What a user should know; nothing where all is well.
@@ -87,15 +111,16 @@ class Likeness(NamedTuple):
         if one_contrast and self.correlation < -ALIKE / 2:
             found.append(
                 f"Bright and dark change places between the images (correlation {self.correlation:.2f}): they are not "
-                "of one contrast; choose model.similarity: lncc."
+                "of one contrast; data.same_contrast: null or false compares them through a map of intensities."
             )
         elif one_contrast and not self.correlation >= ALIKE:
             found.append(
                 f"The images are hardly alike as they lie: correlation {self.correlation:.2f}, normalised mutual "
                 f"information {self.mutual_information:.2f}. If they are of one contrast, they are not aligned, or the "
-                "axes of one are mistaken; if they are not, choose model.similarity: lncc."
+                "axes of one are mistaken; if they are not, data.same_contrast: false compares them through a map of "
+                "intensities, and model.similarity: lncc window by window."
             )
-        if one_scale and (not 1 / SCALES < self.scale_ratio < SCALES or abs(self.offset) > OFFSET):
+        if one_scale and not self.is_one_scale:
             found.append(
                 f"The intensities of the moving image range {self.scale_ratio:.2g} times as far as those of the fixed "
                 f"one, and lie {self.offset:+.2g} ranges from them; data.same_contrast: false scales each on its own."
@@ -110,10 +135,14 @@ def appraise(
     pair: tuple[Image, Image] | None,
     one_contrast: bool = True,
     one_scale: bool = True,
+    likeness: Likeness | None = None,
 ) -> Appraisal:
-    """Appraise labels and, where there is one, a pair of images (fixed, moving); see `Likeness.sentences`."""
+    """Appraise labels and, where there is one, a pair of images (fixed, moving), or how alike they were found to be.
+
+    See `Likeness.sentences`.
+    """
     millilitres = measure_tissues(tissue, domain, names)
-    likeness = None if pair is None else compare_images(*pair, domain)
+    likeness = compare_images(*pair, domain) if pair is not None and likeness is None else likeness
     told = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
     return Appraisal(millilitres, likeness, (*explain_left_out(millilitres), *told))
 
@@ -141,8 +170,8 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
         return Likeness(0.0, 0.0, 1.0, 0.0, float(seen.mean()))
     correlation = float(np.corrcoef(one, other)[0, 1])
     offset = (np.median(other) - np.median(one)) / ranges[0]
-    information = _mutual_information(one, other)
-    return Likeness(correlation, information, float(ranges[1] / ranges[0]), float(offset), float(seen.mean()))
+    information, shares = _mutual_information(one, other), explained_shares(one, other)
+    return Likeness(correlation, information, float(ranges[1] / ranges[0]), float(offset), float(seen.mean()), *shares)
 
 
 def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:

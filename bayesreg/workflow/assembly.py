@@ -50,13 +50,21 @@ def _observations(config: Config, inputs: Inputs) -> list[Any]:
     if config.compares_images:
         if inputs.fixed is None or inputs.moving is None:
             raise InputError("the run compares images, and its folder holds none: inputs/fixed.nii.gz is missing")
-        found.append(ImagePair(inputs.fixed, inputs.moving))
+        pair = ImagePair(
+            inputs.fixed,
+            inputs.moving,
+            fixed_ignore=inputs.fixed_ignore,
+            moving_ignore=inputs.moving_ignore,
+            one_contrast=inputs.matching.one_contrast,
+        )
+        found.append(pair)
     for section in config.observations or []:
         if isinstance(section, LandmarksSection):
             pairs = inputs.points[section.name]
             labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
             sd = pairs.sd if section.sd is None else section.sd
-            found.append(Landmarks(pairs.fixed, pairs.moving, sd, section.name, labels))
+            moving = inputs.matching.pose.inverse.place(pairs.moving)
+            found.append(Landmarks(pairs.fixed, moving, sd, section.name, labels))
     return found
 
 

@@ -85,7 +85,7 @@ class Check:
 
 def _describe(appraisal: dict[str, Any]) -> list[str]:
     """The labels and the images in two lines."""
-    lines = []
+    lines = [f"  {note}" for note in appraisal.get("notes", ())]
     if appraisal.get("millilitres"):
         parts = (
             f"{name} {inside:.0f}" + (f" ({outside:.0f} outside)" if outside >= 0.5 else "")

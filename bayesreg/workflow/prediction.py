@@ -25,6 +25,7 @@ from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
 from bayesreg.model.state import state_of
 from bayesreg.model.terms.landmarks import Landmarks
+from bayesreg.pose import Pose, compose, rigid_projection
 from bayesreg.tissues import label_of
 from bayesreg.types import AnyArray
 
@@ -53,6 +54,7 @@ def predict(
     u_sd: Float[np.ndarray, "nodes 3"],
     places: Places,
     seed: int,
+    pose: Pose,
 ) -> Predicted:
     """Push at most 400 evenly spaced draws forward: u at nodes and places, stiffness, residuals and replications.
 
@@ -69,6 +71,8 @@ def predict(
         Name to place (world mm, in the fixed image); where it is empty some are chosen.
     seed : int
         The seed of the replicated noise.
+    pose : Pose
+        What lies between the posterior's world and that of the moving image.
 
     Raises
     ------
@@ -78,16 +82,19 @@ def predict(
     mesh, with_images = posterior.mesh, images_of(posterior.data) is not None
     places = places or default_places(mesh, u_mean, u_sd)
     nodes, weights = _interpolation(mesh, places)
-    given = posterior.data, jnp.asarray(mesh.neighbours), jnp.asarray(u_mean), jnp.asarray(nodes), jnp.asarray(weights)
+    centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
+    arrays = (mesh.neighbours, u_mean, nodes, weights, projection, pose.rotation)
+    given = posterior.data, *(jnp.asarray(array) for array in arrays)
     key = jax.random.key(seed)
 
     def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
-        data, neighbours, u_mean, nodes, weights = given
+        data, neighbours, u_mean, nodes, weights, projection, rotation = given
         number, here = draw.pop("number"), replace(posterior, data=data)
         u = here.evaluate(draw).u
         distance, stiffness = jnp.linalg.norm(u - u_mean, axis=1), data.body.stiffness_factor(draw)
         found = {"u": u, "distance": distance, "far": (distance > FAR).astype(float),
                  "places": jnp.einsum("la,lai->li", weights, u[nodes]),
+                 "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         if with_images:
             values, cells = here.fill(draw), here.images.quadrature.cells
@@ -100,7 +107,7 @@ def predict(
     some = thin(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    kept = ("places", "observed", "replicated") if with_images else ("places",)
+    kept = ("places", "motion", "observed", "replicated") if with_images else ("places", "motion")
     aside: dict[str, list[np.ndarray]] = {name: [] for name in kept}
     found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
@@ -112,6 +119,9 @@ def predict(
         place_names=np.array(list(places)),
         place_points=np.array(list(places.values()), float),
         place_draws=whole.pop("places"),
+        motion=np.concatenate(compose(pose, centre, whole.pop("motion")), axis=-1),
+        centre=centre,
+        total_sd=None if pose.is_identity else found.sd["turned"],
         **whole,
         **(_residual(posterior, u_mean, mean) if with_images else {}),
         **_landmarks(posterior, mean),

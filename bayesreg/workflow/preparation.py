@@ -16,9 +16,9 @@ from bayesreg.config.observations import LandmarksSection
 from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
-from bayesreg.image import Image, IntensityScale, robust_scale
+from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
-from bayesreg.io.datasets import Anatomy, brainweb, check_same_space, from_files, mni152
+from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, without_labels
 from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
@@ -31,6 +31,7 @@ from bayesreg.model.warp import tissue_on_grid
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
+from bayesreg.workflow.matching import Matched, match_images
 from bayesreg.workflow.prediction import require_inside
 
 PROVENANCE = Path("inputs") / "provenance.json"
@@ -67,7 +68,7 @@ def prepare(config: Config) -> Prepared:
     clock = _Clock()
     _require_start(config)
     points = _points(config)
-    if isinstance(config.data, FilesData) and config.data.labels is None:
+    if isinstance(config.data, FilesData) and config.data.labels is None and config.data.fixed is None:
         assert config.mesh.file is not None
         mesh = load_mesh(config.mesh.file)
         _require_start(config, mesh)
@@ -76,21 +77,33 @@ def prepare(config: Config) -> Prepared:
         tissue = _as_stored(tissue_on_grid(mesh))
         inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points)
         return Prepared(inputs, clock.laps, {})
-    anatomy, moving = _anatomy(config)
+    anatomy = _anatomy(config)
     if anatomy.intracranial is not None:
         anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
     clock.lap("anatomy")
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, names=anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
-    appraisal = _appraise(config, anatomy, domain, moving)
+    matched = _match(config, anatomy, domain)
+    appraisal = _appraise(config, anatomy, domain, matched)
+    clock.lap("images")
     mesh = _mesh(anatomy, domain, config.mesh)
     clock.lap("mesh")
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     if isinstance(config.data, FilesData):
-        images = _scale(config.data, domain, anatomy.image, moving)
         boundary = _known_boundary(config, mesh, None)
-        inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, boundary=boundary, points=points)
+        inputs = Inputs(
+            resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points,
+            fixed_ignore=_ignored(config.data.fixed_ignore),
+        )  # fmt: skip
+        if matched is not None:
+            ignored = matched.moving_ignore
+            inputs = inputs._replace(
+                fixed=_as_stored(matched.fixed),
+                moving=_as_stored(matched.moving),
+                moving_ignore=None if ignored is None else _as_stored(ignored),
+                matching=matched.matching,
+            )
         return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
     fixed = robust_scale(anatomy.image, domain.voxels != 0)(anatomy.image)
@@ -102,6 +115,18 @@ def prepare(config: Config) -> Prepared:
     boundary = _known_boundary(config, mesh, truth)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
     return Prepared(inputs, clock.laps, _describe(config, pair), appraisal)
+
+
+def _ignored(path: Path | None) -> Image | None:
+    return None if path is None else _as_stored(load_mask(path))
+
+
+def _match(config: Config, anatomy: Anatomy, domain: Image) -> Matched | None:
+    """The moving image of a pair from files, brought beside the fixed one."""
+    data = config.data
+    if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
+        return None
+    return match_images(data, domain, anatomy.image, load_image(data.moving), _ignored(data.moving_ignore))
 
 
 def _skull(intracranial: Path | None) -> Image | None:
@@ -126,32 +151,14 @@ def _points(config: Config) -> dict[str, PointPairs]:
     return found
 
 
-def _appraise(config: Config, anatomy: Anatomy, domain: Image, moving: Image | None) -> Appraisal:
+def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
     """What is told of labels and images before the mesh is built."""
-    pair = None if anatomy.image is None or moving is None else (anatomy.image, moving)
-    one_contrast = config.model.similarity != "lncc"
-    one_scale = isinstance(config.data, FilesData) and config.data.same_contrast and config.model.intensity_map is None
-    return appraise(anatomy.tissue, domain, anatomy.names, pair, one_contrast, one_scale and one_contrast)
-
-
-def _scale(
-    data: FilesData, domain: Image, fixed: Image | None, moving: Image | None
-) -> tuple[Image | None, Image | None]:
-    """Both images on one scale of intensities, or each on its own."""
-    if fixed is None or moving is None:
-        return None, None
-    scale = _scale_of("fixed", fixed, domain.voxels != 0)
-    # Also where it goes unused: a constant image is told by its name.
-    own_scale = _scale_of("moving", moving, _within(domain, moving))
-    own_scale = scale if data.same_contrast else own_scale
-    return _as_stored(scale(fixed)), _as_stored(own_scale(moving))
-
-
-def _scale_of(name: str, image: Image, mask: np.ndarray) -> IntensityScale:
-    try:
-        return robust_scale(image, mask)
-    except InputError as error:
-        raise InputError(f"the {name} image within the organ: {error}") from error
+    if matched is None or not isinstance(config.data, FilesData):
+        return appraise(anatomy.tissue, domain, anatomy.names, None)
+    one_contrast = matched.matching.one_contrast and config.model.similarity != "lncc"
+    one_scale = one_contrast and config.data.same_contrast is True and config.model.intensity_map is None
+    found = appraise(anatomy.tissue, domain, anatomy.names, None, one_contrast, one_scale, matched.likeness)
+    return found._replace(notes=matched.notes)
 
 
 def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:
@@ -217,21 +224,18 @@ class _Clock:
         self.laps[name], self._last = now - self._last, now
 
 
-def _anatomy(config: Config) -> tuple[Anatomy, Image | None]:
-    """The fixed side, and the moving image of a pair from files."""
+def _anatomy(config: Config) -> Anatomy:
+    """The fixed side."""
     data = config.data
     if isinstance(data, FilesData):
-        assert data.labels is not None
+        if data.labels is None:
+            assert data.fixed is not None
+            return without_labels(data.fixed, data.intracranial)
         assert data.label_table is not None
-        anatomy = from_files(data.fixed, data.labels, data.label_table, data.intracranial)
-        if data.moving is None or anatomy.image is None:
-            return anatomy, None
-        moving = load_image(data.moving)
-        check_same_space(anatomy.image, moving, ("fixed", "moving"))
-        return anatomy, moving
+        return from_files(data.fixed, data.labels, data.label_table, data.intracranial)
     if isinstance(data, BrainWebData):
-        return brainweb(data.labels, data.t1, data.intracranial_labels), None
-    return mni152(), None
+        return brainweb(data.labels, data.t1, data.intracranial_labels)
+    return mni152()
 
 
 def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
@@ -260,11 +264,6 @@ def _as_stored(image: Image) -> Image:
     """Round to the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
     voxels = np.asarray(image.voxels)
     return Image(voxels.astype(np.float32) if voxels.dtype.kind == "f" else voxels, image.affine.astype(np.float32))
-
-
-def _within(domain: Image, image: Image) -> np.ndarray:
-    """Tell which voxels of an image on another grid lie in the domain."""
-    return np.asarray(domain.interpolate(image.grid_points())) > 0.5
 
 
 def _pair(

@@ -33,22 +33,29 @@ class Understood(NamedTuple):
 def understand(
     fixed: Path,
     moving: Path,
-    labels: Path,
+    labels: Path | None = None,
     table: str | None = None,
     intracranial: Path | None = None,
+    fixed_ignore: Path | None = None,
+    moving_ignore: Path | None = None,
     overrides: Sequence[str] = (),
 ) -> Understood:
     """Make the configuration of a pair in files.
 
     Parameters
     ----------
-    fixed, moving, labels : path
-        Two images, and tissue labels of the fixed one.
+    fixed, moving : path
+        Two images.
+    labels : path, optional
+        Tissue labels of the fixed image, or a mask of the organ; without them `intracranial` is the organ, or what is
+        bright in the fixed image.
     table : str, optional
         The name of a label table (`bayesreg.label_tables`), or a YAML file with labels by tissue; where it is left out,
         the values of the labels tell.
     intracranial : path, optional
         Mask of where the organ may go.
+    fixed_ignore, moving_ignore : path, optional
+        Masks of where the image of that name says nothing; not zero = ignored.
     overrides : sequence of str
         As in `bayesreg.load_config`.
 
@@ -57,8 +64,13 @@ def understand(
     InputError
         If a file is missing or unreadable, no table fits the labels, or an override is wrong.
     """
-    chosen, how = _choose_table(labels, table)
-    paths = {"fixed": fixed, "moving": moving, "labels": labels, "intracranial": intracranial}
+    if labels is None and table is not None:
+        raise InputError(f"--table {table} says what labels mean; give --labels, too")
+    chosen, how = (None, "none") if labels is None else _choose_table(labels, table)
+    paths = {
+        "fixed": fixed, "moving": moving, "labels": labels, "intracranial": intracranial,
+        "fixed_ignore": fixed_ignore, "moving_ignore": moving_ignore,
+    }  # fmt: skip
     files = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
     config = make_config({"data": {"source": "files", "label_table": chosen, **files}}, overrides)
     return Understood(config, tuple(_describe(config, how)))
@@ -71,11 +83,23 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     for name in ("fixed", "moving", "labels"):
         if (path := getattr(data, name)) is not None:
             yield f"{name:<12}{path}: {_describe_grid(load_image(path))}"
-    tissues = "; ".join(f"{name} {shorten(values, 12)}" for name, values in (data.label_table or {}).items())
-    yield f"{'table':<12}{how}: {tissues}"
+    if data.labels is None:
+        yield f"{'labels':<12}none: the organ is {_describe_organ(data)}, of one tissue"
+    else:
+        tissues = "; ".join(f"{name} {shorten(values, 12)}" for name, values in (data.label_table or {}).items())
+        yield f"{'table':<12}{how}: {tissues}"
     yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
-    yield f"{'pose':<12}as the headers say; only the deformation is looked for"
-    yield f"{'contrast':<12}compared by {config.model.similarity}; the model is preset {config.model.preset}"
+    for image in ("fixed", "moving"):
+        if (path := getattr(data, f"{image}_ignore")) is not None:
+            yield f"{'ignored':<12}what is not zero in {path} says nothing, in the {image} image"
+    yield f"{'pose':<12}{'as the headers say' if data.pose == 'fixed' else 'looked for where the headers do not fit'}"
+    contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
+    yield f"{'contrast':<12}{contrast}; compared by {config.model.similarity}"
+    yield f"{'model':<12}preset {config.model.preset}"
+
+
+def _describe_organ(data: FilesData) -> str:
+    return "what is bright in the fixed image" if data.intracranial is None else f"all of {data.intracranial}"
 
 
 def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], str]:

@@ -152,6 +152,8 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
         if config.has_images and not config.compares_images:
             say("the images are shown and not compared: observations does not name them ({kind: images})")
         inputs, provenance = prepared_inputs(config, observations)
+        for line in provenance["appraisal"].get("notes", ()):
+            say(line)
         for sentence in provenance["appraisal"].get("beware", ()):
             say(f"beware: {sentence}")
         # Nothing is written before all input has proved sound, and all of it before the first step is taken.
@@ -311,9 +313,11 @@ def _block(images: ComparedImages | None) -> int:
 
 
 def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
+    """The moving image on the fixed grid by the mean of the displacement, the pose included."""
     if inputs.moving is None or inputs.fixed is None:
         return None
-    return warp_image(inputs.moving, mean_field, inputs.fixed)
+    # Where the voxels lie in the moving image's own world.
+    return warp_image(inputs.matching.pose.inverse.aligned(inputs.moving), mean_field, inputs.fixed)
 
 
 def _finish(
@@ -331,13 +335,19 @@ def _finish(
     save_posterior(posterior, samples.blocks, out / "posterior.nc")
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)
-    grid = inputs.fixed or inputs.tissue
-    moments = moments_on_grid(inputs.mesh, samples.u_mean, samples.u_sd, grid)
+    grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean = mean_values(posterior, draws, samples.u_mean)
-    predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed)
+    predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
+    total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
+    total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
+    moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
+    if not pose.is_identity:
+        # What surrounds the organ, such as the skull, moves by the pose alone.
+        beyond = (moments.sd == 0).all(axis=-1)
+        moments.mean[beyond] = (pose.place(grid.grid_points()) - grid.grid_points())[beyond]
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
         | {"displacement_sd": moments.rms_sd},

@@ -238,7 +238,7 @@ def test_replicates_have_the_maps_of_the_data_and_the_noise_of_the_model():
     assert abs((draws**2).mean(axis=0) / (1 - leverage) - 1).max() < 6 * np.sqrt(2 / count)
     assert float(term.similarity.variance()) == pytest.approx(1 - leverage.mean(), rel=1e-9)
     assert term.noise_sd(5.0) == pytest.approx(np.sqrt(5.0 * (1 - leverage.mean()) / (2 * w.mean())))
-    likelihood = ImageLikelihood(term, term.predicted(u), jnp.asarray(5.0))
+    likelihood = ImageLikelihood(term, term.compared(term.places(u)), jnp.asarray(5.0))
     image = likelihood.sample(jax.random.key(1), (200,)).mean(axis=0)
     gain, offset, _ = fitted(post, state)
     scale = np.sqrt(5.0 / (2 * w))

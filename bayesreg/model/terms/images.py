@@ -14,6 +14,7 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Float, Int
 from numpyro.distributions import constraints
+from scipy import ndimage
 
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
 from bayesreg.fem.location import locate
@@ -21,6 +22,7 @@ from bayesreg.image import Image
 from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
+from bayesreg.model.contrast import contrast_functions, map_contrast
 from bayesreg.model.intensity_map import shading_basis
 from bayesreg.model.options import ModelConfig, TemperaturePrior
 from bayesreg.model.pointwise import Intensities, ValueCurvature
@@ -34,7 +36,7 @@ NOTHING: Values = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
-    """Two images; how they are compared, and what their contrasts may be, stands in `ModelConfig.similarity`.
+    """Two images; how they are compared stands in `ModelConfig.similarity`.
 
     Points that rest beyond the grid of the moving image say nothing.
 
@@ -44,6 +46,13 @@ class ImagePair:
         f and m; their intensities are taken as they are.
     name : str, default "images"
         Its name in tables and in the NumPyro program.
+    fixed_ignore : Image, optional
+        Not zero where the fixed image says nothing: no point is compared there. On any grid, in its world.
+    moving_ignore : Image, optional
+        Not zero where the moving image says nothing, such as in a cavity: a point that is taken there is as probable
+        whatever its intensity. On any grid, in its world.
+    one_contrast : bool, default True
+        False: f is compared through the best map of its intensities to those of m (`bayesreg.model.contrast`).
 
     Raises
     ------
@@ -58,11 +67,55 @@ class ImagePair:
     fixed: Image
     moving: Image
     name: str = "images"
+    fixed_ignore: Image | None = None
+    moving_ignore: Image | None = None
+    one_contrast: bool = True
 
     def __post_init__(self) -> None:
-        for which in ("fixed", "moving"):
-            if not isinstance(given := getattr(self, which), Image):
+        for which in ("fixed", "moving", "fixed_ignore", "moving_ignore"):
+            given = getattr(self, which)
+            if not isinstance(given, Image) and (given is not None or which in ("fixed", "moving")):
                 raise InputError(f"{self.name}: {which} must be an Image, got {type(given).__name__}; see load_image")
+
+    def in_one_contrast(self, mesh: TetMesh, model: ModelConfig) -> ImagePair:
+        """The pair with f in the contrast of m, as far as a map of intensities tells at rest; itself if it is in it.
+
+        Raises
+        ------
+        InputError
+            As `on`.
+        """
+        if self.one_contrast or model.similarity == "lncc":
+            return self
+        positions = self.compared_points(mesh, model).positions(mesh)
+        return MappedPair(
+            map_contrast(self.fixed, self.moving, positions),
+            self.moving,
+            self.name,
+            self.fixed_ignore,
+            self.moving_ignore,
+            source=self.fixed,
+        )
+
+    def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
+        """Functions, besides those of a shading, of which m may have some more than f, smoothed by sd, mm."""
+        return np.zeros((len(positions), 0))
+
+    def compared_points(self, mesh: TetMesh, model: ModelConfig) -> Quadrature:
+        """The points that are compared, by the model's rule.
+
+        Raises
+        ------
+        InputError
+            If the mesh does not overlap an image, or nothing of it is left to compare.
+        """
+        of_pair = "" if self.name == "images" else f" of {self.name!r}"
+        require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
+        require_overlap(mesh, self.moving, f"moving image{of_pair}")
+        return self._seen(mesh, quadrature_of(mesh, self.fixed, model))
+
+    def _seen(self, mesh: TetMesh, quadrature: Quadrature) -> Quadrature:
+        return seen_points(mesh, quadrature, self.moving, self.fixed_ignore)
 
     def on(self, mesh: TetMesh, model: ModelConfig) -> ComparedImages:
         """The term on a mesh.
@@ -72,17 +125,15 @@ class ImagePair:
         InputError
             If the mesh does not overlap an image, or the quadrature has no points or fewer than are independent.
         """
-        of_pair = "" if self.name == "images" else f" of {self.name!r}"
-        require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
-        require_overlap(mesh, self.moving, f"moving image{of_pair}")
-        quadrature = seen_points(mesh, quadrature_of(mesh, self.fixed, model), self.moving)
+        quadrature = self.compared_points(mesh, model)
         positions = quadrature.positions(mesh)
         smooth = self.smoothed_as(model)
         moving = smooth.moving.interpolator(model.interpolation)
         fixed_values = smooth.fixed.interpolate(positions, model.interpolation)
-        shading = None
-        if model.intensity_map is not None:
-            shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, model.intensity_map))
+        more, shading = self.functions(positions, self.smoothing_sd(model)), None
+        if model.intensity_map is not None or more.shape[1]:
+            degree = 0 if model.intensity_map is None else model.intensity_map
+            shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, degree, more))
         return ComparedImages(
             comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior)),
             similarity=SIMILARITIES[model.similarity].on(model, positions, moving),
@@ -93,11 +144,16 @@ class ImagePair:
             positions=jnp.asarray(positions),
             independent_share=jnp.asarray(independent_share(model, len(positions))),
             shading=shading,
+            visible=None if self.moving_ignore is None else visibility(self.moving_ignore),
         )
+
+    def smoothing_sd(self, model: ModelConfig) -> float:
+        """By how much the options smooth both images, mm."""
+        return model.smoothing * max(image.voxel_volume for image in (self.fixed, self.moving)) ** (1 / 3)
 
     def smoothed_as(self, model: ModelConfig) -> ImagePair:
         """The pair with both images smoothed as the options say."""
-        return _smoothed_as(self, model.smoothing) if model.smoothing else self
+        return _smoothed_as(self, self.smoothing_sd(model)) if model.smoothing else self
 
     def smoothed(self, term: ComparedImages, sd: float, interpolation: Interpolation) -> ComparedImages:
         """The term with both images smoothed, sd in mm."""
@@ -108,7 +164,7 @@ class ImagePair:
 
     def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
         """The term with the images compared at four points of every tetrahedron, without a shading."""
-        quadrature = seen_points(mesh, gauss_quadrature(mesh, "gauss4"), self.moving)
+        quadrature = self._seen(mesh, gauss_quadrature(mesh, "gauss4"))
         positions = quadrature.positions(mesh)
         return term._replace(
             similarity=term.similarity.at(positions),
@@ -118,6 +174,24 @@ class ImagePair:
             fixed_values=self.fixed.interpolate(positions, interpolation),
             shading=None,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class MappedPair(ImagePair):
+    """A pair whose fixed image was mapped into the contrast of the moving one.
+
+    Attributes
+    ----------
+    source : Image
+        The fixed image itself, of whose intensities the map is a function.
+    """
+
+    source: Image | None = None
+
+    def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
+        """The functions that make up the map: how much of each is there is inferred with all else."""
+        assert self.source is not None
+        return contrast_functions(self.source, positions, sd)
 
 
 @jax.tree_util.register_static
@@ -156,6 +230,8 @@ class ComparedImages(NamedTuple):
         Effective number of independent quadrature points over that of all: tempers the likelihood.
     shading : (q, k) array or None
         Functions of which m has some more than f (`bayesreg.model.intensity_map`).
+    visible : Interpolator or None
+        1 where the moving image is looked at and 0 where it is ignored; None: it is looked at everywhere.
     """
 
     comparison: Comparison
@@ -167,6 +243,7 @@ class ComparedImages(NamedTuple):
     positions: Float[AnyArray, "points 3"]
     independent_share: Scalar
     shading: Float[AnyArray, "points coefficients"] | None = None
+    visible: Interpolator | None = None
 
     @property
     def name(self) -> str:
@@ -184,8 +261,8 @@ class ComparedImages(NamedTuple):
     def likelihood(self, state: State) -> ImageLikelihood:
         """The distribution of f(x_q), given m(x_q + u(x_q))."""
         # Without the barrier XLA interpolates twice, for the density and for the record.
-        predicted = jax.lax.optimization_barrier(self.predicted(state.u, state.values))
-        return ImageLikelihood(self, predicted, state.values["t_similarity"])
+        compared = jax.lax.optimization_barrier(self.compared(self.places(state.u), state.values))
+        return ImageLikelihood(self, compared, state.values["t_similarity"])
 
     def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
         """x_q + u(x_q), mm."""
@@ -199,13 +276,16 @@ class ComparedImages(NamedTuple):
         """Values of m less what they have more of than f, if a shading is inferred."""
         return moving if self.shading is None else moving - self.shading @ values[shading_name(self.name)]
 
-    def pair(self, predicted: Float[AnyArray, "points"]) -> Intensities:
-        """f(x_q) beside values of m."""
-        return Intensities(self.fixed_values, predicted, self.quadrature.weights)
+    def compared(self, places: Float[AnyArray, "points 3"], values: Values = NOTHING) -> Intensities:
+        """f(x_q) beside m at some places, mm, and how much of each is looked at."""
+        predicted = self.without_shading(self.moving(places), values)
+        share = None if self.visible is None else self.visible(places)
+        return Intensities(self.fixed_values, predicted, self.quadrature.weights, share)
 
     def residuals(self, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING) -> Float[AnyArray, "points"]:
-        """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q))."""
-        return self.similarity.residuals(self.pair(self.predicted(u, values)))
+        """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q)); zero where m is ignored."""
+        pair = self.compared(self.places(u), values)
+        return pair.shares * self.similarity.residuals(pair)
 
     def scaled_residual(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points"]:
         """`residuals` in units of their scale √(T_s / 2w): where the model holds, as `standardised_noise`."""
@@ -219,7 +299,8 @@ class ComparedImages(NamedTuple):
         self, key: AnyArray, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING
     ) -> Float[AnyArray, "points"]:
         """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""
-        return self.similarity.draw(key, self.pair(self.predicted(u, values)))
+        pair = self.compared(self.places(u), values)
+        return pair.shares * self.similarity.draw(key, pair)
 
     def noise_sd(self, t_similarity: float) -> float:
         """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
@@ -246,55 +327,59 @@ class ComparedImages(NamedTuple):
 class ImageLikelihood(dist.Distribution):
     """Intensities of the fixed image at the quadrature points, given the moving image's there.
 
+    Where m is ignored every intensity in the range of f is as probable.
+
     Parameters
     ----------
     term : ComparedImages
-    predicted : (q,) array
-        m(x_q + u(x_q)).
+    compared : Intensities
+        f(x_q) beside m(x_q + u(x_q)).
     temperature : scalar
         T_s, mm³ times squared intensity.
     """
 
     support = constraints.real_vector
 
-    def __init__(self, term: ComparedImages, predicted: Float[AnyArray, "points"], temperature: Scalar) -> None:
-        self.term, self.predicted, self.temperature = term, predicted, temperature
-        super().__init__(event_shape=jnp.shape(predicted), validate_args=False)
+    def __init__(self, term: ComparedImages, compared: Intensities, temperature: Scalar) -> None:
+        self.term, self.compared, self.temperature = term, compared, temperature
+        super().__init__(event_shape=jnp.shape(compared.moving), validate_args=False)
 
     def energy(self, value: Float[AnyArray, "points"]) -> Scalar:
         """E_s, mm³ times squared intensity."""
-        pair = Intensities(value, self.predicted, self.term.quadrature.weights)
-        return self.term.similarity.energy(pair, self.temperature)
+        return self.term.similarity.energy(self.compared._replace(fixed=value), self.temperature)
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
         """Replicates of the fixed image, which the tempering by `independent_share` leaves as they are."""
-        similarity, pair = self.term.similarity, self.term.pair(self.predicted)
+        similarity, pair = self.term.similarity, self.compared
         explained = pair.fixed - similarity.residuals(pair)
         noise = jax.vmap(lambda one: similarity.draw(one, pair))(jax.random.split(key, sample_shape).ravel())
         scale = jnp.sqrt(self.temperature / (2 * pair.weights))
         return (explained + scale * noise).reshape(*sample_shape, *self.event_shape)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
-        """The tempered log density; its normaliser is part of it where T_s is inferred."""
+        """The tempered log density; its normaliser is part of it where T_s is inferred or some of m is ignored."""
+        pair = self.compared._replace(fixed=value)
         found = -self.energy(value) / self.temperature
-        if self.term.comparison.normalised:
-            found += self.term.similarity.log_normaliser(self.term.quadrature.weights, self.temperature)
+        if self.term.comparison.normalised or pair.share is not None:
+            found += self.term.similarity.log_normaliser(pair, self.temperature)
+        if pair.share is not None:
+            found -= (1 - pair.share).sum() * jnp.log(jnp.ptp(self.term.fixed_values))
         return self.term.independent_share * found
 
 
 @jax.jit
 def _scores(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points 3"]:
     moved = term.places(u)
-    pair = term.pair(term.without_shading(term.moving(moved), values))
+    pair = term.compared(moved, values)
     slope = jax.grad(term.similarity.energy)(pair, values["t_similarity"]).moving
     return -slope[:, None] * _slope(term, moved)
 
 
 @jax.jit
 def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-    """Gauss and Newton's curvature in every place x_q + u(x_q)."""
+    """Gauss and Newton's curvature in every place x_q + u(x_q), the share that is looked at held fixed."""
     moved = term.places(u)
-    pair = term.pair(term.without_shading(term.moving(moved), values))
+    pair = term.compared(moved, values)
     convexity = term.similarity.convexity(pair, values["t_similarity"])
     return _chain(term, convexity, _slope(term, moved), values["t_similarity"])
 
@@ -305,7 +390,7 @@ def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Valu
     moved, similarity, t_similarity = term.places(u), term.similarity, values["t_similarity"]
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    pair = term.pair(term.without_shading(term.moving(moved), values))
+    pair = term.compared(moved, values)
     first = jax.grad(similarity.energy)(pair, t_similarity).moving
     second = _subtract(similarity.curvature(pair, t_similarity), similarity.convexity(pair, t_similarity))
     found = _chain(term, second, slope(moved), t_similarity)
@@ -345,10 +430,17 @@ def shading_name(name: str) -> str:
     return f"{name}_shading"
 
 
+def visibility(ignore: Image) -> Interpolator:
+    """1 where an image is looked at and 0 where it is ignored, as a function of the place.
+
+    A voxel's neighbours are ignored with it, since smoothing and interpolation mix its intensity into theirs.
+    """
+    ignored = ndimage.binary_dilation(np.asarray(ignore.voxels) != 0, ndimage.generate_binary_structure(3, 3))
+    return ignore.with_voxels(1.0 - ignored).interpolator("linear")
+
+
 @lru_cache(maxsize=4)
-def _smoothed_as(pair: ImagePair, voxels: float) -> ImagePair:
-    """Both images smoothed by so many voxels of the coarser one."""
-    sd = voxels * max(image.voxel_volume for image in (pair.fixed, pair.moving)) ** (1 / 3)
+def _smoothed_as(pair: ImagePair, sd: float) -> ImagePair:
     with ThreadPoolExecutor() as pool:
         fixed, moving = pool.map(lambda image: image.smoothed(sd), (pair.fixed, pair.moving))
     return replace(pair, fixed=fixed, moving=moving)
@@ -413,12 +505,22 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
     return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))
 
 
-def seen_points(mesh: TetMesh, quadrature: Quadrature, moving: Image) -> Quadrature:
-    """The points that rest on the grid of the moving image: what lies beyond it has not been seen.
+def seen_points(mesh: TetMesh, quadrature: Quadrature, moving: Image, fixed_ignore: Image | None = None) -> Quadrature:
+    """The points that rest on the grid of the moving image, and are not ignored: what lies beyond has not been seen.
 
     Which points count must not depend on the displacement: a posterior could do without those that do not fit.
+
+    Raises
+    ------
+    InputError
+        If none is left.
     """
-    seen = moving.contains(quadrature.positions(mesh))
+    positions = quadrature.positions(mesh)
+    seen = moving.contains(positions)
+    if fixed_ignore is not None:
+        seen &= np.asarray(visibility(fixed_ignore)(jnp.asarray(positions))) > 0.5
+    if not seen.any():
+        raise InputError("nothing is left to compare: all of the mesh lies in fixed_ignore, or beyond the moving image")
     if seen.all():
         return quadrature
     kept = (np.asarray(part)[seen] for part in (quadrature.cells, quadrature.barycentric, quadrature.weights))

@@ -1,0 +1,224 @@
+"""The pose of an organ between two images, by SimpleITK: rigid, by mutual information, from several starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import SimpleITK
+from jaxtyping import Float
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from bayesreg.image import Image
+from bayesreg.pose import Pose
+from bayesreg.types import InputError
+
+# mm: about the organ its surroundings, such as skull and scalp, are compared, too.
+SURROUNDINGS = 15.0
+# Level by level: edge of the voxels, mm, share of them that are looked at, and how many candidates it begins with.
+LEVELS: tuple[tuple[float, float, int | None], ...] = ((8.0, 1.0, None), (4.0, 1.0, 3), (2.0, 0.5, 1))
+# Degrees about each axis that a head in a scanner or on a table may be turned by, besides none.
+TURNS = (-25.0, 25.0)
+BINS = 32
+ITERATIONS = 200
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+class Alignment(NamedTuple):
+    """A pose and what speaks for it.
+
+    Attributes
+    ----------
+    pose : Pose
+    information : float
+        Mutual information of both images about the organ, nats.
+    as_given : float
+        The same as the headers place the images.
+    """
+
+    pose: Pose
+    information: float
+    as_given: float
+
+
+def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | None = None) -> Alignment:
+    """Find the pose by Mattes' mutual information, coarse to fine, from several starts.
+
+    The starts are the headers', and centre on centre, by the grids and by the intensities; each as it is and turned
+    about each axis. The coarsest level compares them all, the others the best and what the headers lead to.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+    organ : Image
+        Nonzero in the organ, on the grid of the fixed image; it is compared with some millimetres around it.
+    moving_ignore : Image, optional
+        Nonzero where the moving image is not looked at, on its grid.
+
+    Raises
+    ------
+    InputError
+        If no start makes the images overlap.
+
+    Notes
+    -----
+    The same images give the same pose: the points that are looked at are chosen by a fixed seed.
+    """
+    around = _around(organ)
+    kept = None if moving_ignore is None else moving_ignore.with_voxels(np.asarray(moving_ignore.voxels) == 0)
+    headers = _euler(np.eye(4), _centre_of(organ))
+    starts, given, best = list(_starts(fixed, moving, organ)), headers, headers
+    for edge, share, most in LEVELS:
+        level = _Level.of(fixed, moving, around, kept, edge, share)
+        # From the headers at every level: where they are right, nothing that a coarser level preferred is nearer.
+        given, *others = (level.improve(start) for start in (given, *starts[:most]))
+        # A step of the optimiser may also make it worse.
+        starts = sorted((headers, given, *others), key=level.value, reverse=True)
+        best = starts[0]
+    information, as_given = level.value(best), level.value(headers)
+    if information <= 0:
+        raise InputError(
+            "no pose makes the two images overlap by more than chance; check that they show the same organ"
+        )
+    return Alignment(Pose(_matrix(best)), information, as_given)
+
+
+def _starts(fixed: Image, moving: Image, organ: Image) -> Iterator[SimpleITK.Euler3DTransform]:
+    centre = _centre_of(organ)
+    shifts = [np.zeros(3)]
+    for of in (_grid_centre, _mass_centre):
+        shifts.append(of(moving) - of(fixed))
+    turns = [np.zeros(3)] + [angle * np.eye(3)[axis] for axis, angle in product(range(3), TURNS)]
+    for shift, turn in list(product(shifts, turns))[1:]:
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+        matrix[:3, 3] = centre + shift - matrix[:3, :3] @ centre
+        yield _euler(matrix, centre)
+
+
+class _Level(NamedTuple):
+    """Both images on grids of one resolution, and how they are compared."""
+
+    fixed: SimpleITK.Image
+    moving: SimpleITK.Image
+    edge: float
+    share: float
+    around: SimpleITK.Image
+    kept: SimpleITK.Image | None
+
+    @classmethod
+    def of(cls, fixed: Image, moving: Image, around: Image, kept: Image | None, edge: float, share: float) -> _Level:
+        masks = [None if one is None else _to_itk(_coarser(one, edge, 0), "uint8") for one in (around, kept)]
+        one, other = (_to_itk(_coarser(image, edge, 1), "float32") for image in (fixed, moving))
+        assert masks[0] is not None
+        return cls(one, other, edge, share, masks[0], masks[1])
+
+    def method(self) -> SimpleITK.ImageRegistrationMethod:
+        method = SimpleITK.ImageRegistrationMethod()
+        method.SetMetricAsMattesMutualInformation(BINS)
+        method.SetMetricFixedMask(self.around)
+        if self.kept is not None:
+            method.SetMetricMovingMask(self.kept)
+        if self.share < 1:
+            method.SetMetricSamplingStrategy(method.RANDOM)
+            method.SetMetricSamplingPercentage(self.share, 1)
+        method.SetInterpolator(SimpleITK.sitkLinear)
+        # One thread adds up in one order: the same images give the same pose to the last bit.
+        method.SetNumberOfThreads(1)
+        method.SetNumberOfWorkUnits(1)
+        return method
+
+    def improve(self, start: SimpleITK.Euler3DTransform) -> SimpleITK.Euler3DTransform:
+        """The best pose near a start; the start where they do not overlap."""
+        method, found = self.method(), SimpleITK.Euler3DTransform(start)
+        method.SetOptimizerAsRegularStepGradientDescent(self.edge / 2, 1e-3 * self.edge, ITERATIONS, 0.6)
+        method.SetOptimizerScalesFromPhysicalShift()
+        method.SetInitialTransform(found, inPlace=True)
+        try:
+            method.Execute(self.fixed, self.moving)
+        except RuntimeError:
+            return start
+        return found
+
+    def value(self, transform: SimpleITK.Euler3DTransform) -> float:
+        """Mutual information, nats; 0 where the images do not overlap."""
+        method = self.method()
+        method.SetInitialTransform(SimpleITK.Euler3DTransform(transform), inPlace=True)
+        try:
+            return -float(method.MetricEvaluate(self.fixed, self.moving))
+        except RuntimeError:
+            return 0.0
+
+
+def _around(organ: Image) -> Image:
+    """The organ and its surroundings."""
+    away = ndimage.distance_transform_edt(np.asarray(organ.voxels) == 0, organ.voxel_sizes)
+    return organ.with_voxels((away <= SURROUNDINGS).astype(np.uint8))
+
+
+def _coarser(image: Image, edge: float, order: int) -> Image:
+    """The image on orthogonal axes with voxels of about this edge, mm; smoothed first, unless by nearest voxels."""
+    sizes, shape = image.voxel_sizes, np.array(image.shape)
+    wanted = np.maximum(sizes, edge)
+    axes = np.linalg.qr(image.affine[:3, :3])[0]
+    # The factor of an orthogonal affine is its axes, up to their signs.
+    axes = axes * np.sign((axes * image.affine[:3, :3]).sum(0))
+    corners = image.voxel_to_world(np.array(list(product(*((-0.5, n - 0.5) for n in shape))))) @ axes
+    low, high = corners.min(0), corners.max(0)
+    count = np.maximum(np.rint((high - low) / wanted).astype(int), 1)
+    affine = np.eye(4)
+    affine[:3, :3] = axes * wanted
+    affine[:3, 3] = axes @ ((low + high) / 2 - wanted * (count - 1) / 2)
+    voxels = np.asarray(image.voxels, float)
+    if order:
+        voxels = ndimage.gaussian_filter(voxels, np.where(wanted > sizes, wanted / sizes / 2, 0.0), mode="nearest")
+    between = image.to_voxel @ affine
+    moved = ndimage.affine_transform(
+        voxels, between[:3, :3], between[:3, 3], tuple(count), order=order, mode="nearest" if order else "constant"
+    )
+    return Image(moved, affine)
+
+
+def _to_itk(image: Image, dtype: str) -> SimpleITK.Image:
+    """An image whose axes are orthogonal."""
+    found = SimpleITK.GetImageFromArray(np.asarray(image.voxels).astype(dtype).transpose(2, 1, 0))
+    affine = FLIP @ image.affine
+    found.SetSpacing(image.voxel_sizes.tolist())
+    found.SetDirection((affine[:3, :3] / image.voxel_sizes).ravel().tolist())
+    found.SetOrigin(affine[:3, 3].tolist())
+    return found
+
+
+def _centre_of(mask: Image) -> Float[np.ndarray, "3"]:
+    return mask.voxel_to_world(np.argwhere(np.asarray(mask.voxels) != 0).mean(0))
+
+
+def _grid_centre(image: Image) -> Float[np.ndarray, "3"]:
+    return image.voxel_to_world((np.array(image.shape) - 1) / 2)
+
+
+def _mass_centre(image: Image) -> Float[np.ndarray, "3"]:
+    voxels = np.asarray(image.voxels, float)
+    return image.voxel_to_world(np.array(ndimage.center_of_mass(voxels - voxels.min() + 1e-12)))
+
+
+def _euler(matrix: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTransform:
+    """A motion of RAS as ITK's of LPS, with its centre of rotation."""
+    lps, about = FLIP @ matrix @ FLIP, FLIP[:3, :3] @ centre
+    found = SimpleITK.Euler3DTransform()
+    found.SetCenter(about.tolist())
+    found.SetMatrix(lps[:3, :3].ravel().tolist())
+    found.SetTranslation((lps[:3, :3] @ about + lps[:3, 3] - about).tolist())
+    return found
+
+
+def _matrix(transform: SimpleITK.Euler3DTransform) -> Float[np.ndarray, "4 4"]:
+    """The motion of RAS of one of ITK."""
+    found = np.eye(4)
+    found[:3, :3] = np.array(transform.GetMatrix()).reshape(3, 3)
+    centre = np.array(transform.GetCenter())
+    found[:3, 3] = np.array(transform.GetTranslation()) + centre - found[:3, :3] @ centre
+    return FLIP @ found @ FLIP

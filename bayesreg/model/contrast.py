@@ -1,0 +1,101 @@
+"""A map from the intensities of f to those of m, for pairs of unlike contrast.
+
+m(x + u) ≈ Σ_k c_k b_k(x): b_k are cubic B-splines of f(x), so that every tissue has its own brightness, and |∇f(x)|, so
+that borders have theirs, as in ultrasound. A shading is what `ModelConfig.intensity_map` adds. (Roche et al. 1998,
+"The correlation ratio as a new similarity measure for multimodal image registration"; with |∇f|, Wein et al. 2008,
+"Automatic CT-ultrasound registration for diagnostic imaging and image-guided intervention".) The coefficients that fit
+best at rest carry f into the contrast of m, and the pair is then compared as one of one contrast. What the map lacks,
+for at rest the tissues do not lie on one another, is inferred with all else: the coefficients have Normal priors about
+those at rest, and stand among the unknowns, so that every interval counts with all maps that the images allow.
+
+Smoothing and a map of intensities do not commute. The b_k are therefore images, which are smoothed as m is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import BSpline
+
+from bayesreg.image import Image
+
+# Splines of f: they follow four tissues and their partial volumes.
+SPLINES = 8
+# The quantiles between which they lie, and how finely they are tabulated.
+ENDS, LEVELS = (0.005, 0.995), 1024
+# Ridge of the fit, as a share of the mean square of a function.
+RIDGE = 1e-4
+# Voxels of the coarser image: all are smoothed by as much for the fit at rest, which tissues that do not lie on one
+# another then harm less.
+BLUR = 1.5
+
+
+def map_contrast(fixed: Image, moving: Image, positions: Float[np.ndarray, "points 3"]) -> Image:
+    """The fixed image in the contrast of the moving one, as far as both tell at rest.
+
+    Parameters
+    ----------
+    fixed, moving : Image
+    positions : (q, 3) array
+        Where to compare them, mm.
+
+    Returns
+    -------
+    Image
+        On the grid of the fixed image.
+    """
+    sd = BLUR * max(image.voxel_volume for image in (fixed, moving)) ** (1 / 3)
+    target = np.asarray(moving.smoothed(sd).interpolate(positions))
+    coefficients = _fit(contrast_functions(fixed, positions, sd), target)
+    found = np.zeros(fixed.shape)
+    for coefficient, image in zip(coefficients, _function_images(fixed, positions), strict=True):
+        found += coefficient * np.asarray(image.voxels)
+    return fixed.with_voxels(found)
+
+
+def contrast_functions(
+    fixed: Image, positions: Float[np.ndarray, "points 3"], sd: float = 0.0
+) -> Float[np.ndarray, "points functions"]:
+    """b_k at some places, smoothed by sd, both in mm."""
+    images = _function_images(fixed, positions)
+    smooth = (image.smoothed(sd) if sd else image for image in images)
+    return np.stack([np.asarray(image.interpolate(positions)) for image in smooth], axis=1)
+
+
+def explained_shares(one: Float[np.ndarray, "points"], other: Float[np.ndarray, "points"]) -> tuple[float, float]:
+    """Shares of the variance of the other intensities that a straight line and splines of the first explain.
+
+    The former is negative where the line falls.
+    """
+    correlation = float(np.corrcoef(one, other)[0, 1])
+    functions = np.stack([spline(one) for spline in _splines(one)], axis=1)
+    left = other - functions @ _fit(functions, other)
+    return correlation * abs(correlation), float(max(1 - left.var() / other.var(), 0.0))
+
+
+def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"]) -> Iterator[Image]:
+    """The splines of f, which lie between its quantiles at these places, and |∇f| over their range, one by one."""
+    voxels, values = np.asarray(fixed.voxels, float), np.asarray(fixed.interpolate(positions))
+    for spline in _splines(values):
+        yield fixed.with_voxels(spline(voxels))
+    along = np.stack(np.gradient(voxels), axis=-1) @ fixed.to_voxel[:3, :3]
+    yield fixed.with_voxels(np.linalg.norm(along, axis=-1) / np.ptp(np.quantile(values, ENDS)))
+
+
+def _splines(values: Float[np.ndarray, "points"]) -> list[partial[np.ndarray]]:
+    """Cubic B-splines between two quantiles of some values, constant beyond them."""
+    low, high = np.quantile(values, ENDS)
+    knots = np.concatenate([np.full(3, low), np.linspace(low, high, SPLINES - 2), np.full(3, high)])
+    levels = np.linspace(low, high, LEVELS)
+    return [partial(np.interp, xp=levels, fp=column) for column in BSpline.design_matrix(levels, knots, 3).toarray().T]
+
+
+def _fit(functions: Float[np.ndarray, "points k"], values: Float[np.ndarray, "points"]) -> Float[np.ndarray, "k"]:
+    """Coefficients by least squares, with a little ridge about the mean."""
+    products = functions.T @ functions
+    middle = np.full(functions.shape[1], values.mean())
+    ridge = RIDGE * np.diag(np.maximum(products.diagonal(), 1e-12 * products.trace()))
+    return middle + np.linalg.solve(products + ridge, functions.T @ (values - functions @ middle))

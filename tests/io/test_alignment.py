@@ -1,0 +1,96 @@
+"""The pose by mutual information, on a phantom whose motion is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from bayesreg.image import Image
+from bayesreg.io.alignment import find_pose
+from bayesreg.pose import Pose
+from bayesreg.types import InputError
+
+# mm
+EDGE = 3.0
+
+
+def organ():
+    """A lopsided body with bright and dark parts, on a grid of 3 mm, and its mask."""
+    rng = np.random.default_rng(0)
+    shape = (50, 56, 46)
+    x = np.stack(np.meshgrid(*(EDGE * (np.arange(n) - n / 2) for n in shape), indexing="ij"), axis=-1)
+    inside = ((x / (52.0, 66.0, 45.0)) ** 2).sum(-1) < 1
+    inside &= ((x - (40.0, 30.0, 20.0)) ** 2).sum(-1) > 20**2
+    texture = ndimage.gaussian_filter(rng.normal(size=shape), 2.5)
+    voxels = inside * (1 + 8 * texture)
+    affine = np.diag([EDGE, EDGE, EDGE, 1.0])
+    affine[:3, 3] = -EDGE * np.array(shape) / 2
+    return Image(voxels, affine), Image(inside.astype(np.uint8), affine)
+
+
+FIXED, MASK = organ()
+
+
+def motion(millimetres, degrees, seed=0):
+    rng = np.random.default_rng(seed)
+    axis, shift = rng.normal(size=3), rng.normal(size=3)
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(degrees * axis / np.linalg.norm(axis), degrees=True).as_matrix()
+    matrix[:3, 3] = millimetres * shift / np.linalg.norm(shift)
+    return Pose(matrix)
+
+
+def moved(pose, values=lambda v: v):
+    """The same body elsewhere: on the grid of the moving image as it was, by its header alone."""
+    noise = np.random.default_rng(1).normal(scale=0.02, size=FIXED.shape)
+    return pose.inverse.aligned(FIXED.with_voxels(values(np.asarray(FIXED.voxels)) + noise))
+
+
+def off(found, pose):
+    at = MASK.voxel_to_world(np.argwhere(np.asarray(MASK.voxels)))
+    return np.linalg.norm(found.place(at) - pose.place(at), axis=1).mean()
+
+
+@pytest.mark.parametrize(("millimetres", "degrees"), [(8.0, 8.0), (20.0, 15.0), (300.0, 20.0)])
+def test_a_rigid_motion_is_found(millimetres, degrees):
+    pose = motion(millimetres, degrees)
+    found = find_pose(FIXED, moved(pose), MASK)
+    assert off(found.pose, pose) < 0.3
+    assert found.information > 1.5 * found.as_given
+
+
+def test_it_is_found_where_bright_and_dark_change_places():
+    pose = motion(8.0, 8.0, seed=2)
+    found = find_pose(FIXED, moved(pose, lambda v: np.where(v > 0, 2 - v, 0.0)), MASK)
+    assert off(found.pose, pose) < 0.3
+
+
+def test_images_that_lie_on_one_another_stay():
+    found = find_pose(FIXED, moved(Pose.identity()), MASK)
+    assert off(found.pose, Pose.identity()) < 0.1
+    assert found.information < 1.05 * found.as_given
+
+
+def test_what_is_ignored_does_not_mislead():
+    """A bright part of the moving image that is elsewhere in the fixed one."""
+    pose = motion(8.0, 8.0, seed=3)
+    moving = moved(pose)
+    voxels = np.array(moving.voxels)
+    voxels[10:25, 10:40, 8:40] = 3 * ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(15, 30, 32)), 1)
+    ignored = np.zeros(moving.shape, np.uint8)
+    ignored[10:25, 10:40, 8:40] = 1
+    found = find_pose(FIXED, moving.with_voxels(voxels), MASK, moving.with_voxels(ignored))
+    assert off(found.pose, pose) < 0.3
+
+
+def test_the_same_images_give_the_same_pose():
+    moving = moved(motion(8.0, 8.0))
+    one, other = (find_pose(FIXED, moving, MASK).pose.matrix for _ in range(2))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_images_without_anything_in_common_are_refused():
+    with pytest.raises(InputError, match="no pose"):
+        find_pose(FIXED, FIXED.with_voxels(np.ones(FIXED.shape)), MASK)

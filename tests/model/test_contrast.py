@@ -1,0 +1,114 @@
+"""Pairs of unlike contrast, compared through a map of intensities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import bayesreg as br
+from bayesreg.image import Image
+from bayesreg.inference.gaussian.mode_search import find_mode
+from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.model.contrast import contrast_functions, explained_shares, map_contrast
+from tests.phantoms import ball_mesh
+
+MESH = ball_mesh(spacing=30.0)
+# mm
+EDGE = 2.5
+
+
+def tissues(seed=0):
+    """Four intensities in smooth blobs over the ball, and a little noise."""
+    rng = np.random.default_rng(seed)
+    low, high = MESH.points.min(0) - 6, MESH.points.max(0) + 6
+    shape = np.ceil((high - low) / EDGE).astype(int)
+    affine = np.diag([EDGE, EDGE, EDGE, 1.0])
+    affine[:3, 3] = low
+    blobs = ndimage.gaussian_filter(rng.normal(size=shape), 4)
+    levels = np.digitize(blobs, np.quantile(blobs, (0.25, 0.5, 0.75)))
+    return Image(ndimage.gaussian_filter(np.array([0.1, 0.4, 0.7, 1.0])[levels], 0.5), affine)
+
+
+FIXED = tissues()
+
+
+def other_contrast(voxels):
+    """Neither rising nor falling."""
+    return np.interp(voxels, [0.1, 0.4, 0.7, 1.0], [0.2, 0.9, 0.5, 0.1])
+
+
+def test_the_map_at_rest_is_the_contrast_of_the_other_image():
+    """The other image is a function of the fixed one, and so the map finds it, but for what it was smoothed by."""
+    moving = FIXED.with_voxels(other_contrast(np.asarray(FIXED.voxels)))
+    inside = FIXED.voxel_to_world(np.argwhere(np.ones(FIXED.shape)))
+    inside = inside[np.linalg.norm(inside - MESH.points.mean(0), axis=1) < 40]
+    found = map_contrast(FIXED, moving, inside)
+    one, other = (np.asarray(image.interpolate(inside)) for image in (found, moving))
+    assert np.corrcoef(one, other)[0, 1] > 0.95
+    assert np.corrcoef(np.asarray(FIXED.interpolate(inside)), other)[0, 1] < 0.2
+
+
+def test_the_mode_of_a_pair_of_unlike_contrast_is_as_near_as_that_of_one_contrast():
+    points = FIXED.grid_points()
+    # m(x + u(x)) = g(f(x)): where what comes to a voxel was.
+    x = points.copy()
+    for _ in range(30):
+        x = points - displacement(x)
+    values, noise = (
+        np.asarray(FIXED.interpolate(x, "cubic")),
+        np.random.default_rng(3).normal(scale=0.01, size=FIXED.shape),
+    )
+    one = error_of(FIXED.with_voxels(values + noise), one_contrast=True)
+    other = error_of(FIXED.with_voxels(other_contrast(values) + noise), one_contrast=False)
+    # The mesh itself is as coarse as that: it moves by 1.8 mm in the mean.
+    assert one < 0.3
+    assert other < 1.3 * one
+
+
+def displacement(x):
+    away = (x - MESH.points.mean(0)) / 40
+    return 2.0 * np.stack([1 - away[..., 1] ** 2, away[..., 0], 0.5 * away[..., 2] ** 2], axis=-1)
+
+
+def error_of(moving, one_contrast):
+    model = br.ModelConfig(
+        preset="registration", fixed={"lam": 10.0, "mu": 1.0}, quadrature="voxels", independent_points=None,
+        surface_load=1.0, body_load=0.1,
+    )  # fmt: skip
+    pair = br.ImagePair(FIXED, moving, one_contrast=one_contrast)
+    posterior = br.build_posterior(mesh=MESH, observations=[pair], model=model)
+    start = flat_position(posterior, posterior.data, posterior.estimands(posterior.reference()))
+    mode = unravel(posterior)(find_mode(posterior, np.asarray(start)))
+    found = posterior.constrain(mode)["u_boundary"]
+    return np.linalg.norm(np.asarray(found) - displacement(MESH.points), axis=1).mean()
+
+
+def test_the_functions_of_the_map_are_among_the_unknowns():
+    moving = FIXED.with_voxels(other_contrast(np.asarray(FIXED.voxels)))
+    pair = br.ImagePair(FIXED, moving, one_contrast=False)
+    posterior = br.build_posterior(mesh=MESH, observations=[pair], model=br.ModelConfig(quadrature="voxels"))
+    basis = np.asarray(posterior.images.shading)
+    functions = contrast_functions(FIXED, np.asarray(posterior.images.positions))
+    left = functions - basis @ np.linalg.lstsq(basis, functions, rcond=None)[0]
+    assert np.linalg.norm(left) < 0.01 * np.linalg.norm(functions)
+    assert posterior.reference()["images_shading"].shape == (basis.shape[1],)
+
+
+@pytest.mark.parametrize("similarity", ["lncc"])
+def test_a_similarity_with_maps_of_its_own_takes_the_images_as_they_are(similarity):
+    pair = br.ImagePair(FIXED, FIXED, one_contrast=False)
+    model = br.ModelConfig(similarity=similarity, quadrature="voxels")
+    assert br.build_posterior(mesh=MESH, observations=[pair], model=model).images.shading is None
+
+
+def test_a_line_and_a_map_explain_what_they_can():
+    rng = np.random.default_rng(0)
+    one = rng.uniform(size=20_000)
+    noise = 0.1 * rng.normal(size=one.shape)
+    line, any_map = explained_shares(one, 3 - 2 * one + noise)
+    assert line == pytest.approx(-(4 / 12) / (4 / 12 + 0.01), abs=0.01)
+    assert any_map == pytest.approx(-line, abs=0.01)
+    line, any_map = explained_shares(one, (one - 0.5) ** 2)
+    assert abs(line) < 0.01
+    assert any_map > 0.99

@@ -1,0 +1,110 @@
+"""Places of either image that say nothing: masks on grids of their own."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesreg as br
+from bayesreg.image import Image
+from bayesreg.types import InputError
+from tests.model.test_gradients import assert_gradient
+from tests.phantoms import box_mesh
+
+MESH = box_mesh(3, size=30.0)
+AFFINE = np.diag([1.5, 1.5, 1.5, 1.0])
+RNG = np.random.default_rng(0)
+FIXED, MOVING = (Image(RNG.normal(size=(21, 21, 21)), AFFINE) for _ in range(2))
+# mm: what is ignored lies below it, on a grid of its own.
+END = 12.0
+IGNORE = Image(np.arange(60)[:, None, None] * np.ones((60, 60, 60)) < 20, np.diag([0.6, 0.6, 0.6, 1.0]))
+
+
+def build(similarity="ssd", t_similarity=4.0, interpolation="linear", **ignored):
+    model = br.ModelConfig(
+        sampled="all", fixed={"lam": 1.0, "mu": 1.0}, quadrature="gauss4", similarity=similarity,
+        t_similarity=t_similarity, interpolation=interpolation,
+    )  # fmt: skip
+    return br.build_posterior(mesh=MESH, observations=[br.ImagePair(FIXED, MOVING, **ignored)], model=model)
+
+
+def test_no_point_is_compared_where_the_fixed_image_is_ignored():
+    term, whole = (build(**given).data.terms["images"] for given in ({"fixed_ignore": IGNORE}, {}))
+    x = np.asarray(whole.positions)[:, 0]
+    # A voxel's neighbours are ignored with it, and half the way to the next.
+    np.testing.assert_allclose(term.positions, np.asarray(whole.positions)[x > END + 0.3])
+    assert (x <= END + 0.3).any()
+
+
+@pytest.mark.parametrize(("similarity", "t_similarity"), [("ssd", 4.0), ("student_t", {"median": 4.0})])
+def test_the_density_is_the_sum_of_noise_where_one_looks_and_of_the_range_elsewhere(similarity, t_similarity):
+    """By SciPy's densities, point by point."""
+    post, displacement = build(similarity, t_similarity, moving_ignore=IGNORE), RNG.normal(size=MESH.points.shape)
+    term, values = post.data.terms["images"], {**post.reference(), "u_boundary": displacement}
+    places = term.places(displacement)
+    f, m, w = np.asarray(term.fixed_values), np.asarray(term.moving(places)), np.asarray(term.quadrature.weights)
+    x = np.asarray(places)[:, 0]
+    share = np.clip((x - END) / 0.6, 0, 1)
+    assert ((share > 0) & (share < 1)).any()
+    scale = np.sqrt(float(values["t_similarity"]) / (2 * w))
+    noise = stats.norm(scale=scale) if similarity == "ssd" else stats.t(4.0, scale=scale)
+    expected = share * noise.logpdf(f - m) - (1 - share) * np.log(np.ptp(f))
+    assert float(post.energies(values)["images"]) == pytest.approx(expected.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("similarity", ["ssd", "student_t", "lncc"])
+def test_the_gradient_is_that_of_differences(similarity):
+    post = build(similarity, interpolation="cubic", moving_ignore=IGNORE)
+    position = {
+        name: value + 0.3 * np.random.default_rng(2).normal(size=np.shape(value))
+        for name, value in post.initial(jax.random.key(0)).items()
+    }
+    assert_gradient(post.logdensity, position)
+
+
+@pytest.mark.parametrize("similarity", ["ssd", "student_t", "lncc"])
+def test_intensities_that_are_ignored_change_nothing(similarity):
+    voxels = np.array(MOVING.voxels)
+    # Its interpolation reaches a voxel further.
+    voxels[:7] = 100.0
+    other, one = (
+        br.build_posterior(
+            mesh=MESH,
+            observations=[br.ImagePair(FIXED, moving, moving_ignore=IGNORE)],
+            model=br.ModelConfig(sampled="all", fixed={"lam": 1.0, "mu": 1.0}, similarity=similarity),
+        )
+        for moving in (MOVING.with_voxels(voxels), MOVING)
+    )
+    values = {**one.reference(), "u_boundary": RNG.normal(scale=0.1, size=MESH.points.shape)}
+    if similarity == "lncc":
+        # The ridge of its windows knows the variance of the whole image.
+        other = other.__class__(**{**vars(other), "data": _with_ridge(other.data, one.data)})
+    for name in ("images", "elastic"):
+        assert float(other.energies(values)[name]) == pytest.approx(float(one.energies(values)[name]), rel=1e-9)
+
+
+def _with_ridge(data, like):
+    similarity = data.terms["images"].similarity._replace(ridge=like.terms["images"].similarity.ridge)
+    return data.with_term("images", data.terms["images"]._replace(similarity=similarity))
+
+
+def test_curvature_is_nothing_where_one_does_not_look():
+    term = build(moving_ignore=IGNORE).data.terms["images"]
+    u = jnp.zeros(MESH.points.shape)
+    matrices = np.abs(np.asarray(term.gauss_newton(u, {"t_similarity": jnp.asarray(1.0)}).matrices)).max(axis=(1, 2))
+    x = np.asarray(term.positions)[:, 0]
+    assert (matrices[x < END] == 0).all()
+    assert (matrices[x > END + 0.6] > 0).all()
+
+
+def test_a_mask_of_everything_is_refused():
+    with pytest.raises(InputError, match="nothing is left to compare"):
+        build(fixed_ignore=IGNORE.with_voxels(np.ones(IGNORE.shape)))
+
+
+def test_a_mask_that_is_no_image_is_refused():
+    with pytest.raises((InputError, TypeError), match="moving_ignore"):
+        br.ImagePair(FIXED, MOVING, moving_ignore=np.ones((3, 3, 3)))
