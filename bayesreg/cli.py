@@ -147,7 +147,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     settings = load_config(config, overrides or ())
     from bayesreg.workflow.check import check
 
-    typer.echo(check(settings).text)
+    typer.echo(check(settings, say=typer.echo).cost)
 
 
 @app.command()

@@ -15,6 +15,9 @@ from scipy import ndimage
 from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.types import AnyArray, InputError
 
+# Cosine of an angle between two axes that passes for a right one.
+RIGHT_ANGLE = 1e-4
+
 
 @dataclass(frozen=True, eq=False)
 class Image:
@@ -77,6 +80,41 @@ class Image:
         """SHA-256 of voxels (as float64) and affine."""
         arrays = (np.asarray(self.voxels, "<f8"), np.asarray(self.affine, "<f8"))
         return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+    @cached_property
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Directions of the voxel axes, columns: those of an orthogonal grid; of a sheared one the nearest such."""
+        left, _, right = np.linalg.svd(self.affine[:3, :3] / self.voxel_sizes)
+        return left @ right
+
+    @property
+    def is_orthogonal(self) -> bool:
+        """Whether the voxel axes are at right angles, as most programs want them."""
+        directions = self.affine[:3, :3] / self.voxel_sizes
+        return bool(np.abs(directions.T @ directions - np.eye(3)).max() < RIGHT_ANGLE)
+
+    def on_orthogonal_grid(self, voxel_sizes: AnyArray | None = None, order: int = 1) -> Image:
+        """The image on a grid whose axes are at right angles, and which covers its own.
+
+        Parameters
+        ----------
+        voxel_sizes : (3,) array, optional
+            mm; the default is its own.
+        order : int
+            Of the splines that interpolate it; 0 takes the nearest voxel, and zero beyond its grid.
+        """
+        sizes, axes = self.voxel_sizes if voxel_sizes is None else np.asarray(voxel_sizes), self.axes
+        ends = np.stack(np.meshgrid(*((-0.5, n - 0.5) for n in self.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+        corners = self.voxel_to_world(ends) @ axes
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        count = np.maximum(np.rint((high - low) / sizes).astype(int), 1)
+        affine = np.eye(4)
+        affine[:3, :3] = axes * sizes
+        affine[:3, 3] = axes @ ((low + high) / 2 - sizes * (count - 1) / 2)
+        between, mode = self.to_voxel @ affine, "nearest" if order else "constant"
+        voxels = np.asarray(self.voxels, float) if order else np.asarray(self.voxels)
+        matrix, offset = between[:3, :3], between[:3, 3]
+        return Image(ndimage.affine_transform(voxels, matrix, offset, tuple(count), order=order, mode=mode), affine)
 
     def with_voxels(self, voxels: AnyArray) -> Image:
         """Another image on the same grid."""

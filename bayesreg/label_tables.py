@@ -1,8 +1,10 @@
-"""Label tables of programs that many use: the values in their files by tissue."""
+"""Label tables: the values in label files by tissue, of programs that many use, by ranges, or by the labels' names."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from bayesreg.tissues import BACKGROUND, ORGAN
 
@@ -36,6 +38,9 @@ TABLES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
 }
 
 
+# The longest range of labels that is no slip.
+LONGEST_RANGE = 100_000
+
 # Labels by which a table is known: others have some of its values, too.
 _MARKS = {"fast": {1, 2, 3}, "freesurfer": {2, 3, 41, 42}, "brainweb": {1, 2, 3, 8}, "mask": {1}}
 
@@ -47,3 +52,44 @@ def recognise_table(values: Iterable[int]) -> str | None:
         if _MARKS[name] <= found <= {value for entry in table.values() for value in entry}:
             return name
     return None
+
+
+def as_range(text: str) -> list[int]:
+    """The labels of a text such as 7 or 1000-1035, its ends included; ValueError for anything else."""
+    ends = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
+    if ends is None:
+        raise ValueError(f"{text!r} is no label; expected a whole number, a range such as 1000-1035, or a name with "
+                         "label_names")  # fmt: skip
+    first, last = int(ends[1]), int(ends[2] or ends[1])
+    if not first <= last < first + LONGEST_RANGE:
+        raise ValueError(
+            f"{text!r} is no range of labels; expected the lower first, and at most {LONGEST_RANGE:,} of them"
+        )
+    return list(range(first, last + 1))
+
+
+def read_label_names(path: str | Path) -> dict[str, int]:
+    """The labels by name in a lookup table: FreeSurfer's, 3D Slicer's (.ctbl) or ITK-SNAP's.
+
+    Raises
+    ------
+    ValueError
+        If the file is no such table.
+    """
+    found: dict[str, int] = {}
+    for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
+        quoted = re.fullmatch(r'\s*(\d+)\s.*"([^"]+)"\s*', line)
+        plain = re.match(r"\s*(\d+)\s+([^\s\d#]\S*)", line)
+        if entry := quoted or plain:
+            found[entry[2]] = int(entry[1])
+    if not found:
+        raise ValueError(
+            f"{path} holds no label names; expected lines such as: 2 Left-Cerebral-White-Matter 245 245 245 0"
+        )
+    return found
+
+
+def name_values(entry: object, known: Mapping[str, int]) -> object:
+    """An entry of a table with names in place of values, where it holds some."""
+    several = entry if isinstance(entry, list | tuple) else [entry]
+    return [known.get(one, one) if isinstance(one, str) else one for one in several]

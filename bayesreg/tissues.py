@@ -47,6 +47,10 @@ BRAIN = ("csf", "gm", "wm")
 PAPER_LAM: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 10.0, 30.0), strict=True))
 PAPER_MU: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 1.0, 1.0), strict=True))
 
+# Lengths that suit a human brain, mm: of an edge on the boundary of its mesh, the radius of the closing that makes its
+# hull, and the gap between mesh and skull.
+BRAIN_EDGE, BRAIN_CLOSING, BRAIN_GAP = 15.5, 8.0, 0.5
+
 # λ and μ where nothing is said (the literature's λ/μ is about 24), and those of a fluid.
 SOLID = {"lam": 10.0, "mu": 1.0}
 FLUID = 0.01

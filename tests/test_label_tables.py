@@ -3,7 +3,7 @@
 import pytest
 
 from bayesreg.config.data import FilesData
-from bayesreg.label_tables import TABLES, recognise_table
+from bayesreg.label_tables import TABLES, as_range, read_label_names, recognise_table
 from bayesreg.tissues import BRAIN, ORGAN, tissue_names
 
 # What SynthSeg writes without a parcellation; FreeSurfer's aseg holds some more.
@@ -44,3 +44,45 @@ def test_a_configuration_names_one(tmp_path):
     assert FilesData.model_validate(data).label_table == TABLES["fast"]
     with pytest.raises(ValueError, match="there is no label table 'fats'; expected fast, freesurfer, brainweb"):
         FilesData.model_validate(data | {"label_table": "fats"})
+
+
+@pytest.mark.parametrize(("text", "labels"), [("7", [7]), ("1000-1003", [1000, 1001, 1002, 1003]), (" 5 - 6 ", [5, 6])])
+def test_a_text_is_a_range_of_labels(text, labels):
+    assert as_range(text) == labels
+
+
+@pytest.mark.parametrize("text", ["", "wm", "3-1", "-4", "1.5", "1-9999999"])
+def test_other_texts_are_refused(text):
+    with pytest.raises(ValueError, match="expected"):
+        as_range(text)
+
+
+FREESURFER_LINES = """#No. Label Name:                            R   G   B   A
+0   Unknown                                 0   0   0   0
+2   Left-Cerebral-White-Matter              245 245 245 0
+41  Right-Cerebral-White-Matter             245 245 245 0
+"""
+SNAP_LINES = """# ITK-SnAP Label Description File
+    0     0    0    0        0  0  0    "Clear Label"
+    3   255    0    0        1  1  1    "Left lobe"
+"""
+
+
+def test_names_are_those_of_a_lookup_table(tmp_path):
+    for name, text in {"freesurfer": FREESURFER_LINES, "snap": SNAP_LINES, "none": "nothing\n"}.items():
+        (tmp_path / f"{name}.txt").write_text(text)
+    found = read_label_names(tmp_path / "freesurfer.txt")
+    assert found == {"Unknown": 0, "Left-Cerebral-White-Matter": 2, "Right-Cerebral-White-Matter": 41}
+    assert read_label_names(tmp_path / "snap.txt")["Left lobe"] == 3
+    with pytest.raises(ValueError, match="no label names"):
+        read_label_names(tmp_path / "none.txt")
+
+
+def test_a_table_may_hold_names_and_ranges(tmp_path):
+    (tmp_path / "lut.txt").write_text(FREESURFER_LINES)
+    names = ["Left-Cerebral-White-Matter", "Right-Cerebral-White-Matter"]
+    given = {"source": "files", "label_names": str(tmp_path / "lut.txt"), "labels": str(tmp_path / "lut.txt")}
+    found = FilesData(**given, label_table={"wm": names, "gm": ["1000-1002", 3]})
+    assert found.label_table == {"wm": (2, 41), "gm": (1000, 1001, 1002, 3)}
+    with pytest.raises(ValueError, match="'Left-Cerebellum' is no label"):
+        FilesData(**given, label_table={"wm": ["Left-Cerebellum"]})

@@ -80,6 +80,33 @@ def test_what_is_said_is_what_was_set(register):
     assert "csf 1; gm 2, 3" in result.output
 
 
+def test_images_alone_are_enough(register):
+    result = register.call()
+    assert result.exit_code == 0, result.output
+    assert register.calls[0][0].data.tissues == ("organ",)
+    assert "labels      none: the organ is what is bright in the fixed image, of one tissue" in result.output
+
+
+def test_a_mask_is_the_organ_where_there_are_no_labels(register):
+    result = register.call("--intracranial", register.path("mask"))
+    assert f"none: the organ is all of {register.path('mask')}" in result.output
+    assert register.calls[0][0].data.label_table is None
+
+
+def test_masks_say_of_which_image_they_are(register):
+    mask = register.path("mask")
+    result = register.call("--labels", register.path("labels"), "--fixed-ignore", mask, "--moving-ignore", mask)
+    assert f"ignored     what is not zero in {mask} says nothing, in the moving image" in result.output
+    data = register.calls[0][0].data
+    assert (str(data.fixed_ignore), str(data.moving_ignore)) == (mask, mask)
+
+
+def test_a_table_without_labels_is_a_mistake(register):
+    result = register.call("--table", "fast")
+    assert result.exit_code == 2
+    assert "give --labels, too" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

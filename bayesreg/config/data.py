@@ -59,8 +59,11 @@ class FilesData(Section):
     """Intra-operative image."""
     labels: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Tissue labels of the fixed image; null takes the tissues of mesh.file, or one for all of the organ."""
+    label_names: FoundFile | None = None
+    """Lookup table of FreeSurfer, 3D Slicer or ITK-SNAP, by which label_table may hold names in place of values."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
-    """Values of the label file by tissue, background being what belongs to none; or fast, freesurfer or brainweb."""
+    """Values of the label file by tissue, or ranges of them (1000-1035), background being what belongs to none; or
+    fast, freesurfer, brainweb or mask."""
     intracranial: FoundImage | None = None
     """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion. Without
     labels it is the organ, too."""

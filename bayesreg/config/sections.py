@@ -24,17 +24,19 @@ from bayesreg.config.values import (
 )
 from bayesreg.model.options import ModelConfig, Vector
 from bayesreg.model.options import wrong as _wrong
+from bayesreg.tissues import BRAIN_EDGE
 
 
 class MeshConfig(Section):
     """How the mesh is made, or which one is taken."""
 
-    edge_length: Positive = 15.5
-    """Wanted length of an edge on the boundary, mm; 15.5 gives a mesh of the paper's size."""
+    edge_length: Positive | None = None
+    """Wanted length of an edge on the boundary, mm; null is 15.5 for a human brain, which gives a mesh of the paper's
+    size, and for the organ in a file as much more or less as it is larger or smaller."""
     envelope: Positive | None = None
     """How far the mesh's surfaces may lie from those of the labels, mm; null is 0.32 edge lengths."""
-    skull_gap: NotNegative = 0.5
-    """Least distance of the boundary nodes from the skull, mm."""
+    skull_gap: NotNegative | None = None
+    """Least distance of the boundary nodes from the skull, mm; null is 0.5 for a human brain, and in proportion."""
     file: FoundFile | None = None
     """A mesh (.vtu) made earlier; the other entries are then left alone."""
 
@@ -188,9 +190,9 @@ class Config(Section):
             isinstance(simulate, CalibratedPair)
             and mesh
             and not mesh.file
-            and simulate.making_edge_length >= mesh.edge_length
+            and simulate.making_edge_length >= (edge := mesh.edge_length or BRAIN_EDGE)
         ):
-            raise _wrong("making_edge_length", f"expected less than mesh.edge_length, {mesh.edge_length:g} mm")
+            raise _wrong("making_edge_length", f"expected less than mesh.edge_length, {edge:g} mm")
         if simulate is not None:
             _require_tissues("lam", simulate.lam, data and data.tissues, whole=True)
             _require_tissues("mu", simulate.mu, data and data.tissues, whole=True)

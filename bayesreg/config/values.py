@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
-from bayesreg.label_tables import TABLES
+from bayesreg.label_tables import TABLES, as_range, name_values, read_label_names
 from bayesreg.tissues import BACKGROUND, tissue_names
 from bayesreg.types import DATA_FOLDER
 
@@ -57,7 +57,14 @@ def _as_pair(value: object) -> object:
 
 
 def _as_list(value: object) -> object:
-    return (value,) if isinstance(value, int) and not isinstance(value, bool) else value
+    """One label or several; a text such as 1000-1035 is a range, its ends included."""
+    several = (value,) if isinstance(value, int | str) and not isinstance(value, bool) else value
+    if not isinstance(several, Sequence):
+        return value
+    found: list[object] = []
+    for one in several:
+        found += as_range(one) if isinstance(one, str) else [one]
+    return tuple(found)
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
@@ -113,8 +120,10 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
     return table
 
 
-def _named_table(value: object) -> object:
-    """The table of a program by its name; anything else as it is."""
+def _named_table(value: object, info: ValidationInfo) -> object:
+    """The table of a program by its name; in others, names of labels that a lookup table lists become their values."""
+    if isinstance(value, dict) and (known := info.data.get("label_names")) is not None:
+        return {tissue: name_values(entry, read_label_names(known)) for tissue, entry in value.items()}
     if not isinstance(value, str):
         return value
     if value not in TABLES:

@@ -13,12 +13,14 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from bayesreg.image import Image
+from bayesreg.io.domain import relative_size
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 
-# mm: about the organ its surroundings, such as skull and scalp, are compared, too.
+# Lengths are those for a human brain, in mm, and in proportion for other organs.
+# About the organ its surroundings, such as skull and scalp, are compared, too.
 SURROUNDINGS = 15.0
-# Level by level: edge of the voxels, mm, share of them that are looked at, and how many candidates it begins with.
+# Level by level: edge of the voxels, share of them that are looked at, and how many candidates it begins with.
 LEVELS: tuple[tuple[float, float, int | None], ...] = ((8.0, 1.0, None), (4.0, 1.0, 3), (2.0, 0.5, 1))
 # Degrees about each axis that a head in a scanner or on a table may be turned by, besides none.
 TURNS = (-25.0, 25.0)
@@ -67,12 +69,13 @@ def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | 
     -----
     The same images give the same pose: the points that are looked at are chosen by a fixed seed.
     """
-    around = _around(organ)
+    size = relative_size(np.asarray(organ.voxels) != 0, organ.voxel_volume)
+    around = _around(organ, size * SURROUNDINGS)
     kept = None if moving_ignore is None else moving_ignore.with_voxels(np.asarray(moving_ignore.voxels) == 0)
     headers = _euler(np.eye(4), _centre_of(organ))
     starts, given, best = list(_starts(fixed, moving, organ)), headers, headers
     for edge, share, most in LEVELS:
-        level = _Level.of(fixed, moving, around, kept, edge, share)
+        level = _Level.of(fixed, moving, around, kept, size * edge, share)
         # From the headers at every level: where they are right, nothing that a coarser level preferred is nearer.
         given, *others = (level.improve(start) for start in (given, *starts[:most]))
         # A step of the optimiser may also make it worse.
@@ -153,33 +156,19 @@ class _Level(NamedTuple):
             return 0.0
 
 
-def _around(organ: Image) -> Image:
+def _around(organ: Image, distance: float) -> Image:
     """The organ and its surroundings."""
     away = ndimage.distance_transform_edt(np.asarray(organ.voxels) == 0, organ.voxel_sizes)
-    return organ.with_voxels((away <= SURROUNDINGS).astype(np.uint8))
+    return organ.with_voxels((away <= distance).astype(np.uint8))
 
 
 def _coarser(image: Image, edge: float, order: int) -> Image:
     """The image on orthogonal axes with voxels of about this edge, mm; smoothed first, unless by nearest voxels."""
-    sizes, shape = image.voxel_sizes, np.array(image.shape)
-    wanted = np.maximum(sizes, edge)
-    axes = np.linalg.qr(image.affine[:3, :3])[0]
-    # The factor of an orthogonal affine is its axes, up to their signs.
-    axes = axes * np.sign((axes * image.affine[:3, :3]).sum(0))
-    corners = image.voxel_to_world(np.array(list(product(*((-0.5, n - 0.5) for n in shape))))) @ axes
-    low, high = corners.min(0), corners.max(0)
-    count = np.maximum(np.rint((high - low) / wanted).astype(int), 1)
-    affine = np.eye(4)
-    affine[:3, :3] = axes * wanted
-    affine[:3, 3] = axes @ ((low + high) / 2 - wanted * (count - 1) / 2)
-    voxels = np.asarray(image.voxels, float)
+    sizes, wanted = image.voxel_sizes, np.maximum(image.voxel_sizes, edge)
     if order:
-        voxels = ndimage.gaussian_filter(voxels, np.where(wanted > sizes, wanted / sizes / 2, 0.0), mode="nearest")
-    between = image.to_voxel @ affine
-    moved = ndimage.affine_transform(
-        voxels, between[:3, :3], between[:3, 3], tuple(count), order=order, mode="nearest" if order else "constant"
-    )
-    return Image(moved, affine)
+        blur = np.where(wanted > sizes, wanted / sizes / 2, 0.0)
+        image = image.with_voxels(ndimage.gaussian_filter(np.asarray(image.voxels, float), blur, mode="nearest"))
+    return image.on_orthogonal_grid(wanted, order)
 
 
 def _to_itk(image: Image, dtype: str) -> SimpleITK.Image:

@@ -146,7 +146,7 @@ def from_files(
     """
     tissue, image = load_labels(labels_path, label_table, unlisted="refused"), None
     if image_path is not None:
-        image = load_image(image_path)
+        image = _load_fixed(image_path)
         tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"))
         names, present = tissue_names(label_table), np.unique(tissue.voxels)
         if lost := [name for index, name in enumerate(names, start=1) if index not in present]:
@@ -173,7 +173,7 @@ def without_labels(image_path: str | Path, mask_path: str | Path | None = None) 
     InputError
         If a file is missing or unreadable, the grids lie apart, or nothing stands out.
     """
-    image = load_image(image_path)
+    image = _load_fixed(image_path)
     if mask_path is not None:
         mask = _on_grid(image, image_path, load_mask(mask_path), mask_path, ("fixed", "intracranial"))
         return Anatomy(image, mask.with_voxels(np.asarray(mask.voxels, np.int8)), mask, (ORGAN,))
@@ -183,6 +183,15 @@ def without_labels(image_path: str | Path, mask_path: str | Path | None = None) 
         image_path, inside.sum() * image.voxel_volume / 1e3,
     )  # fmt: skip
     return Anatomy(image, image.with_voxels(inside.astype(np.int8)), None, (ORGAN,))
+
+
+def _load_fixed(path: str | Path) -> Image:
+    """The image whose grid is that of the results; on one at right angles where its own is sheared."""
+    image = load_image(path)
+    if image.is_orthogonal:
+        return image
+    _log.warning("the axes of %s are not at right angles; it is interpolated on a grid whose axes are", path)
+    return image.on_orthogonal_grid(order=3)
 
 
 def _outstanding(image: Image) -> np.ndarray:

@@ -12,10 +12,12 @@ from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.volumes import check_same_grid
-from bayesreg.tissues import BRAIN, is_fluid, label_of
+from bayesreg.tissues import BRAIN, BRAIN_CLOSING, is_fluid, label_of
 from bayesreg.types import InputError
 
 SPECK = 0.01
+# Solid tissue of Colin27, mm³: lengths that suit a brain of this size suit others in proportion.
+BRAIN_VOLUME = 1.583e6
 
 _log = logging.getLogger(__name__)
 
@@ -24,8 +26,20 @@ class MeshError(InputError):
     """Labels cannot be meshed, or a mesh does not stand for its labels."""
 
 
+def relative_size(mask: Bool[np.ndarray, "X Y Z"], voxel_volume: float) -> float:
+    """The size of a body beside a human brain: the ratio of the cube roots of the volumes; 0.07 for a mouse's brain."""
+    volume = max(int(np.count_nonzero(mask)), 1) * voxel_volume
+    return float(np.cbrt(volume / BRAIN_VOLUME))
+
+
+def size_of_solid(tissue: Image, names: Sequence[str] = BRAIN) -> float:
+    """`relative_size` of the tissues that are no fluid."""
+    solid = [index for index, name in enumerate(names, start=1) if not is_fluid(name)]
+    return relative_size(np.isin(np.asarray(tissue.voxels), solid), tissue.voxel_volume)
+
+
 def mesh_domain(
-    tissue: Image, intracranial: Image | None = None, closing: float = 8.0, names: Sequence[str] = BRAIN
+    tissue: Image, intracranial: Image | None = None, closing: float = BRAIN_CLOSING, names: Sequence[str] = BRAIN
 ) -> Image:
     """The region Ω: the hull of the solid tissues, inside the intracranial mask.
 

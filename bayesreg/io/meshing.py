@@ -23,7 +23,7 @@ from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, tissue_surfaces
 from bayesreg.io.tetwild import tetrahedralize
 from bayesreg.mesh import TetMesh
-from bayesreg.tissues import BRAIN
+from bayesreg.tissues import BRAIN, BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import AnyArray, InputError
 
 __all__ = [
@@ -70,11 +70,11 @@ class MeshOptions:
         Whether to suppress fTetWild's own output.
     """
 
-    edge_length: float = 15.5
+    edge_length: float = BRAIN_EDGE
     inner_edge_length: float | None = None
     envelope: float | None = None
-    skull_gap: float = 0.5
-    closing: float = 8.0
+    skull_gap: float = BRAIN_GAP
+    closing: float = BRAIN_CLOSING
     stop_energy: float = 20.0
     threads: int = 0
     attempts: int = 3

@@ -142,6 +142,10 @@ def _open(path: Path) -> SpatialImage:
                 raise
             source = _LaxNifti.from_filename(path)
     except Exception as error:  # Its readers have no common class of errors.
+        if path.name.lower().endswith((".mif", ".mif.gz", ".mih")):
+            raise InputError(
+                f"image {path} is MRtrix's; convert it first: mrconvert {path.name} image.nii.gz"
+            ) from error
         raise InputError(f"image {path} cannot be read: {_first_line(error)}") from error
     if not isinstance(source, SpatialImage) or source.affine is None:
         raise InputError(f"{path} holds no image on a grid, but {type(source).__name__}")

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
-from bayesreg.io.readers import corners_apart, read_volume
+from bayesreg.io.readers import Volume, corners_apart, read_volume
 from bayesreg.tissues import BACKGROUND, tissue_names
 from bayesreg.types import AnyArray, InputError
 
@@ -150,11 +150,18 @@ def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside"
 def load_whole_numbers(path: str | Path) -> Image:
     """Read a label file as int32; values up to `ROUNDING` from an integer are rounded, and the log says so.
 
+    Of a file of several volumes, the probabilities of one tissue each, the most probable one is the label, counted from
+    1; it is 0 where they sum to less than a half.
+
     Raises
     ------
     InputError
-        As in `load_image`; also if it holds values further from integers, or beyond 32 bits.
+        As in `load_image`; also if it holds values further from integers, or beyond 32 bits, or several volumes that
+        are no probabilities.
     """
+    volume = read_volume(path)
+    if volume.voxels.ndim == 4 and volume.voxels.shape[3] > 1:
+        return _most_probable(volume, path)
     image = load_image(path)
     voxels = np.asarray(image.voxels)
     if voxels.dtype.kind == "f":
@@ -168,6 +175,21 @@ def load_whole_numbers(path: str | Path) -> Image:
     if voxels.max() > np.iinfo(np.int32).max or voxels.min() < np.iinfo(np.int32).min:
         raise InputError(f"label file {path} holds values up to {voxels.max()}; expected labels of at most 32 bits")
     return image.with_voxels(voxels.astype(np.int32))
+
+
+def _most_probable(volume: Volume, path: str | Path) -> Image:
+    shares = np.asarray(volume.voxels, float)
+    if not (np.isfinite(shares).all() and shares.min() >= -ROUNDING and shares.sum(axis=3).max() <= 1 + OVERSHOOT):
+        raise InputError(
+            f"label file {path} has {shares.shape[3]} volumes, which are no probabilities of one tissue each; "
+            "expected one volume of labels"
+        )
+    _log.warning(
+        "label file %s holds probabilities of %d tissues; the most probable is taken, counted from 1", path,
+        shares.shape[3],
+    )  # fmt: skip
+    likely = np.where(shares.sum(axis=3) < 0.5, 0, 1 + shares.argmax(axis=3))
+    return Image(likely.astype(np.int32), volume.affine)
 
 
 def shorten(values: Iterable[object], most: int = 30) -> str:

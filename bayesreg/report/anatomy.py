@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import chain
 from typing import Any
 
@@ -32,10 +33,16 @@ MEDIAN_DRAWS = 500
 
 
 def registration(view: View) -> Drawing | None:
-    """Fixed, moving and warped image, and the differences before and after, on three planes; None without images."""
-    run, limits = view.run, panels.grey_limits(view.run)
+    """Fixed, moving and warped image, and what is between them before and after, on three planes; None without images.
+
+    That is their difference, or, where they are of unlike contrast, the tissues of the fixed image drawn on the others.
+    """
+    run = view.run
     if run.fixed is None or run.moving is None or run.warped is None:
         return None
+    if not run.matching.one_contrast:
+        return _unlike(view, {"fixed f": run.fixed, "moving m": run.moving, "warped m(x + ū)": run.warped})
+    limits = panels.grey_limits(run)
     columns = {"fixed f": run.fixed, "moving m": run.moving, "warped m(x + ū)": run.warped}
     before, after = residual_sd(run, run.moving), residual_sd(run, run.warped)
     with style.look():
@@ -63,6 +70,28 @@ def registration(view: View) -> Drawing | None:
         f"{explain_difference(run.manifest)}"
     )
     alt = f"Fixed, moving and warped images with differences; the residual falls from {before:.3f} to {after:.3f}."
+    return Drawing("registration", "Before and after", caption, alt, uri)
+
+
+def _unlike(view: View, columns: Mapping[str, Image]) -> Drawing:
+    """Images of unlike contrast, each in its own greys, and with the borders of the fixed image's tissues."""
+    with style.look():
+        figure, axes = _grid(view, columns=2 * len(columns))
+        for row, plane in zip(axes, view.planes[::-1], strict=True):
+            for index, image in enumerate(columns.values()):
+                limits = panels.range_of(image)
+                for panel in (row[index], row[len(columns) + index]):
+                    panels.image_panel(panel, image, plane, limits)
+                panels.label_lines(row[len(columns) + index], view.run, plane)
+            _note(row[0], plane.title)
+        for panel, title in zip(axes[0], [*columns, *("borders of f" for _ in columns)], strict=True):
+            panel.set_title(title)
+        uri = style.data_uri(figure)
+    caption = (
+        f"{_focus(view)} The images are of unlike contrast, so that no difference of theirs is shown; the lines are "
+        f"the borders of the tissues in the fixed image, and should lie on those of the warped one. {CONVENTION}"
+    )
+    alt = "Fixed, moving and warped images, and the borders of the fixed image's tissues on each."
     return Drawing("registration", "Before and after", caption, alt, uri)
 
 

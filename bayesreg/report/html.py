@@ -25,6 +25,7 @@ from bayesreg.report import (
     identifiability,
     landmarks,
     marginals,
+    matching,
     modes,
     tables,
     uncertainty,
@@ -47,6 +48,7 @@ from bayesreg.report.verdict import (
 
 SECTIONS = (
     ("accuracy", "Registration"),
+    ("pose", "Pose"),
     ("trust", "Uncertainty"),
     ("landmarks", "Landmarks"),
     ("groups", "Chains that disagree"),
@@ -96,10 +98,11 @@ def write_report(
     allowed = bodies.allowing(run.mesh, posterior, simulated) if bodies.enough(simulated) else None
     fit = bool(predicted and predicted.discrepancies is not None)
     pairs = bool(predicted and predicted.landmark_names is not None)
-    shown = {"groups": apart, "trust": predicted, "landmarks": pairs, "fit": fit, "one-node": nodes}
+    shown = {"groups": apart, "pose": predicted, "trust": predicted, "landmarks": pairs, "fit": fit, "one-node": nodes}
     left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
         *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
+        matching.pose_picture(view),
         uncertainty.maps(view, predicted) if predicted else None,
         uncertainty.places(view, predicted) if predicted else None,
         landmarks.residuals(predicted) if predicted else None,
@@ -124,6 +127,8 @@ def write_report(
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
         "error_tables": error_tables(metrics, run.mesh.names),
+        "notes": matching.notes(run.manifest),
+        "pose": matching.pose_table(predicted) if predicted else None,
         "trust": explain_intervals(run.manifest),
         "places": uncertainty.place_table(view, predicted) if predicted else None,
         "landmarks": landmarks.landmark_table(run.mesh, predicted) if predicted else None,

@@ -102,7 +102,7 @@ def field_panel(
     return drawn
 
 
-def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True) -> None:
+def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True, colour: str = style.INK) -> None:
     """The mesh's border and, by default, the interfaces between its tissues."""
     tissue = np.nan_to_num(view.slice(plane).cellwise(view.run.mesh.tissue), nan=-1.0)
     x, y = np.linspace(*plane.horizontal, tissue.shape[1]), np.linspace(*plane.vertical, tissue.shape[0])
@@ -110,7 +110,7 @@ def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True) -> No
         # Blurred by a pixel, so that the staircase of the pixels does not show.
         level = ndimage.gaussian_filter((tissue == label).astype(float), 1.0)
         width, alpha = (0.8, 0.9) if label < 0 else (0.35, 0.5)
-        axes.contour(x, y, level, [0.5], colors=style.INK, linewidths=width, alpha=alpha)
+        axes.contour(x, y, level, [0.5], colors=colour, linewidths=width, alpha=alpha)
 
 
 def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
@@ -123,6 +123,15 @@ def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
         forbidden = sample(run.skull, points, order=0, outside=1.0) != 0
         picture[forbidden] = to_rgb(style.SKULL)
     field_panel(axes, picture, plane, Normalize(0, 1), style.GREY, dark=run.skull is not None)
+
+
+def label_lines(axes: Axes, run: Run, plane: Plane) -> None:
+    """The borders of the tissue labels."""
+    labels = sample(run.tissue, plane.points(), order=0, outside=0.0)
+    x, y = np.linspace(*plane.horizontal, labels.shape[1]), np.linspace(*plane.vertical, labels.shape[0])
+    for value in np.unique(labels)[1:]:
+        level = ndimage.gaussian_filter((labels == value).astype(float), 1.0)
+        axes.contour(x, y, level, [0.5], colors=style.BORDER, linewidths=0.4)
 
 
 def mesh_panel(axes: Axes, mesh: TetMesh, plane: Plane) -> None:
@@ -170,7 +179,12 @@ def _bound(values: np.ndarray, quantile: float) -> float:
 
 def grey_limits(run: Run) -> tuple[float, float]:
     """One grey scale for the images of a run: the range of the background, without its extremes."""
-    low, high = np.quantile(np.asarray(run.background.voxels, float), (0.005, 0.998))
+    return range_of(run.background)
+
+
+def range_of(image: Image) -> tuple[float, float]:
+    """The range of an image, without its extremes."""
+    low, high = np.quantile(np.asarray(image.voxels, float), (0.005, 0.998))
     return float(low), float(max(high, low + 1e-9))
 
 

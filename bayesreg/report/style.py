@@ -19,6 +19,8 @@ ACCENT = "#9b2335"
 TRUTH = "#111111"
 
 SKULL = "#39424e"
+# Borders drawn on grey images.
+BORDER = "#f5b83d"
 UNIFORM = "#5b6b7b"
 
 MAGNITUDE = "viridis"

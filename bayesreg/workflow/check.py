@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,18 @@ from bayesreg.workflow.assembly import posterior_of, start_of
 from bayesreg.workflow.preparation import prepared_inputs
 
 
-def check(config: str | Path | Config) -> Check:
-    """Everything but sampling, with an estimate of time and memory."""
+def check(config: str | Path | Config, say: Callable[[str], None] = lambda text: None) -> Check:
+    """Everything but sampling, with an estimate of time and memory.
+
+    Parameters
+    ----------
+    config : path or Config
+    say : callable
+        Told what was found of labels and images, before the search for a start, which may take minutes.
+    """
     config = config if isinstance(config, Config) else load_config(config)
     inputs, provenance = prepared_inputs(config)
+    say(describe_inputs(provenance["appraisal"]))
     posterior = posterior_of(config, inputs)
     start = start_of(config, inputs, posterior)
     options, trial, reached = config.sampler, 10, []
@@ -65,14 +74,15 @@ class Check:
 
     @property
     def text(self) -> str:
+        """What was found, and the estimate, in words."""
+        return f"{describe_inputs(self.appraisal)}\n{self.cost}"
+
+    @property
+    def cost(self) -> str:
         """The estimate in words."""
         preparation = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.preparation.items())
-        beware = self.appraisal.get("beware", [])
         return "\n".join(
             [
-                "The configuration can be run, but beware:" if beware else "The configuration is sound.",
-                *(f"  - {sentence}" for sentence in beware),
-                *_describe(self.appraisal),
                 f"  mesh      {self.nodes} nodes, {self.cells} elements, {self.sampled} nodes sampled",
                 f"  prepared  {preparation}",
                 f"  speed     about {self.steps_per_second:.0f} steps per second and chain",
@@ -83,7 +93,14 @@ class Check:
         )
 
 
-def _describe(appraisal: dict[str, Any]) -> list[str]:
+def describe_inputs(appraisal: Mapping[str, Any]) -> str:
+    """What was found of labels and images, in words."""
+    beware = appraisal.get("beware", [])
+    verdict = "The configuration can be run, but beware:" if beware else "The configuration is sound."
+    return "\n".join([verdict, *(f"  - {sentence}" for sentence in beware), *_describe(appraisal)])
+
+
+def _describe(appraisal: Mapping[str, Any]) -> list[str]:
     """The labels and the images in two lines."""
     lines = [f"  {note}" for note in appraisal.get("notes", ())]
     if appraisal.get("millilitres"):

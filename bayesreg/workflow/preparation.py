@@ -20,7 +20,7 @@ from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, without_labels
 from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
-from bayesreg.io.domain import without_ridges
+from bayesreg.io.domain import size_of_solid, without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Inputs, Truth
@@ -29,6 +29,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.options import require_default_image_options
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
+from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.matching import Matched, match_images
@@ -81,12 +82,14 @@ def prepare(config: Config) -> Prepared:
     if anatomy.intracranial is not None:
         anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
     clock.lap("anatomy")
-    domain = mesh_domain(anatomy.tissue, anatomy.intracranial, names=anatomy.names)
+    size = _size(config, anatomy)
+    domain = mesh_domain(anatomy.tissue, anatomy.intracranial, size * BRAIN_CLOSING, anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
     matched = _match(config, anatomy, domain)
     appraisal = _appraise(config, anatomy, domain, matched)
     clock.lap("images")
-    mesh = _mesh(anatomy, domain, config.mesh)
+    settings = _sized(config.mesh, size)
+    mesh = _mesh(anatomy, domain, settings)
     clock.lap("mesh")
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
@@ -107,7 +110,7 @@ def prepare(config: Config) -> Prepared:
         return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
     fixed = robust_scale(anatomy.image, domain.voxels != 0)(anatomy.image)
-    pair = _pair(config, fixed, anatomy, domain, skull, mesh)
+    pair = _pair(config, settings, fixed, anatomy, domain, skull, mesh)
     clock.lap("pair")
     u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
@@ -238,9 +241,22 @@ def _anatomy(config: Config) -> Anatomy:
     return mni152()
 
 
+def _size(config: Config, anatomy: Anatomy) -> float:
+    """The size of the organ beside a human brain, which those that ship are."""
+    return size_of_solid(anatomy.tissue, anatomy.names) if isinstance(config.data, FilesData) else 1.0
+
+
+def _sized(settings: MeshConfig, size: float) -> MeshConfig:
+    """The settings with every length given."""
+    usual = {"edge_length": size * BRAIN_EDGE, "skull_gap": size * BRAIN_GAP}
+    return settings.model_copy(update={name: x for name, x in usual.items() if getattr(settings, name) is None})
+
+
 def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
     if settings.file is not None and edge_length is None:
         return _load_mesh(settings.file, anatomy.names)
+    assert settings.edge_length is not None
+    assert settings.skull_gap is not None
     options = MeshOptions(
         edge_length=edge_length or settings.edge_length,
         envelope=None if edge_length else settings.envelope,
@@ -267,14 +283,20 @@ def _as_stored(image: Image) -> Image:
 
 
 def _pair(
-    config: Config, fixed: Image, anatomy: Anatomy, domain: Image, skull: Image | None, mesh: TetMesh
+    config: Config,
+    meshed: MeshConfig,
+    fixed: Image,
+    anatomy: Anatomy,
+    domain: Image,
+    skull: Image | None,
+    mesh: TetMesh,
 ) -> SyntheticPair:
     settings = config.simulate
     assert settings is not None
     assert skull is not None
     making = mesh
     if isinstance(settings, CalibratedPair):
-        making = _mesh(anatomy, domain, config.mesh, settings.making_edge_length)
+        making = _mesh(anatomy, domain, meshed, settings.making_edge_length)
     given = {} if settings.smoothing_mm is None else {"smoothing_mm": settings.smoothing_mm}
     return make_pair(
         fixed,

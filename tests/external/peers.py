@@ -3,17 +3,23 @@
     python -m tests.external.peers {Demons,B-spline,SyN} PAIR -o OUT
 
 OUT/displacement_mean.nii.gz is then an ITK displacement field on the grid of the fixed image: mm, LPS, fixed to moving.
-The pairs are aligned and of one contrast, but for a slow shading; skull and scalp stay where they are. Every peer is
-given what a good user begins with: images without their shading (N4), and the mask of the inside of the skull.
+Every peer is given what a good user begins with: images without their shading (N4), and the mask of the inside of the
+skull. Where pair.json says that the moving image is misaligned, B-splines and SyN have a rigid stage of their own (SyN
+an affine one after it); where it is of another contrast, they compare by mutual information; and a cavity is outside of
+the mask of the moving image. Demons know none of these, and are not run there.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 FIELD = "displacement_mean.nii.gz"
 THREADS = 2
@@ -30,10 +36,31 @@ def without_shading(pair: Path, out: Path) -> None:
     for name in ("fixed", "moving"):
         image = SimpleITK.ReadImage(str(pair / f"{name}.nii.gz"), SimpleITK.sitkFloat32)
         n4 = SimpleITK.N4BiasFieldCorrectionImageFilter()
-        n4.Execute(SimpleITK.Shrink(image, [4] * 3), SimpleITK.Shrink(inside, [4] * 3))
+        thin = [max(1, round(4 / size)) for size in image.GetSpacing()]
+        same = image.GetSize() == inside.GetSize() and np.allclose(image.GetDirection(), inside.GetDirection())
+        mask = [SimpleITK.Shrink(inside, thin)] if same else []
+        n4.Execute(SimpleITK.Shrink(image, thin), *mask)
         shading = SimpleITK.Exp(n4.GetLogBiasFieldAsImage(image))
         SimpleITK.WriteImage(image / SimpleITK.Cast(shading, image.GetPixelID()), str(out / f"{name}.nii.gz"))
-    shutil.copy(pair / "intracranial.nii.gz", out)
+    for name in ("intracranial.nii.gz", "pair.json"):
+        shutil.copy(pair / name, out)
+    if (pair / "cavity.nii.gz").exists():
+        cavity = SimpleITK.ReadImage(str(pair / "cavity.nii.gz"), SimpleITK.sitkUInt8)
+        SimpleITK.WriteImage(cavity == 0, str(out / "outside_cavity.nii.gz"))
+
+
+class Known(NamedTuple):
+    """What a user knows of a pair."""
+
+    misaligned: bool
+    one_contrast: bool
+    # Of the moving image, where there is a cavity.
+    mask: Path | None
+
+    @classmethod
+    def of(cls, pair: Path) -> Known:
+        facts, mask = json.loads((pair / "pair.json").read_text()), pair / "outside_cavity.nii.gz"
+        return cls(facts.get("rigid", 0) > 0, facts.get("contrast", "t1") == "t1", mask if mask.exists() else None)
 
 
 def demons(pair: Path, field: Path) -> None:
@@ -78,10 +105,13 @@ def b_spline(pair: Path, field: Path) -> None:
 
     fixed, moving = (itk.imread(str(pair / f"{name}.nii.gz"), itk.F) for name in ("fixed", "moving"))
     inside = itk.imread(str(pair / "intracranial.nii.gz"), itk.UC)
-    parameters = itk.ParameterObject.New()
+    parameters, known = itk.ParameterObject.New(), Known.of(pair)
+    if known.misaligned:
+        parameters.AddParameterMap(parameters.GetDefaultParameterMap("rigid", 4))
+    masks = {} if known.mask is None else {"moving_mask": itk.imread(str(known.mask), itk.UC)}
     settings = dict(parameters.GetDefaultParameterMap("bspline", 4, 16.0)) | {
         "Registration": ["MultiResolutionRegistration"],
-        "Metric": ["AdvancedNormalizedCorrelation"],
+        "Metric": ["AdvancedNormalizedCorrelation" if known.one_contrast else "AdvancedMattesMutualInformation"],
         "GridSpacingSchedule": ["8", "4", "2", "1"],
         "Interpolator": ["BSplineInterpolator"],
         "NumberOfSpatialSamples": ["10000"],
@@ -90,7 +120,7 @@ def b_spline(pair: Path, field: Path) -> None:
     }
     parameters.AddParameterMap(settings)
     _, found = itk.elastix_registration_method(
-        fixed, moving, parameter_object=parameters, fixed_mask=inside, number_of_threads=THREADS
+        fixed, moving, parameter_object=parameters, fixed_mask=inside, number_of_threads=THREADS, **masks
     )
     # It also writes a field of its own, by default into the current folder.
     u = itk.transformix_deformation_field(moving, found, output_directory=str(pair))
@@ -98,20 +128,22 @@ def b_spline(pair: Path, field: Path) -> None:
 
 
 def syn(pair: Path, field: Path) -> None:
-    """SyN of ANTs as antsRegistrationSyNQuick.sh calls it, without a rigid and an affine stage, in the mask."""
+    """SyN of ANTs as antsRegistrationSyNQuick.sh calls it, which compares by mutual information, in the mask.
+
+    Without its rigid and its affine stage where the images are aligned.
+    """
     import ants
 
     fixed, moving, inside = (
         ants.image_read(str(pair / f"{name}.nii.gz")) for name in ("fixed", "moving", "intracranial")
     )
-    found = ants.registration(
-        fixed,
-        moving,
-        type_of_transform="antsRegistrationSyNQuick[so]",
-        initial_transform="Identity",
-        mask=inside,
-    )
-    shutil.copy(next(path for path in found["fwdtransforms"] if path.endswith("Warp.nii.gz")), field)
+    known = Known.of(pair)
+    masks = {"mask": inside} | ({} if known.mask is None else {"moving_mask": ants.image_read(str(known.mask))})
+    stages = {} if known.misaligned else {"initial_transform": "Identity"}
+    kind = "antsRegistrationSyNQuick[s]" if known.misaligned else "antsRegistrationSyNQuick[so]"
+    found = ants.registration(fixed, moving, type_of_transform=kind, **masks, **stages)
+    whole = ants.apply_transforms(fixed, moving, found["fwdtransforms"], compose=str(field.with_suffix("")) + "_")
+    shutil.move(whole, field)
 
 
 PEERS: dict[str, Peer] = {"Demons": demons, "B-spline": b_spline, "SyN": syn}

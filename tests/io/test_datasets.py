@@ -5,8 +5,9 @@ import os
 import nibabel as nib
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from bayesreg.io.datasets import brainweb, check_same_grid, from_files, mni152
+from bayesreg.io.datasets import brainweb, check_same_grid, from_files, mni152, without_labels
 
 needs_brainweb = pytest.mark.skipif(
     not os.environ.get("BAYESREG_DATA"), reason="needs the BrainWeb files, in a folder that BAYESREG_DATA names"
@@ -131,3 +132,54 @@ class TestFromFiles:
         nib.save(nib.Nifti1Image(np.zeros((6, 6, 3)), np.diag([2.0, 2.0, 2.0, 1.0])), tmp_path / "part.nii")
         with pytest.raises(ValueError, match=r"no voxel of csf in .*labels\.nii lies on the grid of .*part\.nii"):
             from_files(tmp_path / "part.nii", files["labels"], OWN_TABLE)
+
+
+def head(affine):
+    """A bright ball with a dark hole, on a dark noisy ground, and where it is."""
+    shape = (30, 32, 28)
+    x = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) - np.array(shape) / 2
+    radius = np.linalg.norm(x, axis=-1)
+    rng = np.random.default_rng(0)
+    voxels = np.where((radius < 11) & (radius > 3), 100.0, 0.0) + 5 * rng.normal(size=shape)
+    voxels[1:3, 1:3, 1:3] = 100.0
+    return nib.Nifti1Image(voxels.astype(np.float32), affine), radius < 11
+
+
+class TestWithoutLabels:
+    def test_a_mask_is_the_organ_and_bounds_it(self, files):
+        found = without_labels(files["t1"], files["inside"])
+        assert found.names == ("organ",)
+        np.testing.assert_array_equal(found.tissue.voxels, found.intracranial.voxels)
+        assert found.tissue.voxels.sum() == 64
+
+    def test_without_one_the_organ_is_what_stands_out_filled(self, tmp_path, caplog):
+        image, ball = head(np.diag([2.0, 2.0, 2.0, 1.0]))
+        nib.save(image, tmp_path / "head.nii")
+        found = without_labels(tmp_path / "head.nii")
+        assert found.intracranial is None
+        assert (np.asarray(found.tissue.voxels) != ball).sum() < 0.03 * ball.sum()
+        assert "Otsu" in caplog.text
+        assert f"{np.count_nonzero(found.tissue.voxels) * 8 / 1000:.4g} ml" in caplog.text
+
+
+def test_a_sheared_image_is_laid_on_axes_at_right_angles(tmp_path, caplog):
+    """A gantry tilt: the ball stays where it is in the world, and results are written on a grid that ITK opens."""
+    sheared = np.array([[2.0, 0, 0, 5], [0, 2, 0.6, -3], [0, 0, 2, 1], [0, 0, 0, 1]])
+    image, ball = head(sheared)
+    image = nib.Nifti1Image(ndimage.gaussian_filter(np.asarray(image.dataobj), 1.5), sheared)
+    nib.save(image, tmp_path / "head.nii")
+    nib.save(nib.Nifti1Image(ball.astype(np.uint8), sheared), tmp_path / "ball.nii")
+    found = from_files(tmp_path / "head.nii", tmp_path / "ball.nii", {"organ": 1})
+    assert found.image.is_orthogonal
+    assert "not at right angles" in caplog.text
+    centre = nib.affines.apply_affine(sheared, np.argwhere(ball).mean(axis=0))
+    there = found.tissue.voxel_to_world(np.argwhere(np.asarray(found.tissue.voxels)).mean(axis=0))
+    np.testing.assert_allclose(there, centre, atol=0.1)
+    at = nib.affines.apply_affine(sheared, np.argwhere(ball)[::50])
+    given = np.asarray(image.dataobj)[tuple(np.argwhere(ball)[::50].T)]
+    assert np.corrcoef(given, np.asarray(found.image.interpolate(at, "cubic")))[0, 1] > 0.98
+
+
+def test_a_straight_image_stays_as_it_is(files):
+    found = from_files(files["t1"], files["labels"], OWN_TABLE)
+    np.testing.assert_array_equal(found.image.voxels, np.asarray(nib.load(files["t1"]).dataobj))

@@ -15,9 +15,11 @@ from bayesreg.io.volumes import (
     load_image,
     load_labels,
     load_mask,
+    load_whole_numbers,
     on_grid_of,
     save_image,
 )
+from bayesreg.types import InputError
 from tests.test_image import AFFINES, affine_of
 
 SHAPE = (5, 6, 4)
@@ -320,3 +322,33 @@ class TestOnGridOf:
 # Voxels of (z reversed, x, y), and of thirds, as voxels of the image.
 TURNED = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, SHAPE[2] - 1], [0, 0, 0, 1.0]])
 THIRDS = np.array([[1 / 3, 0, 0, -1 / 3], [0, 1 / 3, 0, -1 / 3], [0, 0, 1 / 3, -1 / 3], [0, 0, 0, 1.0]])
+
+
+class TestProbabilities:
+    def test_the_most_probable_tissue_is_the_label(self, tmp_path, caplog):
+        shares = np.zeros((4, 4, 4, 3), np.float32)
+        shares[0, ..., 0], shares[1, ..., 1], shares[2, ..., 2] = 0.9, 0.6, 0.55
+        shares[1, ..., 2] = 0.4
+        path = write(tmp_path / "tissues.nii.gz", shares)
+        found = load_whole_numbers(path)
+        np.testing.assert_array_equal(found.voxels[:, 0, 0], [1, 2, 3, 0])
+        assert "probabilities of 3 tissues" in caplog.text
+        tissue = load_labels(path, {"gm": 1, "wm": 2, "csf": 3})
+        np.testing.assert_array_equal(tissue.voxels[:, 0, 0], [1, 2, 3, 0])
+
+    def test_several_volumes_of_something_else_are_refused(self, tmp_path):
+        path = write(tmp_path / "bold.nii.gz", np.full((4, 4, 4, 5), 800.0))
+        with pytest.raises(InputError, match="5 volumes, which are no probabilities"):
+            load_whole_numbers(path)
+
+
+def test_an_image_that_zstandard_compressed_is_read(tmp_path):
+    image = some_image()
+    write(tmp_path / "image.nii.zst", np.asarray(image.voxels), image.affine)
+    np.testing.assert_array_equal(load_image(tmp_path / "image.nii.zst").voxels, image.voxels)
+
+
+def test_mrtrix_images_are_refused_with_their_converter(tmp_path):
+    (tmp_path / "image.mif").write_bytes(b"mrtrix image\ndim: 3,3,3\n")
+    with pytest.raises(InputError, match=r"mrconvert image\.mif"):
+        load_image(tmp_path / "image.mif")
