@@ -44,8 +44,9 @@ class MeshConfig(Section):
 class StartConfig(Section):
     """Where the chains start."""
 
-    field: Annotated[Literal["identity", "truth"] | Path, BeforeValidator(find_field)] = "identity"
-    """identity, truth (of a synthetic pair), or a file with a displacement of every node (.npz, .vtu)."""
+    field: Annotated[Literal["identity", "truth", "demons"] | Path, BeforeValidator(find_field)] = "identity"
+    """identity, truth (of a synthetic pair), demons (of the pair of images, which must be of one contrast), or a file
+    with a displacement of every node (.npz, .vtu)."""
     fraction: Range = (0.0, 1.0)
     """Every chain starts at its own fraction of the field, evenly spread from the first to the second."""
     lam: Positive | ByTissue | None = None
@@ -259,6 +260,8 @@ class Config(Section):
         model, data = info.data.get("model"), info.data.get("data")
         if start.field == "truth" and "simulate" in info.data and info.data["simulate"] is None:
             raise _wrong("field", "the truth of this pair is not known; expected identity or a file")
+        if start.field == "demons" and data is not None and not _has_images(data):
+            raise _wrong("field", "demons need a pair of images; expected identity or a file")
         for name in ("lam", "mu"):
             _require_tissues(name, getattr(start, name), data and data.tissues)
             if model is None or model.elasticity in ("tissue", "field"):

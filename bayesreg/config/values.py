@@ -44,7 +44,7 @@ def search_folders(*beside: Path) -> list[Path]:
 
 def find_field(value: object, info: ValidationInfo) -> object:
     """A word for a displacement field as it is, anything else as a file."""
-    return value if value in ("identity", "truth") else _find_file(value, info)
+    return value if value in ("identity", "truth", "demons") else _find_file(value, info)
 
 
 def find_boundary(value: object, info: ValidationInfo) -> object:

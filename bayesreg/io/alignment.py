@@ -1,4 +1,4 @@
-"""The pose of an organ between two images, by SimpleITK: rigid, by mutual information, from several starts."""
+"""Where a search may begin, by SimpleITK: the pose of an organ between two images, and a field of Demons."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bayesreg.image import Image
 from bayesreg.io.domain import relative_size
+from bayesreg.io.readers import from_itk
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 
@@ -24,6 +25,8 @@ SURROUNDINGS = 15.0
 LEVELS: tuple[tuple[float, float, int | None], ...] = ((8.0, 1.0, None), (4.0, 1.0, 3), (2.0, 0.5, 1))
 # Degrees about each axis that a head in a scanner or on a table may be turned by, besides none.
 TURNS = (-25.0, 25.0)
+# Of Demons: voxels that become one, and iterations, level by level.
+DEMONS = ((4, 200), (2, 100), (1, 50))
 BINS = 32
 ITERATIONS = 200
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -87,6 +90,44 @@ def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | 
             "no pose makes the two images overlap by more than chance; check that they show the same organ"
         )
     return Alignment(Pose(_matrix(best)), information, as_given)
+
+
+def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
+    """The displacement that diffeomorphic Demons find between two aligned images of one contrast.
+
+    On three levels, the field smoothed by 1.5 voxels after each iteration; the histogram of the moving image is first
+    matched to that of the fixed one, since Demons compare intensities. (Vercauteren et al. 2009, "Diffeomorphic demons:
+    efficient non-parametric image registration".)
+
+    Returns
+    -------
+    tuple of Image
+        Its x, y and z components, mm, world RAS.
+    """
+    one, other = (_to_itk(image, "float32") for image in (fixed.on_orthogonal_grid(), moving.on_orthogonal_grid()))
+    other = SimpleITK.Resample(other, one, SimpleITK.Transform(), SimpleITK.sitkLinear, 0.0)
+    other = SimpleITK.HistogramMatching(other, one, 256, 15, True)
+    field = None
+    for factor, iterations in DEMONS:
+        level = [_thinned(image, factor) for image in (one, other)]
+        method = SimpleITK.DiffeomorphicDemonsRegistrationFilter()
+        method.SetNumberOfIterations(iterations)
+        method.SetSmoothDisplacementField(True)
+        method.SetStandardDeviations(1.5)
+        field = method.Execute(*level) if field is None else method.Execute(*level, SimpleITK.Resample(field, level[0]))
+    assert field is not None
+    lps = SimpleITK.GetArrayFromImage(field).transpose(2, 1, 0, 3)
+    affine = from_itk(SimpleITK.VectorIndexSelectionCast(field, 0)).affine
+    x, y, z = (Image(sign * lps[..., axis], affine) for axis, sign in enumerate((-1, -1, 1)))
+    return x, y, z
+
+
+def _thinned(image: SimpleITK.Image, factor: int) -> SimpleITK.Image:
+    """Every so many voxels of the smoothed image."""
+    if factor == 1:
+        return image
+    sd = [factor / 2 * size for size in image.GetSpacing()]
+    return SimpleITK.Shrink(SimpleITK.SmoothingRecursiveGaussian(image, sd), [factor] * 3)
 
 
 def _starts(fixed: Image, moving: Image, organ: Image) -> Iterator[SimpleITK.Euler3DTransform]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from jaxtyping import Float
 
 from bayesreg.config import Config
 from bayesreg.config.observations import LandmarksSection
+from bayesreg.image import Image
 from bayesreg.inference.chains.initialise import Start
+from bayesreg.io.alignment import find_demons
 from bayesreg.io.displacements import read_displacement
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
@@ -106,7 +109,19 @@ def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
     if wanted == "truth":
         assert inputs.truth is not None
         return np.asarray(inputs.truth.u)
+    if wanted == "demons":
+        assert inputs.fixed is not None
+        assert inputs.moving is not None
+        if not inputs.matching.one_contrast:
+            raise InputError("start.field: demons compares intensities, and the images are of unlike contrast")
+        return _demons(inputs.fixed, inputs.moving, inputs.mesh)
     return read_displacement(Path(wanted), inputs.mesh)
+
+
+@lru_cache(maxsize=1)
+def _demons(fixed: Image, moving: Image, mesh: TetMesh) -> np.ndarray:
+    """The field of Demons at the nodes, mm."""
+    return np.stack([component.interpolate(mesh.points) for component in find_demons(fixed, moving)], axis=-1)
 
 
 def with_initial(inputs: Inputs, config: Config) -> Inputs:
