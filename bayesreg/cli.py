@@ -66,6 +66,10 @@ MovingIgnore = Annotated[
     Path | None,
     typer.Option("--moving-ignore", metavar="FILE", help="Mask: not zero where MOVING says nothing, as in a cavity."),
 ]
+Channel = Annotated[
+    tuple[Path, Path] | None,
+    typer.Option("--channel", metavar="FIXED MOVING", help="Another image of each visit, such as FLAIR beside T1."),
+]
 OutFolder = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
 RunFolders = Annotated[list[Path], typer.Argument(metavar="DIR DIR...", help="Folders of two or more runs.")]
@@ -127,6 +131,7 @@ def register(
     intracranial: Mask = None,
     fixed_ignore: FixedIgnore = None,
     moving_ignore: MovingIgnore = None,
+    channel: Channel = None,
     overrides: Overrides = None,
     resume: Resume = False,
     quiet: Quiet = False,
@@ -134,7 +139,17 @@ def register(
     """Sample the posterior of a pair in files, without a configuration; DIR/config.yaml holds the one that was used."""
     from bayesreg.workflow.register import understand
 
-    understood = understand(fixed, moving, labels, table, intracranial, fixed_ignore, moving_ignore, overrides or ())
+    understood = understand(
+        fixed,
+        moving,
+        labels,
+        table,
+        intracranial,
+        fixed_ignore,
+        moving_ignore,
+        [channel] if channel else (),
+        overrides or (),
+    )
     typer.echo("\n".join(understood.lines))
     _sample(understood.config, out, resume, quiet)
 

@@ -121,3 +121,13 @@ def test_a_mistake_is_one_message(register, arguments, part):
     assert result.exit_code == 2, result.output
     assert part in result.stderr
     assert not register.calls
+
+
+def test_further_images_are_compared_as_well(register):
+    other = [register.path("fixed"), register.path("moving")]
+    result = register.call("--labels", register.path("labels"), "--channel", *other)
+    assert result.exit_code == 0, result.output
+    first, second = register.calls[0][0].observations
+    assert (first.name, second.name) == ("images", "channel_2")
+    assert (str(second.fixed), str(second.moving)) == tuple(other)
+    assert "channel_2" in result.output

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
-from bayesreg.config.values import FoundFile, Positive, Section
+from bayesreg.config.values import FoundFile, FoundImage, Positive, Section
 from bayesreg.model.options import ScalePrior, is_taken
 
 
@@ -19,9 +19,26 @@ def _free_name(name: str) -> str:
 
 
 class ImagesSection(Section):
-    """The pair of images of the section data, compared as the section model says."""
+    """The pair of images of the section data, or, with a name and files, another pair of the same two visits, such as
+    FLAIR beside T1; compared as the section model says."""
 
     kind: Literal["images"]
+    name: str = "images"
+    """The name of the pair in tables; images is that of the section data."""
+    fixed: FoundImage | None = None
+    """Another image in the world of data.fixed."""
+    moving: FoundImage | None = None
+    """Another image in the world of data.moving."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> ImagesSection:
+        if (self.fixed is None) != (self.moving is None):
+            raise ValueError("a pair of images needs both, fixed and moving")
+        if (self.fixed is None) != (self.name == "images"):
+            raise ValueError("a pair besides that of the section data needs a name, fixed and moving")
+        if self.name != "images":
+            _free_name(self.name)
+        return self
 
 
 class LandmarksSection(Section):
@@ -43,7 +60,7 @@ Observation = Annotated[ImagesSection | LandmarksSection, Field(discriminator="k
 
 
 def _of_different_names(given: list[Observation] | None) -> list[Observation] | None:
-    names = [one.name if isinstance(one, LandmarksSection) else "images" for one in given or []]
+    names = [one.name for one in given or []]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"two observations are named {name}; give one of them another name")

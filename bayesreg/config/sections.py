@@ -211,9 +211,13 @@ class Config(Section):
     @classmethod
     def _are_there(cls, observations: Observations, info: ValidationInfo) -> Observations:
         data = info.data.get("data")
-        wanted = observations is not None and any(isinstance(one, ImagesSection) for one in observations)
-        if wanted and data is not None and not _has_images(data):
+        names = [one.name for one in observations or [] if isinstance(one, ImagesSection)]
+        if names and data is not None and not _has_images(data):
             raise ValueError("images are observed, and data has none; expected data.fixed and data.moving")
+        if names and "images" not in names:
+            raise ValueError(f"{names[0]} is a second pair of images, and the first is left out; expected kind: images")
+        if len(names) > 1 and data is not None and not isinstance(data, FilesData):
+            raise ValueError(f"expected one pair of images, the one that is made of data.source: {data.source}")
         return observations
 
     @property

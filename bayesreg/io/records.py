@@ -163,6 +163,22 @@ class Matching(NamedTuple):
         return cls(Pose(np.array(given["pose"])), bool(given["one_contrast"]), scale)
 
 
+class Channel(NamedTuple):
+    """A further pair of images of the same two visits, as the model sees it.
+
+    Attributes
+    ----------
+    fixed, moving : Image
+        In the world of the fixed image of the first pair, on their scales of intensities.
+    one_contrast : bool
+        Whether the intensities of both mean the same.
+    """
+
+    fixed: Image
+    moving: Image
+    one_contrast: bool = True
+
+
 class Inputs(NamedTuple):
     """The inputs of a run, which a resumed run must find unchanged.
 
@@ -185,6 +201,8 @@ class Inputs(NamedTuple):
     matching : Matching
     fixed_ignore, moving_ignore : Image or None
         Not zero where the image of that name says nothing, each in the world of the fixed image.
+    channels : mapping
+        Further pairs of images, by the name of the observation.
     """
 
     config: str
@@ -199,6 +217,7 @@ class Inputs(NamedTuple):
     matching: Matching = Matching()
     fixed_ignore: Image | None = None
     moving_ignore: Image | None = None
+    channels: Mapping[str, Channel] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +226,7 @@ class Run:
 
     Attributes
     ----------
-    config, mesh, fixed, moving, tissue, skull, truth, boundary, points, matching, fixed_ignore, moving_ignore
+    config, mesh, fixed, moving, tissue, skull, truth, boundary, points, matching, fixed_ignore, moving_ignore, channels
         As in `Inputs`.
     manifest : dict
         The content of run.json.
@@ -239,6 +258,7 @@ class Run:
     matching: Matching = field(default_factory=Matching)
     fixed_ignore: Image | None = None
     moving_ignore: Image | None = None
+    channels: Mapping[str, Channel] = field(default_factory=dict)
     metrics: dict[str, Any] | None = None
     predicted: Predicted | None = None
     bodies: list[dict[str, Any]] | None = None

@@ -16,7 +16,7 @@ from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.points import PointPairs
-from bayesreg.io.records import Inputs, Matching, Predicted, Run, Truth
+from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
 from bayesreg.io.volumes import load_image, save_image
 from bayesreg.types import AnyArray, InputError
 
@@ -49,10 +49,12 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
     images = folder / "inputs"
     images.mkdir(parents=True, exist_ok=True)
     every = ("fixed", "moving", "tissue", "skull", "fixed_ignore", "moving_ignore")
-    names = [name for name in every if getattr(inputs, name) is not None]
+    given = {name: image for name in every if (image := getattr(inputs, name)) is not None}
+    for name, channel in inputs.channels.items():
+        given |= {f"channel-{name}-fixed": channel.fixed, f"channel-{name}-moving": channel.moving}
     # The compression lets other threads run.
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda name: save_image(getattr(inputs, name), images / f"{name}.nii.gz"), names))
+        list(pool.map(lambda name: save_image(given[name], images / f"{name}.nii.gz"), given))
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
         save_arrays(images / "truth.npz", known)
@@ -60,7 +62,8 @@ def write_inputs(folder: str | Path, inputs: Inputs) -> None:
         save_arrays(images / "boundary.npz", {"u_boundary": inputs.boundary})
     if inputs.points:
         save_arrays(images / "points.npz", _points_as_arrays(inputs.points))
-    write_json(images / "matching.json", inputs.matching.as_json())
+    channels = {name: channel.one_contrast for name, channel in inputs.channels.items()}
+    write_json(images / "matching.json", inputs.matching.as_json() | {"channels": channels})
     save_mesh(inputs.mesh, folder / "mesh.vtu")
     write_text(folder / "config.yaml", inputs.config)
 
@@ -84,10 +87,19 @@ def read_inputs(folder: str | Path) -> Inputs:
     truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
     boundary = load_arrays(given, "run anew, into another folder")["u_boundary"] if given.exists() else None
     pairs = _points_of(load_arrays(points, "run anew, into another folder")) if points.exists() else {}
-    matching = Matching.of_json(read_json(_require(folder, "inputs/matching.json")))
+    known_of_images = read_json(_require(folder, "inputs/matching.json"))
+    channels = {name: _channel(folder, name, alike) for name, alike in known_of_images["channels"].items()}
     return Inputs(
-        config, mesh, fixed, moving, tissue, skull, truth, boundary, pairs, matching, fixed_ignore, moving_ignore
+        config, mesh, fixed, moving, tissue, skull, truth, boundary, pairs, Matching.of_json(known_of_images),
+        fixed_ignore, moving_ignore, channels,
+    )  # fmt: skip
+
+
+def _channel(folder: Path, name: str, one_contrast: bool) -> Channel:
+    fixed, moving = (
+        load_image(_require(folder, f"inputs/channel-{name}-{which}.nii.gz")) for which in ("fixed", "moving")
     )
+    return Channel(fixed, moving, one_contrast)
 
 
 def _points_as_arrays(points: Mapping[str, PointPairs]) -> dict[str, AnyArray]:

@@ -51,7 +51,8 @@ def _ease(
     """The problem with all images smoothed, and factors on T_s and T_r, or on the loads."""
     smooth = {name: pair.smoothed(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
     powers = {name: power for own in SCALES.values() for name, power in own.items()}
-    factors = {"t_similarity": similarity, **{name: elastic**power for name, power in powers.items()}}
+    temperatures = {problem.terms[name].comparison.temperature for name in pairs}
+    factors = dict.fromkeys(temperatures, similarity) | {name: elastic**power for name, power in powers.items()}
     scales = {name: problem.blocks[name].times(factor) for name, factor in factors.items() if name in problem.blocks}
     return problem._replace(blocks={**problem.blocks, **scales}, terms={**problem.terms, **smooth})
 

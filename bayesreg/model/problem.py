@@ -38,6 +38,7 @@ from bayesreg.model.options import (
     ModelConfig,
     PriorConfig,
     ScalePrior,
+    TemperaturePrior,
     is_taken,
     of_tissue,
     require_default_image_options,
@@ -75,7 +76,7 @@ def problem_of(
     body = _body(mesh, model, sampled, held, field, blocks)
     # The observations first: what is wrong with them is told before anything that takes long.
     terms = observation_terms(mesh, observations, model)
-    blocks |= _shading_blocks(terms)
+    blocks |= _temperature_blocks(terms, model) | _shading_blocks(terms)
     terms |= _priors(mesh, model, sampled, held, skull)
     return Problem(body, blocks, terms), sampled
 
@@ -130,6 +131,12 @@ def _body(
     )
 
 
+def _temperature_blocks(terms: Terms, model: ModelConfig) -> Blocks:
+    """T_s of every pair of images."""
+    pairs = [term for term in terms.values() if isinstance(term, ComparedImages)]
+    return {pair.comparison.temperature: _scale(model.t_similarity) for pair in pairs}
+
+
 def _shading_blocks(terms: Terms) -> Blocks:
     """The coefficients of the shading of every pair of images that has one, see `bayesreg.model.intensity_map`."""
     pairs = [term for term in terms.values() if isinstance(term, ComparedImages)]
@@ -163,7 +170,10 @@ def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelCo
         if name in terms or name in unknowns or is_taken(name):
             raise InputError(f"the name {name!r} of an observation is taken; give another one")
         if isinstance(observation, ImagePair):
-            terms[name] = observation.on(mesh, model)
+            # The first pair's T_s is that of the options, and all share it where it is known.
+            first = not any(isinstance(term, ComparedImages) for term in terms.values())
+            shared = first or not isinstance(model.t_similarity, TemperaturePrior)
+            terms[name] = observation.on(mesh, model, "t_similarity" if shared else f"{name}_t_similarity")
         elif isinstance(observation, Landmarks):
             terms[name] = observation.on(mesh)
         else:

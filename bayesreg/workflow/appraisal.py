@@ -155,7 +155,7 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
     fixed, moving : Image
         On grids of their own in one world space.
     domain : Image
-        Not zero in Ω, on the grid of the fixed image.
+        Not zero in Ω, on a grid of its own.
     """
     inside = np.argwhere(np.asarray(domain.voxels) != 0)
     inside = inside[:: max(1, len(inside) // VOXELS)]
@@ -163,7 +163,7 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
     seen = np.asarray(moving.contains(places))
     if seen.sum() < 2:
         return Likeness(0.0, 0.0, 1.0, 0.0, float(seen.mean()))
-    one = np.asarray(fixed.voxels, float)[tuple(inside[seen].T)]
+    one = np.asarray(fixed.interpolate(places[seen]))
     other = np.asarray(moving.interpolate(places[seen]))
     ranges = [np.subtract(*np.quantile(values, (0.995, 0.005))) for values in (one, other)]
     if min(ranges) <= 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,8 @@ def _observations(config: Config, inputs: Inputs) -> list[Any]:
             one_contrast=inputs.matching.one_contrast,
         )
         found.append(pair)
+        for name, channel in inputs.channels.items():
+            found.append(replace(pair, name=name, **channel._asdict()))
     for section in config.observations or []:
         if isinstance(section, LandmarksSection):
             pairs = inputs.points[section.name]

@@ -9,7 +9,7 @@ import numpy as np
 from bayesreg.config.data import FilesData
 from bayesreg.image import Image, IntensityScale, robust_scale
 from bayesreg.io.alignment import find_pose
-from bayesreg.io.records import Matching
+from bayesreg.io.records import Channel, Matching
 from bayesreg.io.volumes import check_same_space
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
@@ -74,6 +74,27 @@ def match_images(
     notes = (of_pose, _describe_contrast(alike, one_scale, likeness, data.same_contrast is None))
     matching = Matching(pose, alike, scale)
     return Matched(matching, scales[0](fixed), scale(moving), moving_ignore, likeness, notes)
+
+
+def match_channel(
+    data: FilesData, domain: Image, matching: Matching, name: str, fixed: Image, moving: Image
+) -> Channel:
+    """A further pair of images in the pose of the first, each image on a scale of its own.
+
+    Raises
+    ------
+    InputError
+        If an image does not overlap the organ, or is constant there.
+    """
+    moving = matching.pose.aligned(moving)
+    for which, image in (("fixed", fixed), ("moving", moving)):
+        check_same_space(domain, image, ("first fixed", f"{which} image of {name!r},"))
+    scales = [_scale_of(f"{name} {which}", image, within(domain, image)) for which, image in
+              (("fixed", fixed), ("moving", moving))]  # fmt: skip
+    alike = data.same_contrast
+    if alike is None:
+        alike = compare_images(fixed, moving, domain).is_one_contrast
+    return Channel(scales[0](fixed), scales[1](moving), alike)
 
 
 def _find_pose(

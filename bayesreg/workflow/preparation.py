@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData
-from bayesreg.config.observations import LandmarksSection
+from bayesreg.config.observations import ImagesSection, LandmarksSection
 from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
@@ -23,7 +23,7 @@ from bayesreg.io.displacements import read_boundary, read_displacement, require_
 from bayesreg.io.domain import size_of_solid, without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
-from bayesreg.io.records import Inputs, Truth
+from bayesreg.io.records import Channel, Inputs, Truth
 from bayesreg.io.volumes import load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.options import require_default_image_options
@@ -32,7 +32,7 @@ from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
-from bayesreg.workflow.matching import Matched, match_images
+from bayesreg.workflow.matching import Matched, match_channel, match_images
 from bayesreg.workflow.prediction import require_inside
 
 PROVENANCE = Path("inputs") / "provenance.json"
@@ -106,6 +106,7 @@ def prepare(config: Config) -> Prepared:
                 moving=_as_stored(matched.moving),
                 moving_ignore=None if ignored is None else _as_stored(ignored),
                 matching=matched.matching,
+                channels=_channels(config, domain, matched),
             )
         return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
@@ -118,6 +119,19 @@ def prepare(config: Config) -> Prepared:
     boundary = _known_boundary(config, mesh, truth)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
     return Prepared(inputs, clock.laps, _describe(config, pair), appraisal)
+
+
+def _channels(config: Config, domain: Image, matched: Matched) -> dict[str, Channel]:
+    """The pairs of images besides the first."""
+    assert isinstance(config.data, FilesData)
+    found = {}
+    for section in config.observations or []:
+        if isinstance(section, ImagesSection) and section.fixed is not None and section.moving is not None:
+            images = load_image(section.fixed), load_image(section.moving)
+            channel = match_channel(config.data, domain, matched.matching, section.name, *images)
+            fixed, moving = _as_stored(channel.fixed), _as_stored(channel.moving)
+            found[section.name] = channel._replace(fixed=fixed, moving=moving)
+    return found
 
 
 def _ignored(path: Path | None) -> Image | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesreg.config import Config, make_config, read_mapping
 from bayesreg.config.data import FilesData
+from bayesreg.config.observations import ImagesSection
 from bayesreg.image import Image
 from bayesreg.io.volumes import load_image, load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_table
@@ -38,6 +39,7 @@ def understand(
     intracranial: Path | None = None,
     fixed_ignore: Path | None = None,
     moving_ignore: Path | None = None,
+    channels: Sequence[tuple[Path, Path]] = (),
     overrides: Sequence[str] = (),
 ) -> Understood:
     """Make the configuration of a pair in files.
@@ -56,6 +58,8 @@ def understand(
         Mask of where the organ may go.
     fixed_ignore, moving_ignore : path, optional
         Masks of where the image of that name says nothing; not zero = ignored.
+    channels : sequence of pairs of path
+        Further images of the same two visits, fixed and moving.
     overrides : sequence of str
         As in `bayesreg.load_config`.
 
@@ -72,7 +76,10 @@ def understand(
         "fixed_ignore": fixed_ignore, "moving_ignore": moving_ignore,
     }  # fmt: skip
     files = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
-    config = make_config({"data": {"source": "files", "label_table": chosen, **files}}, overrides)
+    sections: dict[str, Any] = {"data": {"source": "files", "label_table": chosen, **files}}
+    if channels:
+        sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
+    config = make_config(sections, overrides)
     return Understood(config, tuple(_describe(config, how)))
 
 
@@ -89,6 +96,9 @@ def _describe(config: Config, how: str) -> Iterator[str]:
         tissues = "; ".join(f"{name} {shorten(values, 12)}" for name, values in (data.label_table or {}).items())
         yield f"{'table':<12}{how}: {tissues}"
     yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
+    for section in config.observations or []:
+        if isinstance(section, ImagesSection) and section.fixed is not None:
+            yield f"{section.name:<12}{section.fixed} and {section.moving}, compared as well"
     for image in ("fixed", "moving"):
         if (path := getattr(data, f"{image}_ignore")) is not None:
             yield f"{'ignored':<12}what is not zero in {path} says nothing, in the {image} image"
@@ -96,6 +106,11 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
     yield f"{'contrast':<12}{contrast}; compared by {config.model.similarity}"
     yield f"{'model':<12}preset {config.model.preset}"
+
+
+def _channel(number: int, pair: tuple[Path, Path]) -> dict[str, str]:
+    fixed, moving = (str(path.absolute()) for path in pair)
+    return {"kind": "images", "name": f"channel_{number}", "fixed": fixed, "moving": moving}
 
 
 def _describe_organ(data: FilesData) -> str:

@@ -61,7 +61,8 @@ class ImagePair:
 
     Notes
     -----
-    All pairs of a posterior share the options of the model, T_s among them.
+    All pairs of a posterior, such as T1 and FLAIR of one visit, share the options of the model. An inferred T_s is each
+    pair's own.
     """
 
     fixed: Image
@@ -117,8 +118,8 @@ class ImagePair:
     def _seen(self, mesh: TetMesh, quadrature: Quadrature) -> Quadrature:
         return seen_points(mesh, quadrature, self.moving, self.fixed_ignore)
 
-    def on(self, mesh: TetMesh, model: ModelConfig) -> ComparedImages:
-        """The term on a mesh.
+    def on(self, mesh: TetMesh, model: ModelConfig, temperature: str = "t_similarity") -> ComparedImages:
+        """The term on a mesh, with a T_s of this name.
 
         Raises
         ------
@@ -135,7 +136,7 @@ class ImagePair:
             degree = 0 if model.intensity_map is None else model.intensity_map
             shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, degree, more))
         return ComparedImages(
-            comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior)),
+            comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior), temperature),
             similarity=SIMILARITIES[model.similarity].on(model, positions, moving),
             fixed_values=fixed_values,
             moving=moving,
@@ -204,10 +205,13 @@ class Comparison:
     name : str
     normalised : bool
         Whether the likelihood's normaliser is part of the density: where T_s is inferred.
+    temperature : str
+        The name of its T_s among the values.
     """
 
     name: str
     normalised: bool
+    temperature: str = "t_similarity"
 
 
 class ComparedImages(NamedTuple):
@@ -250,6 +254,10 @@ class ComparedImages(NamedTuple):
         """Its name."""
         return self.comparison.name
 
+    def temperature(self, values: Values) -> Scalar:
+        """T_s."""
+        return values[self.comparison.temperature]
+
     def log(self, state: State) -> Scalar:
         """−E_s / T_s, tempered, and the normaliser where T_s is inferred."""
         return self.likelihood(state).log_prob(self.fixed_values)
@@ -262,7 +270,7 @@ class ComparedImages(NamedTuple):
         """The distribution of f(x_q), given m(x_q + u(x_q))."""
         # Without the barrier XLA interpolates twice, for the density and for the record.
         compared = jax.lax.optimization_barrier(self.compared(self.places(state.u), state.values))
-        return ImageLikelihood(self, compared, state.values["t_similarity"])
+        return ImageLikelihood(self, compared, self.temperature(state.values))
 
     def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
         """x_q + u(x_q), mm."""
@@ -289,7 +297,7 @@ class ComparedImages(NamedTuple):
 
     def scaled_residual(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points"]:
         """`residuals` in units of their scale √(T_s / 2w): where the model holds, as `standardised_noise`."""
-        return self.residuals(u, values) * jnp.sqrt(2 * self.quadrature.weights / values["t_similarity"])
+        return self.residuals(u, values) * jnp.sqrt(2 * self.quadrature.weights / self.temperature(values))
 
     def standardised_residual(self, state: State) -> Float[AnyArray, "points"]:
         """`residuals` in units of their standard deviation."""
@@ -371,7 +379,7 @@ class ImageLikelihood(dist.Distribution):
 def _scores(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points 3"]:
     moved = term.places(u)
     pair = term.compared(moved, values)
-    slope = jax.grad(term.similarity.energy)(pair, values["t_similarity"]).moving
+    slope = jax.grad(term.similarity.energy)(pair, term.temperature(values)).moving
     return -slope[:, None] * _slope(term, moved)
 
 
@@ -380,14 +388,14 @@ def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: V
     """Gauss and Newton's curvature in every place x_q + u(x_q), the share that is looked at held fixed."""
     moved = term.places(u)
     pair = term.compared(moved, values)
-    convexity = term.similarity.convexity(pair, values["t_similarity"])
-    return _chain(term, convexity, _slope(term, moved), values["t_similarity"])
+    convexity = term.similarity.convexity(pair, term.temperature(values))
+    return _chain(term, convexity, _slope(term, moved), term.temperature(values))
 
 
 @jax.jit
 def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
     """The exact curvature, ∇m E″ ∇mᵀ + E′ ∇²m with E″ that in the values m_q, less Gauss and Newton's."""
-    moved, similarity, t_similarity = term.places(u), term.similarity, values["t_similarity"]
+    moved, similarity, t_similarity = term.places(u), term.similarity, term.temperature(values)
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
     pair = term.compared(moved, values)
