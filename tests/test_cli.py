@@ -32,9 +32,10 @@ def workflow(monkeypatch):
         calls["run"] = (config, out, resume, progress)
         return SimpleNamespace(converged=config.seed == 1, folder=out)
 
-    def check(config):
+    def check(config, say):
         calls["check"] = (config,)
-        return SimpleNamespace(text="about 3 minutes")
+        say("the images are alike")
+        return SimpleNamespace(cost="about 3 minutes")
 
     def simulate(config, out):
         calls["simulate"] = (config, out)
@@ -77,7 +78,7 @@ def test_run_that_did_not_converge_says_so_with_status_3(workflow):
 
 
 def test_other_commands_call_their_verbs(workflow):
-    assert "about 3 minutes" in invoke("check", QUICK, "--set", "seed=4").output
+    assert invoke("check", QUICK, "--set", "seed=4").output == "the images are alike\nabout 3 minutes\n"
     assert workflow.calls["check"][0].seed == 4
     assert invoke("simulate", QUICK, "-o", "pair").exit_code == 0
     assert workflow.calls["simulate"][1] == Path("pair")
@@ -101,7 +102,7 @@ def test_samplers_to_compare_are_named_or_all(monkeypatch):
 def test_the_real_verbs_take_what_the_commands_give():
     for name, arguments in {
         "run": ("config", "out", "resume", "progress"),
-        "check": ("config",),
+        "check": ("config", "say"),
         "simulate": ("config", "out"),
         "report": ("folder",),
         "compare": ("folders", "out"),
@@ -133,7 +134,7 @@ def test_a_full_disk_is_one_message_that_names_the_way_on(workflow):
 
 
 def test_a_bug_is_not_taken_for_bad_input(workflow):
-    def check(config):
+    def check(config, say):
         raise ValueError("shapes do not match")
 
     workflow.replace("check", check)

@@ -127,7 +127,13 @@ class LocalCorrelation(NamedTuple):
     width: Scalar
 
     @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> LocalCorrelation:
+    def on(
+        cls,
+        model: ModelConfig,
+        positions: Float[np.ndarray, "points 3"],
+        moving: Interpolator,
+        fixed: Float[AnyArray, "points"],
+    ) -> LocalCorrelation:
         """The similarity with windows of the model's width.
 
         Raises

@@ -26,6 +26,9 @@ OF_IMAGES = (
     "quadrature", "most_points", "smoothing", "intensity_map",
 )  # fmt: skip
 
+# Similarities that bring a map of intensities of their own.
+OF_ANY_CONTRAST = ("lncc", "mi")
+
 Lame = Literal["lam", "mu"]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
@@ -146,10 +149,11 @@ class ModelConfig(BaseModel):
     priors : mapping
         A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"liver": PriorConfig(high=60)}}``;
         what is not named has the flat prior on [0, ∞).
-    similarity : {"ssd", "student_t", "lncc"}
+    similarity : {"ssd", "student_t", "lncc", "mi"}
         Sum of squared differences, eq. (1): Gaussian noise; Student's t noise, which forgives outliers; or, for images
         of unlike contrast, squared differences after the best affine map of intensities in each of many windows
-        (`bayesreg.model.local_correlation`).
+        (`bayesreg.model.local_correlation`), or mutual information (`bayesreg.model.mutual_information`), whose
+        t_similarity is no noise, but a temperature of the likelihood alone.
     degrees_of_freedom : float
         ν of "student_t", above 2: the fewer, the heavier the tails; many are Gaussian.
     window_mm : float
@@ -208,7 +212,7 @@ class ModelConfig(BaseModel):
     field: FieldConfig | None = None
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
     priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = {}
-    similarity: Literal["ssd", "student_t", "lncc"] = "ssd"
+    similarity: Literal["ssd", "student_t", "lncc", "mi"] = "ssd"
     window_mm: Positive = 10.0
     degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
     independent_points: Positive | Literal["residual"] | None = None
@@ -235,17 +239,21 @@ class ModelConfig(BaseModel):
         if not isinstance(given, Mapping):
             return given
         chosen = dict(PRESETS.get(str(given.get("preset")), {}))
-        if given.get("similarity") == "lncc":
-            # Its windows have a map each.
+        if given.get("similarity") in OF_ANY_CONTRAST:
             chosen.pop("intensity_map", None)
+        if given.get("similarity") == "mi":
+            # There is no noise to infer.
+            chosen.pop("t_similarity", None)
         return {**chosen, **given}
 
     @model_validator(mode="after")
     def _is_proper(self) -> ModelConfig:
         if self.field is not None and self.elasticity != "field":
             raise wrong("field", f"expected null: it belongs to elasticity: field, which is {self.elasticity} here")
-        if self.intensity_map is not None and self.similarity == "lncc":
-            raise wrong("intensity_map", "expected null with similarity: lncc, which finds a map in each window")
+        if self.intensity_map is not None and self.similarity in OF_ANY_CONTRAST:
+            raise wrong("intensity_map", f"expected null with similarity: {self.similarity}, which has maps of its own")
+        if isinstance(self.t_similarity, TemperaturePrior) and self.similarity == "mi":
+            raise wrong("t_similarity", "expected a number with similarity: mi, which knows no noise to infer")
         if self.independent_points == "residual" and self.quadrature != "voxels":
             raise wrong("independent_points", f"residual needs quadrature: voxels, which is {self.quadrature} here")
         if self.elastic_prior == "loads":

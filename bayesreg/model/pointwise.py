@@ -113,7 +113,11 @@ class SumOfSquaredDifferences(Pointwise):
 
     @classmethod
     def on(
-        cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator
+        cls,
+        model: ModelConfig,
+        positions: Float[np.ndarray, "points 3"],
+        moving: Interpolator,
+        fixed: Float[AnyArray, "points"],
     ) -> SumOfSquaredDifferences:
         """The similarity, which has no settings."""
         return cls()
@@ -153,7 +157,13 @@ class StudentT(Pointwise):
         self.degrees_of_freedom = degrees_of_freedom
 
     @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> StudentT:
+    def on(
+        cls,
+        model: ModelConfig,
+        positions: Float[np.ndarray, "points 3"],
+        moving: Interpolator,
+        fixed: Float[AnyArray, "points"],
+    ) -> StudentT:
         """The similarity with the model's degrees of freedom."""
         return cls(jnp.asarray(model.degrees_of_freedom))
 

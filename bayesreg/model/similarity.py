@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.local_correlation import LocalCorrelation
+from bayesreg.model.mutual_information import MutualInformation
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.pointwise import POINTWISE, Intensities, ValueCurvature
 from bayesreg.types import AnyArray, Scalar
@@ -22,8 +23,14 @@ class Similarity(Protocol):
     """
 
     @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], moving: Interpolator) -> Similarity:
-        """The similarity at these points, mm, for an image m, with the settings that the options hold."""
+    def on(
+        cls,
+        model: ModelConfig,
+        positions: Float[np.ndarray, "points 3"],
+        moving: Interpolator,
+        fixed: Float[AnyArray, "points"],
+    ) -> Similarity:
+        """The similarity at these points, mm, for an image m and f there, with the settings that the options hold."""
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, mm³ times squared intensity."""
@@ -53,4 +60,4 @@ class Similarity(Protocol):
         """The similarity of some of the points alone, given by their indices; traceable."""
 
 
-SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE, "lncc": LocalCorrelation}
+SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE, "lncc": LocalCorrelation, "mi": MutualInformation}

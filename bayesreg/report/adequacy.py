@@ -116,11 +116,16 @@ def residual(view: View) -> Drawing | None:
 
 def explain_difference(manifest: Mapping[str, Any]) -> str:
     """A sentence about maps of f − m(x + ū) where the similarity compares something else; empty where it does not."""
-    if part(manifest, "model", "similarity") != "lncc":
+    left = {
+        "lncc": "what the best affine map of the intensities of m in each window leaves of f",
+        "mi": "f less the mean of its intensities where m has the same one",
+    }
+    similarity = str(part(manifest, "model", "similarity"))
+    if similarity not in left:
         return ""
     return (
-        " The similarity is lncc, for images of unlike contrast: maps of f − m(x + ū) do not show its residual, which "
-        "is what the best affine map of the intensities of m in each window leaves of f."
+        f" The similarity is {similarity}, for images of unlike contrast: maps of f − m(x + ū) do not show its residual, "
+        f"which is {left[similarity]}."
     )
 
 

@@ -18,6 +18,8 @@ E_S = {
     "<var>w</var>: Student’s t",
     "lncc": "Σ <var>wr</var>², where <var>r</var> is what the best affine map of <var>m</var>(<var>x</var> + "
     "<var>u</var>) leaves of <var>f</var> in the window of a quadrature point of weight <var>w</var>",
+    "mi": "−<var>T</var><sub>s</sub> <var>N I</var>, where <var>I</var> is the mutual information of <var>f</var> and "
+    "<var>m</var>(<var>x</var> + <var>u</var>) at <var>N</var> quadrature points",
 }
 KINDS = {"images": "pair of images", "landmarks": "pairs of points", "own": "an observation of your own"}
 

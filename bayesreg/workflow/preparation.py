@@ -26,7 +26,7 @@ from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Channel, Inputs, Truth
 from bayesreg.io.volumes import load_image, load_mask
 from bayesreg.mesh import TetMesh
-from bayesreg.model.options import require_default_image_options
+from bayesreg.model.options import OF_ANY_CONTRAST, require_default_image_options
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
@@ -172,7 +172,7 @@ def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched 
     """What is told of labels and images before the mesh is built."""
     if matched is None or not isinstance(config.data, FilesData):
         return appraise(anatomy.tissue, domain, anatomy.names, None)
-    one_contrast = matched.matching.one_contrast and config.model.similarity != "lncc"
+    one_contrast = matched.matching.one_contrast and config.model.similarity not in OF_ANY_CONTRAST
     one_scale = one_contrast and config.data.same_contrast is True and config.model.intensity_map is None
     found = appraise(anatomy.tissue, domain, anatomy.names, None, one_contrast, one_scale, matched.likeness)
     return found._replace(notes=matched.notes)

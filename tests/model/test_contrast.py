@@ -71,10 +71,10 @@ def displacement(x):
     return 2.0 * np.stack([1 - away[..., 1] ** 2, away[..., 0], 0.5 * away[..., 2] ** 2], axis=-1)
 
 
-def error_of(moving, one_contrast):
+def error_of(moving, one_contrast, **options):
     model = br.ModelConfig(
         preset="registration", fixed={"lam": 10.0, "mu": 1.0}, quadrature="voxels", independent_points=None,
-        surface_load=1.0, body_load=0.1,
+        surface_load=1.0, body_load=0.1, **options,
     )  # fmt: skip
     pair = br.ImagePair(FIXED, moving, one_contrast=one_contrast)
     posterior = br.build_posterior(mesh=MESH, observations=[pair], model=model)

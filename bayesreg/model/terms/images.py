@@ -24,7 +24,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.contrast import contrast_functions, map_contrast
 from bayesreg.model.intensity_map import shading_basis
-from bayesreg.model.options import ModelConfig, TemperaturePrior
+from bayesreg.model.options import OF_ANY_CONTRAST, ModelConfig, TemperaturePrior
 from bayesreg.model.pointwise import Intensities, ValueCurvature
 from bayesreg.model.similarity import SIMILARITIES, Similarity
 from bayesreg.model.state import State
@@ -86,7 +86,7 @@ class ImagePair:
         InputError
             As `on`.
         """
-        if self.one_contrast or model.similarity == "lncc":
+        if self.one_contrast or model.similarity in OF_ANY_CONTRAST:
             return self
         positions = self.compared_points(mesh, model).positions(mesh)
         return MappedPair(
@@ -137,7 +137,7 @@ class ImagePair:
             shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, degree, more))
         return ComparedImages(
             comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior), temperature),
-            similarity=SIMILARITIES[model.similarity].on(model, positions, moving),
+            similarity=SIMILARITIES[model.similarity].on(model, positions, moving, fixed_values),
             fixed_values=fixed_values,
             moving=moving,
             quadrature=quadrature,

@@ -1,0 +1,169 @@
+"""Mutual information, for pairs of unlike contrast: every intensity of m may mean any mixture of intensities of f.
+
+The model is that f(x_q) is drawn from a distribution p(f | m(x_q + u)) of which nothing is known but that it is one for
+all points. Put in by its best estimate from the pair itself, the joint histogram P, it gives the profile likelihood
+
+log p(f | m) = Σ_q log p(f_q | m_q) = N (I(P) − H(f)),    I = Σ_ij P_ij log(P_ij / (P_i P_j)),
+
+where H(f) does not depend on u: the points that are compared are fixed, so that nothing needs the normalisation that
+other programs add for overlaps that change. P is a histogram of cubic B-splines (Thévenaz and Unser 2000, "Optimization
+of mutual information for multiresolution image registration"), which makes it smooth in u.
+
+There is no noise and so no T_s to infer. The temperature of the options is that of the likelihood itself: E_s is
+−T_s N I, and where a search for the mode warms T_s, the likelihood is tempered.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayesreg.interpolation import Interpolator
+from bayesreg.model.options import ModelConfig
+from bayesreg.model.pointwise import Intensities, ValueCurvature
+from bayesreg.types import AnyArray, InputError, Scalar
+
+# Bins of each image; the outer ones hold what lies beyond the range.
+BINS = 24
+# Share of the points that every pair of bins has at least, so that no logarithm is infinite.
+LEAST = 1e-9
+
+
+class Histogram(NamedTuple):
+    """The joint histogram of a pair, and the bins that each point lies in.
+
+    Attributes
+    ----------
+    joint : (BINS, BINS) array
+        P_ij, which sums to one; first f, then m.
+    fixed, moving : (q, BINS) arrays
+        The share of each point in the bins of f and of m.
+    count : scalar
+        N.
+    """
+
+    joint: Float[AnyArray, "bins bins"]
+    fixed: Float[AnyArray, "points bins"]
+    moving: Float[AnyArray, "points bins"]
+    count: Scalar
+
+    def surprise(self) -> Float[AnyArray, "bins bins"]:
+        """log(P_ij / P_j): the log probability of the bins of f, given those of m."""
+        return jnp.log(self.joint) - jnp.log(self.joint.sum(axis=0))
+
+
+class MutualInformation(NamedTuple):
+    """Mutual information; see `Similarity`.
+
+    Attributes
+    ----------
+    temperature : scalar
+        T_s of the options.
+    fixed_range, moving_range : (2,) arrays
+        Intensities between which the bins lie.
+    """
+
+    temperature: Scalar
+    fixed_range: Float[AnyArray, "2"]
+    moving_range: Float[AnyArray, "2"]
+
+    @classmethod
+    def on(
+        cls,
+        model: ModelConfig,
+        positions: Float[np.ndarray, "points 3"],
+        moving: Interpolator,
+        fixed: Float[AnyArray, "points"],
+    ) -> MutualInformation:
+        """The similarity with bins over the ranges of both images at the points.
+
+        Raises
+        ------
+        InputError
+            If an image is constant there.
+        """
+        ranges = []
+        for name, values in (("fixed", fixed), ("moving", moving(jnp.asarray(positions)))):
+            low, high = (float(x) for x in np.quantile(np.asarray(values), (0.001, 0.999)))
+            if not high - low > 1e-9 * max(abs(low), abs(high)):
+                raise InputError(f"the {name} image is constant in the mesh: similarity 'mi' has nothing to compare")
+            ranges.append(jnp.array([low, high]))
+        assert isinstance(model.t_similarity, float)
+        return cls(jnp.asarray(model.t_similarity), *ranges)
+
+    def histogram(self, pair: Intensities) -> Histogram:
+        """The joint histogram of a pair."""
+        fixed, moving = _bins(pair.fixed, self.fixed_range), _bins(pair.moving, self.moving_range)
+        counted = pair.weights / pair.weights.mean() * pair.shares
+        joint = (fixed * counted[:, None]).T @ moving + LEAST * len(counted)
+        return Histogram(joint / joint.sum(), fixed, moving, counted.sum())
+
+    def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
+        """−T_s N I."""
+        found = self.histogram(pair)
+        information = (found.joint * (found.surprise() - jnp.log(found.joint.sum(axis=1))[:, None])).sum()
+        return -self.temperature * found.count * information
+
+    def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
+        """Σ_q log p(f_q), with which the likelihood is a density of f."""
+        found = self.histogram(pair)
+        width = (self.fixed_range[1] - self.fixed_range[0]) / (BINS - 3)
+        return pair.shares @ (found.fixed @ jnp.log(found.joint.sum(axis=1) / width))
+
+    def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
+        """F less its mean given m."""
+        found = self.histogram(pair)
+        given = found.moving @ found.joint.T
+        return pair.fixed - given @ _centres(self.fixed_range) / given.sum(axis=1)
+
+    def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
+        """T_s times Fisher's information as it is observed: the square of each point's ∂ log p(f_q | m_q) / ∂m_q."""
+        found = self.histogram(pair)
+        slope = jax.jvp(lambda m: _bins(m, self.moving_range), (pair.moving,), (jnp.ones_like(pair.moving),))[1]
+        score = ((found.fixed @ found.surprise()) * slope).sum(axis=1)
+        return ValueCurvature(self.temperature * pair.weights / pair.weights.mean() * pair.shares * score**2)
+
+    def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
+        """The same: in the mean over the points the curvature of a log likelihood is the square of its slope."""
+        return self.convexity(pair, temperature)
+
+    def variance(self) -> Scalar:
+        """One: the residuals have no scale that T_s gives."""
+        return jnp.ones(())
+
+    def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
+        """Residuals of f drawn from p(f | m)."""
+        found = self.histogram(pair)
+        given, centres = found.moving @ found.joint.T, _centres(self.fixed_range)
+        one, other = jax.random.split(key)
+        within = (centres[1] - centres[0]) * (jax.random.uniform(other, pair.fixed.shape) - 0.5)
+        drawn = centres[jax.random.categorical(one, jnp.log(given))] + within
+        scale = jnp.sqrt(self.temperature / (2 * pair.weights))
+        return (drawn - given @ centres / given.sum(axis=1)) / scale
+
+    def at(self, positions: Float[np.ndarray, "others 3"]) -> MutualInformation:
+        """The similarity itself."""
+        return self
+
+    def among(self, points: Int[AnyArray, "some"]) -> MutualInformation:
+        """The similarity itself, with a histogram of these points alone."""
+        return self
+
+
+def _centres(bounds: Float[AnyArray, "2"]) -> Float[AnyArray, "bins"]:
+    """The intensities that the bins stand for: one bin beyond each end, whose splines reach inside."""
+    width = (bounds[1] - bounds[0]) / (BINS - 3)
+    return bounds[0] + (jnp.arange(BINS) - 1) * width
+
+
+def _bins(values: Float[AnyArray, "points"], bounds: Float[AnyArray, "2"]) -> Float[AnyArray, "points bins"]:
+    """The share of each value in every bin, by a cubic B-spline; what lies beyond the range counts as its end."""
+    inside = jnp.clip(values, bounds[0], bounds[1])
+    centres = _centres(bounds)
+    t = jnp.abs((inside[:, None] - centres) / (centres[1] - centres[0]))
+    near, far = 2 / 3 - t**2 + t**3 / 2, (2 - t) ** 3 / 6
+    return jnp.where(t < 1, near, jnp.where(t < 2, far, 0.0))
