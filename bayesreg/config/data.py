@@ -107,6 +107,19 @@ class FilesData(Section):
         return table
 
 
+class Scan(Section):
+    """How the moving image of a synthetic pair is stored as a hospital would have it, beside the pair itself."""
+
+    millimetres: NotNegative = 8.0
+    """How far the organ has shifted between the scans, mm."""
+    degrees: NotNegative = 8.0
+    """By how much it is turned."""
+    inverted: StrictBool = False
+    """Whether dark and bright change places in the organ, as between T1 and T2."""
+    cavity: NotNegative = 0.0
+    """Radius of a cavity at the place that moves most, mm; 0: there is none."""
+
+
 class _Pair(Section):
     displacement: Positive = 15.0
     """How far the patch moves towards the centre of gravity, mm."""
@@ -120,6 +133,8 @@ class _Pair(Section):
     """True second Lamé parameter of every tissue."""
     smoothing_mm: NotNegative | None = None
     """Width (sd, mm) of the smoothing of the anatomy beforehand; null lets the kind of pair choose."""
+    scan: Scan | None = None
+    """What `bayesreg simulate` also writes under scans/: the files of two scans, of which all else is to be found."""
 
 
 class PaperPair(_Pair):

@@ -124,8 +124,8 @@ def explain_difference(manifest: Mapping[str, Any]) -> str:
     if similarity not in left:
         return ""
     return (
-        f" The similarity is {similarity}, for images of unlike contrast: maps of f − m(x + ū) do not show its residual, "
-        f"which is {left[similarity]}."
+        f" The similarity is {similarity}, for images of unlike contrast: maps of f − m(x + ū) do not show its "
+        f"residual, which is {left[similarity]}."
     )
 
 

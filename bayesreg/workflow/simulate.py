@@ -5,14 +5,28 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from bayesreg.config import Config, load_config
+from bayesreg.config.data import Scan
 from bayesreg.io import store
+from bayesreg.io.records import Inputs
+from bayesreg.io.volumes import save_image
+from bayesreg.pose import Pose
+from bayesreg.tissues import is_fluid
 from bayesreg.types import InputError
 from bayesreg.workflow.preparation import prepared_inputs, store_inputs, with_unsampled
 
+SCANS = "scans"
+
 
 def simulate(config: str | Path | Config, out: str | Path) -> Path:
-    """Make the synthetic pair of a configuration: images, tissue, skull, mesh and truth in a folder."""
+    """Make the synthetic pair of a configuration: images, tissue, skull, mesh and truth in a folder.
+
+    With `simulate.scan` also the files of two scans, in its subfolder scans: fixed, moving, labels, intracranial and,
+    of the moving scan, cavity, each .nii.gz.
+    """
     config = config if isinstance(config, Config) else load_config(config)
     if config.simulate is None:
         raise InputError("the configuration has no section 'simulate': its pair comes from files")
@@ -20,4 +34,52 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
     store.require_fresh(out)
     inputs, provenance = prepared_inputs(config)
     store_inputs(Path(out), inputs, with_unsampled(provenance, began))
+    if config.simulate.scan is not None:
+        _write_scans(Path(out) / SCANS, inputs, config.simulate.scan, config.seed)
     return Path(out)
+
+
+def _write_scans(folder: Path, inputs: Inputs, scan: Scan, seed: int) -> None:
+    assert inputs.fixed is not None
+    assert inputs.moving is not None
+    assert inputs.skull is not None
+    assert inputs.truth is not None
+    inside = np.asarray(inputs.skull.voxels) == 0
+    voxels, cavity = np.array(inputs.moving.voxels), _cavity(inputs, scan.cavity)
+    fluid = [index for index, name in enumerate(inputs.mesh.names, start=1) if is_fluid(name)]
+    voxels[cavity] = np.median(np.asarray(inputs.fixed.voxels)[np.isin(np.asarray(inputs.tissue.voxels), fluid)])
+    if scan.inverted:
+        voxels[inside] = voxels[inside].max() + voxels[inside].min() - voxels[inside]
+    # The organ lies elsewhere, and so do the voxels that show it.
+    pose = _pose(inputs.mesh.points.mean(axis=0), scan, seed)
+    moving = pose.inverse.aligned(inputs.moving.with_voxels(voxels))
+    written = {
+        "fixed": inputs.fixed,
+        "moving": moving,
+        "labels": inputs.tissue,
+        "intracranial": inputs.skull.with_voxels(inside.astype(np.uint8)),
+    }
+    if cavity.any():
+        written["cavity"] = moving.with_voxels(cavity.astype(np.uint8))
+    folder.mkdir(parents=True)
+    for name, image in written.items():
+        save_image(image, folder / f"{name}.nii.gz")
+
+
+def _cavity(inputs: Inputs, radius: float) -> np.ndarray:
+    """A ball that touches the surface where it has moved most, as it lies in the moved organ; (X, Y, Z) booleans."""
+    assert inputs.truth is not None
+    u, points = np.asarray(inputs.truth.u), inputs.mesh.points
+    most = np.linalg.norm(u, axis=1).argmax()
+    inwards = points.mean(axis=0) - points[most]
+    centre = points[most] + u[most] + radius * inwards / np.linalg.norm(inwards)
+    return np.linalg.norm(inputs.tissue.grid_points() - centre, axis=-1) < radius
+
+
+def _pose(centre: np.ndarray, scan: Scan, seed: int) -> Pose:
+    """A rigid motion about a centre, in a random direction."""
+    axis, shift = np.random.default_rng(seed).normal(size=(2, 3))
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(scan.degrees * axis / np.linalg.norm(axis), degrees=True).as_matrix()
+    matrix[:3, 3] = centre - matrix[:3, :3] @ centre + scan.millimetres * shift / np.linalg.norm(shift)
+    return Pose(matrix)
