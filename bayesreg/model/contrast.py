@@ -1,7 +1,8 @@
 """A map from the intensities of f to those of m, for pairs of unlike contrast.
 
-m(x + u) ≈ Σ_k c_k b_k(x): b_k are cubic B-splines of f(x), so that every tissue has its own brightness, and |∇f(x)|, so
-that borders have theirs, as in ultrasound. A shading is what `ModelConfig.intensity_map` adds. (Roche et al. 1998,
+m(x + u) ≈ Σ_k c_k b_k(x): b_k are cubic B-splines of f(x), so that every intensity has one in m; 1 and f(x) within each
+tissue, where the labels are known, so that tissues as bright as one another in f may differ in m; and |∇f(x)|, so that
+borders have a brightness, as in ultrasound. A shading is what `ModelConfig.intensity_map` adds. (Roche et al. 1998,
 "The correlation ratio as a new similarity measure for multimodal image registration"; with |∇f|, Wein et al. 2008,
 "Automatic CT-ultrasound registration for diagnostic imaging and image-guided intervention".) The coefficients that fit
 best at rest carry f into the contrast of m, and the pair is then compared as one of one contrast. What the map lacks,
@@ -33,7 +34,9 @@ RIDGE = 1e-4
 BLUR = 1.5
 
 
-def map_contrast(fixed: Image, moving: Image, positions: Float[np.ndarray, "points 3"]) -> Image:
+def map_contrast(
+    fixed: Image, moving: Image, positions: Float[np.ndarray, "points 3"], tissue: Image | None = None
+) -> Image:
     """The fixed image in the contrast of the moving one, as far as both tell at rest.
 
     Parameters
@@ -41,6 +44,8 @@ def map_contrast(fixed: Image, moving: Image, positions: Float[np.ndarray, "poin
     fixed, moving : Image
     positions : (q, 3) array
         Where to compare them, mm.
+    tissue : Image, optional
+        Labels on the grid of the fixed image, 0 outside.
 
     Returns
     -------
@@ -49,18 +54,18 @@ def map_contrast(fixed: Image, moving: Image, positions: Float[np.ndarray, "poin
     """
     sd = BLUR * max(image.voxel_volume for image in (fixed, moving)) ** (1 / 3)
     target = np.asarray(moving.smoothed(sd).interpolate(positions))
-    coefficients = _fit(contrast_functions(fixed, positions, sd), target)
+    coefficients = _fit(contrast_functions(fixed, positions, sd, tissue), target)
     found = np.zeros(fixed.shape)
-    for coefficient, image in zip(coefficients, _function_images(fixed, positions), strict=True):
+    for coefficient, image in zip(coefficients, _function_images(fixed, positions, tissue), strict=True):
         found += coefficient * np.asarray(image.voxels)
     return fixed.with_voxels(found)
 
 
 def contrast_functions(
-    fixed: Image, positions: Float[np.ndarray, "points 3"], sd: float = 0.0
+    fixed: Image, positions: Float[np.ndarray, "points 3"], sd: float = 0.0, tissue: Image | None = None
 ) -> Float[np.ndarray, "points functions"]:
     """b_k at some places, smoothed by sd, both in mm."""
-    images = _function_images(fixed, positions)
+    images = _function_images(fixed, positions, tissue)
     smooth = (image.smoothed(sd) if sd else image for image in images)
     return np.stack([np.asarray(image.interpolate(positions)) for image in smooth], axis=1)
 
@@ -76,13 +81,18 @@ def explained_shares(one: Float[np.ndarray, "points"], other: Float[np.ndarray, 
     return correlation * abs(correlation), float(max(1 - left.var() / other.var(), 0.0))
 
 
-def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"]) -> Iterator[Image]:
-    """The splines of f, which lie between its quantiles at these places, and |∇f| over their range, one by one."""
+def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"], tissue: Image | None) -> Iterator[Image]:
+    """The splines of f, between its quantiles at these places, |∇f| over their range, and 1 and f by tissue."""
     voxels, values = np.asarray(fixed.voxels, float), np.asarray(fixed.interpolate(positions))
     for spline in _splines(values):
         yield fixed.with_voxels(spline(voxels))
     along = np.stack(np.gradient(voxels), axis=-1) @ fixed.to_voxel[:3, :3]
     yield fixed.with_voxels(np.linalg.norm(along, axis=-1) / np.ptp(np.quantile(values, ENDS)))
+    if tissue is not None:
+        labels = np.asarray(tissue.voxels)
+        for label in np.unique(labels[labels > 0]):
+            yield fixed.with_voxels((labels == label).astype(float))
+            yield fixed.with_voxels(voxels * (labels == label))
 
 
 def _splines(values: Float[np.ndarray, "points"]) -> list[partial[np.ndarray]]:

@@ -60,10 +60,12 @@ def _observations(config: Config, inputs: Inputs) -> list[Any]:
             fixed_ignore=inputs.fixed_ignore,
             moving_ignore=inputs.moving_ignore,
             one_contrast=inputs.matching.one_contrast,
+            tissue=inputs.tissue,
         )
         found.append(pair)
         for name, channel in inputs.channels.items():
-            found.append(replace(pair, name=name, **channel._asdict()))
+            tissue = inputs.tissue if channel.fixed.shape == inputs.tissue.shape else None
+            found.append(replace(pair, name=name, tissue=tissue, **channel._asdict()))
     for section in config.observations or []:
         if isinstance(section, LandmarksSection):
             pairs = inputs.points[section.name]

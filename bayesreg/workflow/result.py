@@ -15,6 +15,7 @@ from bayesreg.inference.draws.inference_data import open_posterior
 from bayesreg.io import store
 from bayesreg.io.records import Run
 from bayesreg.mesh import TetMesh
+from bayesreg.pose import Motion
 from bayesreg.types import InputError
 
 
@@ -56,6 +57,17 @@ class Result:
     def u_sd(self) -> np.ndarray:
         """Posterior standard deviation of the displacement of every node, (n, 3), mm."""
         return np.asarray(self.run.u_sd)
+
+    @property
+    def pose(self) -> Motion | None:
+        """The rigid part of the displacement, the pose that was found first included, of some draws of every chain.
+
+        Translation of the mesh's centre, mm, and rotation about it, degrees, each (chains, draws, 3); None for runs of
+        versions that did not keep it.
+        """
+        if self.run.predicted is None:
+            return None
+        return Motion(*np.split(np.asarray(self.run.predicted.motion), 2, axis=-1))
 
     @property
     def metrics(self) -> dict[str, Any] | None:

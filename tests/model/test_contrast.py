@@ -102,6 +102,24 @@ def test_a_similarity_with_maps_of_its_own_takes_the_images_as_they_are(similari
     assert br.build_posterior(mesh=MESH, observations=[pair], model=model).images.shading is None
 
 
+def test_tissues_of_one_brightness_may_differ_in_the_other_image():
+    """Two tissues that are as bright in f, one dark and one bright in m: labels tell them apart, and nothing else."""
+    rng = np.random.default_rng(1)
+    labels = 1 + (ndimage.gaussian_filter(rng.normal(size=FIXED.shape), 4) > 0).astype(np.int8)
+    moving = FIXED.with_voxels(np.where(labels == 1, 0.5 * np.asarray(FIXED.voxels), 1 - np.asarray(FIXED.voxels)))
+    inside = FIXED.voxel_to_world(np.argwhere(np.ones(FIXED.shape))[::3])
+    tissue = FIXED.with_voxels(labels)
+    with_labels, without = (map_contrast(FIXED, moving, inside, given) for given in (tissue, None))
+    values = np.asarray(moving.voxels).ravel()
+    assert np.corrcoef(values, np.asarray(with_labels.voxels).ravel())[0, 1] > 0.98
+    assert np.corrcoef(values, np.asarray(without.voxels).ravel())[0, 1] < 0.8
+
+
+def test_labels_on_another_grid_are_refused():
+    with pytest.raises(ValueError, match="tissue must lie on the grid"):
+        br.ImagePair(FIXED, FIXED, tissue=FIXED.with_voxels(FIXED.voxels).on_orthogonal_grid(2 * FIXED.voxel_sizes, 0))
+
+
 def test_a_line_and_a_map_explain_what_they_can():
     rng = np.random.default_rng(0)
     one = rng.uniform(size=20_000)

@@ -53,6 +53,8 @@ class ImagePair:
         whatever its intensity. On any grid, in its world.
     one_contrast : bool, default True
         False: f is compared through the best map of its intensities to those of m (`bayesreg.model.contrast`).
+    tissue : Image, optional
+        Labels on the grid of the fixed image, 0 outside: that map is then another one in every tissue.
 
     Raises
     ------
@@ -71,8 +73,14 @@ class ImagePair:
     fixed_ignore: Image | None = None
     moving_ignore: Image | None = None
     one_contrast: bool = True
+    tissue: Image | None = None
 
     def __post_init__(self) -> None:
+        if self.tissue is not None and self.tissue.shape != self.fixed.shape:
+            raise InputError(
+                f"{self.name}: tissue must lie on the grid of the fixed image, but has the shape {self.tissue.shape}, "
+                f"and not {self.fixed.shape}"
+            )
         for which in ("fixed", "moving", "fixed_ignore", "moving_ignore"):
             given = getattr(self, which)
             if not isinstance(given, Image) and (given is not None or which in ("fixed", "moving")):
@@ -90,11 +98,12 @@ class ImagePair:
             return self
         positions = self.compared_points(mesh, model).positions(mesh)
         return MappedPair(
-            map_contrast(self.fixed, self.moving, positions),
+            map_contrast(self.fixed, self.moving, positions, self.tissue),
             self.moving,
             self.name,
             self.fixed_ignore,
             self.moving_ignore,
+            tissue=self.tissue,
             source=self.fixed,
         )
 
@@ -192,7 +201,7 @@ class MappedPair(ImagePair):
     def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
         """The functions that make up the map: how much of each is there is inferred with all else."""
         assert self.source is not None
-        return contrast_functions(self.source, positions, sd)
+        return contrast_functions(self.source, positions, sd, self.tissue)
 
 
 @jax.tree_util.register_static
