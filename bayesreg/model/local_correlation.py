@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import Intensities, ValueCurvature
+from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
 from bayesreg.model.terms.term import SharedCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -201,6 +201,10 @@ class LocalCorrelation(NamedTuple):
         scale = jnp.sqrt(pair.weights)
         noise = jax.random.normal(key, scale.shape) / scale
         return scale * self.residuals(pair._replace(fixed=noise, share=None))
+
+    def of_one_point(self) -> SumOfSquaredDifferences:
+        """Gaussian noise."""
+        return SumOfSquaredDifferences()
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> LocalCorrelation:
         """The similarity with windows of the same width at other points."""

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import Intensities, ValueCurvature
+from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # Bins of each image; the outer ones hold what lies beyond the range.
@@ -144,6 +144,10 @@ class MutualInformation(NamedTuple):
         drawn = centres[jax.random.categorical(one, jnp.log(given))] + within
         scale = jnp.sqrt(self.temperature / (2 * pair.weights))
         return (drawn - given @ centres / given.sum(axis=1)) / scale
+
+    def of_one_point(self) -> SumOfSquaredDifferences:
+        """Gaussian noise."""
+        return SumOfSquaredDifferences()
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> MutualInformation:
         """The similarity itself."""

@@ -89,6 +89,14 @@ class Pointwise:
         slope = jax.grad(lambda values: self.energy(pair._replace(moving=values), temperature))
         return ValueCurvature(jax.jvp(slope, (pair.moving,), (jnp.ones_like(pair.moving),))[1])
 
+    def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
+        """−log Z_s, a sum over the points."""
+        raise NotImplementedError
+
+    def of_one_point(self: Same) -> Same:
+        """The similarity itself."""
+        return self
+
     def at(self: Same, positions: Float[np.ndarray, "others 3"]) -> Same:
         """The similarity itself, which knows nothing of places."""
         return self

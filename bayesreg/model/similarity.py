@@ -12,7 +12,7 @@ from bayesreg.interpolation import Interpolator
 from bayesreg.model.local_correlation import LocalCorrelation
 from bayesreg.model.mutual_information import MutualInformation
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import POINTWISE, Intensities, ValueCurvature
+from bayesreg.model.pointwise import POINTWISE, Intensities, Pointwise, ValueCurvature
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -52,6 +52,9 @@ class Similarity(Protocol):
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Residuals that follow the model, in units of their scales."""
+
+    def of_one_point(self) -> Pointwise:
+        """The noise of a point by itself."""
 
     def at(self, positions: Float[np.ndarray, "others 3"]) -> Similarity:
         """The similarity with the same settings at other points, mm."""

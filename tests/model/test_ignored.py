@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.image import Image
+from bayesreg.model.terms.images import ImageLikelihood
 from bayesreg.types import InputError
 from tests.model.test_gradients import assert_gradient
 from tests.phantoms import box_mesh
@@ -40,7 +43,7 @@ def test_no_point_is_compared_where_the_fixed_image_is_ignored():
 
 
 @pytest.mark.parametrize(("similarity", "t_similarity"), [("ssd", 4.0), ("student_t", {"median": 4.0})])
-def test_the_density_is_the_sum_of_noise_where_one_looks_and_of_the_range_elsewhere(similarity, t_similarity):
+def test_the_density_is_that_of_noise_where_one_looks_and_of_any_intensity_elsewhere(similarity, t_similarity):
     """By SciPy's densities, point by point."""
     post, displacement = build(similarity, t_similarity, moving_ignore=IGNORE), RNG.normal(size=MESH.points.shape)
     term, values = post.data.terms["images"], {**post.reference(), "u_boundary": displacement}
@@ -50,8 +53,9 @@ def test_the_density_is_the_sum_of_noise_where_one_looks_and_of_the_range_elsewh
     share = np.clip((x - END) / 0.6, 0, 1)
     assert ((share > 0) & (share < 1)).any()
     scale = np.sqrt(float(values["t_similarity"]) / (2 * w))
-    noise = stats.norm(scale=scale) if similarity == "ssd" else stats.t(4.0, scale=scale)
-    expected = share * noise.logpdf(f - m) - (1 - share) * np.log(np.ptp(f))
+    kind = stats.norm if similarity == "ssd" else partial(stats.t, 4.0)
+    hidden = kind(loc=f.mean(), scale=np.sqrt(scale**2 + f.var()))
+    expected = share * kind(scale=scale).logpdf(f - m) + (1 - share) * hidden.logpdf(f)
     assert float(post.energies(values)["images"]) == pytest.approx(expected.sum(), rel=1e-9)
 
 
@@ -89,6 +93,24 @@ def test_intensities_that_are_ignored_change_nothing(similarity):
 def _with_ridge(data, like):
     similarity = data.terms["images"].similarity._replace(ridge=like.terms["images"].similarity.ridge)
     return data.with_term("images", data.terms["images"]._replace(similarity=similarity))
+
+
+def test_no_warmth_of_the_similarity_draws_points_into_the_mask():
+    """The warmer the less a point that fits differs from a hidden one, but it is never the less probable."""
+    for t_similarity in (1e-3, 1.0, 1e3):
+        post = build("student_t", t_similarity, moving_ignore=IGNORE)
+        term = post.data.terms["images"]
+        same = term._replace(fixed_values=term.moving(term.positions))
+        seen = same._replace(visible=lambda places: jnp.ones(len(places)))
+        hidden = same._replace(visible=lambda places: jnp.zeros(len(places)))
+        values = post.reference()
+        logs = [float(_log(one, values)) for one in (seen, hidden)]
+        assert logs[0] > logs[1]
+
+
+def _log(term, values):
+    compared = term.compared(term.positions, values)
+    return ImageLikelihood(term, compared, values["t_similarity"]).log_prob(term.fixed_values)
 
 
 def test_curvature_is_nothing_where_one_does_not_look():

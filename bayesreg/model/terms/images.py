@@ -49,8 +49,8 @@ class ImagePair:
     fixed_ignore : Image, optional
         Not zero where the fixed image says nothing: no point is compared there. On any grid, in its world.
     moving_ignore : Image, optional
-        Not zero where the moving image says nothing, such as in a cavity: a point that is taken there is as probable
-        whatever its intensity. On any grid, in its world.
+        Not zero where the moving image says nothing, such as in a cavity: a point that is taken there may have any
+        intensity of the organ. On any grid, in its world.
     one_contrast : bool, default True
         False: f is compared through the best map of its intensities to those of m (`bayesreg.model.contrast`).
     tissue : Image, optional
@@ -344,7 +344,7 @@ class ComparedImages(NamedTuple):
 class ImageLikelihood(dist.Distribution):
     """Intensities of the fixed image at the quadrature points, given the moving image's there.
 
-    Where m is ignored every intensity in the range of f is as probable.
+    Where m is ignored it may have any intensity that f has in the organ.
 
     Parameters
     ----------
@@ -380,8 +380,19 @@ class ImageLikelihood(dist.Distribution):
         if self.term.comparison.normalised or pair.share is not None:
             found += self.term.similarity.log_normaliser(pair, self.temperature)
         if pair.share is not None:
-            found -= (1 - pair.share).sum() * jnp.log(jnp.ptp(self.term.fixed_values))
+            found += self._hidden(pair)
         return self.term.independent_share * found
+
+    def _hidden(self, pair: Intensities) -> Scalar:
+        """The log density of f where m is ignored: m is then as anywhere in the organ, which is so much more noise."""
+        mean, variance = self.term.fixed_values.mean(), self.term.fixed_values.var()
+        # T_s / (2 w) of the noise and the variance of m are those of a point with this weight.
+        weights = pair.weights / (1 + 2 * pair.weights * variance / self.temperature)
+        hidden = Intensities(pair.fixed, jnp.full_like(pair.fixed, mean), weights, 1 - pair.shares)
+        noise = self.term.similarity.of_one_point()
+        return (
+            noise.log_normaliser(hidden, self.temperature) - noise.energy(hidden, self.temperature) / self.temperature
+        )
 
 
 @jax.jit
