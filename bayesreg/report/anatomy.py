@@ -76,15 +76,13 @@ def registration(view: View) -> Drawing | None:
 def _unlike(view: View, columns: Mapping[str, Image]) -> Drawing:
     """Images of unlike contrast, each in its own greys, and with the borders of the fixed image's tissues."""
     with style.look():
-        figure, axes = _grid(view, columns=2 * len(columns))
+        figure, axes = _grid(view, columns=len(columns))
         for row, plane in zip(axes, view.planes[::-1], strict=True):
-            for index, image in enumerate(columns.values()):
-                limits = panels.range_of(image)
-                for panel in (row[index], row[len(columns) + index]):
-                    panels.image_panel(panel, image, plane, limits)
-                panels.label_lines(row[len(columns) + index], view.run, plane)
+            for panel, image in zip(row, columns.values(), strict=True):
+                panels.image_panel(panel, image, plane, panels.range_of(image))
+                panels.label_lines(panel, view.run, plane)
             _note(row[0], plane.title)
-        for panel, title in zip(axes[0], [*columns, *("borders of f" for _ in columns)], strict=True):
+        for panel, title in zip(axes[0], columns, strict=True):
             panel.set_title(title)
         uri = style.data_uri(figure)
     caption = (
