@@ -70,8 +70,8 @@ BALL = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0) < 8
         ("moving", lambda f: save(f / "bad.nii.gz", np.where(BALL, np.nan, 1)), "NaN"),
         (
             "moving",
-            lambda f: save(f / "bad.nii.gz", BALL, nib.affines.from_matvec(4 * np.eye(3), [900, 0, 0])),
-            "covers 0% of the fixed one",
+            lambda f: save(f / "bad.nii.gz", np.ones(SHAPE)),
+            "the moving image has the same intensity everywhere",
         ),
         ("labels", lambda f: save(f / "bad.nii.gz", BALL), "holds no label"),
         ("labels", lambda f: save(f / "bad.nii.gz", BALL * 0.5), "not integers"),
@@ -92,6 +92,13 @@ def test_a_bad_file_is_named(pair, tmp_path, key, make, part):
     assert result.exit_code == 2, result
     assert part in result.stderr
     assert result.stderr.startswith("bayesreg: ")
+
+
+def test_images_far_apart_are_named_where_their_headers_are_to_be_kept(pair, tmp_path):
+    far = save(tmp_path / "far.nii.gz", BALL, nib.affines.from_matvec(4 * np.eye(3), [900, 0, 0]))
+    result = pair(moving=str(far), pose="fixed")
+    assert result.exit_code == 2
+    assert "covers 0% of the fixed one" in result.stderr
 
 
 def lone_array(folder):

@@ -125,7 +125,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
         ([PAIRS | {"file": "none.csv"}], LABELS, {}, "observations.0.file"),
         ([PAIRS], LABELS | {"fixed": "fixed.nii.gz"}, {}, "a pair of images needs both"),
         ([PAIRS], {"labels": "labels.nii.gz"}, {}, "labels and label_table belong together"),
-        ([PAIRS], {"fixed": "fixed.nii.gz", "moving": "moving.nii.gz"}, {}, "tissue labels of the fixed image"),
+        ([PAIRS], LABELS | {"fixed_ignore": "labels.nii.gz"}, {}, "no image of which a part could be ignored"),
         ([PAIRS], {}, {"mesh": None}, "mesh.file: missing"),
         ([PAIRS], LABELS, {"report": {"landmarks": {"a": [0, 0, 0]}}}, "this key is called report.places now"),
     ],

@@ -62,6 +62,9 @@ def match_images(
     InputError
         If the images do not overlap, or one is constant in Ω.
     """
+    for name, image in (("fixed", fixed), ("moving", moving)):
+        if np.ptp(image.voxels) == 0:
+            raise InputError(f"the {name} image has the same intensity everywhere: it shows nothing to register")
     pose, of_pose = _find_pose(data, domain, fixed, moving, moving_ignore)
     moving = pose.aligned(moving)
     moving_ignore = None if moving_ignore is None else pose.aligned(moving_ignore)
