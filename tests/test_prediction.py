@@ -12,10 +12,12 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
+from bayesreg.pose import Pose
 from bayesreg.workflow.prediction import default_places, mean_values, predict, require_inside
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(3)
+REST = Pose.identity()
 PLACES = {"corner": tuple(MESH.points[0]), "within": (9.0, 11.0, 8.0)}
 
 
@@ -55,7 +57,7 @@ def everywhere() -> np.ndarray:
 def predicted():
     posterior, draws, _ = problem()
     mean, sd = everywhere().mean(axis=(0, 1)), everywhere().std(axis=(0, 1))
-    return predict(posterior, draws, mean_values(posterior, draws, mean), mean, sd, PLACES, seed=1)
+    return predict(posterior, draws, mean_values(posterior, draws, mean), mean, sd, PLACES, seed=1, pose=REST)
 
 
 def test_maps_are_those_of_all_draws():
@@ -107,7 +109,16 @@ def test_replications_differ_between_draws_and_follow_the_seed():
     found = predicted()
     assert len(np.unique(found.replicated[..., 0])) == 36
     mean = everywhere().mean(axis=(0, 1))
-    again = predict(posterior, draws, mean_values(posterior, draws, mean), mean, np.zeros_like(mean), {}, seed=1)
+    again = predict(
+        posterior,
+        draws,
+        mean_values(posterior, draws, mean),
+        mean,
+        np.zeros_like(mean),
+        {},
+        seed=1,
+        pose=REST,
+    )
     np.testing.assert_array_equal(again.replicated, found.replicated)
 
 
@@ -123,7 +134,7 @@ def test_a_sampled_temperature_sets_the_unit_of_its_draw():
     posterior = _Heated(**vars(posterior))
     heated = draws.assign(t_similarity=(("chain", "draw"), np.full((3, 12), 0.2)))
     mean = everywhere().mean(axis=(0, 1))
-    found = predict(posterior, heated, mean_values(posterior, heated, mean), mean, mean, PLACES, seed=1)
+    found = predict(posterior, heated, mean_values(posterior, heated, mean), mean, mean, PLACES, seed=1, pose=REST)
     np.testing.assert_allclose(found.observed[..., :2], predicted().observed[..., :2] / 2, rtol=1e-6)
     np.testing.assert_allclose(found.residual, predicted().residual / 2, rtol=1e-5)
 
@@ -192,7 +203,7 @@ def test_replicates_follow_students_t_where_the_model_does():
         {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
     )
     zero = np.zeros_like(MESH.points)
-    found = predict(posterior, draws, mean_values(posterior, draws, zero), zero, zero, PLACES, seed=0)
+    found = predict(posterior, draws, mean_values(posterior, draws, zero), zero, zero, PLACES, seed=0, pose=REST)
     for k in range(len(found.discrepancies)):
         assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, found.discrepancies[k]
 
