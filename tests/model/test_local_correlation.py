@@ -17,6 +17,7 @@ from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.model.local_correlation import LEAST, RIDGE, windows_of
 from bayesreg.model.pointwise import Intensities
 from bayesreg.model.terms.images import ImageLikelihood
+from bayesreg.pose import Pose
 from bayesreg.workflow.prediction import mean_values, predict
 from tests.model.test_gradients import assert_gradient
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
@@ -261,9 +262,8 @@ def test_predictive_checks_hold_where_the_model_does():
     draws = xr.Dataset(
         {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
     )
-    found = predict(
-        post, draws, mean_values(post, draws, zero), zero, zero, {"here": tuple(MESH.points.mean(axis=0))}, seed=0
-    )
+    places = {"here": tuple(MESH.points.mean(axis=0))}
+    found = predict(post, draws, mean_values(post, draws, zero), zero, zero, places, 0, Pose.identity())
     for k, name in enumerate(("sd", "greatest", "neighbours")):
         assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, name
 

@@ -75,7 +75,7 @@ def test_replicates_have_the_variance_of_the_noise(options, noise):
     assert replicates.shape == (2, count // 2, *post.images.fixed_values.shape)
     weights = np.asarray(post.images.quadrature.weights)
     sd = np.sqrt(3.0 / (2 * weights)) * noise.std()
-    z = (replicates.reshape(count, -1) - np.asarray(likelihood.predicted)) / sd
+    z = (replicates.reshape(count, -1) - np.asarray(likelihood.compared.moving)) / sd
     standard_error = np.sqrt((noise.stats(moments="k") + 2) / count)
     assert abs(z.mean(axis=0)).max() < 5 / np.sqrt(count)
     assert abs((z**2).mean(axis=0) - 1).max() < 6 * standard_error
