@@ -124,8 +124,8 @@ def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: 
     shares = f"a straight line explains {likeness.line_share:.0%} of the moving image, any map {likeness.map_share:.0%}"
     if not alike:
         return f"contrast  unlike ({how}; {shares}): compared through a map of the fixed image's intensities"
-    scale = "one scale" if one_scale else "each on a scale of its own"
-    return f"contrast  the same ({how}; {shares}), intensities on {scale}"
+    scale = "on one scale" if one_scale else "each on a scale of its own"
+    return f"contrast  the same ({how}; {shares}), intensities {scale}"
 
 
 def _scale_of(name: str, image: Image, mask: np.ndarray) -> IntensityScale:
