@@ -94,7 +94,7 @@ class Image:
         return bool(np.abs(directions.T @ directions - np.eye(3)).max() < RIGHT_ANGLE)
 
     def on_orthogonal_grid(self, voxel_sizes: AnyArray | None = None, order: int = 1) -> Image:
-        """The image on a grid whose axes are at right angles, and which covers its own.
+        """The image on a grid whose axes are at right angles, and which covers its own; itself where that is its own.
 
         Parameters
         ----------
@@ -103,6 +103,8 @@ class Image:
         order : int
             Of the splines that interpolate it; 0 takes the nearest voxel, and zero beyond its grid.
         """
+        if self.is_orthogonal and voxel_sizes is None:
+            return self
         sizes, axes = self.voxel_sizes if voxel_sizes is None else np.asarray(voxel_sizes), self.axes
         ends = np.stack(np.meshgrid(*((-0.5, n - 0.5) for n in self.shape), indexing="ij"), axis=-1).reshape(-1, 3)
         corners = self.voxel_to_world(ends) @ axes

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from bayesreg.image import Image
-from bayesreg.types import AnyArray, InputError
+from bayesreg.types import AnyArray
 
 
 class Pose(NamedTuple):
@@ -76,6 +76,13 @@ class Motion(NamedTuple):
     translation: AnyArray
     rotation: AnyArray
 
+    def pose(self, centre: Float[AnyArray, "3"]) -> Pose:
+        """The motion as a pose, the inverse of `Pose.about`; of one motion alone."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec(self.rotation, degrees=True).as_matrix()
+        matrix[:3, 3] = centre + self.translation - matrix[:3, :3] @ centre
+        return Pose(matrix)
+
     @property
     def millimetres(self) -> float:
         """How far the centre goes."""
@@ -85,30 +92,6 @@ class Motion(NamedTuple):
     def degrees(self) -> float:
         """The angle."""
         return float(np.linalg.norm(self.rotation))
-
-
-def fit_pose(
-    points: Float[AnyArray, "k 3"], places: Float[AnyArray, "k 3"], weights: Float[AnyArray, "k"] | None = None
-) -> Pose:
-    """The rigid motion that takes points nearest to places, by least squares (Kabsch 1976).
-
-    Raises
-    ------
-    InputError
-        If fewer than three points are given, or all lie on one line.
-    """
-    points, places = np.asarray(points, float), np.asarray(places, float)
-    weights = np.ones(len(points)) if weights is None else np.asarray(weights, float)
-    centres = [np.average(given, axis=0, weights=weights) for given in (points, places)]
-    product = (points - centres[0]).T @ (weights[:, None] * (places - centres[1]))
-    left, values, right = np.linalg.svd(product)
-    if len(points) < 3 or not values[1] > 1e-9 * max(values[0], 1e-300):
-        raise InputError("a rigid motion needs three points or more that are not on one line")
-    turned = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    matrix = np.eye(4)
-    matrix[:3, :3] = right.T @ turned @ left.T
-    matrix[:3, 3] = centres[1] - matrix[:3, :3] @ centres[0]
-    return Pose(matrix)
 
 
 def rigid_projection(
@@ -124,9 +107,8 @@ def rigid_projection(
     turns = np.stack([np.cross(axis, away) for axis in np.eye(3)])
     modes = np.concatenate([np.broadcast_to(np.eye(3)[:, None], turns.shape), turns])
     weighted = modes * weights[:, None]
-    return centre, np.linalg.solve(np.einsum("aki,bki->ab", weighted, modes), weighted.reshape(6, -1)).reshape(
-        weighted.shape
-    )
+    projection = np.linalg.solve(np.einsum("aki,bki->ab", weighted, modes), weighted.reshape(6, -1))
+    return centre, projection.reshape(weighted.shape)
 
 
 def compose(pose: Pose, centre: Float[np.ndarray, "3"], small: Float[np.ndarray, "*draws 6"]) -> Motion:

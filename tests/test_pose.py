@@ -7,17 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bayesreg.image import Image
-from bayesreg.pose import Pose, compose, fit_pose, rigid_projection
-from bayesreg.types import InputError
+from bayesreg.pose import Motion, Pose, compose, rigid_projection
 
 
 def motion(seed, degrees=15.0, millimetres=20.0):
     rng = np.random.default_rng(seed)
-    axis, shift = rng.normal(size=3), rng.normal(size=3)
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(degrees * axis / np.linalg.norm(axis), degrees=True).as_matrix()
-    matrix[:3, 3] = millimetres * shift / np.linalg.norm(shift)
-    return Pose(matrix)
+    axis, shift = (way / np.linalg.norm(way) for way in rng.normal(size=(2, 3)))
+    return Motion(millimetres * shift, degrees * axis).pose(np.zeros(3))
 
 
 def points(count=50):
@@ -33,29 +29,9 @@ def test_an_aligned_image_has_at_a_point_what_it_had_where_the_pose_takes_the_po
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_rigid_motion_is_found_again(seed):
-    pose, at = motion(seed, degrees=170.0), points()
-    np.testing.assert_allclose(fit_pose(at, pose.place(at)).matrix, pose.matrix, atol=1e-9)
-
-
-def test_the_fit_is_the_nearest_rigid_motion():
-    rng, at = np.random.default_rng(2), points()
-    weights, places = rng.uniform(0.1, 2, len(at)), motion(3).place(at) + rng.normal(size=at.shape)
-    best = fit_pose(at, places, weights)
-
-    def error(pose):
-        return weights @ ((pose.place(at) - places) ** 2).sum(axis=1)
-
-    for seed in range(20):
-        near = motion(seed, degrees=0.3, millimetres=0.3)
-        assert error(best) < error(Pose(near.matrix @ best.matrix))
-
-
-@pytest.mark.parametrize("count", [2, 5])
-def test_points_on_a_line_are_refused(count):
-    at = np.arange(count)[:, None] * np.ones(3)
-    with pytest.raises(InputError, match="three points"):
-        fit_pose(at, at + 1)
+def test_six_numbers_about_a_point_are_the_motion(seed):
+    pose, centre = motion(seed, degrees=170.0), np.array([5.0, -6.0, 7.0])
+    np.testing.assert_allclose(pose.about(centre).pose(centre).matrix, pose.matrix, atol=1e-9)
 
 
 def test_the_rigid_part_of_a_displacement_is_its_least_squares_fit():

@@ -123,7 +123,8 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
 def _named_table(value: object, info: ValidationInfo) -> object:
     """The table of a program by its name; in others, names of labels that a lookup table lists become their values."""
     if isinstance(value, dict) and (known := info.data.get("label_names")) is not None:
-        return {tissue: name_values(entry, read_label_names(known)) for tissue, entry in value.items()}
+        names = read_label_names(known)
+        return {tissue: name_values(entry, names) for tissue, entry in value.items()}
     if not isinstance(value, str):
         return value
     if value not in TABLES:

@@ -10,12 +10,11 @@ import numpy as np
 import SimpleITK
 from jaxtyping import Float
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from bayesreg.image import Image
 from bayesreg.io.domain import relative_size
 from bayesreg.io.readers import from_itk
-from bayesreg.pose import Pose
+from bayesreg.pose import Motion, Pose
 from bayesreg.types import InputError
 
 # Lengths are those for a human brain, in mm, and in proportion for other organs.
@@ -75,7 +74,7 @@ def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | 
     size = relative_size(np.asarray(organ.voxels) != 0, organ.voxel_volume)
     around = _around(organ, size * SURROUNDINGS)
     kept = None if moving_ignore is None else moving_ignore.with_voxels(np.asarray(moving_ignore.voxels) == 0)
-    headers = _euler(np.eye(4), _centre_of(organ))
+    headers = _euler(Pose.identity(), _centre_of(organ))
     starts, given, best = list(_starts(fixed, moving, organ)), headers, headers
     for edge, share, most in LEVELS:
         level = _Level.of(fixed, moving, around, kept, size * edge, share)
@@ -89,7 +88,7 @@ def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | 
         raise InputError(
             "no pose makes the two images overlap by more than chance; check that they show the same organ"
         )
-    return Alignment(Pose(_matrix(best)), information, as_given)
+    return Alignment(_pose(best), information, as_given)
 
 
 def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
@@ -137,10 +136,7 @@ def _starts(fixed: Image, moving: Image, organ: Image) -> Iterator[SimpleITK.Eul
         shifts.append(of(moving) - of(fixed))
     turns = [np.zeros(3)] + [angle * np.eye(3)[axis] for axis, angle in product(range(3), TURNS)]
     for shift, turn in list(product(shifts, turns))[1:]:
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_rotvec(turn, degrees=True).as_matrix()
-        matrix[:3, 3] = centre + shift - matrix[:3, :3] @ centre
-        yield _euler(matrix, centre)
+        yield _euler(Motion(shift, turn).pose(centre), centre)
 
 
 class _Level(NamedTuple):
@@ -235,9 +231,9 @@ def _mass_centre(image: Image) -> Float[np.ndarray, "3"]:
     return image.voxel_to_world(np.array(ndimage.center_of_mass(voxels - voxels.min() + 1e-12)))
 
 
-def _euler(matrix: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTransform:
+def _euler(pose: Pose, centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTransform:
     """A motion of RAS as ITK's of LPS, with its centre of rotation."""
-    lps, about = FLIP @ matrix @ FLIP, FLIP[:3, :3] @ centre
+    lps, about = FLIP @ pose.matrix @ FLIP, FLIP[:3, :3] @ centre
     found = SimpleITK.Euler3DTransform()
     found.SetCenter(about.tolist())
     found.SetMatrix(lps[:3, :3].ravel().tolist())
@@ -245,10 +241,10 @@ def _euler(matrix: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]) -> 
     return found
 
 
-def _matrix(transform: SimpleITK.Euler3DTransform) -> Float[np.ndarray, "4 4"]:
+def _pose(transform: SimpleITK.Euler3DTransform) -> Pose:
     """The motion of RAS of one of ITK."""
     found = np.eye(4)
     found[:3, :3] = np.array(transform.GetMatrix()).reshape(3, 3)
     centre = np.array(transform.GetCenter())
     found[:3, 3] = np.array(transform.GetTranslation()) + centre - found[:3, :3] @ centre
-    return FLIP @ found @ FLIP
+    return Pose(FLIP @ found @ FLIP)

@@ -47,11 +47,7 @@ def load_image(path: str | Path) -> Image:
         If there is no such file, it is not an image or damaged, has more or fewer than three axes, holds
         values that are not real and finite, or its affine is singular.
     """
-    volume = read_volume(path)
-    try:
-        return Image(_one_real(volume.voxels), volume.affine)
-    except ValueError as error:
-        raise InputError(f"image {path}: {error}") from error
+    return _as_image(read_volume(path), path)
 
 
 def load_mask(path: str | Path) -> Image:
@@ -162,7 +158,7 @@ def load_whole_numbers(path: str | Path) -> Image:
     volume = read_volume(path)
     if volume.voxels.ndim == 4 and volume.voxels.shape[3] > 1:
         return _most_probable(volume, path)
-    image = load_image(path)
+    image = _as_image(volume, path)
     voxels = np.asarray(image.voxels)
     if voxels.dtype.kind == "f":
         rounded = np.rint(voxels)
@@ -175,6 +171,13 @@ def load_whole_numbers(path: str | Path) -> Image:
     if voxels.max() > np.iinfo(np.int32).max or voxels.min() < np.iinfo(np.int32).min:
         raise InputError(f"label file {path} holds values up to {voxels.max()}; expected labels of at most 32 bits")
     return image.with_voxels(voxels.astype(np.int32))
+
+
+def _as_image(volume: Volume, path: str | Path) -> Image:
+    try:
+        return Image(_one_real(volume.voxels), volume.affine)
+    except ValueError as error:
+        raise InputError(f"image {path}: {error}") from error
 
 
 def _most_probable(volume: Volume, path: str | Path) -> Image:

@@ -28,7 +28,6 @@ import scipy.sparse
 from jaxtyping import Float, Int
 
 from bayesreg.fem.operators import SparseOperator, sparse_operator
-from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
 from bayesreg.model.terms.term import SharedCurvature
@@ -127,13 +126,7 @@ class LocalCorrelation(NamedTuple):
     width: Scalar
 
     @classmethod
-    def on(
-        cls,
-        model: ModelConfig,
-        positions: Float[np.ndarray, "points 3"],
-        moving: Interpolator,
-        fixed: Float[AnyArray, "points"],
-    ) -> LocalCorrelation:
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> LocalCorrelation:
         """The similarity with windows of the model's width.
 
         Raises
@@ -141,7 +134,7 @@ class LocalCorrelation(NamedTuple):
         InputError
             If the moving image is constant at the points.
         """
-        values = moving(jnp.asarray(positions))
+        values = rest.moving
         # The spline of a constant image varies by rounding.
         if jnp.ptp(values) <= 1e-9 * abs(values).max():
             raise InputError("the moving image is constant in the mesh: similarity 'lncc' has nothing to correlate")

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -72,13 +71,7 @@ class MutualInformation(NamedTuple):
     moving_range: Float[AnyArray, "2"]
 
     @classmethod
-    def on(
-        cls,
-        model: ModelConfig,
-        positions: Float[np.ndarray, "points 3"],
-        moving: Interpolator,
-        fixed: Float[AnyArray, "points"],
-    ) -> MutualInformation:
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> MutualInformation:
         """The similarity with bins over the ranges of both images at the points.
 
         Raises
@@ -87,7 +80,7 @@ class MutualInformation(NamedTuple):
             If an image is constant there.
         """
         ranges = []
-        for name, values in (("fixed", fixed), ("moving", moving(jnp.asarray(positions)))):
+        for name, values in (("fixed", rest.fixed), ("moving", rest.moving)):
             low, high = (float(x) for x in np.quantile(np.asarray(values), (0.001, 0.999)))
             if not high - low > 1e-9 * max(abs(low), abs(high)):
                 raise InputError(f"the {name} image is constant in the mesh: similarity 'mi' has nothing to compare")
@@ -128,7 +121,7 @@ class MutualInformation(NamedTuple):
         return ValueCurvature(self.temperature * pair.weights / pair.weights.mean() * pair.shares * score**2)
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """The same: in the mean over the points the curvature of a log likelihood is the square of its slope."""
+        """`convexity`: in the mean over the points the curvature of a log likelihood is the square of its slope."""
         return self.convexity(pair, temperature)
 
     def variance(self) -> Scalar:

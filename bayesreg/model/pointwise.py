@@ -10,7 +10,6 @@ import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Float, Int
 
-from bayesreg.interpolation import Interpolator
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.terms.term import SharedCurvature
 from bayesreg.types import AnyArray, Scalar
@@ -66,11 +65,16 @@ class ValueCurvature(NamedTuple):
 class Pointwise:
     """Base of these similarities; see `bayesreg.model.similarity.Similarity`.
 
-    A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `on`, `energy`,
-    `log_normaliser`, `variance` and `draw`.
+    A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `energy`,
+    `log_normaliser`, `variance` and `draw`, and `on` where it has settings.
     """
 
     arrays: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def on(cls: type[Same], model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> Same:
+        """The similarity, here without settings."""
+        return cls()
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, a sum over the points, mm³ times squared intensity."""
@@ -119,17 +123,6 @@ class Pointwise:
 class SumOfSquaredDifferences(Pointwise):
     """∫ (f − m(x + u))² dx, eq. (1): Gaussian noise with the variance σ_q² = T_s / (2 w_q)."""
 
-    @classmethod
-    def on(
-        cls,
-        model: ModelConfig,
-        positions: Float[np.ndarray, "points 3"],
-        moving: Interpolator,
-        fixed: Float[AnyArray, "points"],
-    ) -> SumOfSquaredDifferences:
-        """The similarity, which has no settings."""
-        return cls()
-
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Σ_q w_q (f − m)², at any temperature."""
         # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
@@ -165,13 +158,7 @@ class StudentT(Pointwise):
         self.degrees_of_freedom = degrees_of_freedom
 
     @classmethod
-    def on(
-        cls,
-        model: ModelConfig,
-        positions: Float[np.ndarray, "points 3"],
-        moving: Interpolator,
-        fixed: Float[AnyArray, "points"],
-    ) -> StudentT:
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> StudentT:
         """The similarity with the model's degrees of freedom."""
         return cls(jnp.asarray(model.degrees_of_freedom))
 

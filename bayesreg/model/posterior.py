@@ -261,10 +261,11 @@ class Posterior:
         """Densities of single nodes, where a dense preconditioner says what follows a node, and there are images."""
         system = self.data.body.system
         knows = isinstance(system.preconditioner, ReferenceInverse) or not len(system.free)
-        # They know Boltzmann's prior, images without a shading and a hard skull alone.
-        knows &= self.options.elastic_prior == "boltzmann" and self.options.intensity_map is None
-        knows &= not isinstance(self.data.terms.get("skull"), SoftSkull)
-        return SingleNodes() if knows and images_of(self.data) is not None else None
+        # They know Boltzmann's prior, images that are seen everywhere and have no shading, and a hard skull alone.
+        knows &= self.options.elastic_prior == "boltzmann" and not isinstance(self.data.terms.get("skull"), SoftSkull)
+        images = images_of(self.data)
+        knows &= images is not None and images.shading is None and images.visible is None
+        return SingleNodes() if knows else None
 
     @property
     def mode_search(self) -> ModeSearch:

@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.interpolation import Interpolator
 from bayesreg.model.local_correlation import LocalCorrelation
 from bayesreg.model.mutual_information import MutualInformation
 from bayesreg.model.options import ModelConfig
@@ -23,14 +22,8 @@ class Similarity(Protocol):
     """
 
     @classmethod
-    def on(
-        cls,
-        model: ModelConfig,
-        positions: Float[np.ndarray, "points 3"],
-        moving: Interpolator,
-        fixed: Float[AnyArray, "points"],
-    ) -> Similarity:
-        """The similarity at these points, mm, for an image m and f there, with the settings that the options hold."""
+    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> Similarity:
+        """The similarity at these points, mm, of images with these intensities at rest, with the options' settings."""
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, mm³ times squared intensity."""

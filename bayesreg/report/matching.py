@@ -20,7 +20,7 @@ UNITS = ("mm",) * 3 + ("°",) * 3
 
 def notes(manifest: Mapping[str, Any]) -> list[str]:
     """What was found of pose and contrast before the search, a sentence each."""
-    return [" ".join(note.split()) for note in part(manifest, "appraisal", "notes") or []]
+    return list(part(manifest, "appraisal", "notes") or [])
 
 
 def pose_picture(view: View) -> Drawing | None:

@@ -40,7 +40,7 @@ class Appraisal(NamedTuple):
     beware : tuple of str
         What a user should know, a sentence each.
     notes : tuple of str
-        What was found and chosen, a line each.
+        What was found and chosen, a sentence each.
     """
 
     millilitres: Mapping[str, tuple[float, float]]
@@ -132,17 +132,12 @@ def appraise(
     tissue: Image,
     domain: Image,
     names: tuple[str, ...],
-    pair: tuple[Image, Image] | None,
+    likeness: Likeness | None = None,
     one_contrast: bool = True,
     one_scale: bool = True,
-    likeness: Likeness | None = None,
 ) -> Appraisal:
-    """Appraise labels and, where there is one, a pair of images (fixed, moving), or how alike they were found to be.
-
-    See `Likeness.sentences`.
-    """
+    """Appraise labels and, where there is a pair of images, how alike they are; see `Likeness.sentences`."""
     millilitres = measure_tissues(tissue, domain, names)
-    likeness = compare_images(*pair, domain) if pair is not None and likeness is None else likeness
     told = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
     return Appraisal(millilitres, likeness, (*explain_left_out(millilitres), *told))
 

@@ -32,7 +32,7 @@ class Matched(NamedTuple):
     likeness : Likeness
         How alike they are.
     notes : tuple of str
-        What was found, a line each.
+        What was found, a sentence each.
     """
 
     matching: Matching
@@ -90,14 +90,15 @@ def match_channel(
         If an image does not overlap the organ, or is constant there.
     """
     moving = matching.pose.aligned(moving)
-    for which, image in (("fixed", fixed), ("moving", moving)):
-        check_same_space(domain, image, ("first fixed", f"{which} image of {name!r},"))
-    scales = [_scale_of(f"{name} {which}", image, within(domain, image)) for which, image in
-              (("fixed", fixed), ("moving", moving))]  # fmt: skip
     alike = data.same_contrast
     if alike is None:
         alike = compare_images(fixed, moving, domain).is_one_contrast
-    return Channel(scales[0](fixed), scales[1](moving), alike)
+    return Channel(_scaled(f"{name} fixed", fixed, domain), _scaled(f"{name} moving", moving, domain), alike)
+
+
+def _scaled(name: str, image: Image, domain: Image) -> Image:
+    check_same_space(domain, image, ("fixed", name))
+    return _scale_of(name, image, within(domain, image))(image)
 
 
 def _find_pose(
@@ -106,16 +107,16 @@ def _find_pose(
     """The pose, and what is said of it."""
     if data.pose == "fixed":
         check_same_space(fixed, moving, ("fixed", "moving"))
-        return Pose.identity(), "pose      as the headers say (data.pose: fixed)"
+        return Pose.identity(), "Pose: as the headers say (data.pose: fixed)."
     found = find_pose(fixed, moving, domain, moving_ignore)
     told = f"mutual information {found.as_given:.2f} as the headers say"
     if found.information <= GAIN * found.as_given:
-        return Pose.identity(), f"pose      as the headers say, since no other brings much: {told}"
+        return Pose.identity(), f"Pose: as the headers say, since no other brings much: {told}."
     centre = domain.voxel_to_world(np.argwhere(np.asarray(domain.voxels) != 0).mean(axis=0))
     motion = found.pose.about(centre)
     return found.pose, (
-        f"pose      {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the headers: {told}, "
-        f"{found.information:.2f} so (data.pose: fixed keeps the headers')"
+        f"Pose: {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the headers: {told}, "
+        f"{found.information:.2f} so (data.pose: fixed keeps the headers')."
     )
 
 
@@ -123,9 +124,9 @@ def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: 
     how = "found" if found else "as data.same_contrast says"
     shares = f"a straight line explains {likeness.line_share:.0%} of the moving image, any map {likeness.map_share:.0%}"
     if not alike:
-        return f"contrast  unlike ({how}; {shares}): compared through a map of the fixed image's intensities"
+        return f"Contrast: unlike ({how}; {shares}); compared through a map of the fixed image's intensities."
     scale = "on one scale" if one_scale else "each on a scale of its own"
-    return f"contrast  the same ({how}; {shares}), intensities {scale}"
+    return f"Contrast: the same ({how}; {shares}); intensities {scale}."
 
 
 def _scale_of(name: str, image: Image, mask: np.ndarray) -> IntensityScale:

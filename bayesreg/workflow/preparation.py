@@ -171,10 +171,10 @@ def _points(config: Config) -> dict[str, PointPairs]:
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
     """What is told of labels and images before the mesh is built."""
     if matched is None or not isinstance(config.data, FilesData):
-        return appraise(anatomy.tissue, domain, anatomy.names, None)
+        return appraise(anatomy.tissue, domain, anatomy.names)
     one_contrast = matched.matching.one_contrast and config.model.similarity not in OF_ANY_CONTRAST
     one_scale = one_contrast and config.data.same_contrast is True and config.model.intensity_map is None
-    found = appraise(anatomy.tissue, domain, anatomy.names, None, one_contrast, one_scale, matched.likeness)
+    found = appraise(anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale)
     return found._replace(notes=matched.notes)
 
 

@@ -6,14 +6,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bayesreg.config import Config, load_config
 from bayesreg.config.data import Scan
 from bayesreg.io import store
 from bayesreg.io.records import Inputs
 from bayesreg.io.volumes import save_image
-from bayesreg.pose import Pose
+from bayesreg.pose import Motion, Pose
 from bayesreg.tissues import is_fluid
 from bayesreg.types import InputError
 from bayesreg.workflow.preparation import prepared_inputs, store_inputs, with_unsampled
@@ -78,8 +77,5 @@ def _cavity(inputs: Inputs, radius: float) -> np.ndarray:
 
 def _pose(centre: np.ndarray, scan: Scan, seed: int) -> Pose:
     """A rigid motion about a centre, in a random direction."""
-    axis, shift = np.random.default_rng(seed).normal(size=(2, 3))
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(scan.degrees * axis / np.linalg.norm(axis), degrees=True).as_matrix()
-    matrix[:3, 3] = centre - matrix[:3, :3] @ centre + scan.millimetres * shift / np.linalg.norm(shift)
-    return Pose(matrix)
+    shift, axis = (way / np.linalg.norm(way) for way in np.random.default_rng(seed).normal(size=(2, 3)))
+    return Motion(scan.millimetres * shift, scan.degrees * axis).pose(centre)

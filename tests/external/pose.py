@@ -18,11 +18,10 @@ from typing import Any
 import nibabel as nib
 import numpy as np
 from scipy import ndimage as ndi
-from scipy.spatial.transform import Rotation
 
 import bayesreg as br
 from bayesreg.config import make_config
-from bayesreg.pose import Pose
+from bayesreg.pose import Motion, Pose
 from tests.external.make_pair import GLIA, GM, WHITE, data_folder, read_anatomy
 
 NOISE = 0.03
@@ -32,11 +31,8 @@ SETTINGS = ("mesh.edge_length=30.0", "model.most_points=30000", "stop.max_minute
 
 def rigid_motion(seed: int, millimetres: float, degrees: float, centre: np.ndarray) -> np.ndarray:
     """A rigid motion about a centre in a random direction, (4, 4), mm."""
-    axis, shift = np.random.default_rng(seed).normal(size=(2, 3))
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(degrees * axis / np.linalg.norm(axis), degrees=True).as_matrix()
-    matrix[:3, 3] = centre - matrix[:3, :3] @ centre + millimetres * shift / np.linalg.norm(shift)
-    return matrix
+    axis, shift = (way / np.linalg.norm(way) for way in np.random.default_rng(seed).normal(size=(2, 3)))
+    return np.asarray(Motion(millimetres * shift, degrees * axis).pose(centre).matrix)
 
 
 def write_pair(out: Path, data: Path, seed: int, millimetres: float, degrees: float) -> np.ndarray:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from bayesreg.image import Image
 from bayesreg.io.alignment import find_demons, find_pose
-from bayesreg.pose import Pose
+from bayesreg.pose import Motion, Pose
 from bayesreg.types import InputError
 
 # mm
@@ -35,11 +34,8 @@ FIXED, MASK = organ()
 
 def motion(millimetres, degrees, seed=0):
     rng = np.random.default_rng(seed)
-    axis, shift = rng.normal(size=3), rng.normal(size=3)
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(degrees * axis / np.linalg.norm(axis), degrees=True).as_matrix()
-    matrix[:3, 3] = millimetres * shift / np.linalg.norm(shift)
-    return Pose(matrix)
+    axis, shift = (way / np.linalg.norm(way) for way in rng.normal(size=(2, 3)))
+    return Motion(millimetres * shift, degrees * axis).pose(np.zeros(3))
 
 
 def moved(pose, values=lambda v: v):

@@ -140,13 +140,14 @@ class ImagePair:
         smooth = self.smoothed_as(model)
         moving = smooth.moving.interpolator(model.interpolation)
         fixed_values = smooth.fixed.interpolate(positions, model.interpolation)
+        rest = Intensities(fixed_values, moving(jnp.asarray(positions)), quadrature.weights)
         more, shading = self.functions(positions, self.smoothing_sd(model)), None
         if model.intensity_map is not None or more.shape[1]:
             degree = 0 if model.intensity_map is None else model.intensity_map
             shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, degree, more))
         return ComparedImages(
             comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior), temperature),
-            similarity=SIMILARITIES[model.similarity].on(model, positions, moving, fixed_values),
+            similarity=SIMILARITIES[model.similarity].on(model, positions, rest),
             fixed_values=fixed_values,
             moving=moving,
             quadrature=quadrature,
@@ -520,6 +521,12 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
     """
     if model.quadrature in GAUSS_SUBDIVISIONS:
         return gauss_quadrature(mesh, model.quadrature)
+    return _voxels_of(mesh, fixed, model.most_points)
+
+
+@lru_cache(maxsize=4)
+def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
+    """The rule of voxel centres; a map of intensities asks for it, too."""
     centres = fixed.grid_points().reshape(-1, 3)
     near = centres[((centres >= mesh.points.min(axis=0)) & (centres <= mesh.points.max(axis=0))).all(axis=1)]
     cells, barycentric = locate(mesh.points, mesh.cells, near)
@@ -528,8 +535,8 @@ def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature
         raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
     kept = np.flatnonzero(inside)
     volume = fixed.voxel_volume * len(kept)
-    if model.most_points is not None and len(kept) > model.most_points:
-        kept = np.sort(np.random.default_rng(0).choice(kept, model.most_points, replace=False))
+    if most is not None and len(kept) > most:
+        kept = np.sort(np.random.default_rng(0).choice(kept, most, replace=False))
     return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))
 
 
