@@ -25,7 +25,7 @@ _HOME = {
     "TemperaturePrior": "model.options",
     "Posterior": "model.posterior",
     "build_posterior": "model.build",
-    "ImagePair": "model.terms.images",
+    "ImagePair": "model.image_pair",
     "Landmarks": "model.terms.landmarks",
     "independent_points": "model.independence",
     "make_pair": "synthetic.pair",

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bayesreg.model.blocks import Values
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import state_of
-from bayesreg.model.terms.images import ImagePair
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.term import Outside, Standardised
 from bayesreg.types import AnyArray

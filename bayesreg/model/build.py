@@ -13,11 +13,11 @@ import numpy as np
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import fix_a_body, problem_of
 from bayesreg.model.state import State, state_of
-from bayesreg.model.terms.images import ImagePair
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.term import Outside
 from bayesreg.types import AnyArray, InputError
@@ -70,7 +70,7 @@ def build_posterior(
         raise InputError(f"build_posterior needs a mesh: a TetMesh; got {type(mesh).__name__}")
     model = model or ModelConfig()
     given = [
-        one.in_one_contrast(mesh, model) if isinstance(one, ImagePair) else one
+        one.prepared(mesh, model) if isinstance(one, ImagePair) else one
         for one in _observations(fixed, moving, observations)
     ]
     problem, sampled = problem_of(mesh, given, model, skull, reference)

@@ -16,11 +16,11 @@ from bayesreg.fem.multigrid import Multigrid
 from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.coordinates import complete
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.neighbourhood import neighbourhoods
 from bayesreg.model.program import Problem
 from bayesreg.model.single_node import images_of
 from bayesreg.model.state import StaticMesh
-from bayesreg.model.terms.images import ImagePair
 
 # Tolerance of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance
 # can tell.

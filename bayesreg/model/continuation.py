@@ -8,9 +8,9 @@ from functools import partial
 from typing import TypeVar
 
 from bayesreg.interpolation import Interpolation
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.program import Problem
 from bayesreg.model.terms.elastic import SCALES
-from bayesreg.model.terms.images import ImagePair
 
 Made = TypeVar("Made")
 
@@ -49,7 +49,7 @@ def _ease(
     elastic: float,
 ) -> Problem:
     """The problem with all images smoothed, and factors on T_s and T_r, or on the loads."""
-    smooth = {name: pair.smoothed(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
+    smooth = {name: pair.smooth_term(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
     powers = {name: power for own in SCALES.values() for name, power in own.items()}
     temperatures = {problem.terms[name].comparison.temperature for name in pairs}
     factors = dict.fromkeys(temperatures, similarity) | {name: elastic**power for name, power in powers.items()}

@@ -27,7 +27,7 @@ OF_IMAGES = (
 )  # fmt: skip
 
 # Similarities that bring a map of intensities of their own.
-OF_ANY_CONTRAST = ("lncc", "mi")
+OF_ANY_CONTRAST = ("lncc", "mi", "mind")
 
 Lame = Literal["lam", "mu"]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -149,11 +149,12 @@ class ModelConfig(BaseModel):
     priors : mapping
         A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"liver": PriorConfig(high=60)}}``;
         what is not named has the flat prior on [0, ∞).
-    similarity : {"ssd", "student_t", "lncc", "mi"}
+    similarity : {"ssd", "student_t", "lncc", "mi", "mind"}
         Sum of squared differences, eq. (1): Gaussian noise; Student's t noise, which forgives outliers; or, for images
         of unlike contrast, squared differences after the best affine map of intensities in each of many windows
-        (`bayesreg.model.local_correlation`), or mutual information (`bayesreg.model.mutual_information`), whose
-        t_similarity is no noise, but a temperature of the likelihood alone.
+        (`bayesreg.model.local_correlation`), mutual information (`bayesreg.model.mutual_information`), whose
+        t_similarity is no noise, but a temperature of the likelihood alone, or squared differences of what places look
+        like beside their neighbours (`bayesreg.model.self_similarity`).
     degrees_of_freedom : float
         ν of "student_t", above 2: the fewer, the heavier the tails; many are Gaussian.
     window_mm : float
@@ -212,7 +213,7 @@ class ModelConfig(BaseModel):
     field: FieldConfig | None = None
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
     priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = {}
-    similarity: Literal["ssd", "student_t", "lncc", "mi"] = "ssd"
+    similarity: Literal["ssd", "student_t", "lncc", "mi", "mind"] = "ssd"
     window_mm: Positive = 10.0
     degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
     independent_points: Positive | Literal["residual"] | None = None

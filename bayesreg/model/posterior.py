@@ -13,19 +13,21 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.fem.preconditioners import ReferenceInverse
+from bayesreg.interpolation import Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model import coordinates, evaluation, program
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.conditioning import compare_at_four_points, condition
 from bayesreg.model.coordinates import Coordinates
 from bayesreg.model.evaluation import Evaluation
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.independence import independent_scores
 from bayesreg.model.mode_search import ModeSearch
 from bayesreg.model.normaliser import Normaliser
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.program import Problem
 from bayesreg.model.single_node import SingleNodes, images_of
-from bayesreg.model.terms.images import ComparedImages, ImagePair
+from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.terms.skull import Skull, SoftSkull, Walls
 from bayesreg.model.variables import Variables
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -265,6 +267,8 @@ class Posterior:
         knows &= self.options.elastic_prior == "boltzmann" and not isinstance(self.data.terms.get("skull"), SoftSkull)
         images = images_of(self.data)
         knows &= images is not None and images.shading is None and images.visible is None
+        # And no descriptors, which points compare in turn.
+        knows &= images is not None and isinstance(images.moving, Interpolator)
         return SingleNodes() if knows else None
 
     @property

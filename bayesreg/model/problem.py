@@ -31,6 +31,7 @@ from bayesreg.model.blocks import (
     Scale,
 )
 from bayesreg.model.field import StiffnessField, stiffness_field
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.intensity_map import SHARE
 from bayesreg.model.options import (
     FieldConfig,
@@ -47,7 +48,7 @@ from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
 from bayesreg.model.terms.barrier import Barrier
 from bayesreg.model.terms.elastic import SCALES, BoltzmannPrior, LoadPrior
-from bayesreg.model.terms.images import ComparedImages, ImagePair, shading_name
+from bayesreg.model.terms.images import ComparedImages, shading_name
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.terms.rigid import RigidPrior
 from bayesreg.model.terms.skull import Skull, SoftSkull, is_allowed

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from bayesreg.model.local_correlation import LocalCorrelation
 from bayesreg.model.mutual_information import MutualInformation
 from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import POINTWISE, Intensities, Pointwise, ValueCurvature
+from bayesreg.model.pointwise import POINTWISE, Intensities, Pointwise, SumOfSquaredDifferences, ValueCurvature
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -56,4 +56,10 @@ class Similarity(Protocol):
         """The similarity of some of the points alone, given by their indices; traceable."""
 
 
-SIMILARITIES: Mapping[str, type[Similarity]] = {**POINTWISE, "lncc": LocalCorrelation, "mi": MutualInformation}
+SIMILARITIES: Mapping[str, type[Similarity]] = {
+    **POINTWISE,
+    "lncc": LocalCorrelation,
+    "mi": MutualInformation,
+    # Of the descriptors, by which a pair is then compared.
+    "mind": SumOfSquaredDifferences,
+}

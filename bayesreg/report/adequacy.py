@@ -119,6 +119,7 @@ def explain_difference(manifest: Mapping[str, Any]) -> str:
     left = {
         "lncc": "what the best affine map of the intensities of m in each window leaves of f",
         "mi": "f less the mean of its intensities where m has the same one",
+        "mind": "a descriptor of f less that of m, of what a place looks like beside its neighbours",
     }
     similarity = str(part(manifest, "model", "similarity"))
     if similarity not in left:

@@ -20,6 +20,8 @@ E_S = {
     "<var>u</var>) leaves of <var>f</var> in the window of a quadrature point of weight <var>w</var>",
     "mi": "−<var>T</var><sub>s</sub> <var>N I</var>, where <var>I</var> is the mutual information of <var>f</var> and "
     "<var>m</var>(<var>x</var> + <var>u</var>) at <var>N</var> quadrature points",
+    "mind": "∫ (MIND<sub>r</sub>(<var>f</var>) − MIND<sub>r</sub>(<var>m</var>)(<var>x</var> + <var>u</var>))² "
+    "d<var>x</var>, by quadrature over the mesh, whose points look at one neighbour <var>r</var> each",
 }
 KINDS = {"images": "pair of images", "landmarks": "pairs of points", "own": "an observation of your own"}
 

@@ -20,10 +20,10 @@ from bayesreg.io.displacements import read_displacement
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
+from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.options import Lame, ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import cell_entries, lame_parameter
-from bayesreg.model.terms.images import ImagePair
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.types import InputError
 

@@ -1,10 +1,9 @@
-"""A pair of images as an observation: the likelihood exp(−E_s / T_s) of eqs. (1) and (11)."""
+"""The likelihood exp(−E_s / T_s) of eqs. (1) and (11): a pair of images on a mesh."""
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -14,195 +13,18 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Float, Int
 from numpyro.distributions import constraints
-from scipy import ndimage
 
-from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
-from bayesreg.fem.location import locate
-from bayesreg.image import Image
-from bayesreg.interpolation import Interpolation, Interpolator
-from bayesreg.mesh import TetMesh
+from bayesreg.fem.elements import Quadrature
+from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
-from bayesreg.model.contrast import contrast_functions, map_contrast
-from bayesreg.model.intensity_map import shading_basis
-from bayesreg.model.options import OF_ANY_CONTRAST, ModelConfig, TemperaturePrior
 from bayesreg.model.pointwise import Intensities, ValueCurvature
-from bayesreg.model.similarity import SIMILARITIES, Similarity
+from bayesreg.model.self_similarity import InTurn
+from bayesreg.model.similarity import Similarity
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import PointCurvature, SharedCurvature
-from bayesreg.types import AnyArray, InputError, Scalar
+from bayesreg.types import AnyArray, Scalar
 
 NOTHING: Values = MappingProxyType({})
-
-
-@dataclass(frozen=True, eq=False)
-class ImagePair:
-    """Two images; how they are compared stands in `ModelConfig.similarity`.
-
-    Points that rest beyond the grid of the moving image say nothing.
-
-    Attributes
-    ----------
-    fixed, moving : Image
-        f and m; their intensities are taken as they are.
-    name : str, default "images"
-        Its name in tables and in the NumPyro program.
-    fixed_ignore : Image, optional
-        Not zero where the fixed image says nothing: no point is compared there. On any grid, in its world.
-    moving_ignore : Image, optional
-        Not zero where the moving image says nothing, such as in a cavity: a point that is taken there may have any
-        intensity of the organ. On any grid, in its world.
-    one_contrast : bool, default True
-        False: f is compared through the best map of its intensities to those of m (`bayesreg.model.contrast`).
-    tissue : Image, optional
-        Labels on the grid of the fixed image, 0 outside: that map is then another one in every tissue.
-
-    Raises
-    ------
-    InputError
-        If one is no image.
-
-    Notes
-    -----
-    All pairs of a posterior, such as T1 and FLAIR of one visit, share the options of the model. An inferred T_s is each
-    pair's own.
-    """
-
-    fixed: Image
-    moving: Image
-    name: str = "images"
-    fixed_ignore: Image | None = None
-    moving_ignore: Image | None = None
-    one_contrast: bool = True
-    tissue: Image | None = None
-
-    def __post_init__(self) -> None:
-        if self.tissue is not None and self.tissue.shape != self.fixed.shape:
-            raise InputError(
-                f"{self.name}: tissue must lie on the grid of the fixed image, but has the shape {self.tissue.shape}, "
-                f"and not {self.fixed.shape}"
-            )
-        for which in ("fixed", "moving", "fixed_ignore", "moving_ignore"):
-            given = getattr(self, which)
-            if not isinstance(given, Image) and (given is not None or which in ("fixed", "moving")):
-                raise InputError(f"{self.name}: {which} must be an Image, got {type(given).__name__}; see load_image")
-
-    def in_one_contrast(self, mesh: TetMesh, model: ModelConfig) -> ImagePair:
-        """The pair with f in the contrast of m, as far as a map of intensities tells at rest; itself if it is in it.
-
-        Raises
-        ------
-        InputError
-            As `on`.
-        """
-        if self.one_contrast or model.similarity in OF_ANY_CONTRAST:
-            return self
-        positions = self.compared_points(mesh, model).positions(mesh)
-        return MappedPair(
-            map_contrast(self.fixed, self.moving, positions, self.tissue),
-            self.moving,
-            self.name,
-            self.fixed_ignore,
-            self.moving_ignore,
-            tissue=self.tissue,
-            source=self.fixed,
-        )
-
-    def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
-        """Functions, besides those of a shading, of which m may have some more than f, smoothed by sd, mm."""
-        return np.zeros((len(positions), 0))
-
-    def compared_points(self, mesh: TetMesh, model: ModelConfig) -> Quadrature:
-        """The points that are compared, by the model's rule.
-
-        Raises
-        ------
-        InputError
-            If the mesh does not overlap an image, or nothing of it is left to compare.
-        """
-        of_pair = "" if self.name == "images" else f" of {self.name!r}"
-        require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
-        require_overlap(mesh, self.moving, f"moving image{of_pair}")
-        return self._seen(mesh, quadrature_of(mesh, self.fixed, model))
-
-    def _seen(self, mesh: TetMesh, quadrature: Quadrature) -> Quadrature:
-        return seen_points(mesh, quadrature, self.moving, self.fixed_ignore)
-
-    def on(self, mesh: TetMesh, model: ModelConfig, temperature: str = "t_similarity") -> ComparedImages:
-        """The term on a mesh, with a T_s of this name.
-
-        Raises
-        ------
-        InputError
-            If the mesh does not overlap an image, or the quadrature has no points or fewer than are independent.
-        """
-        quadrature = self.compared_points(mesh, model)
-        positions = quadrature.positions(mesh)
-        smooth = self.smoothed_as(model)
-        moving = smooth.moving.interpolator(model.interpolation)
-        fixed_values = smooth.fixed.interpolate(positions, model.interpolation)
-        rest = Intensities(fixed_values, moving(jnp.asarray(positions)), quadrature.weights)
-        more, shading = self.functions(positions, self.smoothing_sd(model)), None
-        if model.intensity_map is not None or more.shape[1]:
-            degree = 0 if model.intensity_map is None else model.intensity_map
-            shading = jnp.asarray(shading_basis(np.asarray(fixed_values), positions, degree, more))
-        return ComparedImages(
-            comparison=Comparison(self.name, isinstance(model.t_similarity, TemperaturePrior), temperature),
-            similarity=SIMILARITIES[model.similarity].on(model, positions, rest),
-            fixed_values=fixed_values,
-            moving=moving,
-            quadrature=quadrature,
-            nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
-            positions=jnp.asarray(positions),
-            independent_share=jnp.asarray(independent_share(model, len(positions))),
-            shading=shading,
-            visible=None if self.moving_ignore is None else visibility(self.moving_ignore),
-        )
-
-    def smoothing_sd(self, model: ModelConfig) -> float:
-        """By how much the options smooth both images, mm."""
-        return model.smoothing * max(image.voxel_volume for image in (self.fixed, self.moving)) ** (1 / 3)
-
-    def smoothed_as(self, model: ModelConfig) -> ImagePair:
-        """The pair with both images smoothed as the options say."""
-        return _smoothed_as(self, self.smoothing_sd(model)) if model.smoothing else self
-
-    def smoothed(self, term: ComparedImages, sd: float, interpolation: Interpolation) -> ComparedImages:
-        """The term with both images smoothed, sd in mm."""
-        # SciPy's filters let other threads run.
-        with ThreadPoolExecutor() as pool:
-            fixed, moving = pool.map(partial(_smooth, sd, interpolation), (self.fixed, self.moving))
-        return term._replace(moving=moving, fixed_values=fixed(term.positions))
-
-    def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
-        """The term with the images compared at four points of every tetrahedron, without a shading."""
-        quadrature = self._seen(mesh, gauss_quadrature(mesh, "gauss4"))
-        positions = quadrature.positions(mesh)
-        return term._replace(
-            similarity=term.similarity.at(positions),
-            quadrature=quadrature,
-            nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
-            positions=jnp.asarray(positions),
-            fixed_values=self.fixed.interpolate(positions, interpolation),
-            shading=None,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class MappedPair(ImagePair):
-    """A pair whose fixed image was mapped into the contrast of the moving one.
-
-    Attributes
-    ----------
-    source : Image
-        The fixed image itself, of whose intensities the map is a function.
-    """
-
-    source: Image | None = None
-
-    def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
-        """The functions that make up the map: how much of each is there is inferred with all else."""
-        assert self.source is not None
-        return contrast_functions(self.source, positions, sd, self.tissue)
 
 
 @jax.tree_util.register_static
@@ -233,8 +55,8 @@ class ComparedImages(NamedTuple):
     similarity : Similarity
     fixed_values : (q,) array
         f(x_q).
-    moving : Interpolator
-        m.
+    moving : Interpolator or InTurn
+        m, or what is compared of it.
     quadrature : Quadrature
     nodes : (q, 4) int array
         Nodes of the cell of every quadrature point.
@@ -251,7 +73,7 @@ class ComparedImages(NamedTuple):
     comparison: Comparison
     similarity: Similarity
     fixed_values: Float[AnyArray, "points"]
-    moving: Interpolator
+    moving: Interpolator | InTurn
     quadrature: Quadrature
     nodes: Int[AnyArray, "points 4"]
     positions: Float[AnyArray, "points 3"]
@@ -457,106 +279,3 @@ def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
 def shading_name(name: str) -> str:
     """The name of the coefficients of the shading of a pair of images."""
     return f"{name}_shading"
-
-
-def visibility(ignore: Image) -> Interpolator:
-    """1 where an image is looked at and 0 where it is ignored, as a function of the place.
-
-    A voxel's neighbours are ignored with it, since smoothing and interpolation mix its intensity into theirs.
-    """
-    ignored = ndimage.binary_dilation(np.asarray(ignore.voxels) != 0, ndimage.generate_binary_structure(3, 3))
-    return ignore.with_voxels(1.0 - ignored).interpolator("linear")
-
-
-@lru_cache(maxsize=4)
-def _smoothed_as(pair: ImagePair, sd: float) -> ImagePair:
-    with ThreadPoolExecutor() as pool:
-        fixed, moving = pool.map(lambda image: image.smoothed(sd), (pair.fixed, pair.moving))
-    return replace(pair, fixed=fixed, moving=moving)
-
-
-def _smooth(sd: float, interpolation: Interpolation, image: Image) -> Interpolator:
-    return image.smoothed(sd).interpolator(interpolation)
-
-
-def independent_share(model: ModelConfig, points: int) -> float:
-    """Effective number of independent quadrature points over the number of all.
-
-    Raises
-    ------
-    InputError
-        If there are fewer points than are said to be independent.
-    """
-    # What residuals tell is known later, see `Posterior.count_independent_points`.
-    if model.independent_points is None or model.independent_points == "residual":
-        return 1.0
-    if model.independent_points > points:
-        raise InputError(
-            f"model.independent_points is {model.independent_points:g}, but the quadrature has {points} points; "
-            "give at most as many, or null for all"
-        )
-    return model.independent_points / points
-
-
-def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
-    """Raise InputError if less than half of the mesh's nodes lie on the image's grid."""
-    inside = image.contains(mesh.points)
-    if inside.mean() < 0.5:
-        corners = image.voxel_to_world(np.array([(0, 0, 0), np.array(image.shape) - 1]))
-        raise InputError(
-            f"the {name} and the mesh do not overlap: {inside.sum()} of {len(inside)} nodes lie on its grid. It runs "
-            f"from {corners[0].round(1).tolist()} to {corners[1].round(1).tolist()} mm (world RAS), the mesh from "
-            f"{mesh.points.min(0).round(1).tolist()} to {mesh.points.max(0).round(1).tolist()} mm; "
-            "check the affines, or align the images first"
-        )
-
-
-def quadrature_of(mesh: TetMesh, fixed: Image, model: ModelConfig) -> Quadrature:
-    """The rule that the options name.
-
-    Raises
-    ------
-    InputError
-        If the rule is "voxels" and no voxel centre lies inside the mesh.
-    """
-    if model.quadrature in GAUSS_SUBDIVISIONS:
-        return gauss_quadrature(mesh, model.quadrature)
-    return _voxels_of(mesh, fixed, model.most_points)
-
-
-@lru_cache(maxsize=4)
-def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
-    """The rule of voxel centres; a map of intensities asks for it, too."""
-    centres = fixed.grid_points().reshape(-1, 3)
-    near = centres[((centres >= mesh.points.min(axis=0)) & (centres <= mesh.points.max(axis=0))).all(axis=1)]
-    cells, barycentric = locate(mesh.points, mesh.cells, near)
-    inside = cells >= 0
-    if not inside.any():
-        raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
-    kept = np.flatnonzero(inside)
-    volume = fixed.voxel_volume * len(kept)
-    if most is not None and len(kept) > most:
-        kept = np.sort(np.random.default_rng(0).choice(kept, most, replace=False))
-    return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))
-
-
-def seen_points(mesh: TetMesh, quadrature: Quadrature, moving: Image, fixed_ignore: Image | None = None) -> Quadrature:
-    """The points that rest on the grid of the moving image, and are not ignored: what lies beyond has not been seen.
-
-    Which points count must not depend on the displacement: a posterior could do without those that do not fit.
-
-    Raises
-    ------
-    InputError
-        If none is left.
-    """
-    positions = quadrature.positions(mesh)
-    seen = moving.contains(positions)
-    if fixed_ignore is not None:
-        seen &= np.asarray(visibility(fixed_ignore)(jnp.asarray(positions))) > 0.5
-    if not seen.any():
-        raise InputError("nothing is left to compare: all of the mesh lies in fixed_ignore, or beyond the moving image")
-    if seen.all():
-        return quadrature
-    kept = (np.asarray(part)[seen] for part in (quadrature.cells, quadrature.barycentric, quadrature.weights))
-    return quadrature_at(mesh, *kept)
