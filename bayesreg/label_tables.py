@@ -28,11 +28,17 @@ _FREESURFER = {
     ),
 }
 
+# The label of what has none: in a table it is a tissue, the rest of the intracranial mask.
+REST = 0
+
 TABLES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
     "fast": {"csf": (1,), "gm": (2,), "wm": (3,)},
     "freesurfer": _FREESURFER,
     # Collins 1998. Glial matter (8) counts as GM; fat, muscle, skin, skull and connective tissue are not of the brain.
     "brainweb": {"csf": (1,), "gm": (2, 8), "wm": (3,), BACKGROUND: (4, 5, 6, 7, 9)},
+    # Tumour labels: necrotic core, oedema and what enhances, which had the label 4 until 2021 and has 3 since 2023.
+    "brats": {"brain": (REST,), "oedema": (2,), "tumour_core": (1, 4)},
+    "brats2023": {"brain": (REST,), "oedema": (2,), "tumour_core": (1, 3)},
     # A mask of the organ is a label file of one label.
     "mask": {ORGAN: (1,)},
 }
@@ -42,7 +48,15 @@ TABLES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
 LONGEST_RANGE = 100_000
 
 # Labels by which a table is known: others have some of its values, too.
-_MARKS = {"fast": {1, 2, 3}, "freesurfer": {2, 3, 41, 42}, "brainweb": {1, 2, 3, 8}, "mask": {1}}
+_MARKS = {
+    "fast": {1, 2, 3},
+    "freesurfer": {2, 3, 41, 42},
+    "brainweb": {1, 2, 3, 8},
+    "brats": {1, 2, 4},
+    # Of the same values as fast, which comes first: it has to be named.
+    "brats2023": {1, 2, 3},
+    "mask": {1},
+}
 
 
 def recognise_table(values: Iterable[int]) -> str | None:

@@ -3,7 +3,7 @@
 import pytest
 
 from bayesreg.config.data import FilesData
-from bayesreg.label_tables import TABLES, as_range, read_label_names, recognise_table
+from bayesreg.label_tables import REST, TABLES, as_range, read_label_names, recognise_table
 from bayesreg.tissues import BRAIN, ORGAN, tissue_names
 
 # What SynthSeg writes without a parcellation; FreeSurfer's aseg holds some more.
@@ -12,10 +12,10 @@ SYNTHSEG = [2, 3, 4, 5, 7, 8, *range(10, 19), 24, 26, 28, 41, 42, 43, 44, 46, 47
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
 def test_every_value_has_one_tissue(table):
-    assert tissue_names(table) in (BRAIN, (ORGAN,))
+    assert tissue_names(table) in (BRAIN, (ORGAN,), ("brain", "oedema", "tumour_core"))
     values = [value for entry in table.values() for value in entry]
     assert len(values) == len(set(values))
-    assert 0 not in values
+    assert (REST in values) == ("brain" in table)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +31,8 @@ def test_every_value_has_one_tissue(table):
         # Atropos: CSF, GM, WM, deep GM, brainstem, cerebellum.
         (range(7), None),
         ([2, 3, 4], None),
+        ([0, 1, 2, 4], "brats"),
+        ([0, 1, 2, 3, 4], None),
     ],
 )
 def test_a_table_is_recognised_by_the_values(values, name):

@@ -142,7 +142,7 @@ def test_without_a_fluid_a_hole_is_the_nearest_tissue():
     ("table", "message"),
     [
         ({}, "expected at least one tissue with its labels"),
-        ({"liver": 0}, "label 0 is the background, and cannot belong to liver"),
+        ({"liver": 0}, "label_table has liver as the label 0: what no label names inside the mask of the organ"),
         ({"left lobe": 1}, "'left lobe' is no name of a tissue"),
         ({"liver": [1, 2], "vessels": 2}, "label 2 belongs to liver already, and cannot belong to vessels"),
         ({"liver": 1.5}, "data.label_table.liver"),

@@ -18,6 +18,7 @@ from bayesreg.config.values import (
     Positive,
     Section,
 )
+from bayesreg.label_tables import REST
 from bayesreg.tissues import BRAIN, ORGAN, PAPER_LAM, PAPER_MU, tissue_names
 
 
@@ -62,9 +63,9 @@ class FilesData(Section):
     label_names: FoundFile | None = None
     """Lookup table of FreeSurfer, 3D Slicer or ITK-SNAP, by which label_table may hold names in place of values."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
-    """Values of the label file by tissue, or ranges of them (1000-1035), background being what belongs to none; or
-    fast, freesurfer, brainweb or mask."""
-    intracranial: FoundImage | None = None
+    """Values of the label file by tissue, or ranges of them (1000-1035), background being what belongs to none, and 0
+    the rest of the intracranial mask; or fast, freesurfer, brainweb, brats, brats2023 or mask."""
+    intracranial: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion. Without
     labels it is the organ, too."""
     fixed_ignore: FoundImage | None = None
@@ -91,6 +92,17 @@ class FilesData(Section):
         if "fixed" in info.data and (moving is None) != (info.data["fixed"] is None):
             raise ValueError("a pair of images needs both, fixed and moving")
         return moving
+
+    @field_validator("intracranial")
+    @classmethod
+    def _bounds_the_rest(cls, mask: Path | None, info: ValidationInfo) -> Path | None:
+        table = info.data.get("label_table") or {}
+        if mask is None and (rest := [name for name, labels in table.items() if REST in labels]):
+            raise ValueError(
+                f"label_table has {rest[0]} as the label 0: what no label names inside the mask of the organ; expected "
+                "that mask, such as what is not zero in an image without a skull"
+            )
+        return mask
 
     @field_validator("fixed_ignore", "moving_ignore")
     @classmethod

@@ -113,8 +113,6 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
         for label in labels:
             if abs(label) >= 2**31:
                 raise ValueError(f"label {label} of {name} has more than 32 bits")
-            if label == 0:
-                raise ValueError(f"label 0 is the background, and cannot belong to {name}")
             if owners.setdefault(label, name) != name:
                 raise ValueError(f"label {label} belongs to {owners[label]} already, and cannot belong to {name}")
     return table

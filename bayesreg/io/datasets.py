@@ -26,7 +26,7 @@ from bayesreg.io.volumes import (
     load_mask,
     on_grid_of,
 )
-from bayesreg.label_tables import TABLES
+from bayesreg.label_tables import REST, TABLES
 from bayesreg.tissues import BRAIN, ORGAN, tissue_names
 from bayesreg.types import DATA_FOLDER, InputError
 
@@ -134,26 +134,31 @@ def from_files(
     labels_path : path
         Tissue labels; on another grid than its own the nearest is taken.
     label_table : mapping
-        Label values of every tissue by its name, in the order that the mesh will have.
+        Label values of every tissue by its name, in the order that the mesh will have. Zero, where it is listed, stands
+        for the rest of the intracranial mask.
     intracranial_path : path, optional
         Mask of where the organ may be (`load_mask`), likewise.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, a tissue of the table is absent, a label is not listed, or the grids lie
-        apart or are one by the other form of a header alone.
+        If a file is missing or unreadable, a tissue of the table is absent, a label is not listed, zero is and there is
+        no mask, or the grids lie apart or are one by the other form of a header alone.
     """
     tissue, image = load_labels(labels_path, label_table, unlisted="refused"), None
+    given = None if intracranial_path is None else load_mask(intracranial_path)
+    for index, name in enumerate(tissue_names(label_table), start=1):
+        if REST in np.atleast_1d(label_table[name]):
+            tissue = _rest_of_mask(tissue, index, given, (name, labels_path, intracranial_path))
     if image_path is not None:
         image = _load_fixed(image_path)
         tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"))
         names, present = tissue_names(label_table), np.unique(tissue.voxels)
         if lost := [name for index, name in enumerate(names, start=1) if index not in present]:
             raise InputError(f"no voxel of {' and '.join(lost)} in {labels_path} lies on the grid of {image_path}")
-    if intracranial_path is None:
+    if given is None or intracranial_path is None:
         return Anatomy(image, tissue, None, tissue_names(label_table))
-    mask = _on_grid(tissue, labels_path, load_mask(intracranial_path), intracranial_path, ("label", "intracranial"))
+    mask = _on_grid(tissue, labels_path, given, intracranial_path, ("label", "intracranial"))
     return Anatomy(image, tissue, mask, tissue_names(label_table))
 
 
@@ -183,6 +188,20 @@ def without_labels(image_path: str | Path, mask_path: str | Path | None = None) 
         image_path, inside.sum() * image.voxel_volume / 1e3,
     )  # fmt: skip
     return Anatomy(image, image.with_voxels(inside.astype(np.int8)), None, (ORGAN,))
+
+
+def _rest_of_mask(
+    tissue: Image, index: int, mask: Image | None, which: tuple[str, str | Path, str | Path | None]
+) -> Image:
+    """Labels of which the tissue of an index, which all that has no label is, ends at a mask."""
+    name, labels_path, mask_path = which
+    if mask is None or mask_path is None:
+        raise InputError(
+            f"{name} is what has no label in {labels_path}, and nothing says where it ends; give a mask of the organ "
+            "as intracranial"
+        )
+    inside = np.asarray(_on_grid(tissue, labels_path, mask, mask_path, ("label", "intracranial")).voxels) != 0
+    return tissue.with_voxels(np.where((np.asarray(tissue.voxels) == index) & ~inside, 0, tissue.voxels))
 
 
 def _load_fixed(path: str | Path) -> Image:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from bayesreg.inference.gaussian import about_gaussian
+from bayesreg.inference.gaussian.laplace import laplace
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _with_step_size, tune
-from bayesreg.inference.gaussian.whitened import Moved
-from tests.inference.gaussians import DIMENSION, GaussianTarget
+from bayesreg.inference.gaussian.whitened import Moved, setup_about
+from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 
 
 class Steps(NamedTuple):
@@ -75,3 +76,26 @@ def test_a_place_without_a_slope_has_no_part_in_the_reference():
     np.testing.assert_array_equal(found.gaussian.centre, expected.gaussian.centre)
     np.testing.assert_array_equal(found.middle, expected.middle)
     assert np.isfinite(found.middle).all()
+
+
+class Ledge(GaussianTarget):
+    """A Gaussian that ends in a steep slope at a little way from the mode."""
+
+    def height(self, data, u):
+        return super().height(data, u) - 1e6 * jnp.maximum(jnp.abs(u.ravel()[0]) - 0.1, 0.0) ** 2
+
+
+def test_chains_start_where_the_density_is_not_next_to_nothing():
+    keys, mode = jax.random.split(jax.random.key(0), 8), np.zeros(DIMENSION)
+    heights = {}
+    for target in (GaussianTarget(), Ledge()):
+        setup = setup_about(target, laplace(target, mode), mode)
+        starts = about_gaussian._scatter(target, setup, jnp.asarray(mode), keys)["u_boundary"]
+        heights[type(target)] = np.array([float(target.height(target.data, u)) for u in starts])
+        assert target.allowed(starts).all()
+        assert len(np.unique(np.asarray(starts)[:, 0, 0])) == 8
+    # The curvature at the mode knows nothing of the slope: drawn from it, most chains would start far below.
+    lowest = -about_gaussian.DEEPEST * DIMENSION
+    assert heights[Ledge].min() > lowest + float(Ledge().height(Ledge().data, jnp.zeros((NODES, 3))))
+    # A Gaussian itself is not narrowed.
+    assert heights[GaussianTarget].mean() < -0.6 * DIMENSION

@@ -111,6 +111,22 @@ class TestFromFiles:
         with pytest.raises(ValueError, match=r"does not list: 11 \(0.008 ml\)"):
             from_files(files["t1"], files["labels"], {"gm": 12, "wm": 13})
 
+    def test_zero_is_the_rest_of_the_mask(self, files, tmp_path):
+        """A mask on a finer grid: what has no label is the organ within it and nothing beyond."""
+        inside = np.zeros((12, 12, 12), np.uint8)
+        inside[:10] = 1
+        nib.save(nib.Nifti1Image(inside, np.diag([1.0, 1, 1, 1])), tmp_path / "mask.nii")
+        table = {"brain": 0, "oedema": 12, "tumour_core": [11, 13]}
+        anatomy = from_files(files["t1"], files["labels"], table, tmp_path / "mask.nii")
+        tissue = np.asarray(anatomy.tissue.voxels)
+        assert anatomy.names == ("brain", "oedema", "tumour_core")
+        assert (tissue[0] == 1).all()
+        assert (tissue[5] == 0).all()
+        assert tissue[1, 1, 1] == 2
+        assert tissue[3, 3, 3] == tissue[2, 2, 2] == 3
+        with pytest.raises(ValueError, match="nothing says where it ends"):
+            from_files(files["t1"], files["labels"], table)
+
     def test_takes_labels_on_another_grid(self, files, tmp_path):
         nib.save(nib.Nifti1Image(np.zeros((12, 12, 12)), np.diag([1.0, 1, 1, 1])), tmp_path / "fine.nii")
         anatomy = from_files(tmp_path / "fine.nii", files["labels"], OWN_TABLE, files["inside"])

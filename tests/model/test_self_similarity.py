@@ -19,8 +19,8 @@ RNG = np.random.default_rng(0)
 DISTANCE = 1.5
 
 
-def small_image(affine=np.diag([1.5, 1.5, 1.5, 1.0]), shape=(15, 14, 13)):
-    return Image(RNG.normal(size=shape), affine)
+def small_image():
+    return Image(RNG.normal(size=(15, 14, 13)), np.diag([1.5, 1.5, 1.5, 1.0]))
 
 
 def test_descriptors_are_those_of_loops():
@@ -42,7 +42,7 @@ def test_descriptors_are_those_of_loops():
     np.testing.assert_allclose([float(one.voxels[tuple(at)]) for one in found], expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("gain, offset", [(300.0, 20.0), (-2.0, 1.0)])
+@pytest.mark.parametrize(("gain", "offset"), [(300.0, 20.0), (-2.0, 1.0)])
 def test_gain_offset_and_an_inverted_contrast_change_nothing(gain, offset):
     image = small_image()
     other = image.with_voxels(gain * np.asarray(image.voxels) + offset)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.gaussian.density import log_normaliser_at
+from bayesreg.inference.gaussian.density import height_and_slope, log_normaliser_at
 from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, recentre, slope_at
 from bayesreg.inference.gaussian.loose import find_slowest, move_alone, place_loose_nodes, search_places
 from bayesreg.inference.gaussian.modes import search_modes
@@ -48,6 +48,10 @@ from bayesreg.types import AnyArray, InputError
 
 # Chains start that much wider than Laplace's approximation.
 OVERDISPERSION = 1.5
+# But no chain starts where the log density is less than at the mode by more than this for each unknown; of a Gaussian
+# it is half the square of the above. Where tetrahedra are squeezed at the mode, wide draws turn some inside out, and
+# behind the barrier no step is short enough to lead out.
+DEEPEST = 10.0
 
 # A Gaussian is averaged over the mode and the places of so many chains at most: each costs a curvature.
 AVERAGED = 16
@@ -272,16 +276,24 @@ def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> An
     Raises
     ------
     InputError
-        If a chain finds no place in the support.
+        If a chain finds no place in the support, or none but where the density is next to nothing.
     """
     width, begin = np.full(len(keys), OVERDISPERSION), whiten(setup.gaussian, jnp.asarray(mode))
+    plain = without_normaliser(target, target.data)
+    lowest = height_and_slope(target, plain, np.asarray(mode))[0] - DEEPEST * dimension(target)
     for _ in range(10):
         points, done = jax.vmap(partial(_start, target, target.data, setup, begin))(keys, jnp.asarray(width))
+        flats = np.asarray(jax.vmap(partial(flat_position, target, target.data))(points))
+        heights = np.array([height_and_slope(target, plain, flat)[0] for flat in flats])
+        done = np.asarray(done) & (heights > lowest)
         if done.all():
             return points
-        # A flight that is caught in a corner of the skull does not end; a shorter one may.
+        # A flight that is caught in a corner of the skull does not end; a shorter one may, and leads less far down.
         width = np.where(done, width, width / 2)
-    raise InputError(f"{int((~done).sum())} of {len(keys)} chains find no start near the mode outside the skull")
+    raise InputError(
+        f"{int((~done).sum())} of {len(keys)} chains find no start near the mode: wherever they are put they lie in "
+        "the skull, or where the density is next to nothing"
+    )
 
 
 @partial(jax.jit, static_argnums=0)
