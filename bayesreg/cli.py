@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 
 from bayesreg import __version__
 from bayesreg.compilation import compile_quickly, keep_compiled_programs
+from bayesreg.label_tables import TABLES
 
 NOT_CONVERGED = 3
 STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
@@ -55,7 +56,7 @@ Table = Annotated[
     typer.Option(
         "--table",
         metavar="NAME|FILE",
-        help="Label table: fast, freesurfer, brainweb, or a YAML file; recognised if left out.",
+        help=f"Label table: {', '.join(TABLES)}, or a YAML file; recognised if left out.",
     ),
 ]
 Mask = Annotated[Path | None, typer.Option("--intracranial", metavar="FILE", help="Mask of where the organ may go.")]

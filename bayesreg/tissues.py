@@ -7,6 +7,7 @@ are named.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -51,6 +52,9 @@ PAPER_MU: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 1.0, 1.0), strict=True))
 # hull, and the gap between mesh and skull.
 BRAIN_EDGE, BRAIN_CLOSING, BRAIN_GAP = 15.5, 8.0, 0.5
 
+# Solid tissue of Colin27, mm³: lengths that suit a brain of this size suit others in proportion.
+BRAIN_VOLUME = 1.583e6
+
 # λ and μ where nothing is said (the literature's λ/μ is about 24), and those of a fluid.
 SOLID = {"lam": 10.0, "mu": 1.0}
 FLUID = 0.01
@@ -58,6 +62,11 @@ FLUID = 0.01
 BACKGROUND = "background"
 # The one tissue of an organ without labels.
 ORGAN = "organ"
+
+
+def size_beside_brain(volume: float) -> float:
+    """The size of a body, mm³, beside a human brain: the ratio of the cube roots of the volumes; 0.07 for a mouse's."""
+    return math.cbrt(volume / BRAIN_VOLUME)
 
 
 def is_fluid(name: str) -> bool:

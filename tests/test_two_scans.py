@@ -11,7 +11,12 @@ import SimpleITK
 from ruamel.yaml import YAML
 
 import bayesreg as br
+from bayesreg.config import make_config
 from bayesreg.io import store
+from bayesreg.io.quality import edge_lengths
+from bayesreg.report.panels import View, ignored
+from bayesreg.report.slices import planes_through
+from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
 from bayesreg.workflow.preparation import prepare
 from tests.io.test_alignment import FIXED, MASK, motion
 from tests.phantoms import ball_mesh
@@ -126,6 +131,24 @@ def test_the_report_shows_it(result):
     assert "Where the moving image lies" in page
     assert "The rigid part of the displacement" in page
     assert "borders of the tissues in the fixed image" in page
+    assert "What is hatched is ignored" in page
+
+
+def test_what_is_hatched_goes_with_the_displacement(result):
+    """A pixel of the warped image is hatched where the posterior mean takes it into the mask."""
+    run = result.run
+    mask = run.moving_ignore
+    view = View.of(run)
+    through = planes_through(run.mesh, mask.voxel_to_world(np.argwhere(np.asarray(mask.voxels) != 0).mean(axis=0)))
+    for plane in through:
+        fixed, moving, warped = ignored(view, plane)
+        assert not fixed.any()
+        assert moving.any()
+        u = view.slice(plane).nodal(run.u_mean)
+        inside = np.isfinite(u).all(axis=-1)
+        there = np.rint(mask.world_to_voxel(plane.points()[inside] + u[inside])).astype(int)
+        there = np.clip(there, 0, np.array(mask.shape) - 1)
+        np.testing.assert_array_equal(warped[inside], np.asarray(mask.voxels)[tuple(there.T)] != 0)
 
 
 def test_the_headers_are_kept_where_one_says_so(folder):
@@ -133,3 +156,17 @@ def test_the_headers_are_kept_where_one_says_so(folder):
     found = prepare(config)
     assert found.inputs.matching.pose.is_identity
     assert any("data.pose: fixed" in note for note in found.appraisal.notes)
+
+
+def test_the_brain_of_a_mouse_is_meshed_as_finely_as_it_is_small(tmp_path):
+    """All lengths are those of a human brain in proportion: edges, the gap to the skull, the levels of the pose."""
+    small = np.diag([0.1, 0.1, 0.1, 1.0])
+    for name, image in (("fixed", FIXED), ("moving", FIXED), ("mask", MASK)):
+        nib.save(nib.Nifti1Image(np.asarray(image.voxels, np.float32), small @ image.affine), tmp_path / f"{name}.nii")
+    data = {"source": "files", **{name: str(tmp_path / f"{name}.nii") for name in ("fixed", "moving")}}
+    config = make_config({"data": {**data, "intracranial": str(tmp_path / "mask.nii")}})
+    mesh = prepare(config).inputs.mesh
+    volume = np.count_nonzero(MASK.voxels) * MASK.voxel_volume / 1000
+    assert mesh.volumes.sum() == pytest.approx(volume, rel=0.15)
+    edge = float(np.median(edge_lengths(mesh.points, mesh.cells)))
+    assert edge == pytest.approx(BRAIN_EDGE * np.cbrt(volume / BRAIN_VOLUME), rel=0.3)

@@ -12,13 +12,10 @@ from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.volumes import check_same_grid
-from bayesreg.tissues import BRAIN, BRAIN_CLOSING, is_fluid, label_of
+from bayesreg.tissues import BRAIN, BRAIN_CLOSING, is_fluid, label_of, size_beside_brain
 from bayesreg.types import InputError
 
 SPECK = 0.01
-# Solid tissue of Colin27, mm³: lengths that suit a brain of this size suit others in proportion.
-BRAIN_VOLUME = 1.583e6
-
 _log = logging.getLogger(__name__)
 
 
@@ -27,9 +24,8 @@ class MeshError(InputError):
 
 
 def relative_size(mask: Bool[np.ndarray, "X Y Z"], voxel_volume: float) -> float:
-    """The size of a body beside a human brain: the ratio of the cube roots of the volumes; 0.07 for a mouse's brain."""
-    volume = max(int(np.count_nonzero(mask)), 1) * voxel_volume
-    return float(np.cbrt(volume / BRAIN_VOLUME))
+    """`bayesreg.tissues.size_beside_brain` of what a mask holds."""
+    return size_beside_brain(max(int(np.count_nonzero(mask)), 1) * voxel_volume)
 
 
 def size_of_solid(tissue: Image, names: Sequence[str] = BRAIN) -> float:

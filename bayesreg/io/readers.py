@@ -15,6 +15,7 @@ from jaxtyping import Float
 from nibabel.arrayproxy import ArrayProxy
 from nibabel.spatialimages import SpatialImage
 
+from bayesreg.io.mrtrix import is_mrtrix, read_mrtrix
 from bayesreg.types import InputError
 
 # What SimpleITK reads and nibabel does not.
@@ -79,7 +80,7 @@ class _Forms(NamedTuple):
 
 
 def read_volume(path: str | Path) -> Volume:
-    """Read a volume: NIfTI, MGZ and what else nibabel knows, NRRD, MetaImage and DICOM by SimpleITK.
+    """Read a volume: NIfTI, MGZ and what else nibabel knows, NRRD, MetaImage and DICOM by SimpleITK, MRtrix's.
 
     Parameters
     ----------
@@ -96,6 +97,8 @@ def read_volume(path: str | Path) -> Volume:
         return _read_dicom(path)
     if is_itk(path):
         return _read_by_itk(path)
+    if is_mrtrix(path):
+        return Volume(*read_mrtrix(path))
     source = _open(path)
     forms = _forms(source)
     for remark in forms.remarks:
@@ -106,7 +109,8 @@ def read_volume(path: str | Path) -> Volume:
 def other_form(path: str | Path) -> Float[np.ndarray, "4 4"] | None:
     """The q-form of a NIfTI header, where it says something else than the s-form, which is taken; without voxels."""
     path = Path(path)
-    return None if _is_folder(path) or is_itk(path) else _forms(_open(path)).other
+    without = _is_folder(path) or is_itk(path) or is_mrtrix(path)
+    return None if without else _forms(_open(path)).other
 
 
 def is_itk(path: Path) -> bool:
@@ -142,10 +146,6 @@ def _open(path: Path) -> SpatialImage:
                 raise
             source = _LaxNifti.from_filename(path)
     except Exception as error:  # Its readers have no common class of errors.
-        if path.name.lower().endswith((".mif", ".mif.gz", ".mih")):
-            raise InputError(
-                f"image {path} is MRtrix's; convert it first: mrconvert {path.name} image.nii.gz"
-            ) from error
         raise InputError(f"image {path} cannot be read: {_first_line(error)}") from error
     if not isinstance(source, SpatialImage) or source.affine is None:
         raise InputError(f"{path} holds no image on a grid, but {type(source).__name__}")

@@ -196,8 +196,9 @@ class ModelConfig(BaseModel):
         Nodes with a known displacement, mm; they are not sampled. Elastography: all boundary nodes held and
         ``sampled=[]``; only λ, μ are then sampled, and E_r, the prior of u_B, is no part of the density.
     skull_width : float
-        0: no sampled node lies in the skull. Else the depth, mm, to which one goes in as easily as by a standard
-        deviation, such as half a voxel: masks of skulls are no better, and nodes that rest on one cost no reflections.
+        0: no sampled node lies in the skull. Else the depth, in voxels of its mask, to which one goes in as easily as
+        by a standard deviation, such as half a voxel: masks are no better, and nodes that rest on a soft one cost no
+        reflections.
     least_volume : float
         0: tetrahedra may be inverted. Else a barrier, which begins where a tetrahedron is left with less than this
         share of its volume (`bayesreg.model.terms.barrier`). Like the skull it has no part in the normaliser.

@@ -202,7 +202,8 @@ def _priors(
         terms["barrier"] = Barrier(jnp.asarray(model.least_volume), elements_of(mesh))
     if skull is not None:
         hard = Skull(skull_distance(skull, mesh, sampled), jnp.asarray(mesh.points[sampled]))
-        soft = SoftSkull(hard, jnp.asarray(sampled), jnp.asarray(model.skull_width))
+        width = model.skull_width * skull.voxel_volume ** (1 / 3)
+        soft = SoftSkull(hard, jnp.asarray(sampled), jnp.asarray(width))
         terms["skull"] = soft if model.skull_width else hard
     return terms
 

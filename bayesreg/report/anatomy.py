@@ -55,10 +55,13 @@ def registration(view: View) -> Drawing | None:
         ]
         norm = panels.symmetric(np.concatenate([before.ravel() for before, _ in changes]))
         for row, plane, change in zip(axes, planes, changes, strict=True):
+            fixed, moving, warped = panels.ignored(view, plane)
             for panel, image in zip(row, columns.values(), strict=False):
                 panels.image_panel(panel, image, plane, limits)
             for panel, picture in zip(row[3:], change, strict=True):
                 drawn = panels.field_panel(panel, picture, plane, norm, style.SIGNED)
+            for panel, mask in zip(row, (fixed, moving, warped, fixed | moving, fixed | warped), strict=True):
+                panels.hatch(panel, plane, mask)
             _note(row[0], plane.title)
         panels.colourbar(figure, drawn, list(axes[:, 3:].ravel()), INTENSITY, shrink=0.6)
         for panel, title in zip(axes[0], [*columns, "before: m − f", "after: m(x + ū) − f"], strict=True):
@@ -66,11 +69,18 @@ def registration(view: View) -> Drawing | None:
         uri = style.data_uri(figure)
     caption = (
         f"{_focus(view)} Differences are shown inside the mesh; their root mean square over the "
-        f"mesh falls from {before:.3f} to {after:.3f} (in units of the scaled intensity). {CONVENTION}"
-        f"{explain_difference(run.manifest)}"
+        f"mesh falls from {before:.3f} to {after:.3f} (in units of the scaled intensity).{_of_ignored(run)} "
+        f"{CONVENTION}{explain_difference(run.manifest)}"
     )
     alt = f"Fixed, moving and warped images with differences; the residual falls from {before:.3f} to {after:.3f}."
     return Drawing("registration", "Before and after", caption, alt, uri)
+
+
+def _of_ignored(run: Run) -> str:
+    """A sentence about what is hatched; empty where nothing is."""
+    if run.fixed_ignore is None and run.moving_ignore is None:
+        return ""
+    return " What is hatched is ignored: the image says nothing there."
 
 
 def _unlike(view: View, columns: Mapping[str, Image]) -> Drawing:
@@ -81,13 +91,16 @@ def _unlike(view: View, columns: Mapping[str, Image]) -> Drawing:
             for panel, image in zip(row, columns.values(), strict=True):
                 panels.image_panel(panel, image, plane, panels.range_of(image))
                 panels.label_lines(panel, view.run, plane)
+            for panel, mask in zip(row, panels.ignored(view, plane), strict=True):
+                panels.hatch(panel, plane, mask)
             _note(row[0], plane.title)
         for panel, title in zip(axes[0], columns, strict=True):
             panel.set_title(title)
         uri = style.data_uri(figure)
     caption = (
         f"{_focus(view)} The images are of unlike contrast, so that no difference of theirs is shown; the lines are "
-        f"the borders of the tissues in the fixed image, and should lie on those of the warped one. {CONVENTION}"
+        f"the borders of the tissues in the fixed image, and should lie on those of the warped one."
+        f"{_of_ignored(view.run)} {CONVENTION}"
     )
     alt = "Fixed, moving and warped images, and the borders of the fixed image's tissues on each."
     return Drawing("registration", "Before and after", caption, alt, uri)

@@ -113,6 +113,35 @@ def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True, colou
         axes.contour(x, y, level, [0.5], colors=colour, linewidths=width, alpha=alpha)
 
 
+def ignored(view: View, plane: Plane) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What says nothing on a plane: in the fixed image, in the moving one, and where the posterior mean takes points.
+
+    Returns
+    -------
+    three bool arrays
+        Pixels of the plane.
+    """
+    run, points = view.run, plane.points()
+    moved = points + np.nan_to_num(view.slice(plane).nodal(run.u_mean))
+    masks = (run.fixed_ignore, points), (run.moving_ignore, points), (run.moving_ignore, moved)
+    nothing = np.zeros(points.shape[:-1], bool)
+    fixed, moving, warped = (
+        nothing if mask is None else sample(mask, places, order=0, outside=0.0) != 0 for mask, places in masks
+    )
+    return fixed, moving, warped
+
+
+def hatch(axes: Axes, plane: Plane, mask: np.ndarray) -> None:
+    """Hatch some pixels of a plane, and draw their border."""
+    if not mask.any():
+        return
+    x, y = np.linspace(*plane.horizontal, mask.shape[1]), np.linspace(*plane.vertical, mask.shape[0])
+    drawn = axes.contourf(x, y, mask.astype(float), [0.5, 1.5], colors="none", hatches=["/////"])
+    drawn.set_edgecolor(style.BORDER)
+    drawn.set_linewidth(0.0)
+    axes.contour(x, y, mask.astype(float), [0.5], colors=style.BORDER, linewidths=0.6)
+
+
 def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
     """Tissue labels and skull."""
     points = plane.points()

@@ -346,9 +346,3 @@ def test_an_image_that_zstandard_compressed_is_read(tmp_path):
     image = some_image()
     write(tmp_path / "image.nii.zst", np.asarray(image.voxels), image.affine)
     np.testing.assert_array_equal(load_image(tmp_path / "image.nii.zst").voxels, image.voxels)
-
-
-def test_mrtrix_images_are_refused_with_their_converter(tmp_path):
-    (tmp_path / "image.mif").write_bytes(b"mrtrix image\ndim: 3,3,3\n")
-    with pytest.raises(InputError, match=r"mrconvert image\.mif"):
-        load_image(tmp_path / "image.mif")
