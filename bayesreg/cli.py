@@ -68,8 +68,12 @@ MovingIgnore = Annotated[
     typer.Option("--moving-ignore", metavar="FILE", help="Mask: not zero where MOVING says nothing, as in a cavity."),
 ]
 Channel = Annotated[
-    tuple[Path, Path] | None,
-    typer.Option("--channel", metavar="FIXED MOVING", help="Another image of each visit, such as FLAIR beside T1."),
+    list[str] | None,
+    typer.Option(
+        "--channel",
+        metavar="FIXED,MOVING",
+        help="Another image of each visit, such as FLAIR beside T1; may be repeated.",
+    ),
 ]
 OutFolder = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
@@ -148,7 +152,7 @@ def register(
         intracranial,
         fixed_ignore,
         moving_ignore,
-        [channel] if channel else (),
+        channel or (),
         overrides or (),
     )
     typer.echo("\n".join(understood.lines))

@@ -142,6 +142,14 @@ class Image:
         indices = self.world_to_voxel(points)
         return ((indices >= -0.5) & (indices <= np.array(self.shape) - 0.5)).all(axis=-1)
 
+    def nearest(self, points: Float[AnyArray, "*batch 3"]) -> np.ndarray:
+        """The value of the nearest voxel at world points (mm), zero beyond the grid."""
+        indices = np.rint(np.asarray(self.world_to_voxel(points))).astype(int)
+        on_grid = ((indices >= 0) & (indices < np.array(self.shape))).all(axis=-1)
+        i, j, k = np.moveaxis(np.where(on_grid[..., None], indices, 0), -1, 0)
+        values = np.asarray(self.voxels)[i, j, k]
+        return np.where(on_grid, values, np.zeros_like(values))
+
     def smoothed(self, sd: float) -> Image:
         """The image smoothed by a Gaussian of some standard deviation, mm."""
         voxels = ndimage.gaussian_filter(np.asarray(self.voxels, float), sd / self.voxel_sizes, mode="nearest")

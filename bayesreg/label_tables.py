@@ -53,19 +53,20 @@ _MARKS = {
     "freesurfer": {2, 3, 41, 42},
     "brainweb": {1, 2, 3, 8},
     "brats": {1, 2, 4},
-    # Of the same values as fast, which comes first: it has to be named.
+    # Of the same values as fast, which is likelier: it has to be named.
     "brats2023": {1, 2, 3},
     "mask": {1},
 }
 
 
-def recognise_table(values: Iterable[int]) -> str | None:
-    """The first table that lists all of some values of a label file, zero aside, and whose marks are among them."""
+def recognise_tables(values: Iterable[int]) -> list[str]:
+    """The tables that list all of some values of a label file, zero aside, and whose marks are among them.
+
+    The likeliest comes first.
+    """
     found = set(values) - {0}
-    for name, table in TABLES.items():
-        if _MARKS[name] <= found <= {value for entry in table.values() for value in entry}:
-            return name
-    return None
+    listed = {name: {value for entry in table.values() for value in entry} for name, table in TABLES.items()}
+    return [name for name in TABLES if _MARKS[name] <= found <= listed[name]]
 
 
 def as_range(text: str) -> list[int]:

@@ -3,7 +3,7 @@
 import pytest
 
 from bayesreg.config.data import FilesData
-from bayesreg.label_tables import REST, TABLES, as_range, read_label_names, recognise_table
+from bayesreg.label_tables import REST, TABLES, as_range, read_label_names, recognise_tables
 from bayesreg.tissues import BRAIN, ORGAN, tissue_names
 
 # What SynthSeg writes without a parcellation; FreeSurfer's aseg holds some more.
@@ -36,7 +36,7 @@ def test_every_value_has_one_tissue(table):
     ],
 )
 def test_a_table_is_recognised_by_the_values(values, name):
-    assert recognise_table(values) == name
+    assert (recognise_tables(values) or [None])[0] == name
 
 
 def test_a_configuration_names_one(tmp_path):
@@ -46,6 +46,13 @@ def test_a_configuration_names_one(tmp_path):
     assert FilesData.model_validate(data).label_table == TABLES["fast"]
     with pytest.raises(ValueError, match="there is no label table 'fats'; expected fast, freesurfer, brainweb"):
         FilesData.model_validate(data | {"label_table": "fats"})
+
+
+def test_zero_may_be_background_without_a_mask(tmp_path):
+    path = tmp_path / "labels.nii"
+    path.touch()
+    data = {"source": "files", "labels": path, "label_table": {"liver": 1, "background": 0}}
+    assert FilesData.model_validate(data).tissues == ("liver",)
 
 
 @pytest.mark.parametrize(("text", "labels"), [("7", [7]), ("1000-1003", [1000, 1001, 1002, 1003]), (" 5 - 6 ", [5, 6])])

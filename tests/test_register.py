@@ -53,7 +53,7 @@ def test_paths_are_enough_and_what_was_understood_is_said_first(register):
     assert config.model.preset == "registration"
     lines = result.output.splitlines()
     assert lines[0].endswith("fixed.nii.gz: 24 × 20 × 16 voxels of 1 × 1 × 2.5 mm")
-    assert "fast, which fits the values: csf 1; gm 2; wm 3" in result.output
+    assert "fast, which fits the values, as brats2023 would (--table): csf 1; gm 2; wm 3" in result.output
     assert lines[-1] == f"Report: {register.folder / 'out' / 'report.html'}"
 
 
@@ -101,6 +101,28 @@ def test_masks_say_of_which_image_they_are(register):
     assert (str(data.fixed_ignore), str(data.moving_ignore)) == (mask, mask)
 
 
+def test_labels_may_be_probabilities(register):
+    shares = np.random.default_rng(0).dirichlet(np.ones(3), SHAPE).astype(np.float32)
+    nib.save(nib.Nifti1Image(shares, np.diag([1.0, 1.0, 2.5, 1.0])), register.folder / "shares.nii.gz")
+    result = register.call("--labels", register.path("shares"))
+    assert result.exit_code == 0, result.output
+    assert "fast, which fits the values, as brats2023 would (--table)" in result.output
+
+
+def test_a_mask_of_any_two_values_serves_as_labels(register):
+    voxels = np.zeros(SHAPE, np.uint8)
+    voxels[1:-1, 1:-1, 1:-1] = 255
+    nib.save(nib.Nifti1Image(voxels, np.diag([1.0, 1.0, 2.5, 1.0])), register.folder / "organ.nii.gz")
+    result = register.call("--labels", register.path("organ"))
+    assert result.exit_code == 0, result.output
+    assert register.calls[0][0].data.label_table == {"organ": (255,)}
+
+
+def test_a_table_that_was_set_is_said_to_be(register):
+    result = register.call("--labels", register.path("labels"), "--set", "data.label_table={gm: 1, wm: [2, 3]}")
+    assert "table       as set: gm 1; wm 2, 3" in result.output
+
+
 def test_a_table_without_labels_is_a_mistake(register):
     result = register.call("--table", "fast")
     assert result.exit_code == 2
@@ -125,9 +147,10 @@ def test_a_mistake_is_one_message(register, arguments, part):
 
 def test_further_images_are_compared_as_well(register):
     other = [register.path("fixed"), register.path("moving")]
-    result = register.call("--labels", register.path("labels"), "--channel", *other)
+    result = register.call("--labels", register.path("labels"), *["--channel", ",".join(other)] * 2)
     assert result.exit_code == 0, result.output
-    first, second = register.calls[0][0].observations
-    assert (first.name, second.name) == ("images", "channel_2")
-    assert (str(second.fixed), str(second.moving)) == tuple(other)
+    first, second, third = register.calls[0][0].observations
+    assert (first.name, second.name, third.name) == ("images", "channel_2", "channel_3")
+    assert (str(second.fixed), str(second.moving)) == (str(third.fixed), str(third.moving)) == tuple(other)
     assert "channel_2" in result.output
+    assert "expected two paths" in register.call("--channel", other[0]).stderr

@@ -97,7 +97,7 @@ class FilesData(Section):
     @classmethod
     def _bounds_the_rest(cls, mask: Path | None, info: ValidationInfo) -> Path | None:
         table = info.data.get("label_table") or {}
-        if mask is None and (rest := [name for name, labels in table.items() if REST in labels]):
+        if mask is None and (rest := [name for name in tissue_names(table) if REST in table[name]]):
             raise ValueError(
                 f"label_table has {rest[0]} as the label 0: what no label names inside the mask of the organ; expected "
                 "that mask, such as what is not zero in an image without a skull"

@@ -11,6 +11,7 @@ import SimpleITK
 from jaxtyping import Float
 from scipy import ndimage
 
+from bayesreg.ignored import fill_ignored, ignored_voxels
 from bayesreg.image import Image
 from bayesreg.io.domain import relative_size
 from bayesreg.io.readers import from_itk
@@ -48,7 +49,13 @@ class Alignment(NamedTuple):
     as_given: float
 
 
-def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | None = None) -> Alignment:
+def find_pose(
+    fixed: Image,
+    moving: Image,
+    organ: Image,
+    fixed_ignore: Image | None = None,
+    moving_ignore: Image | None = None,
+) -> Alignment:
     """Find the pose by Mattes' mutual information, coarse to fine, from several starts.
 
     The starts are the headers', and centre on centre, by the grids and by the intensities; each as it is and turned
@@ -59,8 +66,8 @@ def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | 
     fixed, moving : Image
     organ : Image
         Nonzero in the organ, on the grid of the fixed image; it is compared with some millimetres around it.
-    moving_ignore : Image, optional
-        Nonzero where the moving image is not looked at, on its grid.
+    fixed_ignore, moving_ignore : Image, optional
+        Nonzero where the image of that name is not looked at, on any grid in its world.
 
     Raises
     ------
@@ -73,7 +80,11 @@ def find_pose(fixed: Image, moving: Image, organ: Image, moving_ignore: Image | 
     """
     size = relative_size(np.asarray(organ.voxels) != 0, organ.voxel_volume)
     around = _around(organ, size * SURROUNDINGS)
-    kept = None if moving_ignore is None else moving_ignore.with_voxels(np.asarray(moving_ignore.voxels) == 0)
+    kept = None if moving_ignore is None else moving.with_voxels(~ignored_voxels(moving, moving_ignore))
+    if fixed_ignore is not None:
+        around = around.with_voxels(np.asarray(around.voxels) * ~ignored_voxels(around, fixed_ignore))
+    # Smoothing and the centre of mass know nothing of what is ignored, either.
+    fixed, moving = fill_ignored(fixed, fixed_ignore), fill_ignored(moving, moving_ignore)
     headers = _euler(Pose.identity(), _centre_of(organ))
     starts, given, best = list(_starts(fixed, moving, organ)), headers, headers
     for edge, share, most in LEVELS:

@@ -142,24 +142,50 @@ def from_files(
     Raises
     ------
     InputError
-        If a file is missing or unreadable, a tissue of the table is absent, a label is not listed, zero is and there is
-        no mask, or the grids lie apart or are one by the other form of a header alone.
+        If a file is missing or unreadable, no tissue of the table is there, one lies off the grid of the image, a label
+        is not listed, zero is and there is no mask, or the grids lie apart or are one by the other form of a header.
     """
-    tissue, image = load_labels(labels_path, label_table, unlisted="refused"), None
-    given = None if intracranial_path is None else load_mask(intracranial_path)
-    for index, name in enumerate(tissue_names(label_table), start=1):
-        if REST in np.atleast_1d(label_table[name]):
-            tissue = _rest_of_mask(tissue, index, given, (name, labels_path, intracranial_path))
+    tissue, names = _tissues_there(load_labels(labels_path, label_table, unlisted="refused"), label_table, labels_path)
+    image = None
+    rest = next((name for name in names if REST in np.atleast_1d(label_table[name])), None)
+    if rest is not None:
+        # Until the mask is there its voxels are as those beyond the labels' grid, and the background is neither.
+        index = names.index(rest) + 1
+        tissue = tissue.with_voxels(np.select([tissue.voxels == index, tissue.voxels == 0], [0, -1], tissue.voxels))
     if image_path is not None:
         image = _load_fixed(image_path)
-        tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"))
-        names, present = tissue_names(label_table), np.unique(tissue.voxels)
-        if lost := [name for index, name in enumerate(names, start=1) if index not in present]:
-            raise InputError(f"no voxel of {' and '.join(lost)} in {labels_path} lies on the grid of {image_path}")
-    if given is None or intracranial_path is None:
-        return Anatomy(image, tissue, None, tissue_names(label_table))
-    mask = _on_grid(tissue, labels_path, given, intracranial_path, ("label", "intracranial"))
-    return Anatomy(image, tissue, mask, tissue_names(label_table))
+        tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"), anywhere=rest is not None)
+    mask = None
+    if intracranial_path is not None:
+        given, grid_path = load_mask(intracranial_path), labels_path if image_path is None else image_path
+        mask = _on_grid(tissue, grid_path, given, intracranial_path, ("label", "intracranial"))
+    if rest is not None:
+        if mask is None:
+            raise InputError(
+                f"{rest} is what has no label in {labels_path}, and nothing says where it ends; give a mask of the "
+                "organ as intracranial"
+            )
+        voxels = np.where((np.asarray(tissue.voxels) == 0) & (np.asarray(mask.voxels) != 0), index, tissue.voxels)
+        tissue = tissue.with_voxels(np.maximum(voxels, 0).astype(np.int8))
+    present = np.unique(tissue.voxels)
+    if lost := [name for number, name in enumerate(names, start=1) if number not in present]:
+        if lost == [rest]:
+            raise InputError(f"no voxel is {rest}: all that {intracranial_path} holds has a label in {labels_path}")
+        raise InputError(f"no voxel of {' and '.join(lost)} in {labels_path} lies on the grid of {image_path}")
+    return Anatomy(image, tissue, mask, names)
+
+
+def _tissues_there(tissue: Image, table: LabelTable, path: str | Path) -> tuple[Image, tuple[str, ...]]:
+    """Labels without the tissues of a table that none of them belongs to, as tables for many people have some."""
+    names, present = tissue_names(table), set(np.unique(tissue.voxels).tolist())
+    kept = [index for index in range(1, len(names) + 1) if index in present]
+    if len(kept) == len(names):
+        return tissue, names
+    absent = [name for index, name in enumerate(names, start=1) if index not in present]
+    _log.warning("label file %s holds no label of %s, and the organ goes without", path, " and ".join(absent))
+    number = np.zeros(len(names) + 1, np.int8)
+    number[kept] = np.arange(1, len(kept) + 1)
+    return tissue.with_voxels(number[np.asarray(tissue.voxels)]), tuple(names[index - 1] for index in kept)
 
 
 def without_labels(image_path: str | Path, mask_path: str | Path | None = None) -> Anatomy:
@@ -190,20 +216,6 @@ def without_labels(image_path: str | Path, mask_path: str | Path | None = None) 
     return Anatomy(image, image.with_voxels(inside.astype(np.int8)), None, (ORGAN,))
 
 
-def _rest_of_mask(
-    tissue: Image, index: int, mask: Image | None, which: tuple[str, str | Path, str | Path | None]
-) -> Image:
-    """Labels of which the tissue of an index, which all that has no label is, ends at a mask."""
-    name, labels_path, mask_path = which
-    if mask is None or mask_path is None:
-        raise InputError(
-            f"{name} is what has no label in {labels_path}, and nothing says where it ends; give a mask of the organ "
-            "as intracranial"
-        )
-    inside = np.asarray(_on_grid(tissue, labels_path, mask, mask_path, ("label", "intracranial")).voxels) != 0
-    return tissue.with_voxels(np.where((np.asarray(tissue.voxels) == index) & ~inside, 0, tissue.voxels))
-
-
 def _load_fixed(path: str | Path) -> Image:
     """The image whose grid is that of the results; on one at right angles where its own is sheared."""
     image = load_image(path)
@@ -226,8 +238,18 @@ def _outstanding(image: Image) -> np.ndarray:
     return found
 
 
-def _on_grid(grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]) -> Image:
+def _on_grid(
+    grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str], anywhere: bool = False
+) -> Image:
     """`on_grid_of`; InputError where they share a grid by the form of a header that was not taken."""
+    require_forms_taken(grid, grid_path, image, path, names)
+    return on_grid_of(grid, image, names, anywhere)
+
+
+def require_forms_taken(
+    grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]
+) -> None:
+    """Raise InputError where two images share a grid by the form of a header that was not taken."""
     for one, source, taken in ((grid, grid_path, image), (image, path, grid)):
         other = other_form(source)
         if other is not None and is_same_grid(Image(one.voxels, other), taken):
@@ -235,7 +257,6 @@ def _on_grid(grid: Image, grid_path: str | Path, image: Image, path: str | Path,
                 f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "
                 "s-form, which is taken; write the right one of the two forms into both"
             )
-    return on_grid_of(grid, image, names)
 
 
 def _from_nibabel(source: nib.Nifti1Image) -> Image:

@@ -10,10 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.io.atomic import load_arrays
-from bayesreg.io.fields import SUFFIXES, load_displacement
+from bayesreg.io.fields import load_displacement
 from bayesreg.mesh import TetMesh
+from bayesreg.pose import Pose
 from bayesreg.types import InputError
 
+# Files of displacements of the nodes of a mesh; all others hold a field on a grid.
+NODAL_SUFFIXES = (".npz", ".vtu")
+NOWHERE_ELSE = Pose.identity()
 # A field ends where zeros beside a place take away more than this of it, mm.
 ENDS = 0.25
 
@@ -25,6 +29,28 @@ def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
     if missing:
         raise InputError(f"{path} holds no {' and no '.join(missing)}: the run has not been finished")
     return [np.asarray(data[name], float) for name in names]
+
+
+def read_start(path: Path, mesh: TetMesh, pose: Pose) -> Float[np.ndarray, "nodes 3"]:
+    """A displacement of every node to start from, from a file of all nodes or a displacement field on a grid, mm.
+
+    Parameters
+    ----------
+    path : path
+        A field on a grid is interpolated linearly, and beyond it goes on as at its border. It leads from one world to
+        the other; nodes of a file (`read_displacement`) to where the pose has laid the moving image.
+    mesh : TetMesh
+    pose : Pose
+
+    Raises
+    ------
+    InputError
+        As `read_displacement` and `bayesreg.io.fields.load_displacement`.
+    """
+    if not is_volume(path):
+        return read_displacement(path, mesh)
+    there = np.stack([np.asarray(one.interpolate(mesh.points)) for one in load_displacement(path)], axis=1)
+    return pose.inverse.place(mesh.points + there) - mesh.points
 
 
 def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarray, "nodes 3"]:
@@ -56,12 +82,12 @@ def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarr
     return np.asarray(found[0], float)
 
 
-def require_displacement(path: Path) -> None:
-    """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid (`SUFFIXES`)."""
-    load_displacement(path) if _is_volume(path) else read_displacement(path)
+def require_displacement(path: Path, mesh: TetMesh | None = None) -> None:
+    """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid."""
+    load_displacement(path) if is_volume(path) else read_displacement(path, mesh)
 
 
-def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
+def read_boundary(path: Path, mesh: TetMesh, pose: Pose = NOWHERE_ELSE) -> Float[np.ndarray, "boundary 3"]:
     """Displacement of the boundary nodes from a file of all nodes (.npz, .vtu) or a displacement field on a grid.
 
     Parameters
@@ -69,6 +95,8 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
     path : path
         A field on a grid (`bayesreg.io.fields.load_displacement`) is interpolated linearly.
     mesh : TetMesh
+    pose : Pose
+        As in `read_start`.
 
     Raises
     ------
@@ -76,7 +104,7 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
         If the file holds no displacement or one for another mesh, the field's grid does not reach the boundary,
         or the field ends there: it jumps to zero.
     """
-    if not _is_volume(path):
+    if not is_volume(path):
         return read_displacement(path, mesh)[mesh.boundary]
     components = load_displacement(path)
     places = mesh.points[mesh.boundary]
@@ -97,11 +125,12 @@ def read_boundary(path: Path, mesh: TetMesh) -> Float[np.ndarray, "boundary 3"]:
             f"in voxels beside them, first at {places[ends][0].round(1).tolist()} mm, as where it is known inside the "
             "organ alone; give one that goes on beyond the boundary, or a run's mesh.vtu"
         )
-    return found
+    return pose.inverse.place(places + found) - places
 
 
-def _is_volume(path: Path) -> bool:
-    return path.name.lower().endswith(SUFFIXES)
+def is_volume(path: Path) -> bool:
+    """Tell a field on a grid from displacements of nodes, by its name."""
+    return not path.name.lower().endswith(NODAL_SUFFIXES)
 
 
 def _point_data(path: Path) -> dict[str, np.ndarray]:

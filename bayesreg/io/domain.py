@@ -125,7 +125,7 @@ def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X
         shares = ", ".join(f"{sizes[i] / sizes.sum():.0%}" for i in large[np.argsort(-sizes[large])])
         raise MeshError(f"the {name} has {len(large)} separate parts ({shares} of its volume); expected one")
     dropped = int(sizes.sum() - sizes.max())
-    _log.info("%d specks of the %s left out, %d voxels together", count - 1, name, dropped)
+    _log.warning("%d specks of the %s left out, %d voxels together", count - 1, name, dropped)
     return parts == sizes.argmax() + 1
 
 

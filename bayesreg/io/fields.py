@@ -14,7 +14,6 @@ from bayesreg.io.readers import Volume, from_itk, read_volume
 from bayesreg.io.volumes import write_nifti
 from bayesreg.types import AnyArray, InputError
 
-SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".h5", ".tfm")
 TRANSFORM_SUFFIXES = (".h5", ".tfm")
 # Codes of NIfTI's intents: displacement vectors, as FreeSurfer has them in RAS; vectors, as ITK has them in LPS; and
 # FSL's, in coordinates of its own.

@@ -80,6 +80,33 @@ def load_mask(path: str | Path) -> Image:
     return image.with_voxels((voxels >= 0.5).astype(np.uint8))
 
 
+def load_ignored(path: str | Path) -> Image:
+    """Read a mask of what is ignored: uint8, 1 where the file is not zero, or a probability of 0.5 or more.
+
+    A mask that is zero everywhere ignores nothing, and the log says so.
+
+    Raises
+    ------
+    InputError
+        As in `load_image`; also if the file holds neither whole numbers nor probabilities.
+    """
+    image = load_image(path)
+    voxels = np.asarray(image.voxels)
+    if np.abs(np.rint(voxels) - voxels).max() <= ROUNDING:
+        ignored = np.rint(voxels) != 0
+    elif voxels.min() >= -OVERSHOOT and voxels.max() <= 1 + OVERSHOOT:
+        ignored = voxels >= 0.5
+        _log.warning("mask %s has values between 0 and 1; what is at least 0.5 is ignored", path)
+    else:
+        raise InputError(
+            f"mask {path} has values from {voxels.min():g} to {voxels.max():g}; expected whole numbers, of which zero "
+            "is looked at, or probabilities"
+        )
+    if not ignored.any():
+        _log.warning("mask %s ignores nothing", path)
+    return image.with_voxels(ignored.astype(np.uint8))
+
+
 def save_image(image: Image, path: str | Path) -> None:
     """Write an image as NIfTI, all of it or nothing.
 
@@ -118,13 +145,13 @@ def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside"
     Raises
     ------
     InputError
-        As in `load_image`; also if the file holds values that are not integers, none of the values of a tissue or one
-        that is not listed, or if a value belongs to two tissues.
+        As in `load_image`; also if the file holds values that are not integers, none of any tissue (or of one, where
+        what is not listed is outside), one that is not listed and is refused, or if a value belongs to two tissues.
     """
     image = load_whole_numbers(path)
     values = {name: np.atleast_1d(np.asarray(entry, int)).tolist() for name, entry in table.items()}
     present, counts = np.unique(image.voxels, return_counts=True)
-    _check_table(values, present.tolist(), path)
+    _check_table(values, present.tolist(), path, whole=unlisted == "outside")
     listed = {0, *(value for entry in values.values() for value in entry)}
     millilitres = {
         int(value): count * image.voxel_volume / 1e3
@@ -222,7 +249,9 @@ def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "seco
         )
 
 
-def on_grid_of(grid: Image, image: Image, names: tuple[str, str] = ("first", "second")) -> Image:
+def on_grid_of(
+    grid: Image, image: Image, names: tuple[str, str] = ("first", "second"), anywhere: bool = False
+) -> Image:
     """Labels or a mask on the grid of another image: as they are, or by the nearest voxel, and the log says so.
 
     Parameters
@@ -232,6 +261,8 @@ def on_grid_of(grid: Image, image: Image, names: tuple[str, str] = ("first", "se
         Beyond its own grid it counts as zero.
     names : pair of str
         What to call them in a message.
+    anywhere : bool
+        Whether the image may be a small part of the grid.
 
     Raises
     ------
@@ -240,7 +271,8 @@ def on_grid_of(grid: Image, image: Image, names: tuple[str, str] = ("first", "se
     """
     if is_same_grid(grid, image):
         return grid.with_voxels(image.voxels)
-    check_same_space(grid, image, names)
+    if not anywhere:
+        check_same_space(grid, image, names)
     between = image.to_voxel @ grid.affine
     found = grid.with_voxels(
         ndimage.affine_transform(
@@ -315,7 +347,7 @@ def _storable(voxels: np.ndarray) -> np.ndarray:
     return voxels
 
 
-def _check_table(values: dict[str, list[int]], present: list[int], path: str | Path) -> None:
+def _check_table(values: dict[str, list[int]], present: list[int], path: str | Path, whole: bool) -> None:
     owner: dict[int, str] = {}
     for name, entry in values.items():
         if not entry:
@@ -327,7 +359,7 @@ def _check_table(values: dict[str, list[int]], present: list[int], path: str | P
     absent = [value for value in owner if value not in present]
     empty = [name for name in tissue_names(values) if not set(values[name]) & set(present)]
     shown = ", ".join(map(str, present[:30])) + (", …" if len(present) > 30 else "")
-    if empty:
+    if empty and (whole or len(empty) == len(tissue_names(values))):
         listed = ", ".join(f"{name} ({', '.join(map(str, values[name]))})" for name in empty)
         raise InputError(f"label file {path} holds no label of {listed}; it holds {shown}")
     if absent:

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
 from bayesreg.fem.location import locate
+from bayesreg.ignored import fill_ignored, ignored_voxels
 from bayesreg.image import Image
 from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.mesh import TetMesh
@@ -68,11 +69,10 @@ class ImagePair:
     tissue: Image | None = None
 
     def __post_init__(self) -> None:
-        if self.tissue is not None and self.tissue.shape != self.fixed.shape:
-            raise InputError(
-                f"{self.name}: tissue must lie on the grid of the fixed image, but has the shape {self.tissue.shape}, "
-                f"and not {self.fixed.shape}"
-            )
+        if self.tissue is not None and not (
+            self.tissue.shape == self.fixed.shape and np.allclose(self.tissue.affine, self.fixed.affine, atol=1e-3)
+        ):
+            raise InputError(f"{self.name}: tissue must lie on the grid of the fixed image, and lies on another")
         for which in ("fixed", "moving", "fixed_ignore", "moving_ignore"):
             given = getattr(self, which)
             if not isinstance(given, Image) and (given is not None or which in ("fixed", "moving")):
@@ -81,11 +81,17 @@ class ImagePair:
     def prepared(self, mesh: TetMesh, model: ModelConfig) -> ImagePair:
         """The pair as the options compare it: f in the contrast of m, as far as a map tells at rest, or descriptors.
 
+        What is ignored is filled with what lies beside it.
+
         Raises
         ------
         InputError
             As `on`.
         """
+        fixed, moving = fill_ignored(self.fixed, self.fixed_ignore), fill_ignored(self.moving, self.moving_ignore)
+        return replace(self, fixed=fixed, moving=moving)._contrasted(mesh, model)
+
+    def _contrasted(self, mesh: TetMesh, model: ModelConfig) -> ImagePair:
         if model.similarity == "mind":
             return _self_similar(self)
         if self.one_contrast or model.similarity in OF_ANY_CONTRAST:
@@ -136,7 +142,8 @@ class ImagePair:
         return self._seen(mesh, quadrature_of(mesh, self.fixed, model))
 
     def _seen(self, mesh: TetMesh, quadrature: Quadrature) -> Quadrature:
-        return seen_points(mesh, quadrature, self.moving, self.fixed_ignore)
+        visible = None if self.fixed_ignore is None else visibility(self.fixed, self.fixed_ignore)
+        return seen_points(mesh, quadrature, self.moving, visible)
 
     def on(self, mesh: TetMesh, model: ModelConfig, temperature: str = "t_similarity") -> ComparedImages:
         """The term on a mesh, with a T_s of this name.
@@ -166,7 +173,7 @@ class ImagePair:
             positions=jnp.asarray(positions),
             independent_share=jnp.asarray(independent_share(model, len(positions))),
             shading=shading,
-            visible=None if self.moving_ignore is None else visibility(self.moving_ignore),
+            visible=None if self.moving_ignore is None else visibility(self.moving, self.moving_ignore),
         )
 
     def smoothing_sd(self, model: ModelConfig) -> float:
@@ -244,13 +251,13 @@ class SelfSimilarPair(ImagePair):
             return replace(self, descriptors=tuple(smooth))
 
 
-def visibility(ignore: Image) -> Interpolator:
+def visibility(image: Image, ignore: Image) -> Interpolator:
     """1 where an image is looked at and 0 where it is ignored, as a function of the place.
 
-    A voxel's neighbours are ignored with it, since smoothing and interpolation mix its intensity into theirs.
+    The neighbours of an ignored voxel are ignored with it: they may hold some of what it holds.
     """
-    ignored = ndimage.binary_dilation(np.asarray(ignore.voxels) != 0, ndimage.generate_binary_structure(3, 3))
-    return ignore.with_voxels(1.0 - ignored).interpolator("linear")
+    ignored = ndimage.binary_dilation(ignored_voxels(image, ignore), ndimage.generate_binary_structure(3, 3))
+    return image.with_voxels(1.0 - ignored).interpolator("linear")
 
 
 @lru_cache(maxsize=4)
@@ -258,7 +265,6 @@ def _smoothed_as(pair: ImagePair, sd: float) -> ImagePair:
     return pair.smoothed(sd)
 
 
-@lru_cache(maxsize=4)
 def _self_similar(pair: ImagePair) -> SelfSimilarPair:
     axes, distance = pair.fixed.axes, max(float(image.voxel_sizes.max()) for image in (pair.fixed, pair.moving))
     fixed, moving = (describe_self_similarity(image, axes, distance) for image in (pair.fixed, pair.moving))
@@ -327,8 +333,10 @@ def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
     return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))
 
 
-def seen_points(mesh: TetMesh, quadrature: Quadrature, moving: Image, fixed_ignore: Image | None = None) -> Quadrature:
-    """The points that rest on the grid of the moving image, and are not ignored: what lies beyond has not been seen.
+def seen_points(
+    mesh: TetMesh, quadrature: Quadrature, moving: Image, visible: Interpolator | None = None
+) -> Quadrature:
+    """The points that rest on the grid of the moving image, and are visible: what lies beyond has not been seen.
 
     Which points count must not depend on the displacement: a posterior could do without those that do not fit.
 
@@ -339,8 +347,8 @@ def seen_points(mesh: TetMesh, quadrature: Quadrature, moving: Image, fixed_igno
     """
     positions = quadrature.positions(mesh)
     seen = moving.contains(positions)
-    if fixed_ignore is not None:
-        seen &= np.asarray(visibility(fixed_ignore)(jnp.asarray(positions))) > 0.5
+    if visible is not None:
+        seen &= np.asarray(visible(jnp.asarray(positions))) > 0.5
     if not seen.any():
         raise InputError("nothing is left to compare: all of the mesh lies in fixed_ignore, or beyond the moving image")
     if seen.all():

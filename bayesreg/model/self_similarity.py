@@ -57,7 +57,9 @@ def describe_self_similarity(
     variance = np.mean(distances, axis=0)
     variance = np.maximum(variance, LEAST * variance.mean() or 1.0)
     least = np.min(distances, axis=0)
-    one, two, three, four, five, six = (image.with_voxels(np.exp((least - found) / variance)) for found in distances)
+    one, two, three, four, five, six = (
+        image.with_voxels(np.exp((least - found) / variance).astype(np.float32)) for found in distances
+    )
     return one, two, three, four, five, six
 
 

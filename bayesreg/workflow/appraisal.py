@@ -26,6 +26,8 @@ STRAIGHT = 0.8
 UNLIKE = 0.02
 # Shares that are worth a sentence: of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
+# Labels that fill less of the mask of the organ are of a part of it.
+FILLED = 0.4
 
 
 class Appraisal(NamedTuple):
@@ -135,11 +137,28 @@ def appraise(
     likeness: Likeness | None = None,
     one_contrast: bool = True,
     one_scale: bool = True,
+    intracranial: Image | None = None,
 ) -> Appraisal:
     """Appraise labels and, where there is a pair of images, how alike they are; see `Likeness.sentences`."""
     millilitres = measure_tissues(tissue, domain, names)
     told = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
-    return Appraisal(millilitres, likeness, (*explain_left_out(millilitres), *told))
+    return Appraisal(
+        millilitres, likeness, (*explain_left_out(millilitres), *explain_mask(tissue, intracranial), *told)
+    )
+
+
+def explain_mask(tissue: Image, intracranial: Image | None) -> list[str]:
+    """A sentence where labels fill little of the mask that the organ may move in, both on one grid."""
+    if intracranial is None:
+        return []
+    labelled, inside = np.asarray(tissue.voxels) != 0, np.asarray(intracranial.voxels) != 0
+    filled, all_of_it = (np.count_nonzero(one) * tissue.voxel_volume / 1e3 for one in (labelled & inside, inside))
+    if filled >= FILLED * all_of_it:
+        return []
+    return [
+        f"The labels fill {filled:.3g} of the {all_of_it:.4g} ml of the mask: are they of a part of the organ, such as "
+        "a tumour, or does the table not fit? A label 0 in the table makes the rest of the mask a tissue."
+    ]
 
 
 def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:

@@ -16,7 +16,7 @@ from bayesreg.config.observations import LandmarksSection
 from bayesreg.image import Image
 from bayesreg.inference.chains.initialise import Start
 from bayesreg.io.alignment import find_demons
-from bayesreg.io.displacements import read_displacement
+from bayesreg.io.displacements import read_start
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
@@ -64,7 +64,7 @@ def _observations(config: Config, inputs: Inputs) -> list[Any]:
         )
         found.append(pair)
         for name, channel in inputs.channels.items():
-            tissue = inputs.tissue if channel.fixed.shape == inputs.tissue.shape else None
+            tissue = channel.fixed.with_voxels(inputs.tissue.nearest(channel.fixed.grid_points()))
             found.append(replace(pair, name=name, tissue=tissue, **channel._asdict()))
     for section in config.observations or []:
         if isinstance(section, LandmarksSection):
@@ -120,7 +120,7 @@ def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
         if not inputs.matching.one_contrast:
             raise InputError("start.field: demons compares intensities, and the images are of unlike contrast")
         return _demons(inputs.fixed, inputs.moving, inputs.mesh)
-    return read_displacement(Path(wanted), inputs.mesh)
+    return read_start(Path(wanted), inputs.mesh, inputs.matching.pose)
 
 
 @lru_cache(maxsize=1)

@@ -105,7 +105,7 @@ def _describe(appraisal: Mapping[str, Any]) -> list[str]:
     lines = [f"  {note}" for note in appraisal.get("notes", ())]
     if appraisal.get("millilitres"):
         parts = (
-            f"{name} {inside:.0f}" + (f" ({outside:.0f} outside)" if outside >= 0.5 else "")
+            f"{name} {inside:.4g}" + (f" ({outside:.3g} outside)" if outside >= 0.01 * inside else "")
             for name, (inside, outside) in appraisal["millilitres"].items()
         )
         lines.append(f"  tissues   {', '.join(parts)} ml in the region to mesh")

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from bayesreg.config.data import FilesData
+from bayesreg.ignored import ignored_voxels
 from bayesreg.image import Image, IntensityScale, robust_scale
 from bayesreg.io.alignment import find_pose
 from bayesreg.io.records import Channel, Matching
 from bayesreg.io.volumes import check_same_space
+from bayesreg.model.options import OF_ANY_CONTRAST
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Likeness, compare_images
 
 # A pose is taken where the images share so many times as much information as where the headers place them.
 GAIN = 1.05
+# A mask that ignores a greater share of the organ may be meant the other way round.
+MOST_IGNORED = 0.5
 
 
 class Matched(NamedTuple):
@@ -33,6 +38,8 @@ class Matched(NamedTuple):
         How alike they are.
     notes : tuple of str
         What was found, a sentence each.
+    beware : tuple of str
+        What a user should know of the masks, a sentence each.
     """
 
     matching: Matching
@@ -41,46 +48,65 @@ class Matched(NamedTuple):
     moving_ignore: Image | None
     likeness: Likeness
     notes: tuple[str, ...]
+    beware: tuple[str, ...] = ()
 
 
 def match_images(
-    data: FilesData, domain: Image, fixed: Image, moving: Image, moving_ignore: Image | None = None
+    data: FilesData,
+    similarity: str,
+    domain: Image,
+    fixed: Image,
+    moving: Image,
+    fixed_ignore: Image | None = None,
+    moving_ignore: Image | None = None,
 ) -> Matched:
     """Find what `data` leaves to be found: the pose, whether both are of one contrast, and their scales.
 
     Parameters
     ----------
     data : FilesData
+    similarity : str
+        How the model compares them.
     domain : Image
         Not zero in Ω, on the grid of the fixed image.
     fixed, moving : Image
-    moving_ignore : Image, optional
-        Not zero where the moving image says nothing.
+    fixed_ignore, moving_ignore : Image, optional
+        Not zero where the image of that name says nothing, on any grid in its world.
 
     Raises
     ------
     InputError
-        If the images do not overlap, or one is constant in Ω.
+        If the images do not overlap, one is constant in Ω, or all of Ω is ignored.
     """
     for name, image in (("fixed", fixed), ("moving", moving)):
         if np.ptp(image.voxels) == 0:
             raise InputError(f"the {name} image has the same intensity everywhere: it shows nothing to register")
-    pose, of_pose = _find_pose(data, domain, fixed, moving, moving_ignore)
+    pose, of_pose = _find_pose(data, domain, fixed, moving, fixed_ignore, moving_ignore)
     moving = pose.aligned(moving)
     moving_ignore = None if moving_ignore is None else pose.aligned(moving_ignore)
+    ignored = {"fixed": fixed_ignore, "moving": moving_ignore}
+    seen = _seen(domain, ignored.values())
     # A constant image is told by its name, before it is compared.
-    scales = _scale_of("fixed", fixed, domain.voxels != 0), _scale_of("moving", moving, within(domain, moving))
-    likeness = compare_images(fixed, moving, domain)
+    scales = _scale_of("fixed", fixed, seen.voxels != 0), _scale_of("moving", moving, within(seen, moving))
+    likeness = compare_images(fixed, moving, seen)
     alike = likeness.is_one_contrast if data.same_contrast is None else data.same_contrast
     one_scale = alike and (data.same_contrast is True or likeness.is_one_scale)
     scale = scales[0] if one_scale else scales[1]
-    notes = (of_pose, _describe_contrast(alike, one_scale, likeness, data.same_contrast is None))
+    of_contrast = _describe_contrast(alike, one_scale, likeness, data.same_contrast is None, similarity)
+    of_masks, beware = _describe_ignored(domain, ignored)
     matching = Matching(pose, alike, scale)
-    return Matched(matching, scales[0](fixed), scale(moving), moving_ignore, likeness, notes)
+    images = scales[0](fixed), scale(moving)
+    return Matched(matching, *images, moving_ignore, likeness, (of_pose, of_contrast, *of_masks), tuple(beware))
 
 
 def match_channel(
-    data: FilesData, domain: Image, matching: Matching, name: str, fixed: Image, moving: Image
+    data: FilesData,
+    domain: Image,
+    matched: Matched,
+    name: str,
+    fixed: Image,
+    moving: Image,
+    fixed_ignore: Image | None = None,
 ) -> Channel:
     """A further pair of images in the pose of the first, each image on a scale of its own.
 
@@ -89,11 +115,48 @@ def match_channel(
     InputError
         If an image does not overlap the organ, or is constant there.
     """
-    moving = matching.pose.aligned(moving)
+    moving = matched.matching.pose.aligned(moving)
+    seen = _seen(domain, (fixed_ignore, matched.moving_ignore))
     alike = data.same_contrast
     if alike is None:
-        alike = compare_images(fixed, moving, domain).is_one_contrast
-    return Channel(_scaled(f"{name} fixed", fixed, domain), _scaled(f"{name} moving", moving, domain), alike)
+        alike = compare_images(fixed, moving, seen).is_one_contrast
+    return Channel(_scaled(f"{name} fixed", fixed, seen), _scaled(f"{name} moving", moving, seen), alike)
+
+
+def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
+    """The part of Ω that no mask ignores.
+
+    Raises
+    ------
+    InputError
+        If none is left.
+    """
+    seen = np.asarray(domain.voxels) != 0
+    for mask in masks:
+        if mask is not None:
+            seen &= ~ignored_voxels(domain, mask)
+    if not seen.any():
+        raise InputError("all of the organ is ignored; check fixed_ignore and moving_ignore")
+    return domain.with_voxels(seen.astype(np.uint8))
+
+
+def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple[list[str], list[str]]:
+    """How much of Ω each mask ignores, and what is odd about that."""
+    notes, beware = [], []
+    inside = np.asarray(domain.voxels) != 0
+    for name, mask in masks.items():
+        if mask is None:
+            continue
+        ignored = np.count_nonzero(inside & ignored_voxels(domain, mask))
+        millilitres, share = ignored * domain.voxel_volume / 1e3, ignored / np.count_nonzero(inside)
+        notes.append(f"Ignored: {millilitres:.3g} ml of the organ in the {name} image.")
+        if not ignored:
+            beware.append(
+                f"data.{name}_ignore ignores nothing of the organ: it lies elsewhere in the world, or is empty."
+            )
+        elif share > MOST_IGNORED:
+            beware.append(f"data.{name}_ignore ignores {share:.0%} of the organ; what is not zero in it is ignored.")
+    return notes, beware
 
 
 def _scaled(name: str, image: Image, domain: Image) -> Image:
@@ -102,13 +165,18 @@ def _scaled(name: str, image: Image, domain: Image) -> Image:
 
 
 def _find_pose(
-    data: FilesData, domain: Image, fixed: Image, moving: Image, moving_ignore: Image | None
+    data: FilesData,
+    domain: Image,
+    fixed: Image,
+    moving: Image,
+    fixed_ignore: Image | None,
+    moving_ignore: Image | None,
 ) -> tuple[Pose, str]:
     """The pose, and what is said of it."""
     if data.pose == "fixed":
         check_same_space(fixed, moving, ("fixed", "moving"))
         return Pose.identity(), "Pose: as the headers say (data.pose: fixed)."
-    found = find_pose(fixed, moving, domain, moving_ignore)
+    found = find_pose(fixed, moving, domain, fixed_ignore, moving_ignore)
     told = f"mutual information {found.as_given:.2f} as the headers say"
     if found.information <= GAIN * found.as_given:
         return Pose.identity(), f"Pose: as the headers say, since no other brings much: {told}."
@@ -120,9 +188,12 @@ def _find_pose(
     )
 
 
-def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: bool) -> str:
+def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: bool, similarity: str) -> str:
     how = "found" if found else "as data.same_contrast says"
     shares = f"a straight line explains {likeness.line_share:.0%} of the moving image, any map {likeness.map_share:.0%}"
+    if similarity in OF_ANY_CONTRAST:
+        what = "the same" if alike else "unlike"
+        return f"Contrast: {what} ({how}; {shares}); compared by {similarity}, which serves any."
     if not alike:
         return f"Contrast: unlike ({how}; {shares}); compared through a map of the fixed image's intensities."
     scale = "on one scale" if one_scale else "each on a scale of its own"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,16 +18,17 @@ from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
-from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, without_labels
-from bayesreg.io.displacements import read_boundary, read_displacement, require_displacement
+from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels
+from bayesreg.io.displacements import NOWHERE_ELSE, read_boundary, require_displacement
 from bayesreg.io.domain import size_of_solid, without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Channel, Inputs, Truth
-from bayesreg.io.volumes import load_image, load_mask
+from bayesreg.io.volumes import load_ignored, load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.options import OF_ANY_CONTRAST, require_default_image_options
 from bayesreg.model.warp import tissue_on_grid
+from bayesreg.pose import Pose
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import InputError
@@ -74,7 +75,7 @@ def prepare(config: Config) -> Prepared:
         mesh = load_mesh(config.mesh.file)
         _require_start(config, mesh)
         clock.lap("mesh")
-        boundary, skull = _known_boundary(config, mesh, None), _skull(config.data.intracranial)
+        boundary, skull = _known_boundary(config, mesh), _skull(config.data.intracranial)
         tissue = _as_stored(tissue_on_grid(mesh))
         inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points)
         return Prepared(inputs, clock.laps, {})
@@ -85,7 +86,8 @@ def prepare(config: Config) -> Prepared:
     size = _size(config, anatomy)
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, size * BRAIN_CLOSING, anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
-    matched = _match(config, anatomy, domain)
+    fixed_ignore = _ignored(config, "fixed")
+    matched = _match(config, anatomy, domain, fixed_ignore)
     appraisal = _appraise(config, anatomy, domain, matched)
     clock.lap("images")
     settings = _sized(config.mesh, size)
@@ -94,10 +96,11 @@ def prepare(config: Config) -> Prepared:
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     if isinstance(config.data, FilesData):
-        boundary = _known_boundary(config, mesh, None)
+        pose = NOWHERE_ELSE if matched is None else matched.matching.pose
+        boundary = _known_boundary(config, mesh, pose=pose)
         inputs = Inputs(
             resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points,
-            fixed_ignore=_ignored(config.data.fixed_ignore),
+            fixed_ignore=fixed_ignore,
         )  # fmt: skip
         if matched is not None:
             ignored = matched.moving_ignore
@@ -106,7 +109,7 @@ def prepare(config: Config) -> Prepared:
                 moving=_as_stored(matched.moving),
                 moving_ignore=None if ignored is None else _as_stored(ignored),
                 matching=matched.matching,
-                channels=_channels(config, domain, matched),
+                channels=_channels(config, domain, matched, fixed_ignore),
             )
         return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
@@ -121,29 +124,38 @@ def prepare(config: Config) -> Prepared:
     return Prepared(inputs, clock.laps, _describe(config, pair), appraisal)
 
 
-def _channels(config: Config, domain: Image, matched: Matched) -> dict[str, Channel]:
+def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Image | None) -> dict[str, Channel]:
     """The pairs of images besides the first."""
     assert isinstance(config.data, FilesData)
     found = {}
     for section in config.observations or []:
         if isinstance(section, ImagesSection) and section.fixed is not None and section.moving is not None:
             images = load_image(section.fixed), load_image(section.moving)
-            channel = match_channel(config.data, domain, matched.matching, section.name, *images)
+            channel = match_channel(config.data, domain, matched, section.name, *images, fixed_ignore)
             fixed, moving = _as_stored(channel.fixed), _as_stored(channel.moving)
             found[section.name] = channel._replace(fixed=fixed, moving=moving)
     return found
 
 
-def _ignored(path: Path | None) -> Image | None:
-    return None if path is None else _as_stored(load_mask(path))
+def _ignored(config: Config, which: Literal["fixed", "moving"]) -> Image | None:
+    """The mask of what an image says nothing of, as the file has it."""
+    if not isinstance(config.data, FilesData):
+        return None
+    path, image = getattr(config.data, f"{which}_ignore"), getattr(config.data, which)
+    if path is None:
+        return None
+    mask = load_ignored(path)
+    require_forms_taken(load_image(image), image, mask, path, (which, f"{which}_ignore"))
+    return _as_stored(mask)
 
 
-def _match(config: Config, anatomy: Anatomy, domain: Image) -> Matched | None:
+def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image | None) -> Matched | None:
     """The moving image of a pair from files, brought beside the fixed one."""
     data = config.data
     if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
         return None
-    return match_images(data, domain, anatomy.image, load_image(data.moving), _ignored(data.moving_ignore))
+    images = anatomy.image, load_image(data.moving)
+    return match_images(data, config.model.similarity, domain, *images, fixed_ignore, _ignored(config, "moving"))
 
 
 def _skull(intracranial: Path | None) -> Image | None:
@@ -171,11 +183,13 @@ def _points(config: Config) -> dict[str, PointPairs]:
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
     """What is told of labels and images before the mesh is built."""
     if matched is None or not isinstance(config.data, FilesData):
-        return appraise(anatomy.tissue, domain, anatomy.names)
+        return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
     one_contrast = matched.matching.one_contrast and config.model.similarity not in OF_ANY_CONTRAST
     one_scale = one_contrast and config.data.same_contrast is True and config.model.intensity_map is None
-    found = appraise(anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale)
-    return found._replace(notes=matched.notes)
+    found = appraise(
+        anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale, anatomy.intracranial
+    )
+    return found._replace(notes=matched.notes, beware=(*found.beware, *matched.beware))
 
 
 def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:
@@ -214,19 +228,21 @@ def store_inputs(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
 def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
     """Raise InputError where a file with displacements cannot serve, as far as can be told by now."""
     if isinstance(config.start.field, Path):
-        read_displacement(config.start.field, mesh)
+        require_displacement(config.start.field, mesh)
     if isinstance(config.known_boundary, Path) and mesh is None:
         require_displacement(config.known_boundary)
 
 
-def _known_boundary(config: Config, mesh: TetMesh, truth: Truth | None) -> Float[np.ndarray, "boundary 3"] | None:
-    """u_B where the configuration gives it, mm."""
+def _known_boundary(
+    config: Config, mesh: TetMesh, truth: Truth | None = None, pose: Pose = NOWHERE_ELSE
+) -> Float[np.ndarray, "boundary 3"] | None:
+    """u_B where the configuration gives it, mm; see `read_boundary`."""
     if config.known_boundary is None:
         return None
     if config.known_boundary == "truth":
         assert truth is not None
         return np.asarray(truth.u)[mesh.boundary]
-    return read_boundary(Path(config.known_boundary), mesh)
+    return read_boundary(Path(config.known_boundary), mesh, pose)
 
 
 class _Clock:

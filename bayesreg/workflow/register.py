@@ -13,7 +13,8 @@ from bayesreg.config.data import FilesData
 from bayesreg.config.observations import ImagesSection
 from bayesreg.image import Image
 from bayesreg.io.volumes import load_image, load_whole_numbers, shorten
-from bayesreg.label_tables import TABLES, recognise_table
+from bayesreg.label_tables import TABLES, recognise_tables
+from bayesreg.tissues import ORGAN
 from bayesreg.types import InputError
 
 
@@ -39,7 +40,7 @@ def understand(
     intracranial: Path | None = None,
     fixed_ignore: Path | None = None,
     moving_ignore: Path | None = None,
-    channels: Sequence[tuple[Path, Path]] = (),
+    channels: Sequence[str] = (),
     overrides: Sequence[str] = (),
 ) -> Understood:
     """Make the configuration of a pair in files.
@@ -58,8 +59,8 @@ def understand(
         Mask of where the organ may go.
     fixed_ignore, moving_ignore : path, optional
         Masks of where the image of that name says nothing; not zero = ignored.
-    channels : sequence of pairs of path
-        Further images of the same two visits, fixed and moving.
+    channels : sequence of str
+        Further images of the same two visits: the paths of a fixed and a moving one, with a comma between them.
     overrides : sequence of str
         As in `bayesreg.load_config`.
 
@@ -80,6 +81,8 @@ def understand(
     if channels:
         sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
     config = make_config(sections, overrides)
+    if any(one.startswith("data.label_table") for one in overrides):
+        how = "as set"
     return Understood(config, tuple(_describe(config, how)))
 
 
@@ -89,7 +92,8 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     assert isinstance(data, FilesData)
     for name in ("fixed", "moving", "labels"):
         if (path := getattr(data, name)) is not None:
-            yield f"{name:<12}{path}: {_describe_grid(load_image(path))}"
+            load = load_whole_numbers if name == "labels" else load_image
+            yield f"{name:<12}{path}: {_describe_grid(load(path))}"
     if data.labels is None:
         yield f"{'labels':<12}none: the organ is {_describe_organ(data)}, of one tissue"
     else:
@@ -108,8 +112,14 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     yield f"{'model':<12}preset {config.model.preset}"
 
 
-def _channel(number: int, pair: tuple[Path, Path]) -> dict[str, str]:
-    fixed, moving = (str(path.absolute()) for path in pair)
+def _channel(number: int, pair: str) -> dict[str, str]:
+    parts = pair.split(",")
+    # A path may hold a comma, too.
+    ways = [(Path(",".join(parts[:k])), Path(",".join(parts[k:]))) for k in range(1, len(parts))]
+    if not ways:
+        raise InputError(f"--channel {pair}: expected two paths with a comma between them, FIXED,MOVING")
+    there = next((way for way in ways if way[0].exists() and way[1].exists()), ways[0])
+    fixed, moving = (str(path.absolute()) for path in there)
     return {"kind": "images", "name": f"channel_{number}", "fixed": fixed, "moving": moving}
 
 
@@ -126,13 +136,16 @@ def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], s
             raise InputError(f"--table {table}: neither a file nor one of {', '.join(TABLES)}")
         return read_mapping(table), table
     values = np.unique(load_whole_numbers(labels).voxels).tolist()
-    name = recognise_table(values)
-    if name is None:
+    if len(values) == 2 and values[0] == 0:
+        return {ORGAN: values[1:]}, "a mask, all of one tissue"
+    fitting = recognise_tables(values)
+    if not fitting:
         raise InputError(
             f"no label table fits the labels in {labels} ({shorten(values)}); give --table: {', '.join(TABLES)}, or a "
             "YAML file with labels by tissue, such as liver: [1]"
         )
-    return TABLES[name], f"{name}, which fits the values"
+    also = f", as {' and '.join(fitting[1:])} would (--table)" if fitting[1:] else ""
+    return TABLES[fitting[0]], f"{fitting[0]}, which fits the values{also}"
 
 
 def _describe_grid(image: Image) -> str:

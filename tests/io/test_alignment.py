@@ -77,8 +77,25 @@ def test_what_is_ignored_does_not_mislead():
     voxels[10:25, 10:40, 8:40] = 3 * ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(15, 30, 32)), 1)
     ignored = np.zeros(moving.shape, np.uint8)
     ignored[10:25, 10:40, 8:40] = 1
-    found = find_pose(FIXED, moving.with_voxels(voxels), MASK, moving.with_voxels(ignored))
+    found = find_pose(FIXED, moving.with_voxels(voxels), MASK, moving_ignore=moving.with_voxels(ignored))
     assert off(found.pose, pose) < 0.3
+
+
+def test_a_mask_of_a_small_grid_ignores_what_it_holds_alone():
+    """In both images, and what is bright there, such as metal, has no say."""
+    pose = motion(8.0, 8.0, seed=3)
+    moving = moved(pose)
+    part = np.s_[20:28, 20:28, 18:26]
+    inside = np.zeros(moving.shape, bool)
+    inside[part] = True
+    cropped = moving.with_voxels(inside.astype(np.uint8)).affine.copy()
+    cropped[:3, 3] = moving.voxel_to_world(np.array([20.0, 20.0, 18.0]))
+    mask = Image(np.ones((8, 8, 8), np.uint8), cropped)
+    bright = moving.with_voxels(np.where(inside, 1e4, moving.voxels))
+    assert off(find_pose(FIXED, bright, MASK, moving_ignore=mask).pose, pose) < 0.3
+    metal = FIXED.with_voxels(np.where(inside, 1e4, FIXED.voxels))
+    mask = Image(mask.voxels, np.c_[FIXED.affine[:, :3], [*FIXED.voxel_to_world(np.array([20.0, 20.0, 18.0])), 1.0]])
+    assert off(find_pose(metal, moving, MASK, fixed_ignore=mask).pose, pose) < 0.3
 
 
 def test_the_same_images_give_the_same_pose():

@@ -111,6 +111,28 @@ class TestFromFiles:
         with pytest.raises(ValueError, match=r"does not list: 11 \(0.008 ml\)"):
             from_files(files["t1"], files["labels"], {"gm": 12, "wm": 13})
 
+    def test_a_table_may_hold_tissues_that_are_not_there(self, files, caplog):
+        anatomy = from_files(files["t1"], files["labels"], {"oedema": 7, "csf": 11, "cyst": [8, 9], "gm": [12, 13]})
+        assert anatomy.names == ("csf", "gm")
+        assert anatomy.tissue.voxels[3, 3, 3] == 1
+        assert anatomy.tissue.voxels[1, 1, 1] == 2
+        assert "no label of oedema and cyst" in caplog.text
+        with pytest.raises(ValueError, match="holds no label of oedema"):
+            from_files(files["t1"], files["labels"], {"oedema": 7, "background": [11, 12, 13]})
+
+    def test_the_rest_goes_on_beyond_the_grid_of_the_labels(self, files, tmp_path):
+        """Labels that were cropped to the tumour, on a background that is no part of the organ."""
+        tumour = np.full((2, 2, 3), 5, np.int16)
+        tumour[0, 0, 0], tumour[1, 1, 2] = 0, 9
+        affine = np.diag([2.0, 2.0, 2.0, 1.0])
+        affine[:3, 3] = 4.0
+        nib.save(nib.Nifti1Image(tumour, affine), tmp_path / "tumour.nii")
+        table = {"brain": 0, "tumour": 5, "background": 9}
+        tissue = np.asarray(from_files(files["t1"], tmp_path / "tumour.nii", table, files["inside"]).tissue.voxels)
+        assert (tissue[2:4, 2:4, 2:5] == np.where(tumour == 5, 2, np.where(tumour == 9, 0, 1))).all()
+        assert tissue[1, 1, 1] == 1
+        assert tissue[0, 0, 0] == 0
+
     def test_zero_is_the_rest_of_the_mask(self, files, tmp_path):
         """A mask on a finer grid: what has no label is the organ within it and nothing beyond."""
         inside = np.zeros((12, 12, 12), np.uint8)
