@@ -8,8 +8,8 @@ from pathlib import Path
 
 from bayesreg.tissues import BACKGROUND, ORGAN
 
-# FreeSurfer's aseg and aparc+aseg (FreeSurferColorLUT.txt), and SynthSeg, which takes its values from there. Brainstem,
-# ventral diencephalon and optic chiasm are mixtures: the first and the last count as white matter.
+# FreeSurfer's aseg, aparc+aseg, aparc.a2009s+aseg and wmparc (FreeSurferColorLUT.txt), and SynthSeg, which takes its
+# values from there. Brainstem, ventral diencephalon and optic chiasm are mixtures: the first and the last count as WM.
 _FREESURFER = {
     "csf": (4, 5, 14, 15, 24, 31, 43, 44, 63, 72),
     "gm": (
@@ -18,12 +18,17 @@ _FREESURFER = {
         *(80, 81, 82),
         *range(1000, 1036),
         *range(2000, 2036),
+        *range(11100, 11176),
+        *range(12100, 12176),
     ),
     "wm": (
         *(2, 7, 16, 30, 41, 46, 62, 77, 78, 79, 85),
         *range(251, 256),
         *range(3000, 3036),
         *range(4000, 4036),
+        *range(13100, 13176),
+        *range(14100, 14176),
+        192,
         *(5001, 5002),
     ),
 }

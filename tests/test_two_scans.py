@@ -17,6 +17,7 @@ from bayesreg.io.quality import edge_lengths
 from bayesreg.report.panels import View, ignored
 from bayesreg.report.slices import planes_through
 from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
+from bayesreg.workflow.assembly import _observations
 from bayesreg.workflow.preparation import prepare
 from tests.io.test_alignment import FIXED, MASK, motion
 from tests.phantoms import ball_mesh
@@ -149,6 +150,19 @@ def test_what_is_hatched_goes_with_the_displacement(result):
         there = np.rint(mask.world_to_voxel(plane.points()[inside] + u[inside])).astype(int)
         there = np.clip(there, 0, np.array(mask.shape) - 1)
         np.testing.assert_array_equal(warped[inside], np.asarray(mask.voxels)[tuple(there.T)] != 0)
+
+
+def test_a_channel_on_another_grid_has_the_tissues_where_they_are(result, folder):
+    """The same image stored backwards along its first axis, of the same shape."""
+    config = br.load_config(folder / "run.yaml")
+    inputs = store.read_inputs(folder / "out")
+    channel = inputs.channels["flair"]
+    affine = channel.fixed.affine.copy()
+    affine[:3, 3] = channel.fixed.voxel_to_world(np.array([channel.fixed.shape[0] - 1.0, 0, 0]))
+    affine[:3, 0] *= -1
+    backwards = channel._replace(fixed=br.Image(np.asarray(channel.fixed.voxels)[::-1], affine))
+    first, second = _observations(config, inputs._replace(channels={"flair": backwards}))[:2]
+    np.testing.assert_array_equal(np.asarray(second.tissue.voxels)[::-1], first.tissue.voxels)
 
 
 def test_the_headers_are_kept_where_one_says_so(folder):

@@ -99,13 +99,28 @@ def _displacements(
     return vectors if code == DISPLACEMENT_INTENT else vectors * TO_RAS
 
 
+def _whole_field(transform: SimpleITK.Transform) -> SimpleITK.Image:
+    """The displacement of one of ITK's transforms; of a composite one on the grid of the field that it holds."""
+    if transform.GetName() != "CompositeTransform":
+        return SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
+    parts = SimpleITK.CompositeTransform(transform)
+    every = [parts.GetNthTransform(k) for k in range(parts.GetNumberOfTransforms())]
+    inner = [one for one in every if one.GetName() == "DisplacementFieldTransform"]
+    if len(inner) != 1:
+        raise RuntimeError(f"a composite of {len(inner)} fields")
+    grid = SimpleITK.DisplacementFieldTransform(inner[0]).GetDisplacementField()
+    if len(every) == 1:
+        return grid
+    where = grid.GetSize(), grid.GetOrigin(), grid.GetSpacing(), grid.GetDirection()
+    return SimpleITK.TransformToDisplacementField(transform, SimpleITK.sitkVectorFloat64, *where)
+
+
 def _transform_field(path: Path) -> Volume:
     """The displacement field of one of ITK's transforms."""
     if not path.is_file():
         raise InputError(f"displacement field {path}: there is no such file")
     try:
-        transform = SimpleITK.ReadTransform(str(path))
-        field = SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
+        field = _whole_field(SimpleITK.ReadTransform(str(path)))
     except RuntimeError as error:
         raise InputError(f"{path} holds no displacement field as ITK writes it, or is damaged") from error
     return from_itk(field)

@@ -23,7 +23,7 @@ SUFFIXES = (".mif", ".mif.gz", ".mih")
 FIRST_LINE = b"mrtrix image"
 # A header that is longer is none.
 LONGEST_HEADER = 1_000_000
-_TYPES = {"Int": "i", "UInt": "u", "Float": "f"}
+_TYPES = {"int": "i", "uint": "u", "float": "f"}
 
 
 def is_mrtrix(path: Path) -> bool:
@@ -43,12 +43,8 @@ def read_mrtrix(path: Path) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
     try:
         header, length = _header(content)
         shape = tuple(int(count) for count in header["dim"][0].split(","))
-        place, _, offset = header["file"][0].partition(" ")
-        source = content if place == "." else _content(path.parent / place)
-        first = int(offset or 0)
-        if place == "." and first < length:
-            raise ValueError(f"its voxels begin at {first}, within the header")
-        voxels = _voxels(source[first:], shape, header["layout"][0], header["datatype"][0])
+        stored = b"".join(_stored(path, content, length, place) for place in header["file"])
+        voxels = _voxels(stored, shape, header["layout"][0], header["datatype"][0])
         if "scaling" in header:
             shift, factor = (float(number) for number in header["scaling"][0].split(","))
             voxels = shift + factor * voxels if (shift, factor) != (0, 1) else voxels
@@ -56,7 +52,19 @@ def read_mrtrix(path: Path) -> tuple[np.ndarray, Float[np.ndarray, "4 4"]]:
     except (KeyError, IndexError) as error:
         raise InputError(f"image {path} cannot be read: its header lacks {error}") from error
     except ValueError as error:
-        raise InputError(f"image {path} cannot be read: {error}") from error
+        raise InputError(f"image {path} cannot be read, its header or content is damaged: {error}") from error
+
+
+def _stored(path: Path, content: bytes, length: int, place: str) -> bytes:
+    """The voxels that a line `file:` names: here or in another file, from an offset on."""
+    known = re.fullmatch(r"(.*?)(?:\s+(\d+))?", place)
+    assert known is not None
+    name, first = known[1], int(known[2] or 0)
+    if name == ".":
+        if first < length:
+            raise ValueError(f"its voxels begin at {first}, within the header")
+        return content[first:]
+    return _content(path.parent / name)[first:]
 
 
 def _content(path: Path) -> bytes:
@@ -70,7 +78,8 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     """The values of every key, in their order, and the length of the header."""
     if not content.startswith(FIRST_LINE):
         raise ValueError("it does not begin as MRtrix's images do")
-    end = content.find(b"\nEND", 0, LONGEST_HEADER)
+    last = re.compile(rb"\nEND[ \t\r]*(?=\n|\Z)").search(content, 0, LONGEST_HEADER)
+    end = last.start() if last else -1
     if end < 0 and len(content) < LONGEST_HEADER:
         # A header whose voxels lie in another file ends with its own.
         end = len(content)
@@ -80,12 +89,12 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     for line in content[:end].decode("utf-8", errors="replace").splitlines()[1:]:
         key, _, value = line.partition(":")
         found[key.strip().lower()].append(value.strip())
-    return dict(found), end + len(b"\nEND")
+    return dict(found), last.end() if last else end
 
 
 def _voxels(content: bytes, shape: tuple[int, ...], layout: str, datatype: str) -> np.ndarray:
-    known = re.fullmatch(r"(Int|UInt|Float)(8|16|32|64)(LE|BE)?", datatype)
-    if known is None and datatype != "Bit":
+    known = re.fullmatch(r"(int|uint|float)(8|16|32|64)(le|be)?", datatype.lower())
+    if known is None and datatype.lower() != "bit":
         raise ValueError(f"its voxels are {datatype}; expected whole or real numbers")
     signs = re.findall(r"([+-]?)(\d+)", layout)
     ranks = [int(rank) for _, rank in signs]
@@ -97,7 +106,7 @@ def _voxels(content: bytes, shape: tuple[int, ...], layout: str, datatype: str) 
         flat = np.unpackbits(np.frombuffer(content[: -(-count // 8)], np.uint8))[:count]
     else:
         kind, bits, order = known.groups()
-        numbers = np.dtype(f"{'>' if order == 'BE' else '<'}{_TYPES[kind]}{int(bits) // 8}")
+        numbers = np.dtype(f"{'>' if order == 'be' else '<'}{_TYPES[kind]}{int(bits) // 8}")
         flat = np.frombuffer(content[: count * numbers.itemsize], numbers) if content else np.zeros(0)
         flat = flat.astype(numbers.newbyteorder("="))
     if len(flat) < count:

@@ -272,7 +272,7 @@ def _read_dicom(folder: Path) -> Volume:
         listed = f": {', '.join(series)}" if series else ""
         raise InputError(f"the folder {folder} holds {len(series)} DICOM series{listed}; expected one")
     names = SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(str(folder), series[0])
-    if left := sorted({str(path) for path in folder.glob("*.dcm")} - set(names)):
+    if left := sorted({str(path) for path in folder.iterdir() if _looks_like_dicom(path)} - set(names)):
         raise InputError(
             f"{left[0]} cannot be read as part of the DICOM series in its folder; mend it, or take it away"
         )
@@ -291,6 +291,16 @@ def _read_dicom(folder: Path) -> Volume:
     affine = volume.affine.copy()
     affine[:3, 2], affine[:3, 3] = LPS[:3, :3] @ step, LPS[:3, :3] @ places[0]
     return volume._replace(affine=affine)
+
+
+def _looks_like_dicom(path: Path) -> bool:
+    """By its name, or the four letters that begin its content."""
+    if not path.is_file() or path.name.upper() == "DICOMDIR":
+        return False
+    if path.name.lower().endswith(".dcm"):
+        return True
+    with path.open("rb") as file:
+        return file.read(132)[128:] == b"DICM"
 
 
 def _series(names: tuple[str, ...], folder: Path) -> Volume:

@@ -185,7 +185,7 @@ def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched 
     if matched is None or not isinstance(config.data, FilesData):
         return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
     one_contrast = matched.matching.one_contrast and config.model.similarity not in OF_ANY_CONTRAST
-    one_scale = one_contrast and config.data.same_contrast is True and config.model.intensity_map is None
+    one_scale = one_contrast and config.data.same_contrast is True
     found = appraise(
         anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale, anatomy.intracranial
     )

@@ -129,7 +129,7 @@ def _describe_organ(data: FilesData) -> str:
 
 def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], str]:
     """A table, and where it is from."""
-    if table is not None:
+    if table not in (None, "mask"):
         if table in TABLES:
             return TABLES[table], table
         if not Path(table).is_file():

@@ -8,9 +8,10 @@ import pytest
 import SimpleITK
 
 import bayesreg as br
-from bayesreg.io.displacements import read_boundary
+from bayesreg.io.displacements import read_boundary, read_start
 from bayesreg.io.fields import load_displacement, save_displacement
 from bayesreg.model.warp import nodal_field_on_grid
+from bayesreg.pose import Motion, Pose
 from tests.phantoms import ball_mesh, rotated_affine
 
 MESH = ball_mesh(spacing=24.0)
@@ -51,6 +52,21 @@ def test_nodes_of_a_run_are_taken_as_they_are(tmp_path):
     np.savez(tmp_path / "u.npz", u=u)
     for name in ("mesh.vtu", "u.npz"):
         np.testing.assert_allclose(read_boundary(tmp_path / name, MESH), u[MESH.boundary], rtol=1e-12)
+
+
+def test_a_field_may_be_where_chains_start(tmp_path):
+    """At every node, and less the pose, by which the moving image is laid into the world of the fixed one."""
+    image, pose = grid(), Motion(np.array([4.0, -3.0, 2.0]), np.array([5.0, 0.0, -8.0])).pose(np.zeros(3))
+    save_displacement(tmp_path / "u.nii.gz", affine_field(image.grid_points()), image.affine)
+    np.testing.assert_allclose(
+        read_start(tmp_path / "u.nii.gz", MESH, Pose.identity()), affine_field(MESH.points), atol=1e-4
+    )
+    there = MESH.points + affine_field(MESH.points)
+    for found, nodes in (
+        (read_start(tmp_path / "u.nii.gz", MESH, pose), slice(None)),
+        (read_boundary(tmp_path / "u.nii.gz", MESH, pose), MESH.boundary),
+    ):
+        np.testing.assert_allclose(pose.place(MESH.points[nodes] + found), there[nodes], atol=1e-4)
 
 
 def test_a_field_that_ends_at_the_boundary_is_refused(tmp_path):

@@ -94,6 +94,18 @@ def test_an_affine_transform_is_no_field(tmp_path):
         load_displacement(tmp_path / "a.tfm")
 
 
+def test_a_composite_of_a_rigid_motion_and_a_field_is_one_field(tmp_path):
+    """As ANTs writes it: points go through the last that was added first."""
+    rigid = SimpleITK.Euler3DTransform((0.0, 0.0, 0.0), 0.1, -0.05, 0.2, (3.0, -2.0, 1.0))
+    whole = SimpleITK.CompositeTransform([rigid, SimpleITK.DisplacementFieldTransform(itk_field())])
+    SimpleITK.WriteTransform(whole, str(tmp_path / "both.h5"))
+    found = load_displacement(tmp_path / "both.h5")
+    voxel = np.array([2, 2, 1])
+    point = found[0].voxel_to_world(voxel.astype(float))
+    expected = np.array(whole.TransformPoint((point * LPS).tolist())) * LPS - point
+    np.testing.assert_allclose([float(one.voxels[tuple(voxel)]) for one in found], expected, atol=1e-6)
+
+
 def test_file_holds_lps_vectors(tmp_path):
     save_displacement(tmp_path / "u.nii.gz", np.tile(VECTOR, (*SHAPE, 1)), np.eye(4))
     source = nib.load(tmp_path / "u.nii.gz")

@@ -66,9 +66,19 @@ def test_voxels_in_a_file_of_their_own_with_a_scaling(tmp_path):
     begin = len(BACKWARDS) - 48
     assert voxels[-48:] == BACKWARDS[begin:]
     (tmp_path / "image.dat").write_bytes(BACKWARDS[begin:])
-    own = header.replace(b"file: . 424", b"scaling: 10,0.5\nfile: image.dat") + b"\n"
+    own = header.replace(b"file: . 424", b"scaling: 10,0.5\nENDOSCOPY: no\nfile: image.dat") + b"\n"
     (tmp_path / "image.mih").write_bytes(own)
     check(tmp_path / "image.mih", 10 + 0.5 * VOXELS)
+    for name, part in (
+        ("my first.dat", BACKWARDS[begin : begin + 20]),
+        ("my second.dat", b"xx" + BACKWARDS[begin + 20 :]),
+    ):
+        (tmp_path / name).write_bytes(part)
+    parts = own.replace(b"file: image.dat", b"file: my first.dat\nfile: my second.dat 2").replace(
+        b"Int16LE", b"int16le"
+    )
+    (tmp_path / "parts.mih").write_bytes(parts)
+    check(tmp_path / "parts.mih", 10 + 0.5 * VOXELS)
 
 
 def test_numbers_that_begin_with_the_greatest_byte(tmp_path):
@@ -94,7 +104,7 @@ def test_labels_lie_where_those_of_nifti_do(tmp_path):
         (b"mrtrix tracks\nEND\n", "does not begin as MRtrix's images do"),
         (BACKWARDS.replace(b"Int16LE", b"CFloat32LE"), "its voxels are CFloat32LE"),
         (BACKWARDS.replace(b"-1,+2,-0", b"-1,+1,-0"), "the layout"),
-        (BACKWARDS.replace(b"dim: 2,3,4", b"dim: 2,x,4"), "invalid literal"),
+        (BACKWARDS.replace(b"dim: 2,3,4", b"dim: 2,x,4"), "its header or content is damaged"),
         (BACKWARDS.replace(b"file: . 424", b"file: . 4"), "within the header"),
         (BACKWARDS.replace(b"file: . 424", b"file: elsewhere"), "elsewhere"),
     ],

@@ -120,6 +120,17 @@ def test_a_slice_that_cannot_be_read_is_named(tmp_path):
         read_volume(folder)
 
 
+def test_nor_is_one_without_an_ending_left_out(tmp_path):
+    folder = dicom(tmp_path / "series")
+    for path in sorted(folder.iterdir()):
+        path.rename(path.with_suffix(""))
+    np.testing.assert_array_equal(read_volume(folder).voxels, VOXELS)
+    last = max(folder.iterdir(), key=lambda path: path.name.split("_")[1])
+    last.write_bytes(last.read_bytes()[:140])
+    with pytest.raises(ValueError, match=rf"{last.name} cannot be read as part of"):
+        read_volume(folder)
+
+
 def test_one_slice_is_no_volume(tmp_path):
     folder = dicom(tmp_path / "series")
     with pytest.raises(ValueError, match="is one slice; give the folder"):

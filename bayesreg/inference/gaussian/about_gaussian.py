@@ -159,9 +159,7 @@ def about_gaussian(
         modes = [np.asarray(gaussian.centre) for gaussian in found.gaussians]
         about = [recentre(target, gaussian, [mode]) for gaussian, mode in zip(found.gaussians, modes, strict=True)]
         setups = [setup_about(target, gaussian, mode) for gaussian, mode in zip(about, modes, strict=True)]
-        starts = [_scatter(target, setup, mode, keys) for setup, mode in zip(setups, modes, strict=True)]
-        own = jnp.asarray(found.chains), jnp.arange(len(keys))
-        points = jax.tree.map(lambda *x: jnp.stack(x)[own], *starts)
+        points = _scatter_all(target, setups, modes, np.asarray(found.chains), keys)
         if tuning is None:
             return setups[0]._replace(stand_in=make_stand_in(target, about[0], modes[0])), points
         return _warm_up(walk, tuning, alone, modes[0], points, key_tune, say)
@@ -268,6 +266,20 @@ def _setup_on_average(target: Target, mode: AnyArray, points: Any, alone: int = 
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
     return setup_about(target, average_gaussian(target, places), np.mean(places, axis=0), np.zeros(alone, int))
+
+
+def _scatter_all(
+    target: Target, setups: list[Setup], modes: list[np.ndarray], chains: np.ndarray, keys: AnyArray
+) -> Any:
+    """Where each chain starts, about the mode of the number that `chains` has for it."""
+    starts, order = [], []
+    for number, (setup, mode) in enumerate(zip(setups, modes, strict=True)):
+        own = np.flatnonzero(chains == number)
+        if len(own):
+            starts.append(_scatter(target, setup, jnp.asarray(mode), keys[own]))
+            order.append(own)
+    back = np.argsort(np.concatenate(order))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[back], *starts)
 
 
 def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> Any:
