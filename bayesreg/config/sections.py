@@ -46,7 +46,7 @@ class StartConfig(Section):
 
     field: Annotated[Literal["identity", "truth", "demons"] | Path, BeforeValidator(find_field)] = "identity"
     """identity, truth (of a synthetic pair), demons (of the pair of images, which must be of one contrast), or a file
-    with a displacement of every node (.npz, .vtu)."""
+    with a displacement of every node (.npz, .vtu) or a field on a grid (NIfTI, NRRD, MetaImage, ITK's transforms)."""
     fraction: Range = (0.0, 1.0)
     """Every chain starts at its own fraction of the field, evenly spread from the first to the second."""
     lam: Positive | ByTissue | None = None
