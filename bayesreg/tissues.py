@@ -7,7 +7,6 @@ are named.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -62,11 +61,6 @@ FLUID = 0.01
 BACKGROUND = "background"
 # The one tissue of an organ without labels.
 ORGAN = "organ"
-
-
-def size_beside_brain(volume: float) -> float:
-    """The size of a body, mm³, beside a human brain: the ratio of the cube roots of the volumes; 0.07 for a mouse's."""
-    return math.cbrt(volume / BRAIN_VOLUME)
 
 
 def is_fluid(name: str) -> bool:

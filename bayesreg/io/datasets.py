@@ -27,7 +27,7 @@ from bayesreg.io.volumes import (
     on_grid_of,
 )
 from bayesreg.label_tables import REST, TABLES
-from bayesreg.tissues import BRAIN, ORGAN, tissue_names
+from bayesreg.tissues import BRAIN, ORGAN, is_fluid, tissue_names
 from bayesreg.types import DATA_FOLDER, InputError
 
 __all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_files", "mni152", "without_labels"]
@@ -182,6 +182,8 @@ def _tissues_there(tissue: Image, table: LabelTable, path: str | Path) -> tuple[
     if len(kept) == len(names):
         return tissue, names
     absent = [name for index, name in enumerate(names, start=1) if index not in present]
+    if all(is_fluid(names[index - 1]) for index in kept):
+        raise InputError(f"label file {path} holds no label of {' and '.join(absent)}, and so nothing solid")
     _log.warning("label file %s holds no label of %s, and the organ goes without", path, " and ".join(absent))
     number = np.zeros(len(names) + 1, np.int8)
     number[kept] = np.arange(1, len(kept) + 1)

@@ -11,14 +11,12 @@ from bayesreg.interpolation import Interpolation
 from bayesreg.model.image_pair import ImagePair
 from bayesreg.model.program import Problem
 from bayesreg.model.terms.elastic import SCALES
-from bayesreg.tissues import size_beside_brain
 
 Made = TypeVar("Made")
 
-# Sd of the smoothing, mm in an organ of the size of a human brain, and factors on T_s and T_r of the problems that lead
-# to the posterior's mode. Three stages instead of seven left single nodes of the paper's pair in wrong places, up to 15
-# mm off. A first stage of ten times the T_r folded a few tetrahedra of three in thirteen calibrated pairs, for good,
-# with nodes about 30 mm off.
+# Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
+# instead of seven left single nodes of the paper's pair in wrong places, up to 15 mm off. A first stage of ten times
+# the T_r folded a few tetrahedra of three in thirteen calibrated pairs, for good, with nodes about 30 mm off.
 SMOOTHING = (
     (6.0, 30.0, 0.001), (4.0, 30.0, 0.02), (3.0, 20.0, 0.03), (2.0, 10.0, 0.05), (1.5, 5.0, 0.1), (1.0, 3.0, 0.3),
     (0.5, 1.0, 1.0),
@@ -30,17 +28,15 @@ def continuation(
 ) -> Iterator[Problem]:
     """Every problem, each to be solved for the displacements alone.
 
-    Images smoothed by 6 mm and less and less (in proportion in organs of another size), with a warmer similarity and a
-    colder elastic prior: a displacement of many times its posterior standard deviation is found step by step. The last
-    is the posterior's own. Where no node is sampled there is none, and without images, no easier one.
+    Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement of
+    many times its posterior standard deviation is found step by step. The last is the posterior's own. Where no node is
+    sampled there is none, and without images, no easier one.
     """
     pairs = {name: pair for name, pair in observations.items() if isinstance(pair, ImagePair)}
     if not len(problem.body.slots):
         return
     if pairs:
-        size = size_beside_brain(float(problem.body.mesh.mesh.volumes.sum()))
-        stages = [(size * sd, similarity, elastic) for sd, similarity, elastic in SMOOTHING]
-        yield from _ahead([partial(_ease, problem, pairs, interpolation, *stage) for stage in stages])
+        yield from _ahead([partial(_ease, problem, pairs, interpolation, *stage) for stage in SMOOTHING])
     yield problem
 
 

@@ -48,9 +48,9 @@ from bayesreg.types import AnyArray, InputError
 
 # Chains start that much wider than Laplace's approximation.
 OVERDISPERSION = 1.5
-# But no chain starts where the log density is less than at the mode by more than this for each unknown; of a Gaussian
-# it is half the square of the above. Where tetrahedra are squeezed at the mode, wide draws turn some inside out, and
-# behind the barrier no step is short enough to lead out.
+# But, where it can, no chain starts where the log density is less than at the mode by more than this for each unknown;
+# of a Gaussian it is half the square of the above. Where tetrahedra are squeezed at the mode, wide draws turn some
+# inside out, and behind the barrier no step is short enough to lead out.
 DEEPEST = 10.0
 
 # A Gaussian is averaged over the mode and the places of so many chains at most: each costs a curvature.
@@ -288,24 +288,33 @@ def _scatter(target: Target, setup: Setup, mode: AnyArray, keys: AnyArray) -> An
     Raises
     ------
     InputError
-        If a chain finds no place in the support, or none but where the density is next to nothing.
+        If a chain finds no place in the support.
     """
     width, begin = np.full(len(keys), OVERDISPERSION), whiten(setup.gaussian, jnp.asarray(mode))
     plain = without_normaliser(target, target.data)
     lowest = height_and_slope(target, plain, np.asarray(mode))[0] - DEEPEST * dimension(target)
+    best, heights = None, np.full(len(keys), -np.inf)
     for _ in range(10):
         points, done = jax.vmap(partial(_start, target, target.data, setup, begin))(keys, jnp.asarray(width))
         flats = np.asarray(jax.vmap(partial(flat_position, target, target.data))(points))
-        heights = np.array([height_and_slope(target, plain, flat)[0] for flat in flats])
-        done = np.asarray(done) & (heights > lowest)
-        if done.all():
-            return points
-        # A flight that is caught in a corner of the skull does not end; a shorter one may, and leads less far down.
-        width = np.where(done, width, width / 2)
-    raise InputError(
-        f"{int((~done).sum())} of {len(keys)} chains find no start near the mode: wherever they are put they lie in "
-        "the skull, or where the density is next to nothing"
-    )
+        found = np.array([height_and_slope(target, plain, flat)[0] for flat in flats])
+        higher = np.asarray(done) & (np.nan_to_num(found, nan=-np.inf) > heights)
+        heights = np.where(higher, found, heights)
+        best = points if best is None else jax.tree.map(partial(_choose, higher), points, best)
+        if (heights > lowest).all():
+            return best
+        # A flight that is caught in a corner of the skull does not end; a shorter one may, and leads less far down. Not
+        # to the mode itself: where walls hold it, the Gaussian's centre lies beyond them.
+        width = np.where(heights > lowest, width, width / 2)
+    if np.isfinite(heights).all():
+        return best
+    lost = int((~np.isfinite(heights)).sum())
+    raise InputError(f"{lost} of {len(keys)} chains find no start near the mode outside the skull")
+
+
+def _choose(which: np.ndarray, one: AnyArray, other: AnyArray) -> AnyArray:
+    """The first where it is marked, the other elsewhere, along the leading axis."""
+    return jnp.where(which.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
 @partial(jax.jit, static_argnums=0)
