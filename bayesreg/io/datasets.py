@@ -159,12 +159,12 @@ def from_files(
     if intracranial_path is not None:
         given, grid_path = load_mask(intracranial_path), labels_path if image_path is None else image_path
         mask = _on_grid(tissue, grid_path, given, intracranial_path, ("label", "intracranial"))
-    if rest is not None:
-        if mask is None:
-            raise InputError(
-                f"{rest} is what has no label in {labels_path}, and nothing says where it ends; give a mask of the "
-                "organ as intracranial"
-            )
+    if rest is not None and mask is None:
+        raise InputError(
+            f"{rest} is what has no label in {labels_path}, and nothing says where it ends; give a mask of the organ "
+            "as intracranial"
+        )
+    if rest is not None and mask is not None:
         voxels = np.where((np.asarray(tissue.voxels) == 0) & (np.asarray(mask.voxels) != 0), index, tissue.voxels)
         tissue = tissue.with_voxels(np.maximum(voxels, 0).astype(np.int8))
     present = np.unique(tissue.voxels)
@@ -176,12 +176,15 @@ def from_files(
 
 
 def _tissues_there(tissue: Image, table: LabelTable, path: str | Path) -> tuple[Image, tuple[str, ...]]:
-    """Labels without the tissues of a table that none of them belongs to, as tables for many people have some."""
+    """Labels without the tissues of a table that none of them belongs to, as tables for many people have some.
+
+    The rest of the mask stays: where labels are cropped, it may lie beyond them.
+    """
     names, present = tissue_names(table), set(np.unique(tissue.voxels).tolist())
-    kept = [index for index in range(1, len(names) + 1) if index in present]
+    kept = [k for k, name in enumerate(names, start=1) if k in present or REST in np.atleast_1d(table[name])]
     if len(kept) == len(names):
         return tissue, names
-    absent = [name for index, name in enumerate(names, start=1) if index not in present]
+    absent = [name for index, name in enumerate(names, start=1) if index not in kept]
     if all(is_fluid(names[index - 1]) for index in kept):
         raise InputError(f"label file {path} holds no label of {' and '.join(absent)}, and so nothing solid")
     _log.warning("label file %s holds no label of %s, and the organ goes without", path, " and ".join(absent))

@@ -17,7 +17,7 @@ from bayesreg.types import InputError
 
 # Files of displacements of the nodes of a mesh; all others hold a field on a grid.
 NODAL_SUFFIXES = (".npz", ".vtu")
-NOWHERE_ELSE = Pose.identity()
+IDENTITY = Pose.identity()
 # A field ends where zeros beside a place take away more than this of it, mm.
 ENDS = 0.25
 
@@ -47,7 +47,7 @@ def read_start(path: Path, mesh: TetMesh, pose: Pose) -> Float[np.ndarray, "node
     InputError
         As `read_displacement` and `bayesreg.io.fields.load_displacement`.
     """
-    if not is_volume(path):
+    if not _is_volume(path):
         return read_displacement(path, mesh)
     there = np.stack([np.asarray(one.interpolate(mesh.points)) for one in load_displacement(path)], axis=1)
     return pose.inverse.place(mesh.points + there) - mesh.points
@@ -84,10 +84,10 @@ def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarr
 
 def require_displacement(path: Path, mesh: TetMesh | None = None) -> None:
     """Raise InputError if a file holds no displacement, of nodes (.npz, .vtu) or on a grid."""
-    load_displacement(path) if is_volume(path) else read_displacement(path, mesh)
+    load_displacement(path) if _is_volume(path) else read_displacement(path, mesh)
 
 
-def read_boundary(path: Path, mesh: TetMesh, pose: Pose = NOWHERE_ELSE) -> Float[np.ndarray, "boundary 3"]:
+def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.ndarray, "boundary 3"]:
     """Displacement of the boundary nodes from a file of all nodes (.npz, .vtu) or a displacement field on a grid.
 
     Parameters
@@ -104,7 +104,7 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = NOWHERE_ELSE) -> Float
         If the file holds no displacement or one for another mesh, the field's grid does not reach the boundary,
         or the field ends there: it jumps to zero.
     """
-    if not is_volume(path):
+    if not _is_volume(path):
         return read_displacement(path, mesh)[mesh.boundary]
     components = load_displacement(path)
     places = mesh.points[mesh.boundary]
@@ -128,7 +128,7 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = NOWHERE_ELSE) -> Float
     return pose.inverse.place(places + found) - places
 
 
-def is_volume(path: Path) -> bool:
+def _is_volume(path: Path) -> bool:
     """Tell a field on a grid from displacements of nodes, by its name."""
     return not path.name.lower().endswith(NODAL_SUFFIXES)
 

@@ -125,9 +125,7 @@ def ignored(view: View, plane: Plane) -> tuple[np.ndarray, np.ndarray, np.ndarra
     moved = points + np.nan_to_num(view.slice(plane).nodal(run.u_mean))
     masks = (run.fixed_ignore, points), (run.moving_ignore, points), (run.moving_ignore, moved)
     nothing = np.zeros(points.shape[:-1], bool)
-    fixed, moving, warped = (
-        nothing if mask is None else sample(mask, places, order=0, outside=0.0) != 0 for mask, places in masks
-    )
+    fixed, moving, warped = (nothing if mask is None else mask.nearest(places) != 0 for mask, places in masks)
     return fixed, moving, warped
 
 

@@ -19,7 +19,7 @@ from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels
-from bayesreg.io.displacements import NOWHERE_ELSE, read_boundary, require_displacement
+from bayesreg.io.displacements import IDENTITY, read_boundary, require_displacement
 from bayesreg.io.domain import size_of_solid, without_ridges
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
@@ -96,7 +96,7 @@ def prepare(config: Config) -> Prepared:
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     if isinstance(config.data, FilesData):
-        pose = NOWHERE_ELSE if matched is None else matched.matching.pose
+        pose = IDENTITY if matched is None else matched.matching.pose
         boundary = _known_boundary(config, mesh, pose=pose)
         inputs = Inputs(
             resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points,
@@ -234,7 +234,7 @@ def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
 
 
 def _known_boundary(
-    config: Config, mesh: TetMesh, truth: Truth | None = None, pose: Pose = NOWHERE_ELSE
+    config: Config, mesh: TetMesh, truth: Truth | None = None, pose: Pose = IDENTITY
 ) -> Float[np.ndarray, "boundary 3"] | None:
     """u_B where the configuration gives it, mm; see `read_boundary`."""
     if config.known_boundary is None:

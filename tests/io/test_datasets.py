@@ -132,6 +132,10 @@ class TestFromFiles:
         assert (tissue[2:4, 2:4, 2:5] == np.where(tumour == 5, 2, np.where(tumour == 9, 0, 1))).all()
         assert tissue[1, 1, 1] == 1
         assert tissue[0, 0, 0] == 0
+        nib.save(nib.Nifti1Image(np.full((2, 2, 3), 5, np.int16), affine), tmp_path / "full.nii")
+        whole = from_files(files["t1"], tmp_path / "full.nii", {"brain": 0, "tumour": 5}, files["inside"])
+        assert whole.names == ("brain", "tumour")
+        assert whole.tissue.voxels[1, 1, 1] == 1
 
     def test_zero_is_the_rest_of_the_mask(self, files, tmp_path):
         """A mask on a finer grid: what has no label is the organ within it and nothing beyond."""
