@@ -28,6 +28,7 @@ from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.target import logdensity, without_walls
 from bayesreg.io import store
 from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.preparation import PROVENANCE
 
 REPEATS = 5
 CHAINS = (1, 4, 16, 64, 256, 1024, 4096)
@@ -44,7 +45,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=3.0, help="of each run that samples")
     given = parser.parse_args()
     device, inputs = jax.devices()[0], store.read_inputs(given.run)
-    posterior = posterior_of(br.load_config(given.run / "config.yaml"), inputs)
+    # A run knows how many points are independent; a simulated pair has yet to find out.
+    known = store.read_json(given.run / PROVENANCE).get("independent_points")
+    posterior = posterior_of(br.load_config(given.run / "config.yaml"), inputs, (), known)
     print(f"{device.device_kind} ({device.platform}), JAX {jax.__version__}", flush=True)
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.mesh.cells)} elements, {len(posterior.sampled)} sampled")
     if given.chains:
