@@ -39,6 +39,7 @@ _HOME = {
     "build_mesh": "io.meshing",
     "load_mesh": "io.meshing",
     "save_mesh": "io.meshing",
+    "apply": "workflow.apply",
     "load_config": "config",
     "load_result": "workflow.result",
     "run": "workflow.run",

@@ -2,7 +2,7 @@
 
 import errno
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
@@ -84,6 +84,32 @@ Overrides = Annotated[
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with the run that DIR holds; a finished one needs a larger budget.")
+]
+PointsFile = Annotated[
+    Path | None,
+    typer.Option("--points", metavar="FILE", help="Points: CSV with x, y, z (RAS, mm), .fcsv, .mrk.json or .tag."),
+]
+ImageFile = Annotated[Path | None, typer.Option("--image", metavar="FILE", help="An image.")]
+LabelsFile = Annotated[Path | None, typer.Option("--labels", metavar="FILE", help="Labels, carried as probabilities.")]
+SurfaceFile = Annotated[
+    Path | None,
+    typer.Option("--mesh", metavar="FILE", help="A surface or lines: .vtk, .vtp, .vtu, .stl, .ply or .obj."),
+]
+Inverse = Annotated[bool, typer.Option("--inverse", help="From the world of MOVING to that of FIXED.")]
+Around = Annotated[
+    Literal["harmonic", "missing"],
+    typer.Option("--around", help="Around the mesh the displacement goes on harmonically, or is missing."),
+]
+Like = Annotated[
+    Path | None, typer.Option("--like", metavar="FILE", help="An image on whose grid images and labels are written.")
+]
+Far = Annotated[
+    list[float] | None,
+    typer.Option("--far", metavar="MM", help="Give P(further off than this); 2 if left out; may be repeated."),
+]
+Draws = Annotated[int | None, typer.Option(help="How many draws at most; 1,000, for labels 200, if left out.")]
+Space = Annotated[
+    Literal["RAS", "LPS"] | None, typer.Option("--space", help="Of the coordinates of --mesh, where it does not say.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 Samplers = Annotated[str | None, typer.Option(metavar="NAME,NAME...", help="Which ones; all of them if left out.")]
@@ -180,6 +206,43 @@ def simulate(config: ConfigFile, out: OutFolder, overrides: Overrides = None) ->
 
     simulate(settings, out)
     typer.echo(f"Pair: {out}")
+
+
+@app.command()
+def apply(
+    folder: RunFolder,
+    out: OutFolder,
+    points: PointsFile = None,
+    image: ImageFile = None,
+    labels: LabelsFile = None,
+    mesh: SurfaceFile = None,
+    inverse: Inverse = False,
+    around: Around = "harmonic",
+    like: Like = None,
+    far: Far = None,
+    draws: Draws = None,
+    space: Space = None,
+    quiet: Quiet = False,
+) -> None:
+    """Carry points, surfaces, images or labels from the world of FIXED to that of MOVING, with what is unsure of it."""
+    from bayesreg.workflow.apply import apply
+
+    written = apply(
+        folder,
+        out,
+        points=points,
+        image=image,
+        labels=labels,
+        mesh=mesh,
+        inverse=inverse,
+        around=around,
+        like=like,
+        far=far or (2.0,),
+        draws=draws,
+        space=space,
+        say=(lambda text: None) if quiet else typer.echo,
+    )
+    typer.echo("\n".join(f"Written: {path}" for path in written))
 
 
 @app.command()

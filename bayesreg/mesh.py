@@ -77,44 +77,16 @@ class TetMesh:
         return np.bincount(self.cells.ravel(), np.repeat(self.volumes / 4, 4), len(self.points))
 
     @cached_property
-    def _faces(self) -> Int[np.ndarray, "faces 3"]:
-        """The four faces of every tetrahedron in turn, each opposite to its corner, normals outwards."""
-        return self.cells[:, FACES].reshape(-1, 3)
-
-    @cached_property
-    def _boundary_faces(self) -> Int[np.ndarray, "faces"]:
-        _, first, count = np.unique(np.sort(self._faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return first[count == 1]
-
-    @cached_property
     def boundary_faces(self) -> Int[np.ndarray, "faces 3"]:
         """Triangles that belong to exactly one tetrahedron, normals outwards."""
-        return self._faces[self._boundary_faces]
-
-    @cached_property
-    def boundary_cells(self) -> Int[np.ndarray, "faces"]:
-        """The tetrahedron of each triangle of `boundary_faces`."""
-        return self._boundary_faces // 4
-
-    @cached_property
-    def _shared_faces(self) -> Int[np.ndarray, "pairs 2"]:
-        faces = np.sort(self._faces, axis=1)
-        order = np.lexsort(faces.T)
-        shared = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
-        return np.stack([order[shared], order[shared + 1]], axis=1)
+        faces = self.cells[:, FACES].reshape(-1, 3)
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return faces[first[count == 1]]
 
     @cached_property
     def neighbours(self) -> Int[np.ndarray, "pairs 2"]:
         """Pairs of tetrahedra that share a face."""
-        return self._shared_faces // 4
-
-    @cached_property
-    def across(self) -> Int[np.ndarray, "cells 4"]:
-        """The tetrahedron beyond the face opposite to each corner; −1 where there is none."""
-        one, other = self._shared_faces.T
-        across = np.full(4 * len(self.cells), -1)
-        across[one], across[other] = other // 4, one // 4
-        return across.reshape(-1, 4)
+        return _shared_faces(self.cells) // 4
 
     @cached_property
     def boundary(self) -> Int[np.ndarray, "boundary"]:
@@ -142,6 +114,22 @@ def signed_volumes(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, 
     """Volume of every tetrahedron, mm³; negative where it is inverted."""
     corner = points[cells]
     return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+
+
+def faces_across(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "cells 4"]:
+    """The tetrahedron beyond the face opposite to each corner; −1 where there is none."""
+    one, other = _shared_faces(cells).T
+    across = np.full(4 * len(cells), -1)
+    across[one], across[other] = other // 4, one // 4
+    return across.reshape(-1, 4)
+
+
+def _shared_faces(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "pairs 2"]:
+    """Pairs of faces that are one; face 4 c + a is that of cell c opposite to its corner a."""
+    faces = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    shared = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
+    return np.stack([order[shared], order[shared + 1]], axis=1)
 
 
 def _require_shapes(points: np.ndarray, cells: np.ndarray, tissue: np.ndarray) -> None:

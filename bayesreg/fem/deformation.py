@@ -1,7 +1,6 @@
 """A displacement that is linear in every tetrahedron as a map of space, and its inverse (NumPy, on the host).
 
-Beyond the mesh the displacement goes on as that of the nearest point of its surface: the map is continuous, linear in
-the displacements of the nodes, and where the surface bends less than it is folded it has an inverse.
+Around the mesh it goes on as `bayesreg.fem.surroundings` says, so that there is an image, and a source, of every point.
 """
 
 from __future__ import annotations
@@ -12,59 +11,22 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.fem.location import CellSearch, Location, SurfaceSearch, barycentric_maps
-from bayesreg.mesh import TetMesh, signed_volumes
+from bayesreg.fem.location import CellSearch, Location, barycentric_maps
+from bayesreg.fem.surroundings import Surroundings, surround
+from bayesreg.mesh import TetMesh, faces_across, signed_volumes
 
-# A place lies in a tetrahedron where no barycentric coordinate is below minus this.
-TOLERANCE = 1e-9
+# A place lies in a tetrahedron where no barycentric coordinate is below minus this; between two that a rounding parts,
+# minus the second.
+TOLERANCE, GAP = 1e-9, 1e-4
 # Steps from tetrahedron to tetrahedron on the way to the one that holds a place.
 MOST_STEPS = 12
-# Beyond the mesh: mm between two iterates at which an inverse has been found, and how many there are at most.
-PRECISION, MOST_ITERATIONS = 1e-7, 100
+# So few places are tried in all tetrahedra.
+FEW = 100
 CHUNK = 200_000
 
 
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """How the displacement of points follows from that of the nodes.
-
-    Attributes
-    ----------
-    nodes : (k, 4) int array
-        The nodes of the tetrahedron that holds each point; beyond the mesh those of the nearest triangle, the first
-        of them twice.
-    weights : (k, 4) array
-        Their shares; a node's second one is zero.
-    cell : (k,) int array
-        The tetrahedron that holds the point, or that owns the nearest triangle.
-    beyond : (k,) array
-        Distance from the mesh, mm, zero inside.
-    """
-
-    nodes: Int[np.ndarray, "k 4"]
-    weights: Float[np.ndarray, "k 4"]
-    cell: Int[np.ndarray, "k"]
-    beyond: Float[np.ndarray, "k"]
-
-    def __call__(self, values: Float[np.ndarray, "nodes *channels"]) -> Float[np.ndarray, "k *channels"]:
-        """Values at the points of what is given at the nodes."""
-        found = self.weights[:, 0].reshape(-1, *(1,) * (values.ndim - 1)) * values[self.nodes[:, 0]]
-        for corner in range(1, 4):
-            share = self.weights[:, corner].reshape(-1, *(1,) * (values.ndim - 1))
-            found += share * values[self.nodes[:, corner]]
-        return found
-
-    @property
-    def inside(self) -> Bool[np.ndarray, "k"]:
-        """Which points lie in the mesh."""
-        return self.beyond == 0
-
-    def __getitem__(self, which: Bool[np.ndarray, "k"] | slice) -> Weights:
-        return Weights(self.nodes[which], self.weights[which], self.cell[which], self.beyond[which])
-
-
 class Deformer:
-    """Deformations of one mesh, there and back: x → x + u(x), for any displacement of its nodes.
+    """Where the points of space lie in a mesh and around it, and what displacements of its nodes do to them.
 
     Parameters
     ----------
@@ -75,53 +37,76 @@ class Deformer:
         self.mesh = mesh
 
     @cached_property
-    def _cells(self) -> CellSearch:
-        return CellSearch(self.mesh.points, self.mesh.cells, queries=CHUNK)
+    def surroundings(self) -> Surroundings:
+        """The mesh and what surrounds it."""
+        return surround(self.mesh)
 
     @cached_property
-    def _surface(self) -> SurfaceSearch:
-        return SurfaceSearch(self.mesh.points, self.mesh.boundary_faces)
+    def across(self) -> Int[np.ndarray, "all_cells 4"]:
+        """The tetrahedron beyond the face opposite to each corner; −1 where there is none."""
+        return faces_across(self.surroundings.cells)
 
-    def weights(self, points: Float[np.ndarray, "k 3"]) -> Weights:
-        """Where points lie, mm, and how they follow the nodes."""
-        mesh = self.mesh
-        cell, barycentric = self._cells(points, TOLERANCE)
-        found = Weights(mesh.cells[cell], barycentric, cell, np.zeros(len(points)))
-        out = np.flatnonzero(cell < 0)
-        if len(out):
-            face, share = self._surface(points[out])
-            triangle = mesh.boundary_faces[face]
-            found.nodes[out], found.weights[out] = triangle[:, [0, 1, 2, 0]], np.pad(share, ((0, 0), (0, 1)))
-            found.cell[out] = mesh.boundary_cells[face]
-            nearest = np.einsum("ka,kai->ki", share, mesh.points[triangle])
-            # What lies on the surface by rounding is beyond it, by next to nothing.
-            found.beyond[out] = np.maximum(np.linalg.norm(points[out] - nearest, axis=1), np.finfo(float).tiny)
-        return found
+    @cached_property
+    def _search(self) -> CellSearch:
+        return CellSearch(self.surroundings.points, self.surroundings.cells, queries=CHUNK)
 
-    def moved(self, u: Float[np.ndarray, "nodes 3"]) -> Moved:
-        """The mesh with its nodes displaced, mm, which leads back."""
-        return Moved(self, np.asarray(u, float))
+    def locate(self, points: Float[np.ndarray, "k 3"]) -> Location:
+        """Find the tetrahedron of points, mm: of the mesh, which come first, or around it; −1 beyond the sphere."""
+        return _search_twice(self._search, points)
+
+    def is_inside(self, location: Location) -> Bool[np.ndarray, "k"]:
+        """Which points lie in the mesh itself."""
+        return (location.cell >= 0) & (location.cell < len(self.mesh.cells))
+
+    def displaced(self, u: Float[np.ndarray, "nodes 3"]) -> Displaced:
+        """The mesh with its nodes displaced, mm."""
+        return Displaced(self, np.asarray(u, float))
 
 
-class Moved:
-    """A displaced mesh, which finds where its places came from.
+@dataclass(frozen=True, eq=False)
+class Displaced:
+    """A displaced mesh: it knows where points went, and where places came from.
 
     Attributes
     ----------
-    folded : int
-        How many tetrahedra are turned inside out; places in these have several sources, and get one of them.
+    deformer : Deformer
+    u : (n, 3) array
+        Displacement of every node, mm.
     """
 
-    def __init__(self, deformer: Deformer, u: Float[np.ndarray, "nodes 3"]) -> None:
-        self._of, self.u = deformer, u
-        self._points = deformer.mesh.points + u
-        self._upright = signed_volumes(self._points, deformer.mesh.cells) > 0
-        self.folded = int((~self._upright).sum())
+    deformer: Deformer
+    u: Float[np.ndarray, "nodes 3"]
 
     @cached_property
-    def _to_barycentric(self) -> Float[np.ndarray, "cells 4 4"]:
+    def _everywhere(self) -> Float[np.ndarray, "all_nodes 3"]:
+        return self.deformer.surroundings.extend(self.u)
+
+    @cached_property
+    def _points(self) -> Float[np.ndarray, "all_nodes 3"]:
+        return self.deformer.surroundings.points + self._everywhere
+
+    @cached_property
+    def _upright(self) -> Bool[np.ndarray, "all_cells"]:
+        return signed_volumes(self._points, self.deformer.surroundings.cells) > 0
+
+    @property
+    def folded(self) -> int:
+        """How many tetrahedra of the mesh are turned inside out; places in these have several sources."""
+        return int((~self._upright[: len(self.deformer.mesh.cells)]).sum())
+
+    def displacement(self, points: Float[np.ndarray, "k 3"], location: Location) -> Float[np.ndarray, "k 3"]:
+        """Displacement of points, mm, which lie where `Deformer.locate` has found them."""
+        found = _interpolate(self._everywhere, self.deformer.surroundings.cells, location)
+        far = location.cell < 0
+        if far.any():
+            around = self.deformer.surroundings
+            found[far] = around.move_rigidly(around.rigid_motion(self.u), points[far])
+        return found
+
+    @cached_property
+    def _to_barycentric(self) -> Float[np.ndarray, "all_cells 4 4"]:
         """Coordinate a of a place y in a displaced tetrahedron is row a times (1, y); NaN where it is turned over."""
-        corners = self._points[self._of.mesh.cells]
+        corners = self._points[self.deformer.surroundings.cells]
         linear = np.full((len(corners), 4, 3), np.nan)
         linear[self._upright] = barycentric_maps(corners[self._upright])
         constant = -np.einsum("mai,mi->ma", linear, corners[:, 0])
@@ -129,59 +114,58 @@ class Moved:
         return np.concatenate([constant[..., None], linear], axis=2)
 
     @cached_property
-    def _cells(self) -> tuple[CellSearch, Int[np.ndarray, "upright"]]:
+    def _search(self) -> tuple[CellSearch, Int[np.ndarray, "upright"]]:
         upright = np.flatnonzero(self._upright)
-        return CellSearch(self._points, self._of.mesh.cells[upright], queries=CHUNK), upright
-
-    @cached_property
-    def _surface(self) -> SurfaceSearch:
-        return SurfaceSearch(self._points, self._of.mesh.boundary_faces)
+        return CellSearch(self._points, self.deformer.surroundings.cells[upright], queries=CHUNK), upright
 
     def sources(
-        self,
-        places: Float[np.ndarray, "k 3"],
-        near: Weights | None = None,
-        iterations: int = MOST_ITERATIONS,
-    ) -> tuple[Float[np.ndarray, "k 3"], Weights]:
-        """The points x with x + u(x) = y, mm, and how they follow the nodes.
+        self, places: Float[np.ndarray, "k 3"], near: Location | None = None
+    ) -> tuple[Float[np.ndarray, "k 3"], Location]:
+        """The points x with x + u(x) = y, mm, and where they lie.
 
         Parameters
         ----------
         places : (k, 3) array
             y, mm.
-        near : Weights, optional
-            The sources by a displacement that differs little, where the search begins.
-        iterations : int
-            Searches for the nearest point of the surface, at most, of each source beyond the mesh. With 0 that of
-            `near` is taken, and the error is what the displacement of the surface changes over the difference of u.
+        near : Location, optional
+            Of the sources by a displacement that differs little, where the search begins.
 
         Notes
         -----
-        Inside the displaced mesh y has barycentric coordinates in one tetrahedron, and x has the same: no more than
-        rounding stands between the two. Beyond it x = y − u(x) is iterated, a contraction where the map is one to one.
+        A place has barycentric coordinates in one displaced tetrahedron, and its source has the same in the one at
+        rest: no more than rounding stands between the two. Where tetrahedra are folded one of several sources is taken.
         """
-        mesh = self._of.mesh
-        cell, barycentric = self._search(places, near)
-        inside = cell >= 0
-        weights = Weights(mesh.cells[cell], barycentric, cell, np.zeros(len(places)))
-        points = weights(mesh.points)
-        if not inside.all():
-            out = np.flatnonzero(~inside)
-            start = None if near is None else near[~inside]
-            points[out], beyond = self._beyond(places[out], start, iterations)
-            weights.nodes[out], weights.weights[out] = beyond.nodes, beyond.weights
-            weights.cell[out], weights.beyond[out] = beyond.cell, beyond.beyond
-        return points, weights
+        location = self._locate(places) if near is None else self._step(places, near)
+        around = self.deformer.surroundings
+        points = _interpolate(around.points, around.cells, location)
+        far = location.cell < 0
+        if far.any():
+            points[far] = self._rigid_sources(places[far])
+        return points, location
 
-    def _search(self, places: Float[np.ndarray, "k 3"], near: Weights | None) -> Location:
-        """The displaced tetrahedra that hold places, first by steps from those near by, then by search."""
-        if near is None:
-            cell, barycentric = self._cells[0](places, TOLERANCE)
-            return Location(np.where(cell < 0, -1, self._cells[1][cell]), barycentric)
-        across = self._of.mesh.across
-        cell, barycentric = near.cell.copy(), np.empty((len(places), 4))
-        left = np.arange(len(places))
-        lost = []
+    def _locate(self, places: Float[np.ndarray, "k 3"]) -> Location:
+        if len(places) <= FEW:
+            return self._try_all(places)
+        search, upright = self._search
+        cell, barycentric = _search_twice(search, places)
+        return Location(np.where(cell < 0, -1, upright[cell]), barycentric)
+
+    def _try_all(self, places: Float[np.ndarray, "k 3"]) -> Location:
+        """The same for few places, without what it takes to search for many."""
+        maps = self._to_barycentric
+        found = np.einsum("mai,ki->kma", maps[:, :, 1:], places) + maps[:, :, 0]
+        least = np.nan_to_num(found.min(axis=2), nan=-np.inf)
+        cell = np.where((least >= -TOLERANCE).any(axis=1), (least >= -TOLERANCE).argmax(axis=1), least.argmax(axis=1))
+        rows = np.arange(len(places))
+        barycentric = found[rows, cell]
+        cell[least[rows, cell] < -GAP] = -1
+        return Location(cell, barycentric)
+
+    def _step(self, places: Float[np.ndarray, "k 3"], near: Location) -> Location:
+        """The displaced tetrahedra that hold places, by steps from those near by, else by search."""
+        across, cell = self.deformer.across, near.cell.copy()
+        barycentric, left = np.full((len(places), 4), np.nan), np.flatnonzero(cell >= 0)
+        lost = [np.flatnonzero(cell < 0)]
         for _ in range(MOST_STEPS):
             here = cell[left]
             maps = self._to_barycentric[here]
@@ -197,54 +181,34 @@ class Moved:
             cell[left] = onwards
             if not len(left):
                 break
-        lost = np.concatenate([*lost, left])
-        if len(lost):
-            found_cell, barycentric[lost] = self._search(places[lost], None)
-            cell[lost] = found_cell
+        rest = np.concatenate([*lost, left])
+        if len(rest):
+            cell[rest], barycentric[rest] = self._locate(places[rest])
         return Location(cell, barycentric)
 
-    def _beyond(
-        self, places: Float[np.ndarray, "k 3"], near: Weights | None, iterations: int
-    ) -> tuple[Float[np.ndarray, "k 3"], Weights]:
-        """Sources of places beyond the displaced mesh."""
-        if near is None:
-            face, share = self._surface(places)
-            points = places - np.einsum("ka,kai->ki", share, self.u[self._of.mesh.boundary_faces[face]])
-            weights = self._of.weights(points)
-        else:
-            points, weights = places - near(self.u), near
-        if not iterations:
-            return points, weights
-        left = np.arange(len(places))
-        weights = Weights(*(array.copy() for array in (weights.nodes, weights.weights, weights.cell, weights.beyond)))
-        for _ in range(iterations):
-            found = self._of.weights(points[left])
-            weights.nodes[left], weights.weights[left] = found.nodes, found.weights
-            weights.cell[left], weights.beyond[left] = found.cell, found.beyond
-            onwards = places[left] - found(self.u)
-            moved = np.abs(onwards - points[left]).max(axis=1) > PRECISION
-            points[left] = onwards
-            left = left[moved]
-            if not len(left):
-                break
-        return points, weights
+    def _rigid_sources(self, places: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+        """Beyond the sphere y = x + a + ω × (x − c)."""
+        around = self.deformer.surroundings
+        motion = around.rigid_motion(self.u)
+        linear = np.eye(3) + np.cross(motion[3:], np.eye(3)).T
+        return around.centre + np.linalg.solve(linear, (places - around.centre - motion[:3]).T).T
 
 
-def transfer(
-    u: Float[np.ndarray, "nodes 3"], from_mesh: TetMesh, points: Float[np.ndarray, "queries 3"]
-) -> Float[np.ndarray, "queries 3"]:
-    """Values at any points of a P1 function given at the nodes of a mesh.
+def _interpolate(
+    values: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], location: Location
+) -> Float[np.ndarray, "k 3"]:
+    """Nodal values at points; NaN where these lie in no tetrahedron."""
+    corners = cells[location.cell]
+    found = location.barycentric[:, :1] * values[corners[:, 0]]
+    for corner in range(1, 4):
+        found += location.barycentric[:, corner : corner + 1] * values[corners[:, corner]]
+    return found
 
-    Parameters
-    ----------
-    u : (n, 3) array
-        Values at the nodes of `from_mesh`, for instance displacements in mm.
-    from_mesh : TetMesh
-    points : (k, 3) array
-        Positions, mm. Outside the mesh the value at the nearest point of its surface is taken.
 
-    Returns
-    -------
-    (k, 3) array
-    """
-    return Deformer(from_mesh).weights(points)(np.asarray(u, float))
+def _search_twice(search: CellSearch, points: Float[np.ndarray, "k 3"]) -> Location:
+    """Search once more, less strictly, for points that fell between two tetrahedra."""
+    cell, barycentric = search(points, TOLERANCE)
+    out = np.flatnonzero(cell < 0)
+    if len(out):
+        cell[out], barycentric[out] = search(points[out], GAP)
+    return Location(cell, barycentric)

@@ -195,8 +195,12 @@ def _overlaps(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return cell, first[cell] + offset
 
 
-class SurfaceSearch:
-    """The search for the nearest point of a triangulated surface, prepared once.
+def nearest_on_surface(
+    points: Float[np.ndarray, "nodes 3"],
+    triangles: Int[np.ndarray, "triangles 3"],
+    query: Float[np.ndarray, "queries 3"],
+) -> Location:
+    """The nearest point of a triangulated surface, as a triangle and barycentric coordinates.
 
     Parameters
     ----------
@@ -204,38 +208,27 @@ class SurfaceSearch:
         Nodes, mm.
     triangles : (t, 3) int array
         For instance `TetMesh.boundary_faces`.
+    query : (k, 3) array
+        Points, mm.
 
     Notes
     -----
     The point is exact for the triangles that own one of the four nearest sample points of the surface (3 to
     36 on each triangle); a nearer triangle can be missed only by less than the distance between samples.
     """
+    corners = points[triangles]
+    lattice = _lattice(int(np.clip(np.sqrt(120_000 / len(triangles)), 2, 8)))
+    tree = cKDTree(np.einsum("sa,tai->tsi", lattice, corners).reshape(-1, 3))
+    owner = np.repeat(np.arange(len(triangles)), len(lattice))
 
-    def __init__(self, points: Float[np.ndarray, "nodes 3"], triangles: Int[np.ndarray, "triangles 3"]) -> None:
-        self._corners = points[triangles]
-        lattice = _lattice(int(np.clip(np.sqrt(120_000 / len(triangles)), 2, 8)))
-        self._tree = cKDTree(np.einsum("sa,tai->tsi", lattice, self._corners).reshape(-1, 3))
-        self._owner = np.repeat(np.arange(len(triangles)), len(lattice))
-
-    def __call__(self, query: Float[np.ndarray, "queries 3"]) -> Location:
-        """Find the nearest point to each of these, mm, as a triangle and barycentric coordinates."""
-        return _in_threads(self._search, query, 3)
-
-    def _search(self, query: np.ndarray) -> Location:
-        near = self._owner[self._tree.query(query, k=4)[1]]
-        trial = closest_in_triangles(self._corners[near], query[:, None])
-        gap = np.einsum("kca,kcai->kci", trial, self._corners[near]) - query[:, None]
+    def search(query: np.ndarray) -> Location:
+        near = owner[tree.query(query, k=4)[1]]
+        trial = closest_in_triangles(corners[near], query[:, None])
+        gap = np.einsum("kca,kcai->kci", trial, corners[near]) - query[:, None]
         best, rows = (gap**2).sum(axis=2).argmin(axis=1), np.arange(len(query))
         return Location(near[rows, best], trial[rows, best])
 
-
-def nearest_on_surface(
-    points: Float[np.ndarray, "nodes 3"],
-    triangles: Int[np.ndarray, "triangles 3"],
-    query: Float[np.ndarray, "queries 3"],
-) -> Location:
-    """The nearest point of a triangulated surface, as a triangle and barycentric coordinates; see `SurfaceSearch`."""
-    return SurfaceSearch(points, triangles)(query)
+    return _in_threads(search, query, 3)
 
 
 def _in_threads(
@@ -282,3 +275,29 @@ def _on_edge(corners: np.ndarray, query: np.ndarray, i: int, j: int) -> np.ndarr
     result = np.zeros((*t.shape, 3))
     result[..., i], result[..., j] = 1 - t, t
     return result
+
+
+def transfer(
+    u: Float[np.ndarray, "nodes 3"], from_mesh: TetMesh, points: Float[np.ndarray, "queries 3"]
+) -> Float[np.ndarray, "queries 3"]:
+    """Values at any points of a P1 function given at the nodes of a mesh.
+
+    Parameters
+    ----------
+    u : (n, 3) array
+        Values at the nodes of `from_mesh`, for instance displacements in mm.
+    from_mesh : TetMesh
+    points : (k, 3) array
+        Positions, mm. Outside the mesh the value at the nearest point of its surface is taken.
+
+    Returns
+    -------
+    (k, 3) array
+    """
+    cell, barycentric = locate(from_mesh.points, from_mesh.cells, points)
+    inside = cell >= 0
+    values = np.empty((len(points), 3))
+    values[inside] = np.einsum("ka,kai->ki", barycentric[inside], u[from_mesh.cells[cell[inside]]])
+    face, weight = nearest_on_surface(from_mesh.points, from_mesh.boundary_faces, points[~inside])
+    values[~inside] = np.einsum("ka,kai->ki", weight, u[from_mesh.boundary_faces[face]])
+    return values

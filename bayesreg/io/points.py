@@ -8,15 +8,17 @@ formats say by themselves whether they are LPS or RAS; MNI's is RAS.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from bayesreg.io.atomic import write_text
 from bayesreg.types import InputError
 
 FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
@@ -77,6 +79,22 @@ def read_points(path: str | Path) -> Points:
     if isinstance(found, PointPairs):
         raise InputError(f"{path} holds pairs of points; expected points of one space")
     return found
+
+
+def read_side(path: str | Path, side: Literal["fixed", "moving"]) -> Points:
+    """Read points of one space, or one side of a file of pairs; InputError as in `read_points`."""
+    found = _read(Path(path))
+    return Points(getattr(found, side), found.names, found.sd) if isinstance(found, PointPairs) else found
+
+
+def write_table(path: str | Path, columns: Mapping[str, Sequence[Any]]) -> None:
+    """Write columns of one length as CSV, in one step; numbers with six decimals."""
+    lines = io.StringIO()
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow([value if isinstance(value, str) else f"{value:.6f}" for value in row])
+    write_text(path, lines.getvalue())
 
 
 def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> PointPairs:

@@ -72,14 +72,21 @@ def problem_of(
         require_default_image_options(model)
     sampled, held = sampled_nodes(mesh, model)
     require_proper(mesh, model)
-    field = stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None
-    blocks = {**_blocks(mesh, model, sampled, field, reference), **observation_blocks(observations)}
-    body = _body(mesh, model, sampled, held, field, blocks)
+    body, blocks = body_of(mesh, model, reference)
+    blocks |= observation_blocks(observations)
     # The observations first: what is wrong with them is told before anything that takes long.
     terms = observation_terms(mesh, observations, model)
     blocks |= _temperature_blocks(terms, model) | _shading_blocks(terms)
     terms |= _priors(mesh, model, sampled, held, skull)
     return Problem(body, blocks, terms), sampled
+
+
+def body_of(mesh: TetMesh, model: ModelConfig, reference: Mapping[str, AnyArray] | None = None) -> tuple[Body, Blocks]:
+    """The elastic body and the unknowns that it brings: what it takes to turn draws into displacements."""
+    sampled, held = sampled_nodes(mesh, model)
+    field = stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None
+    blocks = _blocks(mesh, model, sampled, field, reference)
+    return _body(mesh, model, sampled, held, field, blocks), blocks
 
 
 def _blocks(

@@ -15,7 +15,7 @@ from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData
 from bayesreg.config.observations import ImagesSection, LandmarksSection
 from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
-from bayesreg.fem.deformation import transfer
+from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels

@@ -16,8 +16,8 @@ from scipy.optimize import least_squares
 from scipy.sparse.linalg import spsolve
 
 import bayesreg as br
-from bayesreg.fem.deformation import transfer
 from bayesreg.fem.elasticity import stiffness
+from bayesreg.fem.location import transfer
 from bayesreg.synthetic.deformation import push_patch
 from tests.calibration import pairs
 

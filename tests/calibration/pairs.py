@@ -21,7 +21,7 @@ import numpy as np
 
 import bayesreg as br
 from bayesreg.distance import forbidden
-from bayesreg.fem.deformation import transfer
+from bayesreg.fem.location import transfer
 from bayesreg.image import robust_scale
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.diagnostics import convergence

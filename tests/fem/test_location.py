@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bayesreg.fem.deformation import transfer
-from bayesreg.fem.location import closest_in_triangles, locate, nearest_on_surface
+from bayesreg.fem.location import closest_in_triangles, locate, nearest_on_surface, transfer
 from tests.phantoms import ball_mesh, box_mesh
 
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.sparse.csgraph import connected_components
 
 from bayesreg.distance import signed_distance
-from bayesreg.fem.deformation import transfer
 from bayesreg.fem.elasticity import stiffness
 from bayesreg.fem.equilibrium import solve_interior
+from bayesreg.fem.location import transfer
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.warp import volume_ratio

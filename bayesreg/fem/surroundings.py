@@ -1,0 +1,261 @@
+"""A mesh with its surroundings: tetrahedra about it, out to a sphere, on which displacements of the mesh go on.
+
+Nothing is observed and nothing modelled out there. The displacement goes on as the rigid motion that is nearest to it
+and a harmonic rest, which has died away on the sphere; beyond it the rigid motion is left. It is continuous, linear in
+the displacements of the mesh's nodes, and linear in every tetrahedron, so that it is inverted as inside the mesh.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.linalg import splu
+from scipy.spatial import Delaunay, cKDTree
+
+from bayesreg.fem.location import CellSearch
+from bayesreg.mesh import TetMesh, signed_volumes
+from bayesreg.pose import rigid_projection
+
+# The sphere's radius in those of the smallest one about the mesh's centre, and the nodes on it.
+RADIUS, ON_SPHERE = 2.0, 400
+# Nodes between the two, by distance from the surface in mean edges of it: from, to, and apart.
+SHELLS = ((0.8, 2.0, 1.0), (2.0, 5.0, 2.0), (5.0, 1e9, 4.0))
+# The surface is refined until its triangles are faces of the surroundings: in so many rounds, to no more than so many
+# times its nodes, and not below this share of its mean edge.
+MOST_ROUNDS, MOST_NODES, FINEST = 20, 12, 1 / 16
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """A mesh and what surrounds it.
+
+    Attributes
+    ----------
+    mesh : TetMesh
+        The mesh itself.
+    points : (N, 3) array
+        Its nodes, then those around it, mm.
+    cells : (M, 4) int array
+        Its tetrahedra, then those around it.
+    harmonic : (N − n, b) matrix
+        The harmonic part at the nodes around, of that at the nodes on the mesh's boundary.
+    centre : (3,) array
+        About which the rigid motion turns, mm.
+    projection : (6, n, 3) array
+        See `bayesreg.pose.rigid_projection`.
+    """
+
+    mesh: TetMesh
+    points: Float[np.ndarray, "all_nodes 3"]
+    cells: Int[np.ndarray, "all_cells 4"]
+    harmonic: Float[np.ndarray, "around boundary"]
+    centre: Float[np.ndarray, "3"]
+    projection: Float[np.ndarray, "6 nodes 3"]
+
+    def rigid_motion(self, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "6"]:
+        """The small rigid motion nearest to a displacement: translation, mm, and rotation vector, radians."""
+        return np.einsum("aki,ki->a", self.projection, u)
+
+    def move_rigidly(self, motion: Float[np.ndarray, "6"], points: Float[np.ndarray, "k 3"]) -> np.ndarray:
+        """Displacement of points by a small rigid motion, mm, linear in both."""
+        return motion[:3] + np.cross(motion[3:], points - self.centre)
+
+    def extend(self, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "all_nodes 3"]:
+        """A displacement of the mesh's nodes, mm, and how it goes on around it."""
+        motion, boundary = self.rigid_motion(u), self.mesh.boundary
+        rest = u[boundary] - self.move_rigidly(motion, self.mesh.points[boundary])
+        around = self.points[len(self.mesh.points) :]
+        return np.concatenate([u, self.move_rigidly(motion, around) + self.harmonic @ rest])
+
+
+def surround(mesh: TetMesh) -> Surroundings:
+    """Fill the space between a mesh and a sphere about it with tetrahedra.
+
+    Notes
+    -----
+    A Delaunay tetrahedralisation of the nodes on the boundary, of some on the sphere and of a lattice between the two
+    that grows coarser with the distance. Edges of triangles of the surface that are no faces of it are halved until
+    all are (conforming Delaunay refinement); displacements of the new nodes follow from those at the ends of an edge.
+    Where the surface is so creased that this has no end, tetrahedra may reach a little into the mesh: what lies in the
+    mesh is never looked for in them.
+    """
+    centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
+    surface = _Surface.of(mesh)
+    around = np.concatenate([_lattice(mesh, centre), _sphere(mesh, centre)])
+    cells = Delaunay(np.concatenate([surface.points, around])).simplices
+    for _ in range(MOST_ROUNDS):
+        refined = surface.refined(surface.missing(cells))
+        if not len(surface.points) < len(refined.points) < MOST_NODES * len(mesh.boundary):
+            break
+        surface = refined
+        cells = Delaunay(np.concatenate([surface.points, around])).simplices
+    points = np.concatenate([surface.points, around])
+    cells = _outside(mesh, points, cells)
+    count = len(surface.points)
+    harmonic = _harmonic(points, cells, surface.weights, count, len(points) - ON_SPHERE)
+    # The nodes of the mesh's boundary come first, and are the mesh's own.
+    own = len(mesh.boundary)
+    number = np.concatenate([mesh.boundary, len(mesh.points) + np.arange(len(points) - own)])
+    return Surroundings(
+        mesh=mesh,
+        points=np.concatenate([mesh.points, points[own:]]),
+        cells=np.concatenate([mesh.cells, number[cells]]),
+        harmonic=harmonic[own:],
+        centre=centre,
+        projection=projection,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A triangulation that refines the boundary of a mesh.
+
+    Attributes
+    ----------
+    points : (p, 3) array
+        The nodes of the boundary, then those that halve edges.
+    triangles : (t, 3) int array
+    weights : (p, b) sparse matrix
+        Of each point, in those of the nodes of the boundary.
+    finest : float
+        Edges that are shorter are not halved, mm.
+    """
+
+    points: Float[np.ndarray, "p 3"]
+    triangles: Int[np.ndarray, "t 3"]
+    weights: scipy.sparse.csr_array
+    finest: float
+
+    @classmethod
+    def of(cls, mesh: TetMesh) -> _Surface:
+        triangles = np.searchsorted(mesh.boundary, mesh.boundary_faces)
+        points = mesh.points[mesh.boundary]
+        return cls(points, triangles, scipy.sparse.eye_array(len(points), format="csr"), FINEST * _mean_edge(mesh))
+
+    def missing(self, cells: Int[np.ndarray, "cells 4"]) -> Bool[np.ndarray, "t"]:
+        """Which triangles are no faces of tetrahedra."""
+        faces = np.concatenate([np.delete(cells, corner, axis=1) for corner in range(4)])
+        return ~np.isin(self._keys(self.triangles), self._keys(faces[(faces < len(self.points)).all(axis=1)]))
+
+    def _keys(self, triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "t"]:
+        """A number for each triangle, whatever the order of its corners."""
+        ordered, count = np.sort(triangles, axis=1).astype(np.int64), len(self.points)
+        return (ordered[:, 0] * count + ordered[:, 1]) * count + ordered[:, 2]
+
+    def refined(self, which: Bool[np.ndarray, "t"]) -> _Surface:
+        """Halve the longest edge of some triangles, and with it that of the triangle on its other side."""
+        corner = self.points[self.triangles]
+        length = np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2)
+        longest = length.argmax(axis=1)
+        rows = np.flatnonzero(which & (length.max(axis=1) > self.finest))
+        if not len(rows):
+            return self
+        ends = np.stack([self.triangles, np.roll(self.triangles, -1, axis=1)], axis=2)
+        chosen = np.unique(np.sort(ends[rows, longest[rows]], axis=1), axis=0)
+        middle = {(int(a), int(b)): len(self.points) + k for k, (a, b) in enumerate(chosen)}
+        triangles: list[tuple[int, int, int]] = []
+        for triangle in self.triangles.tolist():
+            triangles += _split(triangle, middle)
+        halves = self.weights[chosen[:, 0]] / 2 + self.weights[chosen[:, 1]] / 2
+        return _Surface(
+            np.concatenate([self.points, self.points[chosen].mean(axis=1)]),
+            np.array(triangles),
+            scipy.sparse.vstack([self.weights, halves], format="csr"),
+            self.finest,
+        )
+
+
+def _split(triangle: list[int], middle: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
+    """A triangle, cut from the middle of each of its halved edges in turn."""
+    for start in range(3):
+        a, b, c = triangle[start], triangle[(start + 1) % 3], triangle[(start + 2) % 3]
+        new = middle.get((min(a, b), max(a, b)))
+        if new is not None:
+            return [*_split([a, new, c], middle), *_split([new, b, c], middle)]
+    return [(triangle[0], triangle[1], triangle[2])]
+
+
+def _mean_edge(mesh: TetMesh) -> float:
+    corner = mesh.points[mesh.boundary_faces]
+    return float(np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).mean())
+
+
+def _sphere(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
+    """Nodes on the sphere, on Fibonacci's spiral."""
+    index = np.arange(ON_SPHERE) + 0.5
+    z, turn = 1 - 2 * index / ON_SPHERE, np.pi * (1 + 5**0.5) * index
+    flat = np.sqrt(1 - z**2)
+    return centre + _radius(mesh, centre) * np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+
+
+def _radius(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> float:
+    return RADIUS * float(np.linalg.norm(mesh.points - centre, axis=1).max())
+
+
+def _lattice(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
+    """Nodes between the surface and the sphere: body-centred, a little shaken, for no five are to lie on one sphere."""
+    edge, radius, rng = _mean_edge(mesh), _radius(mesh, centre), np.random.default_rng(0)
+    search, boundary, found = CellSearch(mesh.points, mesh.cells), _samples(mesh), []
+    for nearest, furthest, apart in SHELLS:
+        spacing = 1.25 * apart * edge
+        reach = np.minimum(np.ptp(mesh.points, axis=0).max() / 2 + furthest * edge, radius)
+        ticks = np.arange(-reach, reach + spacing, spacing)
+        grid = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = centre + np.concatenate([grid, grid + spacing / 2])
+        points = points + 0.1 * spacing * rng.uniform(-1, 1, points.shape)
+        distance = boundary.query(points)[0] / edge
+        within = np.linalg.norm(points - centre, axis=1) < radius - 0.6 * apart * edge
+        points = points[(distance >= nearest) & (distance < furthest) & within]
+        found.append(points[search(points).cell < 0])
+    return np.concatenate(found)
+
+
+def _samples(mesh: TetMesh) -> cKDTree:
+    """The surface as corners, middles of edges and centres of triangles."""
+    corner = mesh.points[mesh.boundary_faces]
+    edges = (corner + np.roll(corner, -1, axis=1)) / 2
+    return cKDTree(np.concatenate([mesh.points[mesh.boundary], edges.reshape(-1, 3), corner.mean(axis=1)]))
+
+
+def _outside(
+    mesh: TetMesh, points: Float[np.ndarray, "k 3"], cells: Int[np.ndarray, "cells 4"]
+) -> Int[np.ndarray, "some 4"]:
+    """The tetrahedra that lie outside of a mesh, positively oriented."""
+    volumes = signed_volumes(points, cells)
+    cells = np.where((volumes < 0)[:, None], cells[:, [1, 0, 2, 3]], cells)
+    longest = np.ptp(points[cells], axis=1).max(axis=1)
+    cells = cells[np.abs(volumes) > 1e-9 * longest**3]
+    return cells[CellSearch(mesh.points, mesh.cells)(points[cells].mean(axis=1)).cell < 0]
+
+
+def _harmonic(
+    points: Float[np.ndarray, "k 3"],
+    cells: Int[np.ndarray, "cells 4"],
+    surface: scipy.sparse.csr_array,
+    first: int,
+    last: int,
+) -> Float[np.ndarray, "k boundary"]:
+    """What is harmonic between the surface, the first nodes, and the sphere, the last, where it is zero.
+
+    Edges conduct in proportion to their length, as face over distance does where the mesh is regular. Unlike the finite
+    elements' Laplacian, flat tetrahedra or not, this one makes every value a mean of those about it, and so of those on
+    the surface.
+    """
+    pairs = np.array(list(combinations(range(4), 2)))
+    one, other = np.unique(np.sort(cells[:, pairs].reshape(-1, 2), axis=1), axis=0).T
+    length = np.linalg.norm(points[one] - points[other], axis=1)
+    count = len(points)
+    links = scipy.sparse.coo_array((length, (one, other)), (count, count))
+    links = (links + links.T).tocsr()
+    laplacian = (scipy.sparse.diags_array(links.sum(axis=1)) - links).tocsr()
+    found = np.zeros((count, surface.shape[1]))
+    found[:first] = surface.toarray()
+    # A node of no tetrahedron outside, as within a crease, is nowhere needed.
+    used = np.setdiff1d(cells, [*range(first), *range(last, count)])
+    inner = laplacian[used]
+    found[used] = splu(inner[:, used].tocsc()).solve(-(inner[:, :first] @ found[:first]))
+    return found

@@ -1,0 +1,151 @@
+"""The posterior of the map from the world of the fixed image to that of the moving one, and of its inverse."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.stats import chi2
+
+from bayesreg.fem.deformation import Deformer, Displaced
+from bayesreg.fem.location import Location
+from bayesreg.mesh import TetMesh
+from bayesreg.model.submesh import submesh_variance
+from bayesreg.pose import Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """y = pose(x + u(x)) with draws of u, or, where it is turned round, x as a function of y.
+
+    Attributes
+    ----------
+    deformer : Deformer
+        The mesh, at rest in the fixed image's world.
+    pose : Pose
+        Between the two worlds; known, for what is unknown of it is part of u.
+    u_mean : (n, 3) array
+        Posterior mean of u at the nodes, mm.
+    draws : (S, n, 3) array
+        Draws of it.
+    turned : bool
+        Whether it leads from the moving image's world to that of the fixed one.
+    seed : int
+        Of what the mesh cannot follow.
+
+    Notes
+    -----
+    A draw of u at a point is that of the mesh and a Normal number for what the mesh cannot follow of a smooth
+    displacement (`bayesreg.model.submesh`), as in the standard deviation that a run writes on the grid of its image.
+    """
+
+    deformer: Deformer
+    pose: Pose
+    u_mean: Float[np.ndarray, "nodes 3"]
+    draws: Float[np.ndarray, "draws nodes 3"]
+    turned: bool = False
+    seed: int = 0
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh of the registration."""
+        return self.deformer.mesh
+
+    @property
+    def inverse(self) -> Transform:
+        """The map that leads back."""
+        return replace(self, turned=not self.turned)
+
+    @cached_property
+    def mean(self) -> Displaced:
+        """The mesh, displaced by the posterior mean."""
+        return self.deformer.displaced(self.u_mean)
+
+    @cached_property
+    def folded(self) -> float:
+        """The share of the draws that turn a tetrahedron of the mesh inside out."""
+        return float(np.mean([self.deformer.displaced(u).folded > 0 for u in self.draws]))
+
+    def place(self, points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "k 3"], Location]:
+        """Where the posterior mean of u takes points, mm, and where in the fixed image's world what moves them lies."""
+        if self.turned:
+            return self.mean.sources(self.pose.inverse.place(points))
+        location = self.deformer.locate(points)
+        return self.pose.place(points + self.mean.displacement(points, location)), location
+
+    def place_by(self, draw: int, points: Float[np.ndarray, "k 3"], near: Location) -> Float[np.ndarray, "k 3"]:
+        """Where one of the draws takes points, mm; `near` is as `place` gives it."""
+        displaced, sd = self.deformer.displaced(self.draws[draw]), self.submesh_sd[near.cell]
+        beyond_mesh = sd * np.random.default_rng((self.seed, draw)).standard_normal(sd.shape, np.float32)
+        if self.turned:
+            return displaced.sources(self.pose.inverse.place(points), near)[0] - beyond_mesh
+        return self.pose.place(points + displaced.displacement(points, near) + beyond_mesh)
+
+    def for_each_draw(self, function: Callable[[int], Any]) -> Iterator[Any]:
+        """Call a function with the number of each draw, some side by side, and yield what it returns, in order."""
+        side_by_side = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        with ThreadPoolExecutor(side_by_side) as pool:
+            for first in range(0, len(self.draws), side_by_side):
+                yield from pool.map(function, range(first, min(first + side_by_side, len(self.draws))))
+
+    @cached_property
+    def submesh_sd(self) -> Float[np.ndarray, "all_cells 3"]:
+        """What the mesh cannot follow, a standard deviation by tetrahedron, mm; zero around it, and last beyond."""
+        of_mesh = np.sqrt(submesh_variance(self.mesh, self.u_mean))
+        around = len(self.deformer.surroundings.cells) - len(of_mesh)
+        return np.concatenate([of_mesh, np.zeros((around + 1, 3))])
+
+
+class Spread(NamedTuple):
+    """Where points may lie.
+
+    Attributes
+    ----------
+    places : (k, 3) array
+        By the posterior mean of the displacement, mm.
+    covariance : (k, 3, 3) array
+        Of the draws about that, mm².
+    far : (x, k) array
+        P(a point lies further from there than so many mm), for each such distance.
+    inside : (k,) bool array
+        Whether what moves the point lies in the mesh: outside nothing is observed.
+    """
+
+    places: Float[np.ndarray, "k 3"]
+    covariance: Float[np.ndarray, "k 3 3"]
+    far: Float[np.ndarray, "x k"]
+    inside: Bool[np.ndarray, "k"]
+
+    def ellipsoids(self, probability: float = 0.95) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
+        """Half-axes, mm, the longest first, and their directions (rows) of the regions that hold a Normal point."""
+        variance, directions = np.linalg.eigh(self.covariance)
+        lengths = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 3))
+        return lengths[:, ::-1], np.swapaxes(directions, 1, 2)[:, ::-1]
+
+
+def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence[float] = ()) -> Spread:
+    """Where a transform may take points; a few draws of all points are in memory at a time.
+
+    Parameters
+    ----------
+    transform : Transform
+    points : (k, 3) array
+        mm.
+    far : sequence of float
+        Distances, mm.
+    """
+    places, near = transform.place(points)
+    square, beyond_far = np.zeros((len(points), 3, 3)), np.zeros((len(far), len(points)))
+    for there in transform.for_each_draw(lambda draw: transform.place_by(draw, points, near)):
+        away = there - places
+        square += away[:, :, None] * away[:, None]
+        distance = np.linalg.norm(away, axis=1)
+        beyond_far += distance > np.reshape(far, (-1, 1))
+    count = len(transform.draws)
+    return Spread(places, square / max(count - 1, 1), beyond_far / count, transform.deformer.is_inside(near))
