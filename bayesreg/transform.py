@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +42,11 @@ class Transform:
 
     Notes
     -----
-    A draw of u at a point is that of the mesh and a Normal number for what the mesh cannot follow of a smooth
-    displacement (`bayesreg.model.submesh`), as in the standard deviation that a run writes on the grid of its image.
+    A draw of u is linear between the nodes, and there it averages what these err by on their own: in the middle of a
+    tetrahedron it varies by half as much as at its corners. The truth is not linear, and is not known any better there.
+    A draw at a point is therefore that of the mesh and a Normal number, so that its variance is that of the nodes,
+    interpolated as a standard deviation, and what the mesh cannot follow of a smooth displacement
+    (`bayesreg.model.submesh`): the standard deviation that a run writes on the grid of its image.
     """
 
     deformer: Deformer
@@ -79,13 +83,26 @@ class Transform:
         location = self.deformer.locate(points)
         return self.pose.place(points + self.mean.displacement(points, location)), location
 
-    def place_by(self, draw: int, points: Float[np.ndarray, "k 3"], near: Location) -> Float[np.ndarray, "k 3"]:
-        """Where one of the draws takes points, mm; `near` is as `place` gives it."""
-        displaced, sd = self.deformer.displaced(self.draws[draw]), self.submesh_sd[near.cell]
-        beyond_mesh = sd * np.random.default_rng((self.seed, draw)).standard_normal(sd.shape, np.float32)
+    def place_by(
+        self, draw: int, points: Float[np.ndarray, "k 3"], near: Location, unresolved_sd: Float[np.ndarray, "k 3"]
+    ) -> Float[np.ndarray, "k 3"]:
+        """Where one of the draws takes points, mm.
+
+        Parameters
+        ----------
+        draw : int
+        points : (k, 3) array
+        near : Location
+            As `place` gives it.
+        unresolved_sd : (k, 3) array
+            As `unresolved_sd` gives it there.
+        """
+        displaced = self.deformer.displaced(self.draws[draw])
+        rng = np.random.default_rng((self.seed, draw))
+        beside = unresolved_sd * rng.standard_normal(unresolved_sd.shape, np.float32)
         if self.turned:
-            return displaced.sources(self.pose.inverse.place(points), near)[0] - beyond_mesh
-        return self.pose.place(points + displaced.displacement(points, near) + beyond_mesh)
+            return displaced.sources(self.pose.inverse.place(points), near)[0] - beside
+        return self.pose.place(points + displaced.displacement(points, near) + beside)
 
     def for_each_draw(self, function: Callable[[int], Any]) -> Iterator[Any]:
         """Call a function with the number of each draw, some side by side, and yield what it returns, in order."""
@@ -94,12 +111,26 @@ class Transform:
             for first in range(0, len(self.draws), side_by_side):
                 yield from pool.map(function, range(first, min(first + side_by_side, len(self.draws))))
 
+    def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
+        """What draws of u lack of its standard deviation at points, mm (see above); zero around the mesh."""
+        found = np.zeros((len(near.cell), 3))
+        inside = self.deformer.is_inside(near)
+        cell, share = near.cell[inside], near.barycentric[inside]
+        covariance, submesh = self._covariance
+        own = np.einsum("ka,kabi,kb->ki", share, covariance[cell], share, optimize=True)
+        nodal = np.einsum("ka,kai->ki", share, np.sqrt(np.einsum("maai->mai", covariance))[cell]) ** 2
+        found[inside] = np.sqrt(np.maximum(nodal - own, 0) + submesh[cell])
+        return found
+
     @cached_property
-    def submesh_sd(self) -> Float[np.ndarray, "all_cells 3"]:
-        """What the mesh cannot follow, a standard deviation by tetrahedron, mm; zero around it, and last beyond."""
-        of_mesh = np.sqrt(submesh_variance(self.mesh, self.u_mean))
-        around = len(self.deformer.surroundings.cells) - len(of_mesh)
-        return np.concatenate([of_mesh, np.zeros((around + 1, 3))])
+    def _covariance(self) -> tuple[Float[np.ndarray, "cells 4 4 3"], Float[np.ndarray, "cells 3"]]:
+        """Of each component of u at the corners of every tetrahedron; and what the mesh cannot follow, mm²."""
+        away, cells = self.draws - self.draws.mean(axis=0), self.mesh.cells
+        found = np.empty((len(cells), 4, 4, 3))
+        for a, b in combinations_with_replacement(range(4), 2):
+            product = np.einsum("sci,sci->ci", away[:, cells[:, a]], away[:, cells[:, b]])
+            found[:, a, b] = found[:, b, a] = product / max(len(away) - 1, 1)
+        return found, submesh_variance(self.mesh, self.u_mean)
 
 
 class Spread(NamedTuple):
@@ -142,7 +173,8 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
     """
     places, near = transform.place(points)
     square, beyond_far = np.zeros((len(points), 3, 3)), np.zeros((len(far), len(points)))
-    for there in transform.for_each_draw(lambda draw: transform.place_by(draw, points, near)):
+    sd = transform.unresolved_sd(near)
+    for there in transform.for_each_draw(lambda draw: transform.place_by(draw, points, near, sd)):
         away = there - places
         square += away[:, :, None] * away[:, None]
         distance = np.linalg.norm(away, axis=1)

@@ -7,6 +7,7 @@ import json
 import nibabel as nib
 import numpy as np
 import pytest
+import pyvista
 import SimpleITK
 from ruamel.yaml import YAML
 
@@ -184,3 +185,124 @@ def test_the_brain_of_a_mouse_is_meshed_as_finely_as_it_is_small(tmp_path):
     assert mesh.volumes.sum() == pytest.approx(volume, rel=0.15)
     edge = float(np.median(edge_lengths(mesh.points, mesh.cells)))
     assert edge == pytest.approx(BRAIN_EDGE * np.cbrt(volume / BRAIN_VOLUME), rel=0.3)
+
+
+def test_the_composite_alone_makes_the_warped_image(result):
+    """SimpleITK with transform_mean.h5, the moving image of the run and nothing else."""
+    moving = store.read_inputs(result.folder).moving
+    scaled = result.run.matching.scale.undo(result.run.matching.pose.inverse.aligned(moving))
+    br.save_image(scaled, result.folder / "own_world.nii.gz")
+    fixed = SimpleITK.ReadImage(str(result.folder / "inputs" / "fixed.nii.gz"))
+    image = SimpleITK.ReadImage(str(result.folder / "own_world.nii.gz"), SimpleITK.sitkFloat64)
+    transform = SimpleITK.ReadTransform(str(result.folder / "transform_mean.h5"))
+    theirs = SimpleITK.GetArrayFromImage(SimpleITK.Resample(image, fixed, transform, SimpleITK.sitkLinear, np.nan))
+    ours = np.asarray(nib.load(result.folder / "warped_mean.nii.gz").dataobj)
+    known = np.isfinite(theirs.transpose(2, 1, 0))
+    assert known.mean() > 0.5
+    away = np.abs(theirs.transpose(2, 1, 0) - ours)[known]
+    assert np.median(away) < 1e-3 * SCALE
+    assert away.max() < 0.02 * SCALE
+
+
+@pytest.fixture(scope="module")
+def applied(result, folder):
+    rng = np.random.default_rng(0)
+    points = result.mesh.points.mean(axis=0) + rng.uniform(-15, 15, (20, 3))
+    rows = [f"p{number},{','.join(map(str, point))}" for number, point in enumerate(points)]
+    (folder / "p.csv").write_text("\n".join(["name,x,y,z", *rows, "far,300,0,0"]))
+    ball = pyvista.Sphere(radius=12.0, center=result.mesh.points.mean(axis=0), theta_resolution=12, phi_resolution=12)
+    ball.save(folder / "ball.vtk")
+    ball.save(folder / "ball.stl")
+    said: list[str] = []
+    given = {"points": folder / "p.csv", "mesh": folder / "ball.vtk", "image": folder / "fixed.nii.gz",
+             "labels": folder / "organ.nii.gz"}  # fmt: skip
+    written = br.apply(result.folder, folder / "there", draws=40, far=(0.1, 2.0), say=said.append, **given)
+    return points, written, said
+
+
+def test_apply_writes_what_it_says(applied, folder):
+    points, written, said = applied
+    names = ["points.csv", "ball_in-moving.vtk", "fixed_in-moving.nii.gz", "organ_in-moving.nii.gz", "label-1.nii.gz"]
+    assert [path.name for path in written] == names
+    assert all(path.is_file() for path in written)
+    assert "by 40 draws" in said[0]
+    assert any("1 of 21 points" in line and "nothing is known" in line for line in said)
+    assert any("RAS or LPS" in line for line in said)
+    table = np.genfromtxt(folder / "there" / "points.csv", delimiter=",", names=True, dtype=None, encoding="utf8")
+    assert table["name"].tolist()[-2:] == ["p19", "far"]
+    assert table["in_mesh"].tolist() == [1.0] * 20 + [0.0]
+    there = np.stack([table[axis] for axis in "xyz"], axis=1)[:20]
+    assert np.linalg.norm(there - POSE.place(points), axis=1).max() < 2.0
+    assert ((table["p_over_2mm"] <= table["p_over_01mm"]) & (table["cov_xx"][:] >= 0)).all()
+
+
+def test_apply_leads_back(applied, result, folder):
+    points, _, _ = applied
+    br.apply(result.folder, folder / "back", points=folder / "there" / "points.csv", inverse=True, draws=4)
+    table = np.genfromtxt(folder / "back" / "points.csv", delimiter=",", names=True, dtype=None, encoding="utf8")
+    np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], axis=1)[:20], points, atol=1e-3)
+
+
+def test_apply_carries_the_moving_image_to_the_fixed_one(result, folder):
+    written = br.apply(result.folder, folder / "back", image=folder / "moving.nii.gz", inverse=True, draws=4)
+    ours = np.asarray(nib.load(written[0]).dataobj)
+    warped = np.asarray(nib.load(result.folder / "warped_mean.nii.gz").dataobj)
+    inside = np.asarray(MASK.voxels) != 0
+    # What is ignored in the moving image is filled in the run's.
+    assert np.median(np.abs(ours - warped)[inside]) < 1e-3 * SCALE
+
+
+def test_apply_keeps_the_space_and_the_values_of_a_surface(applied, result, folder):
+    surface = pyvista.read(folder / "there" / "ball_in-moving.vtk")
+    assert (folder / "there" / "ball_in-moving.vtk").read_bytes().split(b"\n")[1] == b"bayesreg SPACE=RAS"
+    given = pyvista.read(folder / "ball.vtk")
+    assert np.linalg.norm(surface.points - POSE.place(np.asarray(given.points, float)), axis=1).max() < 2.0
+    assert {"cov_", "radius95_", "p_over_2mm", "in_mesh"} <= set(surface.point_data)
+    mirrored = given.copy()
+    mirrored.points = np.asarray(given.points) * (-1, -1, 1)
+    mirrored.save(folder / "mirrored.vtk")
+    br.apply(result.folder, folder / "there", mesh=folder / "mirrored.vtk", space="LPS", draws=2)
+    again = pyvista.read(folder / "there" / "mirrored_in-moving.vtk")
+    np.testing.assert_allclose(np.asarray(again.points) * (-1, -1, 1), surface.points, atol=1e-3)
+    written = br.apply(result.folder, folder / "there", mesh=folder / "ball.stl", draws=2)
+    assert pyvista.read(written[0]).n_cells == given.n_cells
+
+
+def test_what_lies_around_the_mesh_can_be_missing(applied, result, folder):
+    given = {"points": folder / "p.csv", "image": folder / "fixed.nii.gz", "labels": folder / "organ.nii.gz"}
+    br.apply(result.folder, folder / "alone", around="missing", draws=2, **given)
+    table = np.genfromtxt(folder / "alone" / "points.csv", delimiter=",", names=True, dtype=None, encoding="utf8")
+    assert np.isnan(table["x"][-1])
+    assert np.isfinite(table["x"][:-1]).all()
+    image = np.asarray(nib.load(folder / "alone" / "fixed_in-moving.nii.gz").dataobj)
+    share = np.asarray(nib.load(folder / "alone" / "organ_in-moving_probability" / "label-1.nii.gz").dataobj)
+    np.testing.assert_array_equal(np.isnan(image), np.isnan(share))
+    assert 0.02 < np.isfinite(image).mean() < 0.9
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "nothing to carry"),
+        ({"points": "none.csv"}, "no such file"),
+        ({"mesh": "fixed.nii.gz"}, "unknown kind of file with a surface"),
+        ({"mesh": "broken.vtk"}, "cannot be read as a surface"),
+        ({"labels": "flair_fixed.nii.gz"}, "not integers"),
+        ({"points": "p.csv", "draws": 1}, "at least two draws"),
+        ({"points": "p.csv", "far": (0.0,)}, "above zero"),
+    ],
+)
+def test_apply_refuses(result, folder, given, message):
+    (folder / "p.csv").exists() or (folder / "p.csv").write_text("x,y,z\n0,0,0")
+    (folder / "broken.vtk").write_text("# vtk DataFile Version 3.0\nnothing\n")
+    files = {key: folder / value if isinstance(value, str) else value for key, value in given.items()}
+    with pytest.raises(br.InputError, match=message):
+        br.apply(result.folder, folder / "refused", **files)
+    assert not (folder / "refused").exists()
+
+
+def test_apply_does_not_replace_what_it_was_given(result, folder):
+    (folder / "points.csv").write_text("x,y,z\n0,0,0")
+    with pytest.raises(br.InputError, match="name another folder"):
+        br.apply(result.folder, folder, points=folder / "points.csv", draws=2)
+    assert (folder / "points.csv").read_text() == "x,y,z\n0,0,0"

@@ -88,6 +88,13 @@ class DistributedConfig(Section):
     """Which this is, from 0."""
 
 
+class ResultsConfig(Section):
+    """What a run leaves for other programs, besides what it always does."""
+
+    draws: Annotated[int, Field(strict=True, ge=0)] = 20
+    """How many draws, evenly spaced, are written as transforms and displacement fields of their own."""
+
+
 class ReportConfig(Section):
     """The content of the report."""
 
@@ -162,6 +169,7 @@ class Config(Section):
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()
+    results: ResultsConfig = ResultsConfig()
     distributed: DistributedConfig | None = None
     """Other processes that share the chains; null runs alone."""
 

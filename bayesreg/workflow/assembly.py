@@ -59,6 +59,8 @@ def nodal_draws(
 
     Nodes that are not sampled follow from those that are, and from λ and μ.
     """
+    if not most:
+        return np.empty((0, *inputs.mesh.points.shape))
     some = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], most)
     u = some["u_boundary"]
     if u.shape[2] == len(inputs.mesh.points):

@@ -7,16 +7,18 @@ from dataclasses import dataclass
 
 import edt
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt
 
 from bayesreg.fem.location import Location
 from bayesreg.image import Image
 from bayesreg.transform import Transform
 
-# Places at a time, and counts of labels.
-CHUNK, MOST_COUNTS = 500_000, 150_000_000
+# Places at a time, and counts of labels in one go over the draws.
+CHUNK, MOST_COUNTS = 500_000, 100_000_000
 # What a draw changes is bounded by its largest change at the nodes about, times this.
 MARGIN = 1.25
+# And what the mesh does not resolve of it by so many standard deviations.
+FURTHEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ class CarriedLabels:
     values: Int[np.ndarray, "L"]
     certain: Int[np.ndarray, "V"]
     open: Int[np.ndarray, "k"]
-    counts: Int[np.ndarray, "L k"]
+    counts: UInt[np.ndarray, "L k"]
     draws: int
 
     @property
@@ -92,20 +94,25 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
     back = transform.inverse
     distance, box = _distance_to_others(numbers), _box(numbers)
     reach = _reach(back)
-    certain, cell, unsure = (np.empty(int(np.prod(grid.shape)), kind) for kind in (np.int16, np.int32, bool))
+    certain, unsure = (np.empty(int(np.prod(grid.shape)), kind) for kind in (np.int16, bool))
+    nearby, unresolved = [], []
     for some in _slices(len(certain)):
         source, near = back.place(_places(grid, np.arange(some.start, some.stop)))
-        certain[some], cell[some] = numbers.nearest(source), near.cell
+        certain[some] = numbers.nearest(source)
         if not keep_around:
             certain[some][~back.deformer.is_inside(near)] = -1
+        sd = back.unresolved_sd(near)
         apart = np.where(numbers.contains(source), distance.nearest(source), _distance_to_box(numbers, box, source))
-        unsure[some] = (apart <= reach[near.cell]) & (certain[some] >= 0)
-    open_voxels = np.flatnonzero(unsure)
+        unsure[some] = (apart <= reach[near.cell] + FURTHEST * sd.max(axis=1)) & (certain[some] >= 0)
+        nearby.append(Location(near.cell[unsure[some]], near.barycentric[unsure[some]]))
+        unresolved.append(sd[unsure[some]].astype(np.float32))
+    open_voxels, unresolved_sd = np.flatnonzero(unsure), np.concatenate(unresolved)
+    cell, barycentric = (np.concatenate(parts) for parts in zip(*nearby, strict=True))
     counts = np.zeros((len(values), len(open_voxels)), np.uint16)
     together = max(MOST_COUNTS // len(values), CHUNK)
     for some in _slices(len(open_voxels), together):
         voxels, part = open_voxels[some], counts[:, some]
-        _count(back, numbers, _places(grid, voxels), cell[voxels], part)
+        _count(back, numbers, _places(grid, voxels), Location(cell[some], barycentric[some]), unresolved_sd[some], part)
     return CarriedLabels(grid, values[order], certain, open_voxels, counts, len(transform.draws))
 
 
@@ -113,19 +120,15 @@ def _count(
     back: Transform,
     numbers: Image,
     places: Float[np.ndarray, "k 3"],
-    cell: Int[np.ndarray, "k"],
-    counts: Int[np.ndarray, "L k"],
+    near: Location,
+    unresolved_sd: Float[np.ndarray, "k 3"],
+    counts: UInt[np.ndarray, "L k"],
 ) -> None:
     """Add the labels that every draw gives to places."""
-    near = Location(cell.astype(np.int64), np.empty((len(cell), 0)))
 
     def labels_of(draw: int) -> Int[np.ndarray, "k"]:
-        return np.concatenate(
-            [
-                numbers.nearest(back.place_by(draw, places[some], Location(near.cell[some], near.barycentric[some])))
-                for some in _slices(len(places))
-            ]
-        )
+        sources = back.place_by(draw, places, near, unresolved_sd)
+        return numbers.nearest(sources)
 
     columns = np.arange(len(places))
     for found in back.for_each_draw(labels_of):
@@ -180,4 +183,4 @@ def _reach(back: Transform) -> Float[np.ndarray, "cells"]:
     # Back through (I + ∇u)⁻¹.
     stretch = np.linalg.norm(np.linalg.solve(moved_edges, edges), ord=2, axis=(1, 2))
     reach = MARGIN * stretch * away[around.cells].max(axis=1)
-    return np.append(reach, away.max()) + 5 * back.submesh_sd.max(axis=1)
+    return np.append(reach, away.max())

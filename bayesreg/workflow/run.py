@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.devices import is_first, require_joined, wait
@@ -37,12 +38,14 @@ from bayesreg.model.single_node import images_of
 from bayesreg.model.terms.images import ComparedImages
 from bayesreg.model.warp import moments_on_grid, warp_image
 from bayesreg.report.metrics import compute_metrics
+from bayesreg.transform import Transform
 from bayesreg.types import InputError
-from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
+from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with_initial
 from bayesreg.workflow.manifest import manifest
 from bayesreg.workflow.prediction import mean_values, predict
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
 from bayesreg.workflow.result import Result, load_result, report
+from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
 # whole state is written.
@@ -344,22 +347,29 @@ def _finish(
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
     total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
     moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
-    if not pose.is_identity:
-        # What surrounds the organ, such as the skull, moves by the pose alone.
-        beyond = (moments.sd == 0).all(axis=-1)
-        moments.mean[beyond] = (pose.place(grid.grid_points()) - grid.grid_points())[beyond]
+    transform = Transform(
+        Deformer(inputs.mesh),
+        pose,
+        samples.u_mean,
+        nodal_draws(config, inputs, draws, config.results.draws),
+        seed=config.seed,
+    )
+    field = displacement_on(transform.mean, grid).field
+    mean_field = total_displacement(pose, grid.grid_points(), field)
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
         | {"displacement_sd": moments.rms_sd},
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
-        warped=_warp(inputs, moments.mean),
+        warped=_warp(inputs, mean_field),
         metrics=metrics,
         predicted=predicted,
         bodies=store.read_bodies(out),
         **inputs._asdict(),
     )
-    store.write_results(out, finished, moments.mean, moments.sd)
+    # Before run.json, which says that all is there.
+    write_transforms(out, transform, grid, field)
+    store.write_results(out, finished, mean_field, moments.sd)
     checkpoints.remove_blocks(out)
     result = Result(out, finished)
     write_report(finished, idata, *judged, result.report)
