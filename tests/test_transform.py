@@ -8,7 +8,7 @@ from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.pose import Motion
-from bayesreg.transform import Transform, spread
+from bayesreg.transform import Transform, distances_of, spread
 from bayesreg.workflow.carried_labels import carry_labels
 from tests.phantoms import ball_mesh
 
@@ -213,3 +213,27 @@ def test_a_mesh_alone_is_enough():
     points = mesh.points[:3]
     deformer = Deformer(mesh)
     np.testing.assert_allclose(deformer.displaced(u).displacement(points, deformer.locate(points)), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize("sd", [(1.0, 1.0, 1.0), (3.0, 0.5, 0.2), (1.0, 1.0, 0.01), (2.0, 1.0, 0.5)])
+def test_distances_of_normal_vectors_are_those_of_drawn_ones(sd):
+    turn = POSE.rotation
+    covariance = (turn @ np.diag(np.square(sd)) @ turn.T)[None]
+    drawn = np.linalg.norm(np.random.default_rng(0).standard_normal((200_000, 3)) * sd, axis=1)
+    distances = (0.3, 0.5, 1.0, 2.0, 4.0)
+    found = distances_of(np.concatenate([covariance, covariance * np.nan]), distances)
+    for share, distance in zip(found.far, distances, strict=True):
+        assert share[0] == pytest.approx((drawn > distance).mean(), abs=0.01)
+    assert found.radius[0] == pytest.approx(np.quantile(drawn, 0.95), rel=0.02)
+    assert np.isnan([found.radius[1], *found.far[:, 1]]).all()
+
+
+def test_the_covariance_in_closed_form_is_that_of_the_draws():
+    transform = _transform(draws=400)
+    points = _points(transform, 200, 28.0)
+    found = spread(transform, points)
+    _, near = transform.place(points)
+    closed = POSE.rotation @ transform.covariance(near) @ POSE.rotation.T
+    sd, drawn = (np.sqrt(np.einsum("kii->ki", one)) for one in (closed, found.covariance))
+    np.testing.assert_allclose(drawn, sd, rtol=0.15)
+    assert np.mean(drawn / sd) == pytest.approx(1, abs=0.01)
