@@ -40,6 +40,7 @@ _HOME = {
     "load_mesh": "io.meshing",
     "save_mesh": "io.meshing",
     "apply": "workflow.apply",
+    "maps": "workflow.maps",
     "load_config": "config",
     "load_result": "workflow.result",
     "run": "workflow.run",

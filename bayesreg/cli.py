@@ -107,6 +107,11 @@ Far = Annotated[
     list[float] | None,
     typer.Option("--far", metavar="MM", help="Give P(further off than this); 2 if left out; may be repeated."),
 ]
+Margin = Annotated[
+    list[int] | None,
+    typer.Option("--margin", metavar="LABEL", help="Write the surface beyond which this one of --labels is improbable "
+                 "(below 5 %); may be repeated."),
+]  # fmt: skip
 Draws = Annotated[int | None, typer.Option(help="How many draws at most; 1,000, for labels 200, if left out.")]
 Space = Annotated[
     Literal["RAS", "LPS"] | None, typer.Option("--space", help="Of the coordinates of --mesh, where it does not say.")
@@ -222,6 +227,7 @@ def apply(
     far: Far = None,
     draws: Draws = None,
     space: Space = None,
+    margin: Margin = None,
     quiet: Quiet = False,
 ) -> None:
     """Carry points, surfaces, images or labels from the world of FIXED to that of MOVING, with what is unsure of it."""
@@ -240,8 +246,19 @@ def apply(
         far=far or (2.0,),
         draws=draws,
         space=space,
+        margins=margin or (),
         say=(lambda text: None) if quiet else typer.echo,
     )
+    typer.echo("\n".join(f"Written: {path}" for path in written))
+
+
+@app.command()
+def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: Like = None, quiet: Quiet = False) -> None:
+    """Write maps of a run: how sure every point is, how volume changes, how stiff the tissue is."""
+    from bayesreg.workflow.maps import maps
+
+    say = (lambda text: None) if quiet else typer.echo
+    written = maps(folder, out, far=far or (2.0,), like=like, say=say)
     typer.echo("\n".join(f"Written: {path}" for path in written))
 
 

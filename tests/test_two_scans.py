@@ -15,6 +15,7 @@ import bayesreg as br
 from bayesreg.config import make_config
 from bayesreg.io import store
 from bayesreg.io.quality import edge_lengths
+from bayesreg.mesh import signed_volumes
 from bayesreg.report.panels import View, ignored
 from bayesreg.report.slices import planes_through
 from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
@@ -306,3 +307,44 @@ def test_apply_does_not_replace_what_it_was_given(result, folder):
     with pytest.raises(br.InputError, match="name another folder"):
         br.apply(result.folder, folder, points=folder / "points.csv", draws=2)
     assert (folder / "points.csv").read_text() == "x,y,z\n0,0,0"
+
+
+def test_a_margin_holds_a_label_point_by_point(result, folder):
+    given = {"labels": folder / "organ.nii.gz", "like": folder / "moving.nii.gz"}
+    *_, path = br.apply(result.folder, folder / "margin", margins=[1], draws=20, **given)
+    assert path.name == "organ_in-moving_margin95_label-1.vtk"
+    surface = pyvista.read(path)
+    share = br.load_image(folder / "margin" / "organ_in-moving_probability" / "label-1.nii.gz")
+    assert surface.is_manifold
+    voxels = share.voxel_volume * (np.asarray(share.voxels) > 0.05).sum()
+    assert surface.volume == pytest.approx(voxels, rel=0.1)
+    with pytest.raises(br.InputError, match="label 7, of which a margin is wanted"):
+        br.apply(result.folder, folder / "margin", margins=[7], **given)
+    with pytest.raises(br.InputError, match="give labels, too"):
+        br.apply(result.folder, folder / "margin", points=folder / "pairs.csv", margins=[1])
+
+
+def test_maps(result, folder):
+    written = br.maps(result.folder, folder / "maps", far=(0.1, 2.0), draws=40)
+    names = ["radius95", "p_over_0.1mm", "p_over_2mm", "jacobian_mean", "jacobian_sd", "p_inverted"]
+    assert [path.name for path in written] == [f"{name}.nii.gz" for name in names]
+    found = {name: np.asarray(nib.load(path).dataobj) for name, path in zip(names, written, strict=True)}
+    sd = nib.load(result.folder / "displacement_sd.nii.gz")
+    np.testing.assert_allclose(nib.load(written[0]).affine, sd.affine, atol=1e-6)
+    total = np.sqrt((np.asarray(sd.dataobj)[..., 0, :] ** 2).sum(axis=-1))
+    inside = total > 0
+    np.testing.assert_array_equal(found["radius95"] > 0, inside)
+    # √(χ² of one degree of freedom) … √(χ² of three): 1.96 … 1.61 times the root of the summed variances.
+    ratio = found["radius95"][inside] / total[inside]
+    assert 1.3 < np.quantile(ratio, 0.05) < np.quantile(ratio, 0.95) < 2.3
+    assert (found["p_over_2mm"] <= found["p_over_0.1mm"]).all()
+    mesh = result.mesh
+    u = result.u_mean
+    ratio = (signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes).min(), 3 * found["jacobian_sd"].max()
+    assert found["jacobian_mean"][inside].min() > ratio[0] - ratio[1]
+    assert (found["p_inverted"] == 0).all()
+    away = np.eye(4)
+    away[:3, 3] = 900.0
+    br.save_image(br.Image(np.zeros((3, 3, 3)), away), folder / "far.nii.gz")
+    with pytest.raises(br.InputError, match="no voxel of the grid"):
+        br.maps(result.folder, folder / "maps", like=folder / "far.nii.gz")

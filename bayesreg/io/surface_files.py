@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from skimage import measure
 
 from bayesreg.io.atomic import replacing
 from bayesreg.types import AnyArray, InputError
@@ -104,6 +105,29 @@ def write_surface(
         moved.save(temporary)
         if path.suffix.lower() == ".vtk":
             _say_space(temporary, surface.space)
+
+
+def save_outline(
+    path: str | Path, values: Float[np.ndarray, "X Y Z"], affine: Float[np.ndarray, "4 4"], level: float
+) -> None:
+    """Write the surface about all voxels above a level as a .vtk file, world RAS mm, all of it or nothing.
+
+    Raises
+    ------
+    InputError
+        If no voxel is above the level.
+    """
+    import pyvista
+
+    if not (values > level).any():
+        raise InputError(f"{path}: no voxel is above {level:g}, so that there is no surface")
+    # A rim of zeros closes the surface where it meets the end of the grid.
+    points, faces, _, _ = measure.marching_cubes(np.pad(values, 1), level)
+    world = (points - 1) @ affine[:3, :3].T + affine[:3, 3]
+    surface = pyvista.PolyData(world, np.insert(faces, 0, 3, axis=1).ravel())
+    with replacing(path) as temporary:
+        surface.save(temporary)
+        _say_space(temporary, "RAS")
 
 
 def _named_space(path: Path) -> Space | None:

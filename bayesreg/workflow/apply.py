@@ -17,7 +17,7 @@ from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.points import Points, read_side, write_table
-from bayesreg.io.surface_files import Space, SurfaceFile, read_surface, write_surface
+from bayesreg.io.surface_files import Space, SurfaceFile, read_surface, save_outline, write_surface
 from bayesreg.io.volumes import load_image, load_whole_numbers, save_image, write_nifti
 from bayesreg.transform import Spread, Transform, spread
 from bayesreg.types import InputError
@@ -30,6 +30,8 @@ Around = Literal["harmonic", "missing"]
 # Draws of all chains together: of points, and of labels, which take longer.
 POINT_DRAWS, LABEL_DRAWS = 1000, 200
 CHUNK = 500_000
+# The probability with which a margin holds a label, point by point.
+MARGIN = 0.95
 
 
 def transform_of(result: Result, draws: int = POINT_DRAWS) -> Transform:
@@ -54,6 +56,7 @@ def apply(
     far: Sequence[float] = (2.0,),
     draws: int | None = None,
     space: Space | None = None,
+    margins: Sequence[int] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> list[Path]:
     """Carry what lies in the world of the fixed image to that of the moving one, over the posterior.
@@ -87,6 +90,8 @@ def apply(
         How many at most; the default is 1,000, for labels 200.
     space : "RAS" or "LPS", optional
         Of the coordinates in `mesh`, where the file does not say it.
+    margins : sequence of int
+        Labels; of each a surface is written (.vtk, RAS) beyond which every point has it with less than 5 %.
     say : callable
         Told what is done, and beware of.
 
@@ -101,6 +106,8 @@ def apply(
         If nothing is given to carry, or a file is wrong.
     """
     given = {"points": points, "image": image, "labels": labels, "mesh": mesh}
+    if margins and labels is None:
+        raise InputError("a margin is that of a label: give labels, too")
     if all(path is None for path in given.values()):
         raise InputError("there is nothing to carry: give points, an image, labels or a mesh")
     if draws is not None and draws < 2:
@@ -118,9 +125,10 @@ def apply(
     if image is not None:
         tasks.append(partial(_carry_image, load_image(image), _grid(result, like, inverse), Path(image), how))
     if labels is not None:
-        tasks.append(
-            partial(_carry_labels, load_whole_numbers(labels), _grid(result, like, inverse), Path(labels), how)
-        )
+        found = load_whole_numbers(labels)
+        if absent := sorted(set(margins) - set(np.unique(found.voxels).tolist())):
+            raise InputError(f"label {absent[0]}, of which a margin is wanted, is not in {labels}")
+        tasks.append(partial(_carry_labels, found, _grid(result, like, inverse), Path(labels), how, margins))
     how.out.mkdir(parents=True, exist_ok=True)
     transform = transform_of(result, draws or (LABEL_DRAWS if points is None and mesh is None else POINT_DRAWS))
     transform = transform.inverse if inverse else transform
@@ -242,7 +250,9 @@ def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Tr
     return [target]
 
 
-def _carry_labels(labels: Image, grid: Image, path: Path, how: _How, transform: Transform) -> list[Path]:
+def _carry_labels(
+    labels: Image, grid: Image, path: Path, how: _How, margins: Sequence[int], transform: Transform
+) -> list[Path]:
     some = replace(transform, draws=transform.draws[:: max(len(transform.draws) // LABEL_DRAWS, 1)])
     how.say(f"labels of {path}, by {len(some.draws)} draws")
     found = carry_labels(some, labels, grid, keep_around=how.around == "harmonic")
@@ -253,4 +263,8 @@ def _carry_labels(labels: Image, grid: Image, path: Path, how: _How, transform: 
     for value, probability in found.probabilities():
         write_nifti(probability, grid.affine, part := folder / f"label-{value}.nii.gz")
         written.append(part)
+        if value in margins:
+            target = how.name(path, f"_margin95_label-{value}.vtk")
+            save_outline(target, np.nan_to_num(probability), grid.affine, 1 - MARGIN)
+            written.append(target)
     return written
