@@ -9,6 +9,7 @@ import pytest
 from ruamel.yaml import YAML
 
 import bayesreg as br
+from bayesreg.inference.draws.inference_data import arviz
 from bayesreg.io import store
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import prepared_inputs
@@ -93,6 +94,26 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
         assert 'id="landmarks"' in page
         assert 'id="fit"' not in page
         assert "Before and after" not in page
+
+
+def test_arviz_finds_what_it_knows_by_name(folder, tmp_path):
+    pairs = [{"kind": "landmarks", "file": "pairs.csv", "name": "points"}]
+    with without_reports():
+        idata = br.run(configuration(folder, pairs), tmp_path / "out", progress=False).idata
+    assert idata.posterior["u_boundary"].attrs["units"] == "mm"
+    assert idata.sample_stats["diverging"].dtype == bool
+    assert {"lp", "acceptance_rate", "n_steps"} <= set(idata.sample_stats.data_vars)
+    draws, observed = idata.posterior_predictive["points"], idata.observed_data["points"]
+    assert draws.dims == ("chain", "draw", "points_point", "axis")
+    assert observed.sizes == {"points_point": 8, "axis": 3}
+    np.testing.assert_allclose(draws.mean(("chain", "draw")), observed, atol=0.6)
+    # Against the density in closed form: ∏ N(q − p; u(p), sd²), up to the spread of the replicates.
+    log = idata.log_likelihood["points"]
+    assert log.dims == ("chain", "draw", "points_point")
+    assert log.max() <= 3 * (-0.5 * np.log(2 * np.pi) - np.log(0.2)) + 1e-9
+    found = arviz().loo(idata, var_name="points")
+    assert np.isfinite(float(getattr(found, "elpd_loo", getattr(found, "elpd", np.nan))))
+    assert len(arviz().summary(idata, var_names=["lam", "mu"])) > 0
 
 
 def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(folder, tmp_path):

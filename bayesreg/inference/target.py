@@ -63,6 +63,10 @@ class Variables(Protocol):
     def constants(self) -> Mapping[str, AnyArray]:
         """Arrays that a reader of the draws needs, such as the mesh."""
 
+    @property
+    def attributes(self) -> Mapping[str, Mapping[str, str]]:
+        """What variables and constants mean, and their units: "long_name" and "units", as in xarray."""
+
     def values(self, estimands: Estimands) -> dict[str, Any]:
         """Variables of estimands whose arrays may have leading axes; on the host."""
 

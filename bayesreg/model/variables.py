@@ -26,6 +26,22 @@ DIMS = {
     "boundary": ("node",),
 }
 
+# "1" is a number without unit: moduli are relative, unless one of them is fixed in a unit.
+MEANINGS = {
+    "u_boundary": ("displacement of the sampled nodes, world RAS", "mm"),
+    "lam": ("first Lamé parameter λ", "1"),
+    "mu": ("second Lamé parameter μ, the shear modulus", "1"),
+    "ratio": ("λ/μ", "1"),
+    "field": ("components of the logarithm of stiffness, whitened", "1"),
+    "field_sd": ("standard deviation of the logarithm of stiffness", "1"),
+    "t_similarity": ("temperature T_s of the images", "1"),
+    "t_elastic": ("temperature T_r of the elastic prior", "1"),
+    "points": ("nodes, world RAS", "mm"),
+    "cells": ("nodes of each tetrahedron", "1"),
+    "tissue": ("tissue of each tetrahedron", "1"),
+    "boundary": ("sampled nodes", "1"),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Variables:
@@ -61,6 +77,11 @@ class Variables:
         """Points (mm), cells, tissue of every cell and the sampled nodes."""
         mesh = self.mesh
         return {"points": mesh.points, "cells": mesh.cells, "tissue": mesh.tissue, "boundary": self.nodes}
+
+    @property
+    def attributes(self) -> Mapping[str, Mapping[str, str]]:
+        """What variables and constants mean, and their units."""
+        return {name: {"long_name": meaning, "units": units} for name, (meaning, units) in MEANINGS.items()}
 
     def values(self, estimands: Values) -> dict[str, np.ndarray]:
         """u_B, all entries of λ, μ and λ/μ, and what else is sampled; arrays may have leading axes.

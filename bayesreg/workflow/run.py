@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
@@ -28,7 +29,7 @@ from bayesreg.inference.chains.run import (
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.diagnostics import convergence
-from bayesreg.inference.draws.inference_data import dataset, open_posterior, save_posterior, to_blocks
+from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior, to_blocks
 from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
 from bayesreg.io.records import Inputs, Run
@@ -42,7 +43,7 @@ from bayesreg.transform import Transform
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with_initial
 from bayesreg.workflow.manifest import manifest
-from bayesreg.workflow.prediction import mean_values, predict
+from bayesreg.workflow.prediction import mean_values, predict, predict_landmarks
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
 from bayesreg.workflow.result import Result, load_result, report
 from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
@@ -336,6 +337,10 @@ def _finish(
     from bayesreg.report.html import write_report
 
     save_posterior(posterior, samples.blocks, out / "posterior.nc")
+    # A file that is open is not added to.
+    with xr.open_dataset(out / "posterior.nc", group="posterior") as draws:
+        groups = predict_landmarks(posterior, draws, config.seed)
+    append_groups(out / "posterior.nc", groups)
     idata = open_posterior(out / "posterior.nc")
     draws, judged = dataset(idata, "posterior"), convergence(idata)
     grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose

@@ -199,6 +199,6 @@ def _statistics(windows: Tally) -> dict[str, AnyArray]:
         "solver_iterations": windows.solver_iterations / windows.steps,
         "solver_failed": windows.solver_failed.astype(int),
         "outside_support": windows.outside_support.astype(int),
-        "diverging": windows.diverging.astype(int),
-        "gradients": windows.gradients.astype(int),
+        "diverging": windows.diverging > 0,
+        "n_steps": windows.gradients.astype(int),
     }

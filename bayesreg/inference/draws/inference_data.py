@@ -8,7 +8,7 @@ wait for: hence inside the functions.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,20 @@ _OLD = int(version("arviz").split(".")[0]) < 1
 
 STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
-    "outside_support", "diverging", "gradients",
+    "outside_support", "diverging", "n_steps",
 )  # fmt: skip
+# Of the steps since the draw before.
+MEANINGS = {
+    "lp": "log posterior density, up to a constant",
+    "acceptance_rate": "mean acceptance probability",
+    "similarity_energy": "E_s, eq. (1)",
+    "strain_energy": "E_r, eq. (3)",
+    "solver_iterations": "conjugate-gradient iterations of an elastic solve, mean",
+    "solver_failed": "elastic solves that failed",
+    "outside_support": "proposals outside of the support",
+    "diverging": "whether the energy error of a trajectory was beyond bounds",
+    "n_steps": "gradients of the log density",
+}
 # Functions of estimands that stand beside them.
 DERIVED = ("ratio",)
 # The file's pieces hold so many nodes (or modes, elements) of a block of draws: both few nodes of all draws and all
@@ -65,7 +77,14 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
         "coords": dict(variables.coords),
         "dims": {name: list(dims) for name, dims in variables.dims.items()},
     }
-    return az.from_dict(**groups, **labels) if _OLD else az.from_dict(groups, **labels)
+    found = az.from_dict(**groups, **labels) if _OLD else az.from_dict(groups, **labels)
+    for group in ("posterior", "constant_data"):
+        for name, attributes in variables.attributes.items():
+            if name in getattr(found, group):
+                getattr(found, group)[name].attrs.update(attributes)
+    for name, meaning in MEANINGS.items():
+        found.sample_stats[name].attrs["long_name"] = meaning
+    return found
 
 
 def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
@@ -142,6 +161,13 @@ def _extend(file: netCDF4.Dataset, idata: Any) -> None:
             if "draw" in values.dims:
                 where = tuple(rows if dim == "draw" else slice(None) for dim in values.dims)
                 place[str(name)][where] = values.to_numpy() + (first if name == "draw" else 0)
+
+
+def append_groups(path: str | Path, groups: Mapping[str, xr.Dataset]) -> None:
+    """Add groups, such as `log_likelihood`, to a file of `save_posterior`, those of the same names being replaced."""
+    for name, data in groups.items():
+        encoding = {variable: {"zlib": True, "complevel": 1} for variable in data.data_vars}
+        data.to_netcdf(path, mode="a", group=name, engine="netcdf4", encoding=encoding)
 
 
 def _groups(idata: Any) -> list[str]:
