@@ -263,6 +263,14 @@ def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: Like = None, 
 
 
 @app.command()
+def slicer(folder: RunFolder, out: OutFolder) -> None:
+    """Write a run as a scene of 3D Slicer, in the world of MOVING."""
+    from bayesreg.workflow.slicer import slicer
+
+    typer.echo(f"Scene: {slicer(folder, out)}")
+
+
+@app.command()
 def report(folder: RunFolder) -> None:
     """Write the report of a run once more."""
     from bayesreg.workflow.result import report

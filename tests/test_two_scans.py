@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from xml.etree import ElementTree
 
 import nibabel as nib
 import numpy as np
@@ -21,6 +22,7 @@ from bayesreg.report.slices import planes_through
 from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
 from bayesreg.workflow.assembly import _observations
 from bayesreg.workflow.preparation import prepare
+from bayesreg.workflow.slicer import slicer
 from tests.io.test_alignment import FIXED, MASK, motion
 from tests.phantoms import ball_mesh
 
@@ -65,6 +67,7 @@ def folder(tmp_path_factory):
                   "fixed": {"lam": 10.0, "mu": 1.0}},
         "sampler": {"name": "laplace", "chains": 2},
         "stop": {"rhat": None, "max_steps": 200},
+        "results": {"draws": 4, "bids": {"subject": "01", "session": "or"}},
     }  # fmt: skip
     YAML(typ="safe").dump(content, folder / "run.yaml")
     return folder
@@ -348,3 +351,53 @@ def test_maps(result, folder):
     br.save_image(br.Image(np.zeros((3, 3, 3)), away), folder / "far.nii.gz")
     with pytest.raises(br.InputError, match="no voxel of the grid"):
         br.maps(result.folder, folder / "maps", like=folder / "far.nii.gz")
+
+
+def test_a_scene_for_slicer(result, folder):
+    scene = slicer(result.folder, folder / "scene")
+    root = ElementTree.parse(scene).getroot()
+    nodes = {node.get("id"): node for node in root}
+    assert len(nodes) == len(list(root))
+    for node in root:
+        if node.get("fileName"):
+            assert (scene.parent / node.get("fileName")).is_file()
+        for reference in filter(None, node.get("references", "").split(";")):
+            assert reference.partition(":")[2] in nodes
+    named = {node.get("name"): node for node in root}
+    assert "transform:" in named["fixed"].get("references")
+    assert "transform:" not in named["moving"].get("references")
+    # Everything but what is carried lies in the moving image's world.
+    moving, own = (nib.load(path) for path in (scene.parent / "moving.nii.gz", folder / "moving.nii.gz"))
+    np.testing.assert_allclose(moving.affine, own.affine, atol=1e-4)
+    places = br.read_point_pairs(scene.parent / "places.mrk.json", scene.parent / "places.mrk.json")
+    predicted = result.run.predicted
+    assert list(places.names) == list(predicted.place_names)
+    u = predicted.place_draws.mean(axis=(0, 1))
+    expected = result.run.matching.pose.place(predicted.place_points + u)
+    np.testing.assert_allclose(places.fixed, expected, atol=0.05)
+    ellipsoids = pyvista.read(scene.parent / "places_95.vtk")
+    centres = [ellipsoids.points[ellipsoids["number"] == k].mean(axis=0) for k in range(len(places.names))]
+    np.testing.assert_allclose(centres, places.fixed, atol=1e-3)
+    surface = pyvista.read(scene.parent / "surface.vtk")
+    assert surface.is_manifold
+    assert (surface["radius95"] > 0).all()
+
+
+def test_names_of_bids(result):
+    place = result.folder / "bids" / "sub-01" / "ses-or" / "anat"
+    stem = "sub-01_ses-or_"
+    names = ["from-intraop_to-preop_mode-image_xfm.h5", "from-preop_to-intraop_mode-image_xfm.h5",
+             "space-preop_desc-warped_T1w.nii.gz", "space-preop_stat-mean_displacement.nii.gz",
+             "space-preop_stat-sd_displacement.nii.gz"]  # fmt: skip
+    sidecars = [name.replace(".nii.gz", ".json").replace(".h5", ".json") for name in names]
+    assert sorted(path.name for path in place.iterdir()) == sorted(stem + name for name in [*names, *sidecars])
+    assert (place / (stem + names[0])).samefile(result.folder / "transform_mean.h5")
+    description = json.loads((result.folder / "bids" / "dataset_description.json").read_text())
+    assert description["DatasetType"] == "derivative"
+    with pytest.raises(br.InputError, match=r"results.bids.subject"):
+        make_config({"data": {"source": "mni152"}, "results": {"bids": {"subject": "sub_1"}}})
+
+
+def test_draws_are_left_as_transforms(result):
+    names = [path.name for path in sorted((result.folder / "transforms").iterdir())]
+    assert names == [f"draw-{k}{end}" for k in range(1, 5) for end in (".h5", ".nii.gz", "_inverse.h5")]

@@ -88,11 +88,29 @@ class DistributedConfig(Section):
     """Which this is, from 0."""
 
 
+BidsLabel = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9]+$")]
+
+
+class BidsConfig(Section):
+    """Names of BIDS: letters and digits."""
+
+    subject: BidsLabel
+    session: BidsLabel | None = None
+    fixed: BidsLabel = "preop"
+    """What the space of the fixed image is called."""
+    moving: BidsLabel = "intraop"
+    """What the space of the moving image is called."""
+    suffix: BidsLabel = "T1w"
+    """Of the moving image."""
+
+
 class ResultsConfig(Section):
     """What a run leaves for other programs, besides what it always does."""
 
     draws: Annotated[int, Field(strict=True, ge=0)] = 20
     """How many draws, evenly spaced, are written as transforms and displacement fields of their own."""
+    bids: BidsConfig | None = None
+    """Write the results under the names of BIDS derivatives, too."""
 
 
 class ReportConfig(Section):

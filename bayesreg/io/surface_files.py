@@ -8,10 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from skimage import measure
 
 from bayesreg.io.atomic import replacing
@@ -110,21 +111,49 @@ def write_surface(
 def save_outline(
     path: str | Path, values: Float[np.ndarray, "X Y Z"], affine: Float[np.ndarray, "4 4"], level: float
 ) -> None:
-    """Write the surface about all voxels above a level as a .vtk file, world RAS mm, all of it or nothing.
+    """Write the surface about all voxels above a level as a .vtk file, world RAS mm.
 
     Raises
     ------
     InputError
         If no voxel is above the level.
     """
-    import pyvista
-
     if not (values > level).any():
         raise InputError(f"{path}: no voxel is above {level:g}, so that there is no surface")
     # A rim of zeros closes the surface where it meets the end of the grid.
     points, faces, _, _ = measure.marching_cubes(np.pad(values, 1), level)
-    world = (points - 1) @ affine[:3, :3].T + affine[:3, 3]
-    surface = pyvista.PolyData(world, np.insert(faces, 0, 3, axis=1).ravel())
+    save_surface(path, (points - 1) @ affine[:3, :3].T + affine[:3, 3], faces)
+
+
+def save_ellipsoids(
+    path: str | Path,
+    centres: Float[np.ndarray, "k 3"],
+    half_axes: Float[np.ndarray, "k 3"],
+    directions: Float[np.ndarray, "k 3 3"],
+) -> None:
+    """Write ellipsoids, world RAS mm, each direction a row, as one surface in a .vtk file."""
+    import pyvista
+
+    ball = pyvista.Icosphere(radius=1.0, nsub=2)
+    points, faces = np.asarray(ball.points, float), np.asarray(ball.regular_faces).astype(np.int64)
+    every = centres[:, None] + np.einsum("pa,ka,kai->kpi", points, half_axes, directions)
+    number = np.repeat(np.arange(len(centres)), len(points))
+    shift = len(points) * np.arange(len(centres))[:, None, None]
+    save_surface(path, every.reshape(-1, 3), (faces + shift).reshape(-1, 3), {"number": number})
+
+
+def save_surface(
+    path: str | Path,
+    points: Float[np.ndarray, "k 3"],
+    faces: Int[np.ndarray, "t 3"],
+    values: Mapping[str, AnyArray] = MappingProxyType({}),
+) -> None:
+    """Write triangles, world RAS mm, with values at the points as a .vtk file, all of it or nothing."""
+    import pyvista
+
+    surface = pyvista.PolyData(points, np.insert(faces, 0, 3, axis=1).ravel())
+    for name, value in values.items():
+        surface.point_data[name] = np.asarray(value)
     with replacing(path) as temporary:
         surface.save(temporary)
         _say_space(temporary, "RAS")

@@ -42,6 +42,7 @@ from bayesreg.report.metrics import compute_metrics
 from bayesreg.transform import Transform
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with_initial
+from bayesreg.workflow.bids import write_bids
 from bayesreg.workflow.manifest import manifest
 from bayesreg.workflow.prediction import mean_values, predict, predict_landmarks
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
@@ -375,6 +376,8 @@ def _finish(
     # Before run.json, which says that all is there.
     write_transforms(out, transform, grid, field)
     store.write_results(out, finished, mean_field, moments.sd)
+    if config.results.bids is not None:
+        write_bids(out, config.results.bids)
     checkpoints.remove_blocks(out)
     result = Result(out, finished)
     write_report(finished, idata, *judged, result.report)

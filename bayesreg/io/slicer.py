@@ -1,0 +1,93 @@
+"""Scenes and points for 3D Slicer: an index of files (.mrml, XML) beside these, and markups (.mrk.json)."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.io.atomic import write_json, write_text
+
+SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
+    "markups-schema-v1.0.3.json#"
+)
+TO_LPS = np.array([-1.0, -1.0, 1.0])
+
+
+class Item(NamedTuple):
+    """A file of a scene.
+
+    Attributes
+    ----------
+    kind : str
+        "volume", "transform", "model" or "markups".
+    name : str
+    file : str
+        Beside the scene.
+    transform : str
+        The name of an earlier item of the kind "transform" that carries this one; empty for none.
+    colour : tuple
+        Of a model: red, green, blue and opacity.
+    """
+
+    kind: str
+    name: str
+    file: str
+    transform: str = ""
+    colour: tuple[float, float, float, float] = (0.8, 0.8, 0.8, 1.0)
+
+
+# By kind: the elements of the node and of its storage, and the classes behind them.
+ELEMENTS = {
+    "volume": ("Volume", "vtkMRMLScalarVolumeNode", "VolumeArchetypeStorage", "vtkMRMLVolumeArchetypeStorageNode"),
+    "transform": ("Transform", "vtkMRMLTransformNode", "TransformStorage", "vtkMRMLTransformStorageNode"),
+    "model": ("Model", "vtkMRMLModelNode", "ModelStorage", "vtkMRMLModelStorageNode"),
+    "markups": (
+        "MarkupsFiducial", "vtkMRMLMarkupsFiducialNode", "MarkupsFiducialStorage", "vtkMRMLMarkupsFiducialStorageNode",
+    ),
+}  # fmt: skip
+DISPLAYS = {
+    "volume": ("VolumeDisplay", "vtkMRMLScalarVolumeDisplayNode", {"colorNodeRef": "vtkMRMLColorTableNodeGrey"}),
+    "model": ("ModelDisplay", "vtkMRMLModelDisplayNode", {"visibility": "true"}),
+    "markups": ("MarkupsDisplay", "vtkMRMLMarkupsDisplayNode", {"visibility": "true"}),
+}
+
+
+def write_scene(path: str | Path, items: Sequence[Item]) -> None:
+    """Write a scene whose items lie beside it, in one step."""
+    scene = ET.Element("MRML", version="Slicer5.0.0", userTags="")
+    transforms: dict[str, str] = {}
+    for number, item in enumerate(items, start=1):
+        element, node, storage, storage_node = ELEMENTS[item.kind]
+        references = [f"storage:{storage_node}{number}"]
+        ET.SubElement(scene, storage, id=f"{storage_node}{number}", name=f"{item.name} file", fileName=quote(item.file))
+        if item.kind in DISPLAYS:
+            display, display_node, settings = DISPLAYS[item.kind]
+            if item.kind == "model":
+                red, green, blue, opacity = item.colour
+                settings = settings | {"color": f"{red:g} {green:g} {blue:g}", "opacity": f"{opacity:g}"}
+            ET.SubElement(scene, display, id=f"{display_node}{number}", name=f"{item.name} display", attrib=settings)
+            references.append(f"display:{display_node}{number}")
+        if item.transform:
+            references.append(f"transform:{transforms[item.transform]}")
+        if item.kind == "transform":
+            transforms[item.name] = f"{node}{number}"
+        ET.SubElement(scene, element, id=f"{node}{number}", name=item.name, references=";".join(references) + ";")
+    ET.indent(scene)
+    write_text(path, '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(scene, encoding="unicode") + "\n")
+
+
+def write_markups(path: str | Path, names: Sequence[str], points: Float[np.ndarray, "k 3"]) -> None:
+    """Write points, world RAS mm, as a .mrk.json file."""
+    controls = [
+        {"id": str(number), "label": name, "position": (point * TO_LPS).tolist(), "positionStatus": "defined"}
+        for number, (name, point) in enumerate(zip(names, points, strict=True), start=1)
+    ]
+    markups = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": controls}
+    write_json(path, {"@schema": SCHEMA, "markups": [markups]})
