@@ -34,6 +34,7 @@ from bayesreg.report.estimands import Diagnosed, Estimand, estimands
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.report.modes import Grouping, grouping
 from bayesreg.report.panels import View
+from bayesreg.report.three_d import three_d
 from bayesreg.report.trust import explain_intervals
 from bayesreg.report.verdict import (
     Verdict,
@@ -101,7 +102,8 @@ def write_report(
     shown = {"groups": apart, "pose": predicted, "trust": predicted, "landmarks": pairs, "fit": fit, "one-node": nodes}
     left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
-        *(draw(view) for draw in (anatomy.registration, anatomy.data, anatomy.result, anatomy.displacement)),
+        *(draw(view) for draw in (anatomy.registration, anatomy.checkerboard, anatomy.data, anatomy.result)),
+        anatomy.displacement(view),
         matching.pose_picture(view),
         uncertainty.maps(view, predicted) if predicted else None,
         uncertainty.places(view, predicted) if predicted else None,
@@ -126,6 +128,8 @@ def write_report(
         "facts": key_facts(run.manifest, entries, posterior),
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
+        "swipes": anatomy.swipes(view),
+        "three_d": three_d(view, predicted) if predicted else None,
         "error_tables": error_tables(metrics, run.mesh.names),
         "notes": matching.notes(run.manifest),
         "pose": matching.pose_table(predicted) if predicted else None,
