@@ -34,6 +34,7 @@ from bayesreg.report.estimands import Diagnosed, Estimand, estimands
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.report.modes import Grouping, grouping
 from bayesreg.report.panels import View
+from bayesreg.report.summary import summarise_run
 from bayesreg.report.three_d import three_d
 from bayesreg.report.trust import explain_intervals
 from bayesreg.report.verdict import (
@@ -119,12 +120,14 @@ def write_report(
         convergence.traces(posterior, sample_stats, entries),
         convergence.distributions(run.mesh, entries, posterior["node"].to_numpy(), threshold_of(run.manifest)),
     ]
+    judged = _judge(run.manifest, entries, groups)
     content = {
         "title": name_of(run),
         "subtitle": _subtitle(run, posterior),
         "sections": [(key, name) for key, name in SECTIONS if key not in left_out],
         "approximation": approximation(run.manifest),
-        "verdict": _judge(run.manifest, entries, groups),
+        "verdict": judged,
+        "summary": summarise_run(run, predicted, judged) if predicted else [],
         "facts": key_facts(run.manifest, entries, posterior),
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},

@@ -33,6 +33,8 @@ GREY = "gray"
 
 WIDTH = 10.8
 DPI = 160
+# Of pictures, from 1 to 100.
+QUALITY = 88
 
 _SETTINGS: Any = {
     "font.family": "sans-serif",
@@ -99,11 +101,14 @@ def new_figure(height: float, width: float = WIDTH) -> Figure:
     return Figure(figsize=(width, height), layout=ConstrainedLayoutEngine(hspace=0.04))
 
 
-def data_uri(figure: Figure, kind: str = "png") -> str:
-    """A figure as a data URI: "png" for pictures, "svg" for curves."""
+def data_uri(figure: Figure, kind: str = "webp") -> str:
+    """A figure as a data URI: "webp" for pictures, a fifth of the size of PNG on noisy images; "svg" for curves."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=DPI, metadata={"Date": None} if kind == "svg" else None)
-    media = "image/svg+xml" if kind == "svg" else "image/png"
+    if kind == "svg":
+        figure.savefig(buffer, format=kind, metadata={"Date": None})
+    else:
+        figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs={"quality": QUALITY})
+    media = "image/svg+xml" if kind == "svg" else f"image/{kind}"
     return f"data:{media};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 

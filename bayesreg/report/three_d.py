@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 from markupsafe import Markup
+from scipy.sparse.csgraph import connected_components
 
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import FACES, TetMesh
@@ -79,9 +81,9 @@ def three_d(view: View, predicted: Predicted) -> ThreeD:
         "places": _places(predicted),
     }
     caption = (
-        "Drag to turn, scroll to come nearer. The surface of the mesh and the fluid in it, where they were before and "
-        "where the posterior mean takes them (the pose left out), and each place within the ellipsoid that holds it "
-        "with 95 %. “Enlarge” shows movement and ellipsoids so many times as large as they are."
+        "Drag to turn, scroll to come nearer. The surface of the mesh and the fluid deep in it, where they were before "
+        "and where the posterior mean takes them (the pose left out), and each place within the ellipsoid that holds "
+        "it with 95 %. “Enlarge” shows movement and ellipsoids so many times as large as they are."
     )
     own = {"three": "three.module.min.js", "orbit-controls": "OrbitControls.js"}
     libraries = {name: _data_uri(_read(file)) for name, file in own.items()}
@@ -103,15 +105,18 @@ def _shell(
 
 
 def _fluid_surface(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
-    """Faces between fluid inside and what is solid."""
+    """The surface of the largest connected piece of fluid deep inside, such as the ventricles; empty without any."""
     fluid = np.array([is_fluid(name) for name in mesh.names])[mesh.tissue]
-    faces = mesh.cells[fluid][:, FACES].reshape(-1, 3)
-    if not len(faces) or fluid.all():
+    deep = np.flatnonzero(fluid & ~np.isin(mesh.cells, mesh.boundary).any(axis=1))
+    if not len(deep):
         return np.zeros((0, 3), int)
+    one, other = mesh.neighbours[np.isin(mesh.neighbours, deep).all(axis=1)].T
+    graph = scipy.sparse.coo_array((np.ones(len(one)), (one, other)), (len(mesh.cells), len(mesh.cells)))
+    piece = connected_components(graph, directed=False)[1][deep]
+    largest = deep[piece == np.bincount(piece).argmax()]
+    faces = mesh.cells[largest][:, FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    faces = faces[first[count == 1]]
-    outer = {tuple(row) for row in np.sort(mesh.boundary_faces, axis=1).tolist()}
-    return faces[[tuple(row) not in outer for row in np.sort(faces, axis=1).tolist()]]
+    return faces[first[count == 1]]
 
 
 def _places(predicted: Predicted) -> list[dict[str, Any]]:

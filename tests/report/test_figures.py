@@ -3,8 +3,8 @@ import io
 from dataclasses import replace
 
 import numpy as np
+import PIL.Image
 import pytest
-from matplotlib import image
 from matplotlib.figure import Figure
 
 from bayesreg.report import adequacy, anatomy, convergence, marginals, style
@@ -36,7 +36,8 @@ def coarse(monkeypatch):
 
 
 def pixels(drawing) -> np.ndarray:
-    return image.imread(io.BytesIO(base64.b64decode(drawing.uri.split(",")[1])))[..., :3]
+    picture = PIL.Image.open(io.BytesIO(base64.b64decode(drawing.uri.split(",")[1])))
+    return np.asarray(picture.convert("RGB")) / 255
 
 
 def test_the_error_on_a_plane_is_the_norm_of_the_interpolated_error(study, view):

@@ -1,18 +1,30 @@
 import base64
 import io
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
+import PIL.Image
 import pytest
-from matplotlib import image
 
 from bayesreg.report import style
 from bayesreg.report.html import write_report
 from bayesreg.report.places import regions
 
-FIGURES = {"registration", "data", "result", "displacement", "stiffness", "node", "traces", "distributions"}
+FIGURES = {
+    "registration",
+    "swipe",
+    "checkerboard",
+    "data",
+    "result",
+    "displacement",
+    "stiffness",
+    "node",
+    "traces",
+    "distributions",
+}
 FORWARD = {"uncertainty", "places", "residual"}
 
 
@@ -26,12 +38,15 @@ class Page(HTMLParser):
         self.text = ""
         self.tags: set[str] = set()
         self.links: list[str] = []
+        self.scripts: dict[str, str] = {}
+        self._script = ""
         self._key = ""
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         found = dict(attrs)
         self.tags.add(tag)
+        self._script = found.get("type", "") if tag == "script" else ""
         self._key = found.get("id", "") if tag == "figure" else self._key
         if tag == "img":
             self.figures[self._key] = found["src"]
@@ -42,7 +57,13 @@ class Page(HTMLParser):
             self.rows[-1].append("")
         self.links += [value for key, value in found.items() if key in ("href", "src") and value]
 
+    def handle_endtag(self, tag):
+        self._script = ""
+
     def handle_data(self, data):
+        if self._script:
+            self.scripts[self._script] = self.scripts.get(self._script, "") + data
+            return
         self.text += data
         if self.rows and self.rows[-1]:
             self.rows[-1][-1] += data
@@ -80,19 +101,58 @@ def clinical(tmp_path_factory, uniform_study):
 def test_every_figure_is_drawn_and_embedded(full):
     assert set(full.figures) == FIGURES | FORWARD
     for key, uri in full.figures.items():
-        kind, content = re.fullmatch(r"data:image/(png|svg\+xml);base64,(.+)", uri).groups()
+        kind, content = re.fullmatch(r"data:image/(png|webp|svg\+xml);base64,(.+)", uri).groups()
         content = base64.b64decode(content)
-        if kind == "png":
-            pixels = image.imread(io.BytesIO(content))[..., :3]
-            assert pixels.shape[1] == round(style.WIDTH * 40)
+        if kind != "svg+xml":
+            pixels = np.asarray(PIL.Image.open(io.BytesIO(content)).convert("RGB")) / 255
+            assert key == "swipe" or pixels.shape[1] == round(style.WIDTH * 40)
             assert pixels.std() > 0.02, key
         else:
             assert content.count(b"<path") > 50, key
 
 
-def test_the_page_needs_no_network_and_no_script(full):
+def test_the_page_needs_no_network(full):
     assert all(link.startswith(("#", "data:")) for link in full.links)
-    assert not full.tags & {"script", "link", "iframe"}
+    assert not full.tags & {"link", "iframe"}
+    # What the browser's modules import stands in the page.
+    libraries = json.loads(full.scripts["importmap"])["imports"]
+    assert set(libraries) == {"three", "orbit-controls"}
+    assert all(uri.startswith("data:text/javascript;base64,") for uri in libraries.values())
+    wanted = re.findall(r'from "([^"]+)"', full.scripts["module"])
+    assert set(wanted) == set(libraries)
+
+
+def test_three_dimensions_show_the_mesh_where_it_was_and_went(full, study):
+    run, shown = study.run, json.loads(full.scripts["application/json"])
+    outer = shown["shells"][0]
+    points, faces = np.array(outer["points"]), np.array(outer["faces"])
+    np.testing.assert_allclose(points, run.mesh.points[run.mesh.boundary], atol=0.01)
+    np.testing.assert_allclose(outer["moved"], run.u_mean[run.mesh.boundary], atol=0.01)
+    np.testing.assert_array_equal(run.mesh.boundary[faces], run.mesh.boundary_faces)
+    for colours in outer["colours"].values():
+        assert len(colours) == 3 * len(points)
+        assert 0 <= min(colours) <= max(colours) <= 1
+    assert [place["name"] for place in shown["places"]] == list(run.predicted.place_names)
+    for place in shown["places"]:
+        axes = np.array(place["axes"])
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-3)
+        assert np.linalg.det(axes) > 0
+
+
+def test_a_place_ends_no_script(tmp_path, study):
+    names = np.array(["</script><b>", *study.run.predicted.place_names[1:]])
+    run = replace(study.run, predicted=study.run.predicted._replace(place_names=names))
+    assert (
+        json.loads(page(tmp_path, study._replace(run=run)).scripts["application/json"])["places"][0]["name"] == names[0]
+    )
+
+
+def test_what_a_clinician_reads_first(full, study):
+    run = study.run
+    most = np.linalg.norm(run.u_mean, axis=1).max()
+    for question in ("What moved?", "How far?", "How sure?", "Where not to trust it?"):
+        assert question in full.text
+    assert f"the most, {most:.1f} mm" in full.text
 
 
 def test_table_1_holds_the_errors_of_the_boundary_nodes(full, study):

@@ -54,4 +54,4 @@ def test_where_nothing_is_left_out_that_is_said(study, residual, covariance, sai
     table = landmark_table(study.run.mesh, predicted)
     assert said in table.caption
     assert "nan" not in str(table)
-    assert residuals(predicted).uri.startswith("data:image/png")
+    assert residuals(predicted).uri.startswith("data:image/webp")

@@ -14,7 +14,7 @@ function start() {
   const camera = new THREE.PerspectiveCamera(30, 1, data.size / 100, data.size * 20);
   // World RAS: up is superior; seen from the front, right and above.
   camera.up.set(0, 0, 1);
-  camera.position.set(...data.centre).add(new THREE.Vector3(1.0, 2.4, 0.9).multiplyScalar(data.size));
+  camera.position.set(...data.centre).add(new THREE.Vector3(0.8, 1.7, 0.7).multiplyScalar(data.size));
   const controls = new OrbitControls(camera, renderer.domElement);
   controls.target.set(...data.centre);
   controls.update();
@@ -27,8 +27,8 @@ function start() {
     geometry.setIndex(shell.faces.flat());
     geometry.setAttribute("position", new THREE.Float32BufferAttribute(shell.points.flat(), 3));
     const material = new THREE.MeshStandardMaterial({
-      roughness: 0.85, side: THREE.DoubleSide, transparent: true, opacity: 1.0, vertexColors: Boolean(shell.colours),
-      color: shell.colours ? 0xffffff : new THREE.Color(shell.colour),
+      roughness: 0.85, side: shell.colours ? THREE.FrontSide : THREE.DoubleSide, transparent: Boolean(shell.colours),
+      vertexColors: Boolean(shell.colours), color: shell.colours ? 0xffffff : new THREE.Color(shell.colour),
     });
     const mesh = new THREE.Mesh(geometry, material);
     scene.add(mesh);
