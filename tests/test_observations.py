@@ -96,6 +96,33 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
         assert "Before and after" not in page
 
 
+def test_landmarks_are_held_out(folder, tmp_path):
+    """Points that no observation names are compared with the result, and change nothing of it."""
+    table = (folder / "pairs.csv").read_text().splitlines()
+    (folder / "six.csv").write_text("\n".join(table[:7]))
+    (folder / "two.csv").write_text("\n".join([table[0], *table[7:], "far,200,0,0,201,0,0,0.2"]))
+    seen = [{"kind": "landmarks", "file": "six.csv"}]
+    plain = br.run(configuration(folder, seen, evaluation=None), tmp_path / "plain", progress=False)
+    file = configuration(folder, seen, evaluation={"landmarks": "two.csv"})
+    result = br.run(file, tmp_path / "out", progress=False)
+    np.testing.assert_array_equal(result.idata.posterior["u_boundary"], plain.idata.posterior["u_boundary"])
+    found = br.load_result(tmp_path / "out").run.predicted
+    assert list(found.evaluation_names) == ["p6", "p7", "far"]
+    assert found.evaluation_inside.tolist() == [True, True, False]
+    np.testing.assert_allclose(found.evaluation_before[:2], np.linalg.norm(SHIFT), atol=1.0)
+    after = np.linalg.norm(found.evaluation_residual[:2], axis=1)
+    assert (after < found.evaluation_before[:2]).all()
+    assert (np.sqrt(np.einsum("kii->ki", found.evaluation_covariance)) >= 0.2).all()
+    page = result.report.read_text(encoding="utf-8")
+    assert 'id="evaluation"' in page
+    assert "Target registration error" in page
+    assert 'id="evaluation"' not in plain.report.read_text(encoding="utf-8")
+    with pytest.raises(br.InputError, match=r"evaluation.landmarks"):
+        br.load_config(configuration(folder, seen, evaluation={"landmarks": "none.csv"}))
+    with pytest.raises(br.InputError, match="this name is taken"):
+        br.load_config(configuration(folder, [seen[0] | {"name": "evaluation"}]))
+
+
 def test_arviz_finds_what_it_knows_by_name(folder, tmp_path):
     pairs = [{"kind": "landmarks", "file": "pairs.csv", "name": "points"}]
     with without_reports():

@@ -113,6 +113,17 @@ class ResultsConfig(Section):
     """Write the results under the names of BIDS derivatives, too."""
 
 
+class EvaluationConfig(Section):
+    """What the result is held against, and the sampler never sees."""
+
+    landmarks: FoundFile
+    """Pairs of points: both of each in one file (.csv, or .tag of two volumes), or those of the fixed image."""
+    moving_landmarks: FoundFile | None = None
+    """The points in the moving image, where they stand in a file of their own."""
+    sd: Positive | None = None
+    """Sd of the error of each coordinate with which they were found, mm; null takes the file's column sd, else zero."""
+
+
 class ReportConfig(Section):
     """The content of the report."""
 
@@ -188,6 +199,8 @@ class Config(Section):
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()
     results: ResultsConfig = ResultsConfig()
+    evaluation: EvaluationConfig | None = None
+    """Landmarks that are held out."""
     distributed: DistributedConfig | None = None
     """Other processes that share the chains; null runs alone."""
 

@@ -83,6 +83,14 @@ class Predicted(NamedTuple):
         All landmarks that were observed: names, places in the fixed image, sd and residual at the mean, mm.
     left_out_residual, left_out_covariance : (k, 3), (k, 3, 3) arrays or None
         The residual of each landmark, predicted by all observations but itself, where there are few.
+    evaluation_names, evaluation_points : (k,), (k, 3) arrays or None
+        Landmarks that were held out: names, and places in the fixed image.
+    evaluation_before, evaluation_posed : (k,) arrays or None
+        Their distances, mm, by the headers and by the pose alone.
+    evaluation_residual, evaluation_covariance : (k, 3), (k, 3, 3) arrays or None
+        Found less predicted by the posterior mean, mm, in the moving image's world, and the covariance of that.
+    evaluation_inside : (k,) bool array or None
+        Which lie in the mesh.
     stiffness_mean, stiffness_sd : (m,) array or None
         Posterior mean and standard deviation of every element's stiffness over its tissue's; None without a field.
     stiffer : scalar or None
@@ -111,6 +119,13 @@ class Predicted(NamedTuple):
     landmark_residual: AnyArray | None = None
     left_out_residual: AnyArray | None = None
     left_out_covariance: AnyArray | None = None
+    evaluation_names: np.ndarray | None = None
+    evaluation_points: AnyArray | None = None
+    evaluation_before: AnyArray | None = None
+    evaluation_posed: AnyArray | None = None
+    evaluation_residual: AnyArray | None = None
+    evaluation_covariance: AnyArray | None = None
+    evaluation_inside: AnyArray | None = None
     stiffness_mean: AnyArray | None = None
     stiffness_sd: AnyArray | None = None
     stiffer: AnyArray | None = None
@@ -197,7 +212,8 @@ class Inputs(NamedTuple):
     boundary : (b, 3) array or None
         Displacement of the boundary nodes, mm, where it is known and not sampled.
     points : mapping
-        Pairs of points that were observed, by the name of the observation, as they were given.
+        Pairs of points that were observed, by the name of the observation, and those that were held out, as
+        "evaluation"; as they were given.
     matching : Matching
     fixed_ignore, moving_ignore : Image or None
         Not zero where the image of that name says nothing, each in the world of the fixed image.

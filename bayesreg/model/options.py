@@ -17,7 +17,7 @@ from bayesreg.types import InputError
 TAKEN = (
     "u_boundary", "lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load", "field", "field_sd", "elastic",
     "rigid", "skull", "barrier", "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations",
-    "solver_failed", "outside_support",
+    "solver_failed", "outside_support", "evaluation",
 )  # fmt: skip
 
 # Options that say how images are compared.

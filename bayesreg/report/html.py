@@ -22,6 +22,7 @@ from bayesreg.report import (
     bodies,
     convergence,
     density,
+    evaluation,
     identifiability,
     landmarks,
     marginals,
@@ -53,6 +54,7 @@ SECTIONS = (
     ("pose", "Pose"),
     ("trust", "Uncertainty"),
     ("landmarks", "Landmarks"),
+    ("evaluation", "Held out"),
     ("groups", "Chains that disagree"),
     ("stiffnesses", "Stiffness"),
     ("fit", "Fit"),
@@ -100,7 +102,16 @@ def write_report(
     allowed = bodies.allowing(run.mesh, posterior, simulated) if bodies.enough(simulated) else None
     fit = bool(predicted and predicted.discrepancies is not None)
     pairs = bool(predicted and predicted.landmark_names is not None)
-    shown = {"groups": apart, "pose": predicted, "trust": predicted, "landmarks": pairs, "fit": fit, "one-node": nodes}
+    held_out = bool(predicted and predicted.evaluation_residual is not None)
+    shown = {
+        "evaluation": held_out,
+        "groups": apart,
+        "pose": predicted,
+        "trust": predicted,
+        "landmarks": pairs,
+        "fit": fit,
+        "one-node": nodes,
+    }
     left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
         *(draw(view) for draw in (anatomy.registration, anatomy.checkerboard, anatomy.data, anatomy.result)),
@@ -109,6 +120,7 @@ def write_report(
         uncertainty.maps(view, predicted) if predicted else None,
         uncertainty.places(view, predicted) if predicted else None,
         landmarks.residuals(predicted) if predicted else None,
+        evaluation.evaluation(predicted) if predicted else None,
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
         bodies.scatter(allowed) if allowed else None,
@@ -139,6 +151,7 @@ def write_report(
         "trust": explain_intervals(run.manifest),
         "places": uncertainty.place_table(view, predicted) if predicted else None,
         "landmarks": landmarks.landmark_table(run.mesh, predicted) if predicted else None,
+        "evaluation": evaluation.evaluation_table(predicted) if predicted else None,
         "groups": modes.explanation(groups) if apart else "",
         "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
         "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),

@@ -33,6 +33,7 @@ from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
+from bayesreg.workflow.evaluation import NAME
 from bayesreg.workflow.matching import Matched, match_channel, match_images
 from bayesreg.workflow.prediction import require_inside
 
@@ -166,7 +167,7 @@ def _skull(intracranial: Path | None) -> Image | None:
 
 
 def _points(config: Config) -> dict[str, PointPairs]:
-    """The landmarks of a configuration, read before anything takes long."""
+    """The landmarks of a configuration, those held out among them, read before anything takes long."""
     found = {}
     for section in config.observations or []:
         if isinstance(section, LandmarksSection):
@@ -177,6 +178,8 @@ def _points(config: Config) -> dict[str, PointPairs]:
                     f"{section.file} a column sd"
                 )
             found[section.name] = pairs
+    if config.evaluation is not None:
+        found[NAME] = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
     return found
 
 

@@ -41,8 +41,10 @@ from bayesreg.model.warp import moments_on_grid, warp_image
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.transform import Transform
 from bayesreg.types import InputError
+from bayesreg.workflow.apply import POINT_DRAWS
 from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with_initial
 from bayesreg.workflow.bids import write_bids
+from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
 from bayesreg.workflow.manifest import manifest
 from bayesreg.workflow.prediction import mean_values, predict, predict_landmarks
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
@@ -348,13 +350,18 @@ def _finish(
     metrics = None
     if inputs.truth is not None:
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
-    mean = mean_values(posterior, draws, samples.u_mean)
+    mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
     predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
+    if config.evaluation is not None:
+        u = nodal_draws(config, inputs, draws, POINT_DRAWS)
+        transform = Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
+        held_out = evaluate_landmarks(inputs.points[NAME], transform, config.evaluation.sd)
+        predicted = predicted._replace(**held_out)
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
     total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
     moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
     transform = Transform(
-        Deformer(inputs.mesh),
+        deformer,
         pose,
         samples.u_mean,
         nodal_draws(config, inputs, draws, config.results.draws),

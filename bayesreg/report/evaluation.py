@@ -1,0 +1,92 @@
+"""Landmarks that were held out: target registration error before and after, and whether it is as large as expected."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from bayesreg.io.records import Predicted
+from bayesreg.report import style
+from bayesreg.report.landmarks import surprise
+from bayesreg.report.style import Drawing
+from bayesreg.report.tables import Table
+from bayesreg.report.verdict import fixed
+from bayesreg.transform import distances_of
+
+LEVELS = (0.5, 0.9, 0.95)
+
+
+def evaluation_table(predicted: Predicted) -> Table | None:
+    """Distances by the headers, by the pose, and by the posterior mean; None where nothing was held out."""
+    if predicted.evaluation_residual is None:
+        return None
+    inside, after = np.asarray(predicted.evaluation_inside), np.linalg.norm(predicted.evaluation_residual, axis=1)
+    rows = [
+        [name, *(fixed(float(value)) for value in (x.mean(), np.median(x), np.quantile(x, 0.95), x.max()))]
+        for name, x in {
+            "By the headers": np.asarray(predicted.evaluation_before),
+            "By the pose alone": np.asarray(predicted.evaluation_posed),
+            "By the posterior mean": after,
+        }.items()
+    ]
+    found = _surprise(predicted)
+    shares = ", ".join(f"{(found <= level).mean():.0%} in the {level:.0%}" for level in LEVELS).replace("%", " %")
+    caption = (
+        f"Distance from where {len(after)} landmarks were found in the moving image, mm; the sampler never saw them. "
+        f"Of the {int(inside.sum())} that lie in the mesh, {shares} region that the posterior gives them."
+    )
+    return Table("Target registration error", caption, ["", "Mean", "Median", "95 %", "Greatest"], [("", rows)])
+
+
+def evaluation(predicted: Predicted) -> Drawing | None:
+    """Errors before and after, beside what was expected, and a calibration curve; None where nothing was held out."""
+    if predicted.evaluation_residual is None or predicted.evaluation_posed is None:
+        return None
+    inside = np.asarray(predicted.evaluation_inside)
+    after, before = np.linalg.norm(predicted.evaluation_residual, axis=1), np.asarray(predicted.evaluation_posed)
+    radius = distances_of(np.asarray(predicted.evaluation_covariance)).radius
+    found = np.sort(_surprise(predicted))
+    count = len(found)
+    with style.look():
+        figure = style.new_figure(3.4)
+        left, middle, right = figure.subplots(1, 3)
+        order = np.argsort(before)
+        left.plot(before[order], "o", ms=3, color=style.UNIFORM, label="by the pose alone")
+        left.plot(after[order], "o", ms=3, color=style.ACCENT, label="by the posterior mean")
+        left.set(xlabel="landmark", ylabel="error, mm", ylim=(0, None), title="before and after")
+        left.legend()
+        middle.plot(radius[inside], after[inside], "o", ms=4, color=style.ACCENT)
+        reach = 1.05 * max(radius[inside].max(initial=0.1), after[inside].max(initial=0.1))
+        middle.plot([0, reach], [0, reach], color=style.MUTED, lw=0.8)
+        middle.set(
+            xlabel="95 % radius, mm",
+            ylabel="error, mm",
+            xlim=(0, reach),
+            ylim=(0, reach),
+            title="error and expectation",
+        )
+        nominal = np.linspace(0, 1, 101)
+        low, high = (stats.binom.ppf(edge, count, nominal) / max(count, 1) for edge in (0.025, 0.975))
+        right.fill_between(nominal, low, high, color=style.FAINT, lw=0)
+        right.plot(nominal, nominal, color=style.MUTED, lw=0.8)
+        right.step([0, *found, 1], [0, *(np.arange(1, count + 1) / max(count, 1)), 1], where="post", color=style.ACCENT)
+        right.set(
+            xlabel="probability of the region", ylabel="share of landmarks in it", title="calibration", aspect="equal"
+        )
+        uri = style.data_uri(figure)
+    caption = (
+        "Left: each landmark’s distance from where it was found, before the deformation and after it. Middle: the same "
+        "beside the radius that should hold it with 95 %; below the line is inside. Right: how many landmarks lie in "
+        "the regions of each probability; grey is where 95 % of such curves run if the probabilities are right."
+    )
+    alt = f"Errors of {len(after)} landmarks that were held out, and how often they lie in their regions."
+    return Drawing("held-out", "Landmarks that were held out", caption, alt, uri)
+
+
+def _surprise(predicted: Predicted) -> np.ndarray:
+    """Of each landmark in the mesh the probability of the least region that holds it."""
+    inside = np.asarray(predicted.evaluation_inside)
+    residual, covariance = (
+        np.asarray(x)[inside] for x in (predicted.evaluation_residual, predicted.evaluation_covariance)
+    )
+    return surprise(residual, covariance)

@@ -1,0 +1,38 @@
+"""Landmarks that the sampler never saw: how far they are from where the posterior takes them, and should be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesreg.io.points import PointPairs
+from bayesreg.transform import Transform, spread
+from bayesreg.types import AnyArray
+
+# Among the points of a run's inputs; no observation has this name.
+NAME = "evaluation"
+
+
+def evaluate_landmarks(pairs: PointPairs, transform: Transform, sd: float | None) -> dict[str, AnyArray]:
+    """What `Predicted` keeps of landmarks that were held out.
+
+    Parameters
+    ----------
+    pairs : PointPairs
+        As they were given, each side in the world of its own image.
+    transform : Transform
+        From the fixed image's world.
+    sd : float or None
+        Of the error of each coordinate with which a landmark is found, mm; None takes that of the file, else zero.
+    """
+    found = spread(transform, pairs.fixed)
+    own = pairs.sd if sd is None else np.full(len(pairs.fixed), sd)
+    variance = np.zeros(len(pairs.fixed)) if own is None else np.square(own)
+    return {
+        "evaluation_names": np.array([name or str(number) for number, name in enumerate(pairs.names, start=1)]),
+        "evaluation_points": pairs.fixed,
+        "evaluation_before": np.linalg.norm(pairs.moving - pairs.fixed, axis=1),
+        "evaluation_posed": np.linalg.norm(pairs.moving - transform.pose.place(pairs.fixed), axis=1),
+        "evaluation_residual": pairs.moving - found.places,
+        "evaluation_covariance": found.covariance + variance[:, None, None] * np.eye(3),
+        "evaluation_inside": found.inside,
+    }
