@@ -50,6 +50,7 @@ class Variables:
     dims: ClassVar = {"u_boundary": ("node", "axis")}
     coords: ClassVar = {"node": np.arange(NODES), "axis": list("xyz"), "tissue": ["tissue"]}
     constants: ClassVar = {}
+    attributes: ClassVar = {}
 
     def values(self, estimands):
         shape = (*np.shape(estimands["u_boundary"])[:-2], 1)
