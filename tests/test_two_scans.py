@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from xml.etree import ElementTree
 
 import nibabel as nib
@@ -401,3 +402,13 @@ def test_names_of_bids(result):
 def test_draws_are_left_as_transforms(result):
     names = [path.name for path in sorted((result.folder / "transforms").iterdir())]
     assert names == [f"draw-{k}{end}" for k in range(1, 5) for end in (".h5", ".nii.gz", "_inverse.h5")]
+
+
+def test_a_run_that_has_moved_is_carried_on_alone(applied, result, folder, tmp_path):
+    """None of the files that it was made of is needed; nodes that were not sampled are solved for again."""
+    shutil.copytree(result.folder, tmp_path / "copied")
+    text = (tmp_path / "copied" / "config.yaml").read_text().replace(str(folder), "/gone")
+    (tmp_path / "copied" / "config.yaml").write_text(text)
+    assert len(result.mesh.interior) > 0
+    br.apply(tmp_path / "copied", tmp_path / "there", points=folder / "p.csv", draws=40, far=(0.1, 2.0))
+    assert (tmp_path / "there" / "points.csv").read_bytes() == (folder / "there" / "points.csv").read_bytes()

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy import ndimage
 
-from bayesreg.config import load_config
+from bayesreg.config import model_of
 from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.inference.draws.inference_data import dataset
@@ -37,9 +37,9 @@ MARGIN = 0.95
 def transform_of(result: Result, draws: int = POINT_DRAWS) -> Transform:
     """The transform of a run from the fixed image's world to the moving one's, with up to so many of its draws."""
     run = result.run
-    config = load_config(result.folder / "config.yaml")
-    u = nodal_draws(config, run, dataset(result.idata, "posterior"), draws)
-    return Transform(Deformer(run.mesh), run.matching.pose, run.u_mean, u, seed=config.seed)
+    # The files that the configuration names need not be there any more.
+    u = nodal_draws(model_of(run.config), run, dataset(result.idata, "posterior"), draws)
+    return Transform(Deformer(run.mesh), run.matching.pose, run.u_mean, u, seed=int(run.manifest["seed"]))
 
 
 def apply(

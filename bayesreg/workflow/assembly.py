@@ -53,7 +53,7 @@ def posterior_of(
 
 
 def nodal_draws(
-    config: Config, inputs: Inputs | Run, draws: xr.Dataset, most: int
+    model: ModelConfig, inputs: Inputs | Run, draws: xr.Dataset, most: int
 ) -> Float[np.ndarray, "draws nodes 3"]:
     """The displacement of every node, mm, of up to so many evenly spaced draws of a run, those of all chains together.
 
@@ -65,7 +65,7 @@ def nodal_draws(
     u = some["u_boundary"]
     if u.shape[2] == len(inputs.mesh.points):
         return u.reshape(-1, *u.shape[2:])
-    body, blocks = body_of(inputs.mesh, _model(config.model, inputs), _references(config, inputs.mesh))
+    body, blocks = body_of(inputs.mesh, _model(model, inputs))
     known = {name: values for name, values in some.items() if name in blocks}
 
     def displacement(draw: dict[str, AnyArray], given: tuple[Body, Blocks]) -> AnyArray:

@@ -327,6 +327,16 @@ def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
     return warp_image(inputs.matching.pose.inverse.aligned(inputs.moving), mean_field, inputs.fixed)
 
 
+def _store_draws(posterior: Posterior, samples: Samples, path: Path, seed: int) -> Any:
+    """Write posterior.nc, with what ArviZ wants to know of landmarks, and open it."""
+    save_posterior(posterior, samples.blocks, path)
+    # A file that is open is not added to.
+    with xr.open_dataset(path, group="posterior") as draws:
+        groups = predict_landmarks(posterior, draws, seed)
+    append_groups(path, groups)
+    return open_posterior(path)
+
+
 def _finish(
     config: Config,
     inputs: Inputs,
@@ -339,12 +349,7 @@ def _finish(
     """Everything after the last draw: the files of the run folder, run.json last but for the report."""
     from bayesreg.report.html import write_report
 
-    save_posterior(posterior, samples.blocks, out / "posterior.nc")
-    # A file that is open is not added to.
-    with xr.open_dataset(out / "posterior.nc", group="posterior") as draws:
-        groups = predict_landmarks(posterior, draws, config.seed)
-    append_groups(out / "posterior.nc", groups)
-    idata = open_posterior(out / "posterior.nc")
+    idata = _store_draws(posterior, samples, out / "posterior.nc", config.seed)
     draws, judged = dataset(idata, "posterior"), convergence(idata)
     grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
     metrics = None
@@ -352,22 +357,19 @@ def _finish(
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
     predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
+
+    def transform(most: int) -> Transform:
+        u = nodal_draws(config.model, inputs, draws, most)
+        return Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
+
     if config.evaluation is not None:
-        u = nodal_draws(config, inputs, draws, POINT_DRAWS)
-        transform = Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
-        held_out = evaluate_landmarks(inputs.points[NAME], transform, config.evaluation.sd)
+        held_out = evaluate_landmarks(inputs.points[NAME], transform(POINT_DRAWS), config.evaluation.sd)
         predicted = predicted._replace(**held_out)
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
     total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
     moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
-    transform = Transform(
-        deformer,
-        pose,
-        samples.u_mean,
-        nodal_draws(config, inputs, draws, config.results.draws),
-        seed=config.seed,
-    )
-    field = displacement_on(transform.mean, grid).field
+    some = transform(config.results.draws)
+    field = displacement_on(some.mean, grid).field
     mean_field = total_displacement(pose, grid.grid_points(), field)
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
@@ -381,7 +383,7 @@ def _finish(
         **inputs._asdict(),
     )
     # Before run.json, which says that all is there.
-    write_transforms(out, transform, grid, field)
+    write_transforms(out, some, grid, field)
     store.write_results(out, finished, mean_field, moments.sd)
     if config.results.bids is not None:
         write_bids(out, config.results.bids)
