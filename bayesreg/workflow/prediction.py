@@ -29,6 +29,7 @@ from bayesreg.model.state import state_of
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.pose import Pose, compose, rigid_projection
 from bayesreg.tissues import label_of
+from bayesreg.transform import Transform
 from bayesreg.types import AnyArray
 
 Places = Mapping[str, tuple[float, float, float]]
@@ -164,6 +165,16 @@ def _landmarks(posterior: Posterior, mean: dict[str, AnyArray]) -> dict[str, np.
         "left_out_residual": np.concatenate([one.residual for one in left]),
         "left_out_covariance": np.concatenate([one.covariance for one in left]),
     }
+
+
+def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
+    """The predictions, draws of places being as unsure as the nodes about these (`bayesreg.transform.Transform`)."""
+    places = np.asarray(predicted.place_points)
+    sd = transform.unresolved_sd(transform.deformer.locate(places))
+    draws = np.asarray(predicted.place_draws)
+    # A stream of its own: those of draws have their number.
+    rng = np.random.default_rng((transform.seed, len(transform.draws)))
+    return predicted._replace(place_draws=draws + sd * rng.standard_normal(draws.shape))
 
 
 def predict_landmarks(posterior: Posterior, draws: xr.Dataset, seed: int) -> dict[str, xr.Dataset]:

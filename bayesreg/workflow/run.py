@@ -46,7 +46,7 @@ from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with
 from bayesreg.workflow.bids import write_bids
 from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
 from bayesreg.workflow.manifest import manifest
-from bayesreg.workflow.prediction import mean_values, predict, predict_landmarks
+from bayesreg.workflow.prediction import mean_values, predict, predict_landmarks, with_unresolved
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
 from bayesreg.workflow.result import Result, load_result, report
 from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
@@ -362,8 +362,10 @@ def _finish(
         u = nodal_draws(config.model, inputs, draws, most)
         return Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
 
+    many = transform(POINT_DRAWS)
+    predicted = with_unresolved(predicted, many)
     if config.evaluation is not None:
-        held_out = evaluate_landmarks(inputs.points[NAME], transform(POINT_DRAWS), config.evaluation.sd)
+        held_out = evaluate_landmarks(inputs.points[NAME], many, config.evaluation.sd)
         predicted = predicted._replace(**held_out)
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
     total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
