@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from bayesreg.interpolation import Interpolation, Interpolator
@@ -137,6 +138,15 @@ class Image:
         x, y, z = (np.arange(n)[:, None] * self.affine[:3, axis] for axis, n in enumerate(self.shape))
         return x[:, None, None] + y[:, None] + (z + self.affine[:3, 3])
 
+    def centres(self, numbers: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k 3"]:
+        """World position of voxels by their number in the order of memory, mm."""
+        return self.voxel_to_world(np.stack(np.unravel_index(numbers, self.shape), axis=1).astype(float))
+
+    def blocks(self, length: int = 500_000) -> Iterator[tuple[slice, Float[np.ndarray, "k 3"]]]:
+        """Some voxels at a time, in the order of memory, and their world positions, mm."""
+        for some in slices(int(np.prod(self.shape)), length):
+            yield some, self.centres(np.arange(some.start, some.stop))
+
     def contains(self, points: Float[AnyArray, "*batch 3"]) -> Bool[AnyArray, "*batch"]:
         """Tell which world points (mm) lie on the grid (its voxels' extent included)."""
         indices = self.world_to_voxel(points)
@@ -173,6 +183,12 @@ class Image:
     ) -> Float[AnyArray, "*batch"]:
         """Values at world points (mm); nearest value outside the grid. Differentiable in `points`."""
         return self.interpolator(method)(jnp.asarray(points, float))
+
+
+def slices(count: int, length: int) -> Iterator[slice]:
+    """Stretches of a length that follow one another, up to a count."""
+    for first in range(0, count, length):
+        yield slice(first, min(first + length, count))
 
 
 def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:

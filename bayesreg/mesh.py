@@ -84,6 +84,12 @@ class TetMesh:
         return faces[first[count == 1]]
 
     @cached_property
+    def boundary_edge(self) -> float:
+        """Mean length of the edges of the boundary's triangles, mm."""
+        corner = self.points[self.boundary_faces]
+        return float(np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).mean())
+
+    @cached_property
     def neighbours(self) -> Int[np.ndarray, "pairs 2"]:
         """Pairs of tetrahedra that share a face."""
         return _shared_faces(self.cells) // 4

@@ -114,21 +114,20 @@ class Transform:
 
     def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
         """What draws of u lack of its standard deviation at points, mm (see above); zero around the mesh."""
-        return np.sqrt(np.maximum(self._variance(near) - np.einsum("kii->ki", self._drawn_covariance(near)), 0))
+        return np.sqrt(self._unresolved_variance(near, self._drawn_covariance(near)))
 
     def covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
         """The posterior covariance of u at points, mm² (see above), along the axes of the fixed image's world.
 
         Around the mesh, where no draw is asked, it is NaN.
         """
-        found = self._drawn_covariance(near)
-        unresolved = np.maximum(self._variance(near) - np.einsum("kii->ki", found), 0)
-        found += unresolved[:, :, None] * np.eye(3)
+        drawn = self._drawn_covariance(near)
+        found = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
         found[~self.deformer.is_inside(near)] = np.nan
         return found
 
     def _drawn_covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
-        """Of the draws, which are linear in every tetrahedron; zero around the mesh."""
+        """The covariance of the draws, which are linear in every tetrahedron; zero around the mesh."""
         found = np.zeros((len(near.cell), 3, 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
@@ -138,14 +137,18 @@ class Transform:
         found[inside] = total
         return found
 
-    def _variance(self, near: Location) -> Float[np.ndarray, "k 3"]:
-        """That of the nodes, interpolated as a standard deviation, and what the mesh cannot follow."""
+    def _unresolved_variance(self, near: Location, drawn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 3"]:
+        """The variance of u (the nodes', interpolated, and what the mesh cannot follow) less that of the draws."""
         found = np.zeros((len(near.cell), 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
-        sd = np.sqrt(np.einsum("maaii->mai", self._cell_covariance))
-        found[inside] = np.einsum("ka,kai->ki", share, sd[cell]) ** 2 + self._submesh_variance[cell]
+        nodal = np.einsum("ka,kai->ki", share, self._corner_sd[cell]) ** 2
+        found[inside] = np.maximum(nodal + self._submesh_variance[cell] - np.einsum("kii->ki", drawn[inside]), 0)
         return found
+
+    @cached_property
+    def _corner_sd(self) -> Float[np.ndarray, "cells 4 3"]:
+        return np.sqrt(np.einsum("maaii->mai", self._cell_covariance))
 
     @cached_property
     def _submesh_variance(self) -> Float[np.ndarray, "cells 3"]:
@@ -153,7 +156,7 @@ class Transform:
 
     @cached_property
     def _cell_covariance(self) -> Float[np.ndarray, "cells 4 4 3 3"]:
-        """Of u between the corners of every tetrahedron."""
+        """The covariance of u between the corners of every tetrahedron."""
         away, cells = self.draws - self.draws.mean(axis=0), self.mesh.cells
         found = np.empty((len(cells), 4, 4, 3, 3))
         for a, b in combinations_with_replacement(range(4), 2):

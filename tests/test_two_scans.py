@@ -412,3 +412,15 @@ def test_a_run_that_has_moved_is_carried_on_alone(applied, result, folder, tmp_p
     assert len(result.mesh.interior) > 0
     br.apply(tmp_path / "copied", tmp_path / "there", points=folder / "p.csv", draws=40, far=(0.1, 2.0))
     assert (tmp_path / "there" / "points.csv").read_bytes() == (folder / "there" / "points.csv").read_bytes()
+
+
+@pytest.mark.parametrize(("asked", "used"), [(None, 200), (300, 300)])
+def test_labels_are_carried_by_as_many_draws_as_asked_for(result, folder, tmp_path, asked, used):
+    said: list[str] = []
+    small = br.Image(np.zeros((4, 4, 4)), POSE.matrix @ MASK.affine @ np.diag([12.0, 12.0, 12.0, 1.0]))
+    br.save_image(small, tmp_path / "small.nii.gz")
+    # Points ask for more draws than labels do.
+    given = {"points": folder / "p.csv", "labels": folder / "organ.nii.gz", "like": tmp_path / "small.nii.gz"}
+    (folder / "p.csv").exists() or (folder / "p.csv").write_text("x,y,z\n0,0,0")
+    br.apply(result.folder, tmp_path / "out", draws=asked, say=said.append, **given)
+    assert any(line.startswith("labels of") and line.endswith(f"by {used} draws") for line in said)

@@ -55,7 +55,7 @@ class Deformer:
         return _search_twice(self._search, points)
 
     def is_inside(self, location: Location) -> Bool[np.ndarray, "k"]:
-        """Which points lie in the mesh itself."""
+        """Tell which points lie in the mesh itself."""
         return (location.cell >= 0) & (location.cell < len(self.mesh.cells))
 
     def displaced(self, u: Float[np.ndarray, "nodes 3"]) -> Displaced:
@@ -151,7 +151,7 @@ class Displaced:
         return Location(np.where(cell < 0, -1, upright[cell]), barycentric)
 
     def _try_all(self, places: Float[np.ndarray, "k 3"]) -> Location:
-        """The same for few places, without what it takes to search for many."""
+        """Find few places in all tetrahedra, without what it takes to search for many."""
         maps = self._to_barycentric
         found = np.einsum("mai,ki->kma", maps[:, :, 1:], places) + maps[:, :, 0]
         least = np.nan_to_num(found.min(axis=2), nan=-np.inf)

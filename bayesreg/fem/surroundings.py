@@ -134,10 +134,10 @@ class _Surface:
     def of(cls, mesh: TetMesh) -> _Surface:
         triangles = np.searchsorted(mesh.boundary, mesh.boundary_faces)
         points = mesh.points[mesh.boundary]
-        return cls(points, triangles, scipy.sparse.eye_array(len(points), format="csr"), FINEST * _mean_edge(mesh))
+        return cls(points, triangles, scipy.sparse.eye_array(len(points), format="csr"), FINEST * mesh.boundary_edge)
 
     def missing(self, cells: Int[np.ndarray, "cells 4"]) -> Bool[np.ndarray, "t"]:
-        """Which triangles are no faces of tetrahedra."""
+        """Tell which triangles are no faces of tetrahedra."""
         faces = np.concatenate([np.delete(cells, corner, axis=1) for corner in range(4)])
         return ~np.isin(self._keys(self.triangles), self._keys(faces[(faces < len(self.points)).all(axis=1)]))
 
@@ -179,11 +179,6 @@ def _split(triangle: list[int], middle: dict[tuple[int, int], int]) -> list[tupl
     return [(triangle[0], triangle[1], triangle[2])]
 
 
-def _mean_edge(mesh: TetMesh) -> float:
-    corner = mesh.points[mesh.boundary_faces]
-    return float(np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).mean())
-
-
 def _sphere(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
     """Nodes on the sphere, on Fibonacci's spiral."""
     index = np.arange(ON_SPHERE) + 0.5
@@ -198,7 +193,7 @@ def _radius(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> float:
 
 def _lattice(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
     """Nodes between the surface and the sphere: body-centred, a little shaken, for no five are to lie on one sphere."""
-    edge, radius, rng = _mean_edge(mesh), _radius(mesh, centre), np.random.default_rng(0)
+    edge, radius, rng = mesh.boundary_edge, _radius(mesh, centre), np.random.default_rng(0)
     search, boundary, found = CellSearch(mesh.points, mesh.cells), _samples(mesh), []
     for nearest, furthest, apart in SHELLS:
         spacing = 1.25 * apart * edge

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from bayesreg.image import Image
 from bayesreg.io.readers import Volume, from_itk, read_volume
+from bayesreg.io.spaces import LPS
 from bayesreg.io.volumes import write_nifti
 from bayesreg.types import AnyArray, InputError
 
@@ -18,7 +19,6 @@ TRANSFORM_SUFFIXES = (".h5", ".tfm")
 # Codes of NIfTI's intents: displacement vectors, as FreeSurfer has them in RAS; vectors, as ITK has them in LPS; and
 # FSL's, in coordinates of its own.
 DISPLACEMENT_INTENT, VECTOR_INTENT, FSL_INTENTS = 1006, 1007, range(2001, 2020)
-TO_RAS = np.array([-1.0, -1.0, 1.0])
 
 
 def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affine: Float[AnyArray, "4 4"]) -> None:
@@ -34,7 +34,7 @@ def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affin
     affine : (4, 4) array
         Voxel index to world RAS, mm.
     """
-    lps = np.asarray(field, np.float32) * TO_RAS.astype(np.float32)
+    lps = np.asarray(field, np.float32) * LPS.astype(np.float32)
     write_nifti(lps[:, :, :, None], affine, Path(path), intent=VECTOR_INTENT)
 
 
@@ -85,7 +85,7 @@ def _displacements(
 ) -> Float[np.ndarray, "X Y Z 3"]:
     """In world RAS, mm, by what the header says of the vectors."""
     if not isinstance(volume.header, nib.Nifti1Header):
-        return vectors * TO_RAS
+        return vectors * LPS
     code, name = int(volume.header["intent_code"]), str(volume.header.get_intent("code")[2])
     first = float(volume.header["intent_p1"])
     if code in FSL_INTENTS:
@@ -96,7 +96,7 @@ def _displacements(
         return vectors if first == 1 else vectors - grid.grid_points()
     if name == "Mapping":
         return vectors - grid.grid_points()
-    return vectors if code == DISPLACEMENT_INTENT else vectors * TO_RAS
+    return vectors if code == DISPLACEMENT_INTENT else vectors * LPS
 
 
 def _whole_field(transform: SimpleITK.Transform) -> SimpleITK.Image:

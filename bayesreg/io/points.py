@@ -19,12 +19,13 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.io.atomic import write_text
+from bayesreg.io.spaces import TO_RAS
 from bayesreg.types import InputError
 
 FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
 PLAIN = ("x", "y", "z")
 # Factors that take points in a file's system to RAS.
-SYSTEMS = {"RAS": (1.0, 1.0, 1.0), "0": (1.0, 1.0, 1.0), "LPS": (-1.0, -1.0, 1.0), "1": (-1.0, -1.0, 1.0)}
+SYSTEMS = {**TO_RAS, "0": TO_RAS["RAS"], "1": TO_RAS["LPS"]}
 
 
 # The rows of a tag file: up to the first semicolon outside of quotes.

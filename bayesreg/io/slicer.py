@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.io.atomic import write_json, write_text
+from bayesreg.io.spaces import LPS
 
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
 )
-TO_LPS = np.array([-1.0, -1.0, 1.0])
 
 
 class Item(NamedTuple):
@@ -86,7 +86,7 @@ def write_scene(path: str | Path, items: Sequence[Item]) -> None:
 def write_markups(path: str | Path, names: Sequence[str], points: Float[np.ndarray, "k 3"]) -> None:
     """Write points, world RAS mm, as a .mrk.json file."""
     controls = [
-        {"id": str(number), "label": name, "position": (point * TO_LPS).tolist(), "positionStatus": "defined"}
+        {"id": str(number), "label": name, "position": (point * LPS).tolist(), "positionStatus": "defined"}
         for number, (name, point) in enumerate(zip(names, points, strict=True), start=1)
     ]
     markups = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": controls}

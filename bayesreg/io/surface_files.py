@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from skimage import measure
 
 from bayesreg.io.atomic import replacing
+from bayesreg.io.spaces import TO_RAS
 from bayesreg.types import AnyArray, InputError
 
 Space = Literal["RAS", "LPS"]
 SUFFIXES = (".vtk", ".vtp", ".vtu", ".stl", ".ply", ".obj")
-TO_RAS = {"RAS": np.array([1.0, 1.0, 1.0]), "LPS": np.array([-1.0, -1.0, 1.0])}
 
 
 class SurfaceFile(NamedTuple):
@@ -66,14 +66,13 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
         raise InputError(f"{path}: unknown kind of file with a surface; known are {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file with a surface")
-    errors: list[str] = []
     try:
         with pyvista.VtkErrorCatcher(raise_errors=True):
             surface = pyvista.read(path)
-    except Exception as error:  # VTK's readers raise whatever they like.
-        errors.append(str(error).splitlines()[0] if str(error) else type(error).__name__)
-    if errors or not isinstance(surface, pyvista.PolyData | pyvista.UnstructuredGrid) or not surface.n_points:
-        raise InputError(f"{path} cannot be read as a surface: {errors[0] if errors else 'it holds no points'}")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as a surface: {str(error).partition(chr(10))[0]}") from error
+    if not isinstance(surface, pyvista.PolyData | pyvista.UnstructuredGrid) or not surface.n_points:
+        raise InputError(f"{path} cannot be read as a surface: it holds no points")
     points = np.asarray(surface.points, float)
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not finite")

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
+from bayesreg.io.spaces import LPS
 from bayesreg.pose import Pose
 from bayesreg.types import AnyArray
 
-TO_LPS = np.array([-1.0, -1.0, 1.0])
 # Fields are rounded to this, mm: smaller files, and an error of an eighth of a micrometre.
 QUANTUM = 2.0**-12
 
@@ -62,13 +62,13 @@ def _write_text(file: h5py.File, name: str, text: str) -> None:
 
 def _affine(pose: Pose) -> tuple[str, np.ndarray, np.ndarray]:
     """Its matrix row by row, its translation; about the origin."""
-    matrix = np.diag([*TO_LPS, 1.0]) @ np.asarray(pose.matrix, float) @ np.diag([*TO_LPS, 1.0])
+    matrix = np.diag([*LPS, 1.0]) @ np.asarray(pose.matrix, float) @ np.diag([*LPS, 1.0])
     return "AffineTransform", np.zeros(3), np.concatenate([matrix[:3, :3].ravel(), matrix[:3, 3]])
 
 
 def _displacement_field(field: Float[AnyArray, "X Y Z 3"], grid: Image) -> tuple[str, np.ndarray, np.ndarray]:
     """Size, origin, spacing and directions of its grid; vectors, the first voxel axis running fastest."""
-    origin, directions = grid.affine[:3, 3] * TO_LPS, TO_LPS[:, None] * grid.affine[:3, :3] / grid.voxel_sizes
+    origin, directions = grid.affine[:3, 3] * LPS, LPS[:, None] * grid.affine[:3, :3] / grid.voxel_sizes
     known = np.concatenate([grid.shape, origin, grid.voxel_sizes, directions.ravel()])
-    vectors = np.round(np.asarray(field) / QUANTUM) * QUANTUM * TO_LPS
+    vectors = np.round(np.asarray(field) / QUANTUM) * QUANTUM * LPS
     return "DisplacementFieldTransform", known, vectors.transpose(2, 1, 0, 3).astype(np.float32).ravel()

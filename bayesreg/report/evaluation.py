@@ -84,7 +84,7 @@ def evaluation(predicted: Predicted) -> Drawing | None:
 
 
 def _surprise(predicted: Predicted) -> np.ndarray:
-    """Of each landmark in the mesh the probability of the least region that holds it."""
+    """The probability of the least region that holds each landmark in the mesh."""
     inside = np.asarray(predicted.evaluation_inside)
     residual, covariance = (
         np.asarray(x)[inside] for x in (predicted.evaluation_residual, predicted.evaluation_covariance)

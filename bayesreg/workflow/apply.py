@@ -29,7 +29,6 @@ Around = Literal["harmonic", "missing"]
 
 # Draws of all chains together: of points, and of labels, which take longer.
 POINT_DRAWS, LABEL_DRAWS = 1000, 200
-CHUNK = 500_000
 # The probability with which a margin holds a label, point by point.
 MARGIN = 0.95
 
@@ -128,7 +127,8 @@ def apply(
         found = load_whole_numbers(labels)
         if absent := sorted(set(margins) - set(np.unique(found.voxels).tolist())):
             raise InputError(f"label {absent[0]}, of which a margin is wanted, is not in {labels}")
-        tasks.append(partial(_carry_labels, found, _grid(result, like, inverse), Path(labels), how, margins))
+        grid, most = _grid(result, like, inverse), draws or LABEL_DRAWS
+        tasks.append(partial(_carry_labels, found, grid, Path(labels), how, margins, most))
     how.out.mkdir(parents=True, exist_ok=True)
     transform = transform_of(result, draws or (LABEL_DRAWS if points is None and mesh is None else POINT_DRAWS))
     transform = transform.inverse if inverse else transform
@@ -236,13 +236,11 @@ def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
 def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Transform) -> list[Path]:
     """By the posterior mean, linearly interpolated; zero where the image ends."""
     back, voxels = transform.inverse, np.empty(int(np.prod(grid.shape)), np.float32)
-    inside = np.empty(len(voxels), bool)
-    for first in range(0, len(voxels), CHUNK):
-        some = slice(first, min(first + CHUNK, len(voxels)))
-        places = grid.voxel_to_world(np.stack(np.unravel_index(np.arange(some.start, some.stop), grid.shape), 1) * 1.0)
+    inside, given = np.empty(len(voxels), bool), np.asarray(image.voxels, float)
+    for some, places in grid.blocks():
         source, location = back.place(places)
         index = image.world_to_voxel(source).T
-        voxels[some] = ndimage.map_coordinates(np.asarray(image.voxels, float), index, order=1, mode="grid-constant")
+        voxels[some] = ndimage.map_coordinates(given, index, order=1, mode="grid-constant")
         inside[some] = back.deformer.is_inside(location)
     if how.around == "missing":
         voxels[~inside] = np.nan
@@ -251,9 +249,10 @@ def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Tr
 
 
 def _carry_labels(
-    labels: Image, grid: Image, path: Path, how: _How, margins: Sequence[int], transform: Transform
+    labels: Image, grid: Image, path: Path, how: _How, margins: Sequence[int], most: int, transform: Transform
 ) -> list[Path]:
-    some = replace(transform, draws=transform.draws[:: max(len(transform.draws) // LABEL_DRAWS, 1)])
+    count = min(len(transform.draws), most)
+    some = replace(transform, draws=transform.draws[np.linspace(0, len(transform.draws) - 1, count).astype(int)])
     how.say(f"labels of {path}, by {len(some.draws)} draws")
     found = carry_labels(some, labels, grid, keep_around=how.around == "harmonic")
     save_image(found.most_probable, target := how.name(path, ".nii.gz"))

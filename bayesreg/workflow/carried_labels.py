@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int, UInt
 
 from bayesreg.fem.location import Location
-from bayesreg.image import Image
+from bayesreg.image import Image, slices
 from bayesreg.transform import Transform
 
-# Places at a time, and counts of labels in one go over the draws.
-CHUNK, MOST_COUNTS = 500_000, 100_000_000
+# Counts of labels in one go over the draws.
+MOST_COUNTS = 100_000_000
 # What a draw changes is bounded by its largest change at the nodes about, times this.
 MARGIN = 1.25
 # And what the mesh does not resolve of it by so many standard deviations.
@@ -96,8 +96,8 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
     reach = _reach(back)
     certain, unsure = (np.empty(int(np.prod(grid.shape)), kind) for kind in (np.int16, bool))
     nearby, unresolved = [], []
-    for some in _slices(len(certain)):
-        source, near = back.place(_places(grid, np.arange(some.start, some.stop)))
+    for some, places in grid.blocks():
+        source, near = back.place(places)
         certain[some] = numbers.nearest(source)
         if not keep_around:
             certain[some][~back.deformer.is_inside(near)] = -1
@@ -109,10 +109,16 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
     open_voxels, unresolved_sd = np.flatnonzero(unsure), np.concatenate(unresolved)
     cell, barycentric = (np.concatenate(parts) for parts in zip(*nearby, strict=True))
     counts = np.zeros((len(values), len(open_voxels)), np.uint16)
-    together = max(MOST_COUNTS // len(values), CHUNK)
-    for some in _slices(len(open_voxels), together):
-        voxels, part = open_voxels[some], counts[:, some]
-        _count(back, numbers, _places(grid, voxels), Location(cell[some], barycentric[some]), unresolved_sd[some], part)
+    for some in slices(len(open_voxels), max(MOST_COUNTS // len(values), 1)):
+        part = counts[:, some]
+        _count(
+            back,
+            numbers,
+            grid.centres(open_voxels[some]),
+            Location(cell[some], barycentric[some]),
+            unresolved_sd[some],
+            part,
+        )
     return CarriedLabels(grid, values[order], certain, open_voxels, counts, len(transform.draws))
 
 
@@ -133,16 +139,6 @@ def _count(
     columns = np.arange(len(places))
     for found in back.for_each_draw(labels_of):
         counts[found, columns] += 1
-
-
-def _slices(count: int, length: int = CHUNK) -> Iterator[slice]:
-    for first in range(0, count, length):
-        yield slice(first, min(first + length, count))
-
-
-def _places(grid: Image, voxels: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k 3"]:
-    """World position of voxels by their number, mm."""
-    return grid.voxel_to_world(np.stack(np.unravel_index(voxels, grid.shape), axis=1).astype(float))
 
 
 def _distance_to_others(numbers: Image) -> Image:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.fem.location import Location
-from bayesreg.image import Image
+from bayesreg.image import Image, slices
 from bayesreg.io.volumes import load_image, write_nifti
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.warp import Covered, covered_voxels
@@ -99,8 +99,7 @@ def jacobians(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> dict[
 def _distances(transform: Transform, covered: Covered, far: Sequence[float]) -> dict[str, Float[np.ndarray, "k"]]:
     names = ["radius95", *(f"p_over_{distance:g}mm" for distance in far)]
     found = np.empty((len(names), len(covered.cell)), np.float32)
-    for first in range(0, len(covered.cell), CHUNK):
-        some = slice(first, first + CHUNK)
+    for some in slices(len(covered.cell), CHUNK):
         at = distances_of(transform.covariance(Location(covered.cell[some], covered.barycentric[some])), far)
         found[:, some] = np.concatenate([at.radius[None], at.far])
     return dict(zip(names, found, strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +21,6 @@ MEAN, MEAN_INVERSE, ENSEMBLE = "transform_mean.h5", "transform_mean_inverse.h5",
 ENSEMBLE_SPACING = 0.2
 # What the grid of an inverse reaches beyond the displaced mesh, mm.
 MARGIN = 10.0
-CHUNK = 500_000
 
 
 class OnGrid(NamedTuple):
@@ -43,7 +41,7 @@ class OnGrid(NamedTuple):
 def displacement_on(displaced: Displaced, grid: Image, known: list[Location] | None = None) -> OnGrid:
     """u at the voxel centres of a grid; with their locations, if these are known from another u, it is faster."""
     field, found = np.empty((int(np.prod(grid.shape)), 3), np.float32), []
-    for index, (some, points) in enumerate(_voxels(grid)):
+    for index, (some, points) in enumerate(grid.blocks()):
         location = displaced.deformer.locate(points) if known is None else known[index]
         field[some] = displaced.displacement(points, location)
         found.append(location)
@@ -53,7 +51,7 @@ def displacement_on(displaced: Displaced, grid: Image, known: list[Location] | N
 def return_on(displaced: Displaced, grid: Image, near: list[Location] | None = None) -> OnGrid:
     """x − z at the voxel centres z = x + u(x) of a grid; with locations of sources near by it is faster."""
     field, found = np.empty((int(np.prod(grid.shape)), 3), np.float32), []
-    for index, (some, places) in enumerate(_voxels(grid)):
+    for index, (some, places) in enumerate(grid.blocks()):
         sources, location = displaced.sources(places, None if near is None else near[index])
         field[some] = sources - places
         found.append(location)
@@ -89,7 +87,7 @@ def write_transforms(
 
 def _write_ensemble(folder: Path, transform: Transform, grid: Image) -> None:
     folder.mkdir(exist_ok=True)
-    sizes = np.maximum(grid.voxel_sizes, ENSEMBLE_SPACING * _mean_edge(transform))
+    sizes = np.maximum(grid.voxel_sizes, ENSEMBLE_SPACING * transform.mesh.boundary_edge)
     there = grid.with_voxels(np.zeros(grid.shape, np.int8)).on_orthogonal_grid(sizes, order=0)
     back = around_displaced(there, transform.mesh.points + transform.u_mean)
     located, near = displacement_on(transform.mean, there).locations, return_on(transform.mean, back).locations
@@ -118,17 +116,3 @@ def around_displaced(grid: Image, points: Float[np.ndarray, "k 3"]) -> Image:
     affine = np.array(grid.affine)
     affine[:3, 3] = grid.voxel_to_world(low.astype(float))
     return Image(np.zeros(high - low + 1, np.int8), affine)
-
-
-def _voxels(grid: Image) -> Iterator[tuple[slice, Float[np.ndarray, "k 3"]]]:
-    """Some voxels at a time and their centres, mm."""
-    count = int(np.prod(grid.shape))
-    for first in range(0, count, CHUNK):
-        some = slice(first, min(first + CHUNK, count))
-        index = np.unravel_index(np.arange(some.start, some.stop), grid.shape)
-        yield some, grid.voxel_to_world(np.stack(index, axis=1).astype(float))
-
-
-def _mean_edge(transform: Transform) -> float:
-    corner = transform.mesh.points[transform.mesh.boundary_faces]
-    return float(np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).mean())
