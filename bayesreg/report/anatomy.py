@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -30,16 +30,6 @@ CONVENTION = (
 INTENSITY = "intensity (scaled)"
 MAX_VOXELS = 200_000
 MEDIAN_DRAWS = 500
-# Of a checkerboard, from left to right.
-SQUARES = 9
-
-
-class Swipe(NamedTuple):
-    """Two pictures of one plane."""
-
-    title: str
-    fixed: str
-    warped: str
 
 
 def registration(view: View) -> Drawing | None:
@@ -72,7 +62,7 @@ def registration(view: View) -> Drawing | None:
                 drawn = panels.field_panel(panel, picture, plane, norm, style.SIGNED)
             for panel, mask in zip(row, (fixed, moving, warped, fixed | moving, fixed | warped), strict=True):
                 panels.hatch(panel, plane, mask)
-            _note(row[0], plane.title)
+            note(row[0], plane.title)
         panels.colourbar(figure, drawn, list(axes[:, 3:].ravel()), INTENSITY, shrink=0.6)
         for panel, title in zip(axes[0], [*columns, "before: m − f", "after: m(x + ū) − f"], strict=True):
             panel.set_title(title)
@@ -84,60 +74,6 @@ def registration(view: View) -> Drawing | None:
     )
     alt = f"Fixed, moving and warped images with differences; the residual falls from {before:.3f} to {after:.3f}."
     return Drawing("registration", "Before and after", caption, alt, uri)
-
-
-def checkerboard(view: View) -> Drawing | None:
-    """Squares of the fixed image in turn with the moving one, before and after, and the borders of tissues."""
-    run = view.run
-    if run.fixed is None or run.moving is None or run.warped is None:
-        return None
-    other = {"before: fixed and moving": run.moving, "after: fixed and warped": run.warped}
-    fixed_limits = panels.range_of(run.fixed)
-    limits = fixed_limits if run.matching.one_contrast else panels.range_of(run.moving)
-    with style.look():
-        planes = view.planes[::-1]
-        figure = style.new_figure(0.5 * style.WIDTH * 1.35)
-        axes = figure.subplots(2, len(planes))
-        for row, (title, image) in zip(axes, other.items(), strict=True):
-            for panel, plane in zip(row, planes, strict=True):
-                points = plane.points()
-                fixed, moved = (
-                    (sample(one, points, outside=low) - low) / (high - low)
-                    for one, (low, high) in ((run.fixed, fixed_limits), (image, limits))
-                )
-                side = np.ptp(plane.horizontal) / SQUARES
-                across, up = (points[..., axis] // side for axis in panels.IN_PLANE[plane.axis])
-                picture = np.where((across + up) % 2 == 0, fixed, moved)
-                panels.field_panel(panel, picture, plane, Normalize(0, 1), style.GREY, dark=True)
-                panels.label_lines(panel, run, plane)
-            _note(row[0], title)
-        for panel, plane in zip(axes[0], planes, strict=True):
-            panel.set_title(plane.title)
-        uri = style.data_uri(figure)
-    caption = (
-        "Squares of the fixed image in turn with those of the other one: where they fit, edges run on from square to "
-        f"square. The lines are the borders of the tissues in the fixed image. {CONVENTION}"
-    )
-    alt = "Checkerboards of the fixed image with the moving one, before and after registration."
-    return Drawing("checkerboard", "Checkerboard", caption, alt, uri)
-
-
-def swipes(view: View) -> list[Swipe]:
-    """The fixed image and the warped one on each plane, for a slider between the two; empty without images."""
-    run = view.run
-    if run.fixed is None or run.moving is None or run.warped is None:
-        return []
-    limits = panels.range_of(run.fixed)
-    other = limits if run.matching.one_contrast else panels.range_of(run.moving)
-    found = []
-    for plane in view.planes[::-1]:
-        points = plane.points()
-        pictures = [
-            style.grey_uri(np.clip((sample(image, points, outside=low) - low) / (high - low), 0, 1))
-            for image, (low, high) in ((run.fixed, limits), (run.warped, other))
-        ]
-        found.append(Swipe(plane.title, *pictures))
-    return found
 
 
 def _of_ignored(run: Run) -> str:
@@ -157,7 +93,7 @@ def _unlike(view: View, columns: Mapping[str, Image]) -> Drawing:
                 panels.label_lines(panel, view.run, plane)
             for panel, mask in zip(row, panels.ignored(view, plane), strict=True):
                 panels.hatch(panel, plane, mask)
-            _note(row[0], plane.title)
+            note(row[0], plane.title)
         for panel, title in zip(axes[0], columns, strict=True):
             panel.set_title(title)
         uri = style.data_uri(figure)
@@ -305,7 +241,8 @@ def _focus(view: View) -> str:
     )
 
 
-def _note(axes: Axes, text: str) -> None:
+def note(axes: Axes, text: str) -> None:
+    """Write what a row of panels shows at its left, upwards."""
     place: dict[str, Any] = {"transform": axes.transAxes, "rotation": 90, "ha": "right", "va": "center"}
     axes.text(-0.03, 0.5, text, fontsize=8, color=style.MUTED, **place)
 

@@ -28,6 +28,7 @@ from bayesreg.report import (
     marginals,
     matching,
     modes,
+    overlays,
     tables,
     uncertainty,
 )
@@ -114,7 +115,7 @@ def write_report(
     }
     left_out = {key for key, wanted in shown.items() if not wanted}
     drawings = [
-        *(draw(view) for draw in (anatomy.registration, anatomy.checkerboard, anatomy.data, anatomy.result)),
+        *(draw(view) for draw in (anatomy.registration, overlays.checkerboard, anatomy.data, anatomy.result)),
         anatomy.displacement(view),
         matching.pose_picture(view),
         uncertainty.maps(view, predicted) if predicted else None,
@@ -143,7 +144,7 @@ def write_report(
         "facts": key_facts(run.manifest, entries, posterior),
         "warnings": warnings_of(run.manifest, run.mesh, posterior),
         "drawings": {drawing.key: drawing for drawing in drawings if drawing is not None},
-        "swipes": anatomy.swipes(view),
+        "swipes": overlays.swipes(view),
         "three_d": three_d(view, predicted) if predicted else None,
         "error_tables": error_tables(metrics, run.mesh.names),
         "notes": matching.notes(run.manifest),
