@@ -144,6 +144,23 @@ def test_arviz_finds_what_it_knows_by_name(folder, tmp_path):
     assert len(arviz().summary(idata, var_names=["lam", "mu"])) > 0
 
 
+def require_images_are_predicted(result):
+    """Replicated intensities of images beside landmarks, by all the ten draws, about those observed."""
+    observed, draws = result.idata.observed_data, result.idata.posterior_predictive
+    assert set(observed.data_vars) == set(draws.data_vars) == {"images", "vessel"}
+    assert draws["images"].dims == ("chain", "draw", "images_point")
+    assert draws.sizes["draw"] == 10
+    assert observed["images_x"].attrs["units"] == "mm"
+    places = np.stack([observed[f"images_{axis}"] for axis in "xyz"], axis=1)
+    assert (places.min(axis=0) > result.mesh.points.min(axis=0)).all()
+    away = (draws["images"] - observed["images"]).to_numpy()
+    sd = np.sqrt((away**2).mean(axis=(0, 1)))
+    # Half of the spread of f is what m does not tell.
+    assert np.median(sd) < 2 * observed["images"].std()
+    assert (sd > 0).all()
+    assert set(result.idata.log_likelihood.data_vars) == {"vessel"}
+
+
 def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(folder, tmp_path):
     observed = [{"kind": "images"}, {"kind": "landmarks", "file": "plain.csv", "sd": {"median": 0.5}, "name": "vessel"}]
     sections = {"sampler": {"name": "laplace", "chains": 2, "block": 5}}
@@ -154,6 +171,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
         br.run(short, tmp_path / "out", progress=False)
         whole = br.run(longer, tmp_path / "whole", progress=False)
     result = br.run(longer, tmp_path / "out", resume=True, progress=False)
+    require_images_are_predicted(result)
     assert result.idata.posterior["vessel_sd"].shape == (2, 10)
     assert (result.idata.posterior["vessel_sd"] > 0).all()
     assert list(result.run.manifest["observations"]) == ["images", "vessel"]

@@ -1,9 +1,13 @@
 """The transforms that a run leaves, in the hands of other programs: SimpleITK, ANTs, nitransforms and nibabel."""
 
+import ants
 import nibabel as nib
+import nitransforms
 import numpy as np
+import pandas as pd
 import pytest
 import SimpleITK
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from bayesreg.fem.deformation import Deformer
@@ -63,6 +67,12 @@ def _of_itk(transform, points):
     return np.array([transform.TransformPoint(point.tolist()) for point in points * LPS]) * LPS
 
 
+def _lies_between_voxels(image, points):
+    """Nearer to the border than the last voxel's centre, programs take what lies beyond for zero, or go on."""
+    index = np.asarray(image.world_to_voxel(points))
+    return ((index >= 0) & (index <= np.array(image.shape) - 1)).all(axis=-1)
+
+
 @pytest.mark.parametrize("name", GRIDS)
 def test_simpleitk_resamples_and_moves_points_as_we_do(name, tmp_path):
     transform, grid = _transform(), _grid(GRIDS[name])
@@ -107,20 +117,49 @@ def test_each_draw_has_its_own(name, tmp_path):
         np.testing.assert_allclose(np.linalg.norm(points + field - placed, axis=1).mean(), 0, atol=0.1)
 
 
-def test_nitransforms_and_ants_read_them(tmp_path):
-    transform, grid = _transform(), _grid(GRIDS["oblique, anisotropic and left-handed"])
+@pytest.mark.parametrize("name", ["anisotropic", "oblique, anisotropic and left-handed"])
+def test_ants_nitransforms_and_nibabel_resample_and_move_points_as_we_do(name, tmp_path):
+    transform, grid = _transform(), _grid(GRIDS[name])
     write_transforms(tmp_path, transform, grid)
+    composite, inverse = (str(tmp_path / f"transform_mean{end}.h5") for end in ("", "_inverse"))
     points = CENTRE + np.random.default_rng(2).uniform(-20, 20, (50, 3))
     placed, _ = transform.place(points)
-    ants = pytest.importorskip("ants")
-    table = __import__("pandas").DataFrame(points * LPS, columns=list("xyz"))
-    found = (
-        ants.apply_transforms_to_points(3, table, [str(tmp_path / "transform_mean.h5")])[list("xyz")].to_numpy() * LPS
-    )
-    assert np.linalg.norm(found - placed, axis=1).max() < 0.12
-    manip = pytest.importorskip("nitransforms.manip")
-    read = manip.load(tmp_path / "transform_mean.h5", fmt="itk")
-    assert np.linalg.norm(read.map(points) - placed, axis=1).max() < 0.12
+    for path, start, end in ((composite, points, placed), (inverse, placed, points)):
+        table = pd.DataFrame(start * LPS, columns=list("xyz"))
+        by_ants = ants.apply_transforms_to_points(3, table, [path])[list("xyz")].to_numpy() * LPS
+        by_nitransforms = nitransforms.manip.load(path, fmt="itk").map(start)
+        assert np.linalg.norm(by_ants - end, axis=1).max() < 0.12
+        assert np.linalg.norm(by_nitransforms - end, axis=1).max() < 0.12
+
+    moving = _smooth_image(Image(np.zeros((45, 60, 50)), POSE.matrix @ _grid(TURN @ np.diag([3.0, 2.0, -2.5])).affine))
+    there = transform.place(grid.grid_points().reshape(-1, 3))[0].reshape(*grid.shape, 3)
+    ours, known = np.asarray(moving.interpolate(there)), _lies_between_voxels(moving, there)
+    assert known.mean() > 0.3
+    for image, stem in ((grid, "fixed"), (moving, "moving")):
+        nib.save(nib.Nifti1Image(np.asarray(image.voxels, np.float64), image.affine), tmp_path / f"{stem}.nii.gz")
+    fixed_file, moving_file = tmp_path / "fixed.nii.gz", tmp_path / "moving.nii.gz"
+
+    by_ants = ants.apply_transforms(ants.image_read(str(fixed_file)), ants.image_read(str(moving_file)), [composite])
+    np.testing.assert_allclose(by_ants.numpy()[known], ours[known], atol=5e-4)
+    read = nitransforms.manip.load(composite, fmt="itk")
+    by_nitransforms = nitransforms.resampling.apply(read, moving_file, reference=fixed_file, order=1, prefilter=False)
+    np.testing.assert_allclose(np.asarray(by_nitransforms.dataobj)[known], ours[known], atol=5e-4)
+
+
+def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
+    transform, grid = _transform(), _grid(GRIDS["oblique, anisotropic and left-handed"])
+    write_transforms(tmp_path, transform, grid)
+    moving = _smooth_image(Image(np.zeros((45, 60, 50)), POSE.matrix @ _grid(TURN @ np.diag([3.0, 2.0, -2.5])).affine))
+    for number, u in enumerate(transform.draws, start=1):
+        field = nib.load(tmp_path / "transforms" / f"draw-{number}.nii.gz")
+        voxels = np.moveaxis(np.indices(field.shape[:3]), 0, -1)
+        places = nib.affines.apply_affine(field.affine, voxels) + field.get_fdata()[..., 0, :] * LPS
+        index = nib.affines.apply_affine(np.linalg.inv(moving.affine), places)
+        theirs = ndimage.map_coordinates(np.asarray(moving.voxels), np.moveaxis(index, -1, 0), order=1)
+        centres = nib.affines.apply_affine(field.affine, voxels).reshape(-1, 3)
+        there, _ = Transform(transform.deformer, POSE, u, transform.draws[:0]).place(centres)
+        known = _lies_between_voxels(moving, there)
+        np.testing.assert_allclose(theirs.ravel()[known], np.asarray(moving.interpolate(there))[known], atol=5e-4)
 
 
 def test_without_a_pose_and_without_draws(tmp_path):

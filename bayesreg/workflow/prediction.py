@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jax.scipy.stats import norm
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
@@ -20,7 +19,6 @@ from bayesreg.inference.gaussian.about_gaussian import MOST_UNKNOWNS
 from bayesreg.inference.layout import dimension
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
-from bayesreg.model import coordinates
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.posterior import Posterior
@@ -175,58 +173,6 @@ def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
     # A stream of its own: those of draws have their number.
     rng = np.random.default_rng((transform.seed, len(transform.draws)))
     return predicted._replace(place_draws=draws + sd * rng.standard_normal(draws.shape))
-
-
-def predict_landmarks(posterior: Posterior, draws: xr.Dataset, seed: int) -> dict[str, xr.Dataset]:
-    """What ArviZ wants to know of landmarks: groups observed_data, posterior_predictive and log_likelihood.
-
-    Parameters
-    ----------
-    posterior : Posterior
-    draws : xarray.Dataset
-        The group `posterior` of the run.
-    seed : int
-        Of the replicated noise.
-
-    Returns
-    -------
-    dict
-        A Dataset by group, each with a variable by observation: displacements (…, point, axis), mm; the log likelihood
-        (chain, draw, point) with its normaliser, as leave-one-out needs it. Empty where there are no landmarks.
-    """
-    given = {name: one for name, one in posterior.observations.items() if isinstance(one, Landmarks)}
-    if not given:
-        return {}
-    key = jax.random.key(seed)
-
-    def forward(draw: dict[str, AnyArray], data: Any) -> dict[str, tuple[AnyArray, AnyArray]]:
-        number, found = draw.pop("number").astype(int), {}
-        state = state_of(data.body, data.blocks, coordinates.fill(data.blocks, draw))
-        for index, name in enumerate(given):
-            term = data.terms[name]
-            mean, sd = term.predicted(state), term.sd(state.values)[:, None]
-            noise = jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, number), index), mean.shape)
-            found[name] = mean + sd * noise, norm.logpdf(term.shift, mean, sd).sum(axis=1)
-        return found
-
-    names = [name for name in posterior.reference() if name in draws]
-    every = thin(draws, names, draws.sizes["draw"] * draws.sizes["chain"])
-    chains, count = every["u_boundary"].shape[:2]
-    every["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    blocks = list(push_forward(forward, every, posterior.data))
-    groups: dict[str, dict[str, xr.DataArray]] = {"observed_data": {}, "posterior_predictive": {}, "log_likelihood": {}}
-    for name, one in given.items():
-        labels = {f"{name}_point": list(one.labels), "axis": list("xyz")}
-        replicated, log = (np.concatenate([block[name][part] for block in blocks], axis=1) for part in (0, 1))
-        coords = {"chain": draws["chain"].to_numpy(), "draw": draws["draw"].to_numpy(), **labels}
-        dims = ("chain", "draw", f"{name}_point")
-        unit = {"units": "mm", "long_name": "displacement of the landmarks, world RAS"}
-        shift = np.asarray(posterior.data.terms[name].shift)
-        groups["observed_data"][name] = xr.DataArray(shift, labels, (dims[2], "axis"), attrs=unit)
-        groups["posterior_predictive"][name] = xr.DataArray(replicated, coords, (*dims, "axis"), attrs=unit)
-        del coords["axis"]
-        groups["log_likelihood"][name] = xr.DataArray(log, coords, dims)
-    return {group: xr.Dataset(content) for group, content in groups.items()}
 
 
 def _stiffness(found: Summary) -> dict[str, np.ndarray]:

@@ -46,7 +46,8 @@ from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with
 from bayesreg.workflow.bids import write_bids
 from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
 from bayesreg.workflow.manifest import manifest
-from bayesreg.workflow.prediction import mean_values, predict, predict_landmarks, with_unresolved
+from bayesreg.workflow.prediction import mean_values, predict, with_unresolved
+from bayesreg.workflow.predictive_groups import predictive_groups
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
 from bayesreg.workflow.result import Result, load_result, report
 from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
@@ -328,11 +329,11 @@ def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
 
 
 def _store_draws(posterior: Posterior, samples: Samples, path: Path, seed: int) -> Any:
-    """Write posterior.nc, with what ArviZ wants to know of landmarks, and open it."""
+    """Write posterior.nc, with what ArviZ wants to know of the observations, and open it."""
     save_posterior(posterior, samples.blocks, path)
     # A file that is open is not added to.
     with xr.open_dataset(path, group="posterior") as draws:
-        groups = predict_landmarks(posterior, draws, seed)
+        groups = predictive_groups(posterior, draws, seed)
     append_groups(path, groups)
     return open_posterior(path)
 

@@ -103,6 +103,23 @@ class Ranks(NamedTuple):
     acceptance: np.ndarray
 
 
+class Sampled(NamedTuple):
+    """Draws of the posteriors of all replications, after the warm-up.
+
+    Attributes
+    ----------
+    quantities : (draw, r, k) array
+    u : (draw, r, n, 3) array
+        Displacement of every node, mm.
+    acceptance : (r,) array
+        The mean over the draws.
+    """
+
+    quantities: np.ndarray
+    u: np.ndarray
+    acceptance: np.ndarray
+
+
 class Verdict(NamedTuple):
     """Tests of uniform ranks; a quantity fails below a significance shared out over all of them (Bonferroni).
 
@@ -157,22 +174,22 @@ def calibrate(
     key_data, key_chains = jax.random.split(jax.random.key(seed))
     observed = simulated(simulator.posterior, simulator.posterior.data, truths, key_data)
     starts = of_posterior(posterior, simulator.draw_prior(rng, settings.replications))
-    draws, acceptance = _chains(posterior, observed, starts, key_chains, settings, sampler, say)
+    sampled = sample(posterior, observed, starts, key_chains, settings, sampler, say)
     at_truth = jax.jit(jax.vmap(partial(quantities_at, posterior), in_axes=(None, 0, 0)))
     true = np.asarray(at_truth(posterior.data, observed, of_posterior(posterior, truths)))
-    return _ranks(quantity_names(posterior), true, draws, acceptance, rng)
+    return _ranks(quantity_names(posterior), true, sampled.quantities, sampled.acceptance, rng)
 
 
-def _chains(
+def sample(
     posterior: br.Posterior,
     observed: Any,
     starts: Estimands,
     key: Any,
-    settings: Settings,
-    sampler: str,
-    say: Say,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Quantities (draw, r, k) after the warm-up, and the mean acceptance of each replication."""
+    settings: Settings = SETTINGS,
+    sampler: str = "hmc",
+    say: Say = lambda text: None,
+) -> Sampled:
+    """Sample the posterior of each of the data sets (r, q), one chain each, from draws of the prior."""
     kernel = choose_sampler(sampler, posterior).sampler
     say("a mode for each replication")
     problems = [replace(posterior, data=observing(posterior.data, f)) for f in observed]
@@ -189,11 +206,12 @@ def _chains(
         if stage == 0:
             states = _flown(posterior, posterior.data, setup, observed, modes, jax.random.split(key_flight, len(modes)))
         key_stage = jax.random.fold_in(key, stage)
-        states, places, found, acceptance = _run(
+        states, places, *found = _run(
             kernel, posterior, setup, observed, states, key_stage, settings, stage == settings.stages, say
         )
         visited = np.concatenate([modes[:, None], np.moveaxis(places[len(places) // 2 :], 0, 1)], axis=1)
-    return found[settings.warm_up :], acceptance[settings.warm_up :].mean(axis=0)
+    quantities, u, acceptance = (each[settings.warm_up :] for each in found)
+    return Sampled(quantities, u, acceptance.mean(axis=0))
 
 
 def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
@@ -244,7 +262,8 @@ def _advance(  # type: ignore[no-untyped-def]
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
         place = ravel_pytree(posterior.coordinates.unconstrain(data, drawn.estimands))[0]
-        return state, drawn.estimands, place, quantities(drawn.estimands, drawn.evaluation), info.acceptance_rate
+        seen = quantities(drawn.estimands, drawn.evaluation), drawn.evaluation.u
+        return state, drawn.estimands, place, *seen, info.acceptance_rate
 
     return jax.lax.map(one, (setup, observed, keys, states), batch_size=BATCH)
 
@@ -259,8 +278,8 @@ def _run(
     settings: Settings,
     last: bool,
     say: Say,
-) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray]:
-    """Where the chains end; flat positions, quantities and acceptances, the steps leading, then the replications.
+) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where the chains end; flat positions, quantities, u and acceptances, the steps leading, then the replications.
 
     Each chain's step is tuned on its own, by dual averaging as in production: where one step served all replications,
     some chains stood still.
@@ -278,9 +297,9 @@ def _run(
         states, ends, *found = _advance(kernel, posterior, data, setup, observed, keys, states)
         kept.append([np.asarray(x) for x in found])
         if step < tuned:
-            averaging = jax.vmap(update)(averaging, jnp.nan_to_num(found[2]))
+            averaging = jax.vmap(update)(averaging, jnp.nan_to_num(found[-1]))
         if step % 20 == 0:
-            size, rate = np.median(setup.step_size), kept[-1][2].mean()
+            size, rate = np.median(setup.step_size), kept[-1][-1].mean()
             say(f"transition {step} of {steps}, acceptance {rate:.0%}, step {size:.2g}")
     return ends, *(np.stack(x) for x in zip(*kept, strict=True))
 

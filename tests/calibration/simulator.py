@@ -20,6 +20,7 @@ from scipy.linalg import solve_triangular
 
 import bayesreg as br
 from bayesreg.inference.target import without_normaliser
+from bayesreg.mesh import TetMesh
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
@@ -62,11 +63,6 @@ class Variant(NamedTuple):
         return {"t_similarity": T_SIMILARITY, "t_elastic": T_ELASTIC} if self.temperatures else {}
 
     @property
-    def nodes(self) -> np.ndarray:
-        """Those whose displacements are sampled."""
-        return np.arange(len(MESH.points)) if self.loads else MESH.boundary
-
-    @property
     def options(self) -> dict[str, Any]:
         """Of `ModelConfig`."""
         elastic = {"t_elastic": T_ELASTIC}
@@ -107,10 +103,12 @@ class Simulator:
     Parameters
     ----------
     variant : Variant
+    mesh : TetMesh
+        Whose nodes are displaced: that of the posterior, or a finer one of the same box.
     """
 
-    def __init__(self, variant: Variant) -> None:
-        self.variant = variant
+    def __init__(self, variant: Variant, mesh: TetMesh = MESH) -> None:
+        self.variant, self.mesh = variant, mesh
         self.posterior = posterior_of(variant)
 
     @cached_property
@@ -119,10 +117,10 @@ class Simulator:
         found = {}
         for name in LAME:
             of_tissue = []
-            for tissue in range(len(MESH.names)):
-                here = (MESH.tissue == tissue).astype(float)
+            for tissue in range(len(self.mesh.names)):
+                here = (self.mesh.tissue == tissue).astype(float)
                 lam, mu = (here, 0 * here) if name == "lam" else (0 * here, here)
-                of_tissue.append(paper.stiffness(MESH.points, MESH.cells, lam, mu).toarray())
+                of_tissue.append(paper.stiffness(self.mesh.points, self.mesh.cells, lam, mu).toarray())
             found[name] = np.stack(of_tissue)
         return found
 
@@ -134,26 +132,26 @@ class Simulator:
         """The precision of the displacements of the sampled nodes but for rigid motions, which it leaves free."""
         if not self.variant.loads:
             return self.schur_complement(values["lam"], values["mu"]) / values.get("t_elastic", T_ELASTIC)
-        K, variances = self.stiffness(values["lam"], values["mu"]), np.zeros(len(MESH.points))
-        for cell in MESH.cells:
-            variances[cell] += values["body_load"] ** 2 * paper.volume(MESH.points[cell]) / 4
-        for a, b, c in MESH.boundary_faces:
-            side, other = MESH.points[b] - MESH.points[a], MESH.points[c] - MESH.points[a]
+        K, variances = self.stiffness(values["lam"], values["mu"]), np.zeros(len(self.mesh.points))
+        for cell in self.mesh.cells:
+            variances[cell] += values["body_load"] ** 2 * paper.volume(self.mesh.points[cell]) / 4
+        for a, b, c in self.mesh.boundary_faces:
+            side, other = self.mesh.points[b] - self.mesh.points[a], self.mesh.points[c] - self.mesh.points[a]
             variances[[a, b, c]] += values["surface_load"] ** 2 * np.linalg.norm(np.cross(side, other)) / 6
         return K @ (K / np.repeat(variances, 3)[:, None])
 
     def schur_complement(self, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
         """S of the boundary, (3b, 3b)."""
         K = self.stiffness(lam, mu)
-        boundary = (3 * MESH.boundary[:, None] + np.arange(3)).ravel()
+        boundary = (3 * self.mesh.boundary[:, None] + np.arange(3)).ravel()
         interior = np.setdiff1d(np.arange(len(K)), boundary)
         coupling = K[np.ix_(interior, boundary)]
         return K[np.ix_(boundary, boundary)] - coupling.T @ np.linalg.solve(K[np.ix_(interior, interior)], coupling)
 
     def draw_displacement(self, rng: np.random.Generator, values: dict[str, Any]) -> Any:
         """The sampled nodes' of the untruncated Gaussian prior, (b, 3) in mm."""
-        nodes = self.variant.nodes
-        rigid = paper.rigid_modes(MESH.points[nodes]) / (RIGID_SD * np.sqrt(len(nodes)))
+        nodes = np.arange(len(self.mesh.points)) if self.variant.loads else self.mesh.boundary
+        rigid = paper.rigid_modes(self.mesh.points[nodes]) / (RIGID_SD * np.sqrt(len(nodes)))
         precision = self.elastic_precision(values) + rigid @ rigid.T
         factor = np.linalg.cholesky(precision)
         return solve_triangular(factor, rng.normal(size=len(factor)), lower=True, trans=1).reshape(-1, 3)
@@ -175,7 +173,7 @@ class Simulator:
         while len(draws) < count:
             values = self.draw_parameters(rng)
             u = self.draw_displacement(rng, values)
-            if not self.variant.skull or (MESH.points[MESH.boundary, 0] + u[:, 0] <= WALL).all():
+            if not self.variant.skull or (self.mesh.points[self.mesh.boundary, 0] + u[:, 0] <= WALL).all():
                 blocks = self.posterior.data.blocks
                 values |= {name: values[name][blocks[name].free.index] for name in LAME}
                 draws.append({"u_boundary": u, **values})

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Int
 
 from bayesreg.inference.draws.moments import Moments, extend, pool, zero_moments
 from bayesreg.types import AnyArray
@@ -42,6 +43,12 @@ class Summary(NamedTuple):
     quantiles: Any
 
 
+def evenly_spaced(total: int, most: int) -> Int[np.ndarray, "k"]:
+    """Up to so many indices below a total: the middles of equal stretches."""
+    count = min(total, most)
+    return ((np.arange(count) + 0.5) * total / count).astype(int)
+
+
 def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np.ndarray]:
     """Evenly spaced draws of the named variables.
 
@@ -57,10 +64,7 @@ def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np
     dict
         Arrays (chain, draw, …).
     """
-    chains, total = posterior.sizes["chain"], posterior.sizes["draw"]
-    # The middles of equal stretches.
-    count = min(total, max(1, most // chains))
-    chosen = ((np.arange(count) + 0.5) * total / count).astype(int)
+    chosen = evenly_spaced(posterior.sizes["draw"], max(1, most // posterior.sizes["chain"]))
     some = posterior[list(names)].isel(draw=chosen).transpose("chain", "draw", ...)
     return {str(name): np.asarray(some[name].to_numpy(), float) for name in some.data_vars}
 
