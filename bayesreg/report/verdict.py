@@ -55,10 +55,10 @@ def number(value: float | int | None, digits: int = 3) -> str:
         return NONE
     if value == 0:
         return "0"
+    if not 1e-3 <= abs(value) < 1e7:
+        return f"{value:.{digits - 1}g}".replace("e+", "e").replace("-", "−")
     if abs(value) >= 10**digits:
-        return f"{value:,.0f}"
-    if abs(value) < 1e-3:
-        return f"{value:.{digits - 1}g}".replace("-", "−")
+        return f"{value:,.0f}".replace("-", "−")
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
     return f"{value:.{decimals}f}".replace("-", "−")
 

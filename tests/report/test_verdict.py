@@ -160,7 +160,17 @@ def test_the_worst_estimand_is_named_with_its_region():
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0"), (1234.5, "1,234"), (12.345, "12.3"), (-0.5, "−0.500"), (1e-6, "1e−06"), (math.nan, "–"), (None, "–")],
+    [
+        (0.0, "0"),
+        (1234.5, "1,234"),
+        (-1234.5, "−1,234"),
+        (6.08e23, "6.1e23"),
+        (12.345, "12.3"),
+        (-0.5, "−0.500"),
+        (1e-6, "1e−06"),
+        (math.nan, "–"),
+        (None, "–"),
+    ],
 )
 def test_numbers(value, text):
     assert number(value) == text
