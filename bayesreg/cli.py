@@ -16,11 +16,20 @@ STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
 class _Commands(TyperGroup):
-    """A mistake of the user gives one message and status 2, a failing disk status 1; any other exception is a bug."""
+    """A mistake of the user gives one message and status 2, a failing disk status 1; any other exception is a bug.
+
+    A signal gives a message, too, and the status that shells know it by.
+    """
 
     def invoke(self, ctx: Any) -> Any:
+        from bayesreg.workflow.interruption import Interrupted, ending_at_once
+
         try:
-            return super().invoke(ctx)
+            with ending_at_once():
+                return super().invoke(ctx)
+        except Interrupted as signal:
+            typer.echo(f"bayesreg: {signal}; a run goes on from its last whole block of draws with --resume", err=True)
+            raise typer.Exit(signal.status) from None
         except ValueError as error:
             from bayesreg.types import InputError
 
@@ -41,7 +50,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Status: 0 done, 2 bad input, 3 not converged (results are written), 1 anything else.",
+    epilog="Status: 0 done, 2 bad input, 3 not converged (results are written), 130 and 143 stopped by Ctrl-C and "
+    "SIGTERM (a run goes on with --resume), 1 anything else.",
 )
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]

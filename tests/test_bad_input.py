@@ -150,4 +150,4 @@ def test_a_folder_that_holds_another_run_is_left_alone(pair, tmp_path):
 def test_a_folder_without_a_run(tmp_path, command):
     result = CliRunner().invoke(app, [command, *[str(tmp_path)] * (2 if command == "compare" else 1)])
     assert result.exit_code == 2
-    assert "holds no finished run" in result.stderr
+    assert "holds no run of bayesreg" in result.stderr

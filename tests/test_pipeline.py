@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import interpolation_at
-from bayesreg.io import checkpoints, store
+from bayesreg.io import checkpoints, ledger, store
 from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
 from bayesreg.workflow import preparation
@@ -154,7 +154,8 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "cut", resume=True, progress=False)
     provenance = store.read_json(folder / "cut" / preparation.PROVENANCE)
     assert 0 < provenance["unsampled"] < 600
-    store.write_json(folder / "cut" / preparation.PROVENANCE, provenance | {"unsampled": 3600})
+    with ledger.writing(folder / "cut") as place:
+        store.write_json(place(preparation.PROVENANCE), provenance | {"unsampled": 3600})
     resumed = br.run(folder / "run.yaml", folder / "cut", resume=True, progress=False)
     timings = resumed.run.manifest["timings"]
     assert 3600 + timings["sampling"] < timings["total"] < 3600 + timings["sampling"] + 600
@@ -179,7 +180,7 @@ def test_a_finished_run_is_continued_with_more_draws(finished, folder):
     np.testing.assert_allclose(continued.u_sd, whole.u_sd, rtol=1e-12)
     assert f"max_steps: {2 * STOP['max_steps']}" in (folder / "continued" / "config.yaml").read_text()
     (folder / "continued" / "state.npz").unlink()
-    with pytest.raises(br.InputError, match=r"cannot be continued: state\.npz"):
+    with pytest.raises(br.InputError, match=r"holds no whole run: state\.npz is missing"):
         br.run(folder / "run.yaml", folder / "continued", resume=True, progress=False)
     assert (folder / "continued" / "run.json").exists()
 

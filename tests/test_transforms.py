@@ -67,6 +67,11 @@ def _of_itk(transform, points):
     return np.array([transform.TransformPoint(point.tolist()) for point in points * LPS]) * LPS
 
 
+def _place(folder):
+    (folder / "transforms").mkdir(exist_ok=True)
+    return folder.joinpath
+
+
 def _lies_between_voxels(image, points):
     """Nearer to the border than the last voxel's centre, programs take what lies beyond for zero, or go on."""
     index = np.asarray(image.world_to_voxel(points))
@@ -76,7 +81,7 @@ def _lies_between_voxels(image, points):
 @pytest.mark.parametrize("name", GRIDS)
 def test_simpleitk_resamples_and_moves_points_as_we_do(name, tmp_path):
     transform, grid = _transform(), _grid(GRIDS[name])
-    write_transforms(tmp_path, transform, grid)
+    write_transforms(_place(tmp_path), transform, grid)
     there, back = (SimpleITK.ReadTransform(str(tmp_path / f"transform_mean{end}.h5")) for end in ("", "_inverse"))
     # On voxel centres the field is exact; the moving image has a grid of its own.
     moving = _smooth_image(Image(np.zeros((45, 60, 50)), POSE.matrix @ _grid(TURN @ np.diag([3.0, 2.0, -2.5])).affine))
@@ -96,7 +101,7 @@ def test_simpleitk_resamples_and_moves_points_as_we_do(name, tmp_path):
 @pytest.mark.parametrize("name", ["upright", "oblique, anisotropic and left-handed"])
 def test_each_draw_has_its_own(name, tmp_path):
     transform, grid = _transform(), _grid(GRIDS[name])
-    write_transforms(tmp_path, transform, grid)
+    write_transforms(_place(tmp_path), transform, grid)
     assert sorted(path.name for path in (tmp_path / "transforms").iterdir()) == [
         f"draw-{draw}{end}" for draw in (1, 2) for end in (".h5", ".nii.gz", "_inverse.h5")
     ]
@@ -120,7 +125,7 @@ def test_each_draw_has_its_own(name, tmp_path):
 @pytest.mark.parametrize("name", ["anisotropic", "oblique, anisotropic and left-handed"])
 def test_ants_nitransforms_and_nibabel_resample_and_move_points_as_we_do(name, tmp_path):
     transform, grid = _transform(), _grid(GRIDS[name])
-    write_transforms(tmp_path, transform, grid)
+    write_transforms(_place(tmp_path), transform, grid)
     composite, inverse = (str(tmp_path / f"transform_mean{end}.h5") for end in ("", "_inverse"))
     points = CENTRE + np.random.default_rng(2).uniform(-20, 20, (50, 3))
     placed, _ = transform.place(points)
@@ -148,7 +153,7 @@ def test_ants_nitransforms_and_nibabel_resample_and_move_points_as_we_do(name, t
 
 def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
     transform, grid = _transform(), _grid(GRIDS["oblique, anisotropic and left-handed"])
-    write_transforms(tmp_path, transform, grid)
+    write_transforms(_place(tmp_path), transform, grid)
     moving = _smooth_image(Image(np.zeros((45, 60, 50)), POSE.matrix @ _grid(TURN @ np.diag([3.0, 2.0, -2.5])).affine))
     for number, u in enumerate(transform.draws, start=1):
         field = nib.load(tmp_path / "transforms" / f"draw-{number}.nii.gz")
@@ -164,7 +169,7 @@ def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
 
 def test_without_a_pose_and_without_draws(tmp_path):
     transform, grid = _transform(Pose.identity(), draws=0), _grid(GRIDS["upright"])
-    write_transforms(tmp_path, transform, grid, displacement_on(transform.mean, grid).field)
+    write_transforms(_place(tmp_path), transform, grid, displacement_on(transform.mean, grid).field)
     assert {path.name for path in tmp_path.iterdir()} == {"transform_mean.h5", "transform_mean_inverse.h5"}
     x, y, z = load_displacement(tmp_path / "transform_mean.h5")
     expected = transform.mean.displacement(*[grid.grid_points().reshape(-1, 3)] * 1, transform.deformer.locate(
@@ -176,7 +181,7 @@ def test_without_a_pose_and_without_draws(tmp_path):
 def test_a_sheared_grid_gets_one_at_right_angles(tmp_path):
     linear = np.array([[2.0, 0.6, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.5]])
     transform = _transform(draws=0)
-    write_transforms(tmp_path, transform, _grid(linear))
+    write_transforms(_place(tmp_path), transform, _grid(linear))
     there = SimpleITK.ReadTransform(str(tmp_path / "transform_mean.h5"))
     points = CENTRE + np.random.default_rng(2).uniform(-20, 20, (50, 3))
     assert np.linalg.norm(_of_itk(there, points) - transform.place(points)[0], axis=1).max() < 0.12

@@ -15,13 +15,16 @@ import numpy as np
 
 from bayesreg.types import AnyArray, InputError
 
+# How the names of files begin that are not whole yet.
+PARTIAL = ".partial-"
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary path beside a file, which replaces it when the block ends well and is removed when it does not."""
     path = Path(path)
     # The name's end stays, since writers choose the format by it.
-    temporary = path.with_name(f".partial-{os.getpid()}-{path.name}")
+    temporary = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
     try:
         yield temporary
         temporary.replace(path)

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from bayesreg.io.atomic import load_arrays, save_arrays
-from bayesreg.types import AnyArray, InputError
+from bayesreg.io.ledger import ANEW, Stage, drop, is_listed, require_file, writing
+from bayesreg.types import AnyArray
 
-RESUME_ANEW = "delete state.npz in that run's folder, and it resumes from its first step"
+STATE, DRAWS = "state.npz", "draws"
 
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:
     """Write one block of draws in one step; a block of the same index is replaced."""
-    path = _block_path(folder, index)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_arrays(path, arrays)
+    with writing(folder) as place:
+        save_arrays(place(_block_name(index)), arrays)
 
 
 class StoredBlocks:
@@ -40,8 +40,7 @@ class StoredBlocks:
     def __init__(self, folder: str | Path, count: int, writes: bool = True) -> None:
         self.folder, self.count, self.writes = Path(folder), count, writes
         for index in range(count):
-            if not _block_path(self.folder, index).exists():
-                raise InputError(f"{_block_path(self.folder, index)} is missing; {RESUME_ANEW}")
+            require_file(self.folder, _block_name(index))
 
     def __len__(self) -> int:
         return self.count
@@ -49,7 +48,7 @@ class StoredBlocks:
     def __getitem__(self, index: int, /) -> dict[str, np.ndarray]:
         if not 0 <= index < self.count:
             raise IndexError(f"block {index} of {self.count}")
-        return load_arrays(_block_path(self.folder, index), RESUME_ANEW)
+        return load_arrays(require_file(self.folder, _block_name(index)), ANEW)
 
     def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
         return (self[index] for index in range(self.count))
@@ -61,42 +60,34 @@ class StoredBlocks:
         self.count += 1
 
 
-def _block_path(folder: str | Path, index: int) -> Path:
-    return Path(folder) / "draws" / f"block_{index:05d}.npz"
+def _block_name(index: int) -> str:
+    return f"{DRAWS}/block_{index:05d}.npz"
 
 
-def save_state(folder: str | Path, arrays: Mapping[str, AnyArray]) -> None:
-    """Replace state.npz, what the next block starts from, in one step."""
-    save_arrays(Path(folder) / "state.npz", arrays)
+def save_state(folder: str | Path, arrays: Mapping[str, AnyArray], stage: Stage | None = None) -> None:
+    """Replace state.npz, what the next block starts from, in one step; the run may come to another stage with it."""
+    with writing(folder, stage) as place:
+        save_arrays(place(STATE), arrays)
 
 
 def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
-    """The content of state.npz; None where there is none."""
-    path = Path(folder) / "state.npz"
-    return load_arrays(path, "delete it, and the run resumes from its first step") if path.exists() else None
+    """The content of state.npz; None where no chain has started yet."""
+    return load_arrays(require_file(folder, STATE), ANEW) if is_listed(folder, STATE) else None
 
 
 def remove_blocks(folder: str | Path) -> None:
     """Remove draws/ of a run whose results are complete; state.npz stays, from which it can be continued."""
-    shutil.rmtree(Path(folder) / "draws", ignore_errors=True)
+    drop(folder, DRAWS)
+    shutil.rmtree(Path(folder) / DRAWS, ignore_errors=True)
 
 
 def reopen(folder: str | Path, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
     """Make of a finished run one that was cut off after these blocks, which hold all its draws.
 
     Killed between any two of its steps, it leaves a finished run, or what it is to leave.
-
-    Raises
-    ------
-    InputError
-        If the run's last state was not kept.
     """
-    folder = Path(folder)
-    state = load_state(folder)
-    if state is None:
-        raise InputError(f"{folder} cannot be continued: state.npz, where its chains stood last, is missing")
+    state = load_arrays(require_file(folder, STATE), ANEW)
     kept = StoredBlocks(folder, 0)
     for block in blocks:
         kept.append(block)
-    save_state(folder, state | {"blocks": np.array(len(kept))})
-    (folder / "run.json").unlink()
+    save_state(folder, state | {"blocks": np.array(len(kept))}, "prepared")

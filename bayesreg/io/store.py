@@ -1,9 +1,9 @@
-"""The run folder: inputs, results, and the checkpoints that a killed run continues from."""
+"""The inputs and the results of a run in its folder; what is read has the content that was written (`ledger`)."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
 from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
+from bayesreg.io.ledger import ANEW, STATUS, is_listed, require_file, stage_of, writing
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.points import PointPairs
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
@@ -22,9 +23,9 @@ from bayesreg.types import AnyArray, InputError
 
 BODIES = "bodies.json"
 RESULTS = (
-    "config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html", BODIES,
+    STATUS, "config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html",
+    BODIES,
 )  # fmt: skip
-_BODY = {"seed", "true", "found", "failed"}
 
 
 def require_fresh(folder: str | Path) -> None:
@@ -43,51 +44,50 @@ def require_fresh(folder: str | Path) -> None:
         )
 
 
-def write_inputs(folder: str | Path, inputs: Inputs) -> None:
-    """Write config.yaml, mesh.vtu and inputs/ into a folder, which is made if need be."""
-    folder = Path(folder)
-    images = folder / "inputs"
-    images.mkdir(parents=True, exist_ok=True)
+# From the name of a file of a run, relative to its folder, to where it is to be written (`ledger.writing`).
+Place = Callable[[str], Path]
+
+
+def write_inputs(place: Place, inputs: Inputs) -> None:
+    """Write config.yaml and what is in inputs/, where they have their places."""
     every = ("fixed", "moving", "tissue", "skull", "fixed_ignore", "moving_ignore")
     given = {name: image for name in every if (image := getattr(inputs, name)) is not None}
     for name, channel in inputs.channels.items():
         given |= {f"channel-{name}-fixed": channel.fixed, f"channel-{name}-moving": channel.moving}
+    places = [place(f"inputs/{name}.nii.gz") for name in given]
     # The compression lets other threads run.
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda name: save_image(given[name], images / f"{name}.nii.gz"), given))
+        list(pool.map(save_image, given.values(), places))
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
-        save_arrays(images / "truth.npz", known)
+        save_arrays(place("inputs/truth.npz"), known)
     if inputs.boundary is not None:
-        save_arrays(images / "boundary.npz", {"u_boundary": inputs.boundary})
+        save_arrays(place("inputs/boundary.npz"), {"u_boundary": inputs.boundary})
     if inputs.points:
-        save_arrays(images / "points.npz", _points_as_arrays(inputs.points))
+        save_arrays(place("inputs/points.npz"), _points_as_arrays(inputs.points))
     channels = {name: channel.one_contrast for name, channel in inputs.channels.items()}
-    write_json(images / "matching.json", inputs.matching.as_json() | {"channels": channels})
-    save_mesh(inputs.mesh, folder / "mesh.vtu")
-    write_text(folder / "config.yaml", inputs.config)
+    write_json(place("inputs/matching.json"), inputs.matching.as_json() | {"channels": channels})
+    save_mesh(inputs.mesh, place("inputs/mesh.vtu"))
+    write_text(place("config.yaml"), inputs.config)
 
 
 def read_inputs(folder: str | Path) -> Inputs:
-    """Read what `write_inputs` wrote; InputError where a part is missing or unreadable."""
-    folder = Path(folder)
-    images = folder / "inputs"
-    config = _require(folder, "config.yaml").read_text(encoding="utf-8")
-    mesh = load_mesh(_require(folder, "mesh.vtu"))
-    tissue = load_image(_require(folder, "inputs/tissue.nii.gz"))
+    """Read what `write_inputs` wrote; InputError where a part is missing or damaged."""
+    config = require_file(folder, "config.yaml").read_text(encoding="utf-8")
+    mesh = load_mesh(require_file(folder, "inputs/mesh.vtu"))
+    tissue = load_image(require_file(folder, "inputs/tissue.nii.gz"))
     fixed, moving, skull, fixed_ignore, moving_ignore = (
-        load_image(path) if (path := images / f"{name}.nii.gz").exists() else None
+        None if (path := _file(folder, f"inputs/{name}.nii.gz")) is None else load_image(path)
         for name in ("fixed", "moving", "skull", "fixed_ignore", "moving_ignore")
     )
-    if (fixed is None) != (moving is None):
-        raise InputError(
-            f"{folder} holds no finished run: inputs/{'fixed' if fixed is None else 'moving'}.nii.gz is missing"
-        )
-    known, given, points = images / "truth.npz", images / "boundary.npz", images / "points.npz"
-    truth = Truth(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
-    boundary = load_arrays(given, "run anew, into another folder")["u_boundary"] if given.exists() else None
-    pairs = _points_of(load_arrays(points, "run anew, into another folder")) if points.exists() else {}
-    known_of_images = read_json(_require(folder, "inputs/matching.json"))
+    known, given, points = (
+        None if (path := _file(folder, f"inputs/{name}.npz")) is None else load_arrays(path, ANEW)
+        for name in ("truth", "boundary", "points")
+    )
+    truth = None if known is None else Truth(**known)
+    boundary = None if given is None else given["u_boundary"]
+    pairs = {} if points is None else _points_of(points)
+    known_of_images = read_json(require_file(folder, "inputs/matching.json"))
     channels = {name: _channel(folder, name, alike) for name, alike in known_of_images["channels"].items()}
     return Inputs(
         config, mesh, fixed, moving, tissue, skull, truth, boundary, pairs, Matching.of_json(known_of_images),
@@ -95,9 +95,9 @@ def read_inputs(folder: str | Path) -> Inputs:
     )  # fmt: skip
 
 
-def _channel(folder: Path, name: str, one_contrast: bool) -> Channel:
+def _channel(folder: str | Path, name: str, one_contrast: bool) -> Channel:
     fixed, moving = (
-        load_image(_require(folder, f"inputs/channel-{name}-{which}.nii.gz")) for which in ("fixed", "moving")
+        load_image(require_file(folder, f"inputs/channel-{name}-{which}.nii.gz")) for which in ("fixed", "moving")
     )
     return Channel(fixed, moving, one_contrast)
 
@@ -117,38 +117,37 @@ def _points_of(arrays: Mapping[str, np.ndarray]) -> dict[str, PointPairs]:
 
 
 def write_results(
-    folder: str | Path,
+    place: Place,
     run: Run,
     displacement_mean: Float[np.ndarray, "X Y Z 3"],
     displacement_sd: Float[np.ndarray, "X Y Z 3"],
 ) -> None:
-    """Write what a finished run adds to its inputs, run.json last.
+    """Write what a finished run adds to its inputs.
 
     Parameters
     ----------
-    folder : path
-        Where `write_inputs` has written; files of the same names are replaced, each in one step.
+    place : callable
+        As of `ledger.writing`.
     run : Run
     displacement_mean, displacement_sd : (X, Y, Z, 3) arrays
         Posterior mean and standard deviation of u on the grid of the background, world RAS, mm. The mean is
         written as a resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
     """
-    folder = Path(folder)
     by_cell = {} if run.predicted is None else run.predicted.by_cell
-    save_mesh(run.mesh, folder / "mesh.vtu", {"u_mean": run.u_mean, "u_sd": run.u_sd}, by_cell)
+    save_mesh(run.mesh, place("mesh.vtu"), {"u_mean": run.u_mean, "u_sd": run.u_sd}, by_cell)
     if run.warped is not None:
         scale = run.matching.scale
-        save_image(run.warped if scale is None else scale.undo(run.warped), folder / "warped_mean.nii.gz")
+        save_image(run.warped if scale is None else scale.undo(run.warped), place("warped_mean.nii.gz"))
     affine = run.background.affine
-    save_displacement(folder / "displacement_mean.nii.gz", displacement_mean, affine)
+    save_displacement(place("displacement_mean.nii.gz"), displacement_mean, affine)
     # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
     unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
-    save_displacement(folder / "displacement_sd.nii.gz", unsigned, affine)
+    save_displacement(place("displacement_sd.nii.gz"), unsigned, affine)
     if run.metrics is not None:
-        write_json(folder / "metrics.json", run.metrics)
+        write_json(place("metrics.json"), run.metrics)
     if run.predicted is not None:
-        save_arrays(folder / "predicted.npz", run.predicted.known)
-    write_json(folder / "run.json", run.manifest)
+        save_arrays(place("predicted.npz"), run.predicted.known)
+    write_json(place("run.json"), run.manifest)
 
 
 def read_run(folder: str | Path) -> Run:
@@ -157,48 +156,50 @@ def read_run(folder: str | Path) -> Run:
     Raises
     ------
     InputError
-        If the folder holds no finished run, or a part of it is missing or unreadable.
+        If the folder holds no finished run, or a part of it is missing or damaged.
     """
-    folder = Path(folder)
-    manifest = read_json(_require(folder, "run.json"))
+    require_finished(folder)
+    manifest = read_json(require_file(folder, "run.json"))
     inputs = read_inputs(folder)
-    u_mean, u_sd = read_point_data(folder / "mesh.vtu", "u_mean", "u_sd")
-    warped = None if inputs.moving is None else load_image(_require(folder, "warped_mean.nii.gz"))
+    u_mean, u_sd = read_point_data(require_file(folder, "mesh.vtu"), "u_mean", "u_sd")
+    warped = None if inputs.moving is None else load_image(require_file(folder, "warped_mean.nii.gz"))
     if warped is not None and inputs.matching.scale is not None:
         warped = inputs.matching.scale(warped)
-    metrics = read_json(folder / "metrics.json") if (folder / "metrics.json").exists() else None
-    known = folder / "predicted.npz"
-    predicted = Predicted(**load_arrays(known, "run anew, into another folder")) if known.exists() else None
+    metrics = None if (path := _file(folder, "metrics.json")) is None else read_json(path)
+    known = None if (path := _file(folder, "predicted.npz")) is None else Predicted(**load_arrays(path, ANEW))
     return Run(
         manifest=manifest,
         u_mean=u_mean,
         u_sd=u_sd,
         warped=warped,
         metrics=metrics,
-        predicted=predicted,
+        predicted=known,
         bodies=read_bodies(folder),
         **inputs._asdict(),
     )
 
 
+def require_finished(folder: str | Path) -> None:
+    """Raise InputError where a folder holds no finished run."""
+    stage = stage_of(folder)
+    if stage == "prepared":
+        raise InputError(f"the run in {folder} has not ended; bayesreg run --resume goes on with it")
+    if stage is None:
+        raise InputError(f"{folder} holds no run of bayesreg: {STATUS} is missing")
+
+
 def write_bodies(folder: str | Path, bodies: Sequence[Mapping[str, Any]]) -> None:
     """Write bodies.json of a run: simulated registrations on its mesh."""
-    write_json(Path(folder) / BODIES, list(bodies))
+    with writing(folder) as place:
+        write_json(place(BODIES), list(bodies))
 
 
 def read_bodies(folder: str | Path) -> list[dict[str, Any]] | None:
     """Read what `write_bodies` wrote; None where nothing was, InputError where it is damaged."""
-    path = Path(folder) / BODIES
-    if not path.exists():
-        return None
-    bodies = read_json(path)
-    whole = isinstance(bodies, list) and all(isinstance(body, dict) and body.keys() >= _BODY for body in bodies)
-    if not whole:
-        raise InputError(f"{path} holds no simulated bodies; remove it, and they are simulated anew")
-    return bodies
+    path = _file(folder, BODIES)
+    return None if path is None else read_json(path)
 
 
-def _require(folder: Path, name: str) -> Path:
-    if not (folder / name).exists():
-        raise InputError(f"{folder} holds no finished run: {name} is missing")
-    return folder / name
+def _file(folder: str | Path, name: str) -> Path | None:
+    """The path of a file that not every run has."""
+    return require_file(folder, name) if is_listed(folder, name) else None

@@ -9,12 +9,13 @@ from pathlib import Path
 from bayesreg import __version__
 from bayesreg.config.sections import BidsConfig
 from bayesreg.io.atomic import write_json
+from bayesreg.io.store import Place
 from bayesreg.workflow.transforms import MEAN, MEAN_INVERSE
 
 FOLDER = "bids"
 
 
-def write_bids(folder: Path, names: BidsConfig) -> None:
+def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
     """Write a derivative dataset, bids/, into the folder of a run; files are linked where the disk can do that.
 
     Parameters
@@ -23,14 +24,15 @@ def write_bids(folder: Path, names: BidsConfig) -> None:
         Of a finished run.
     names : BidsConfig
         Subject and session, and what the spaces of both images are called.
+    place : callable
+        As of `bayesreg.io.ledger.writing`.
 
     Notes
     -----
     A transform from-A_to-B resamples an image of A on the grid of B, as BIDS has it for mode-image.
     """
     entities = f"sub-{names.subject}" + ("" if names.session is None else f"_ses-{names.session}")
-    place = folder / FOLDER / entities.replace("_", "/") / "anat"
-    place.mkdir(parents=True, exist_ok=True)
+    within = f"{FOLDER}/{entities.replace('_', '/')}/anat"
     there, back = (f"from-{a}_to-{b}_mode-image" for a, b in ((names.moving, names.fixed), (names.fixed, names.moving)))
     units, space = {"Units": "mm"}, f"space-{names.fixed}"
     known = {
@@ -47,13 +49,13 @@ def write_bids(folder: Path, names: BidsConfig) -> None:
     for source, (name, description, more) in known.items():
         if not (folder / source).is_file():
             continue
-        target = place / f"{entities}_{name}"
-        _link(folder / source, target)
-        sidecar = target.with_name(target.name.removesuffix(".gz").rpartition(".")[0] + ".json")
-        write_json(sidecar, {"Description": description, "Sources": [f"bids::../{source}"], **more})
+        target = f"{within}/{entities}_{name}"
+        _link(folder / source, place(target))
+        sidecar = target.removesuffix(".gz").rpartition(".")[0] + ".json"
+        write_json(place(sidecar), {"Description": description, "Sources": [f"bids::../{source}"], **more})
     generated = [{"Name": "bayesreg", "Version": __version__}]
     write_json(
-        folder / FOLDER / "dataset_description.json",
+        place(f"{FOLDER}/dataset_description.json"),
         {"Name": "bayesreg", "BIDSVersion": "1.10.0", "DatasetType": "derivative", "GeneratedBy": generated},
     )
 

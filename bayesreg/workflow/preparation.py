@@ -21,6 +21,7 @@ from bayesreg.io import store
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels
 from bayesreg.io.displacements import IDENTITY, read_boundary, require_displacement
 from bayesreg.io.domain import size_of_solid, without_ridges
+from bayesreg.io.ledger import writing
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Channel, Inputs, Truth
@@ -37,7 +38,7 @@ from bayesreg.workflow.evaluation import NAME
 from bayesreg.workflow.matching import Matched, match_channel, match_images
 from bayesreg.workflow.prediction import require_inside
 
-PROVENANCE = Path("inputs") / "provenance.json"
+PROVENANCE = "inputs/provenance.json"
 
 
 class Prepared(NamedTuple):
@@ -223,9 +224,9 @@ def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:
 
 def store_inputs(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
     """Write the inputs of a run, and where they come from."""
-    (out / PROVENANCE).parent.mkdir(parents=True, exist_ok=True)
-    store.write_json(out / PROVENANCE, provenance)
-    store.write_inputs(out, inputs)
+    with writing(out, "prepared") as place:
+        store.write_json(place(PROVENANCE), provenance)
+        store.write_inputs(place, inputs)
 
 
 def _require_start(config: Config, mesh: TetMesh | None = None) -> None:

@@ -13,10 +13,13 @@ import numpy as np
 from bayesreg.inference.draws.diagnostics import Convergence, convergence
 from bayesreg.inference.draws.inference_data import open_posterior
 from bayesreg.io import store
+from bayesreg.io.ledger import locked, require_file, require_unchanged, writing
 from bayesreg.io.records import Run
 from bayesreg.mesh import TetMesh
 from bayesreg.pose import Motion
 from bayesreg.types import InputError
+
+POSTERIOR, REPORT = "posterior.nc", "report.html"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,7 @@ class Result:
     @cached_property
     def idata(self) -> Any:
         """The draws, as ArviZ opens them."""
-        return open_posterior(self.folder / "posterior.nc")
+        return open_posterior(require_file(self.folder, POSTERIOR))
 
     @cached_property
     def convergence(self) -> Convergence:
@@ -82,20 +85,24 @@ class Result:
     @property
     def report(self) -> Path:
         """The HTML report."""
-        return self.folder / "report.html"
+        return self.folder / REPORT
 
 
 def load_result(folder: str | Path) -> Result:
-    """Open a finished run; InputError where the folder holds none."""
-    return Result(Path(folder), store.read_run(folder))
+    """Open a finished run; InputError where the folder holds none, or a file of it is damaged."""
+    run = store.read_run(folder)
+    require_unchanged(folder, but=REPORT)
+    return Result(Path(folder), run)
 
 
 def report(folder: str | Path) -> Path:
     """Write the report of a finished run anew, and return its path."""
     from bayesreg.report.html import write_report
 
-    result = load_result(folder)
-    write_report(result.run, result.idata, *result.convergence, result.report)
+    with locked(folder):
+        result = load_result(folder)
+        with writing(folder) as place:
+            write_report(result.run, result.idata, *result.convergence, place(REPORT))
     return result.report
 
 

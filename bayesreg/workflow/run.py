@@ -11,12 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from rich.console import Console
 
 from bayesreg.config import Config, load_config, resolved_yaml
-from bayesreg.fem.deformation import Deformer
-from bayesreg.image import Image
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.devices import is_first, require_joined, wait
 from bayesreg.inference.chains.run import (
@@ -28,29 +25,21 @@ from bayesreg.inference.chains.run import (
 )
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block, Blocks
-from bayesreg.inference.draws.diagnostics import convergence
-from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior, to_blocks
+from bayesreg.inference.draws.inference_data import to_blocks
 from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
-from bayesreg.io.records import Inputs, Run
+from bayesreg.io.ledger import is_sound, locked, read_status, require_file, stage_of, writing
+from bayesreg.io.records import Inputs
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
 from bayesreg.model.terms.images import ComparedImages
-from bayesreg.model.warp import moments_on_grid, warp_image
-from bayesreg.report.metrics import compute_metrics
-from bayesreg.transform import Transform
 from bayesreg.types import InputError
-from bayesreg.workflow.apply import POINT_DRAWS
-from bayesreg.workflow.assembly import nodal_draws, posterior_of, start_of, with_initial
-from bayesreg.workflow.bids import write_bids
-from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
-from bayesreg.workflow.manifest import manifest
-from bayesreg.workflow.prediction import mean_values, predict, with_unresolved
-from bayesreg.workflow.predictive_groups import predictive_groups
+from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
+from bayesreg.workflow.finish import finish
+from bayesreg.workflow.interruption import ending_between_blocks
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
-from bayesreg.workflow.result import Result, load_result, report
-from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
+from bayesreg.workflow.result import REPORT, Result, load_result, report
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
 # whole state is written.
@@ -62,6 +51,8 @@ BEGUN, KEPT, SAMPLED, ENDED = (
     "all draws are judged",
     "the run has ended",
 )
+
+Reached = tuple[Checkpoint, Blocks]
 
 
 def run(
@@ -117,9 +108,9 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
         wait(ENDED)
         return result
     wait(BEGUN)
-    if not (out / "run.json").exists():
+    if stage_of(out) != "finished":
         begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
-        found = store.read_json(out / PROVENANCE).get("independent_points")
+        found = store.read_json(require_file(out, PROVENANCE)).get("independent_points")
         posterior = posterior_of(begun, inputs, observations, found)
         _sample(begun, posterior, _load_reached(begun, inputs, posterior, out, progress=False), out, progress=False)
         wait(SAMPLED)
@@ -130,56 +121,85 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
 def _run(config: Config, out: Path, resume: bool, progress: bool, observations: list[Any]) -> Result:
     began = time.perf_counter()
     say = _narrator(progress)
-    if resume and (out / "config.yaml").exists():
-        known = _resumed_config(out, config)
-        if (out / "run.json").exists() and known.stop == config.stop:
-            say(f"{out} holds a finished run already; another budget (stop) would continue it")
-            if not (out / "report.html").exists():
-                report(out)
-            wait(BEGUN)
-            return load_result(out)
-        inputs, provenance = store.read_inputs(out), store.read_json(out / PROVENANCE)
-        posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
-        _require_same_observations(out, provenance, posterior, observations)
-        # What `simulate` has made is not tempered yet.
-        posterior = _temper(config, inputs, posterior, say)
-        provenance["independent_points"] = posterior.independent_points
-        if (out / "run.json").exists():
-            checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
-        inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
-        write_text(out / "config.yaml", inputs.config)
-        reached = _load_reached(config, inputs, posterior, out, progress)
-        sampled = float(reached[0].seconds)
-        began -= provenance["unsampled"] + sampled
-        store.write_json(out / PROVENANCE, with_unsampled(provenance, began + sampled))
-    else:
-        # A run that was cut off before its configuration was written has nothing yet that is worth keeping.
-        if not (resume and (out / PROVENANCE).exists()):
-            store.require_fresh(out)
-        say("reading the files, meshing")
-        if config.has_images and not config.compares_images:
-            say("the images are shown and not compared: observations does not name them ({kind: images})")
-        inputs, provenance = prepared_inputs(config, observations)
-        for line in provenance["appraisal"].get("notes", ()):
-            say(line)
-        for sentence in provenance["appraisal"].get("beware", ()):
-            say(f"beware: {sentence}")
-        # Nothing is written before all input has proved sound, and all of it before the first step is taken.
-        posterior = posterior_of(config, inputs, observations)
-        provenance["observations"] = _fingerprint(posterior, observations)
-        searching = time.perf_counter()
-        posterior = _temper(config, inputs, posterior, say)
-        provenance["independent_points"] = posterior.independent_points
-        reached = _first(config, inputs, posterior, out, progress, time.perf_counter() - searching)
-        inputs = with_initial(inputs, config)
-        store_inputs(out, inputs, with_unsampled(provenance, began + float(reached[0].seconds)))
+    if resume and stage_of(out) is not None:
+        with locked(out):
+            return _resume(config, out, progress, observations, began, say)
+    # What a run has left that was cut off before its inputs stood is worth nothing.
+    if not (resume and read_status(out) is not None):
+        store.require_fresh(out)
+    say("reading the files, meshing")
+    if config.has_images and not config.compares_images:
+        say("the images are shown and not compared: observations does not name them ({kind: images})")
+    inputs, provenance = prepared_inputs(config, observations)
+    for line in provenance["appraisal"].get("notes", ()):
+        say(line)
+    for sentence in provenance["appraisal"].get("beware", ()):
+        say(f"beware: {sentence}")
+    # Nothing is written before all input has proved sound, and all of it before the first step is taken.
+    posterior = posterior_of(config, inputs, observations)
+    provenance["observations"] = _fingerprint(posterior, observations)
+    searching = time.perf_counter()
+    posterior = _temper(config, inputs, posterior, say)
+    provenance["independent_points"] = posterior.independent_points
+    reached = _first(config, inputs, posterior, out, progress, time.perf_counter() - searching)
+    inputs = with_initial(inputs, config)
+    with locked(out):
+        if stage_of(out) is not None:
+            raise InputError(f"another process has begun a run in {out} meanwhile; name another folder")
+        provenance = with_unsampled(provenance, began + float(reached[0].seconds))
+        store_inputs(out, inputs, provenance)
+        return _go_on(config, inputs, posterior, reached, provenance, out, began, progress, say)
+
+
+def _resume(
+    config: Config, out: Path, progress: bool, observations: list[Any], began: float, say: Callable[[str], None]
+) -> Result:
+    known = _resumed_config(out, config)
+    finished = stage_of(out) == "finished"
+    if finished and known.stop == config.stop:
+        say(f"{out} holds a finished run already; another budget (stop) would continue it")
+        if not is_sound(out, REPORT):
+            report(out)
+        wait(BEGUN)
+        return load_result(out)
+    inputs, provenance = store.read_inputs(out), store.read_json(require_file(out, PROVENANCE))
+    posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
+    _require_same_observations(out, provenance, posterior, observations)
+    # What `simulate` has made is not tempered yet.
+    posterior = _temper(config, inputs, posterior, say)
+    provenance["independent_points"] = posterior.independent_points
+    if finished:
+        checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
+    inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
+    reached = _load_reached(config, inputs, posterior, out, progress)
+    sampled = float(reached[0].seconds)
+    began -= provenance["unsampled"] + sampled
+    with writing(out) as place:
+        write_text(place("config.yaml"), inputs.config)
+        store.write_json(place(PROVENANCE), with_unsampled(provenance, began + sampled))
+    return _go_on(config, inputs, posterior, reached, provenance, out, began, progress, say)
+
+
+def _go_on(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    reached: Reached,
+    provenance: dict[str, Any],
+    out: Path,
+    began: float,
+    progress: bool,
+    say: Callable[[str], None],
+) -> Result:
+    """Sample from where the chains stand, and write the results."""
     _save_state(out, *reached)
     say(_describe_mesh(inputs))
     wait(BEGUN)
-    samples = _sample(config, posterior, reached, out, progress)
+    with ending_between_blocks(say) as require_no_signal:
+        samples = _sample(config, posterior, reached, out, progress, require_no_signal)
     wait(SAMPLED)
     say("writing the results")
-    result = _finish(config, inputs, posterior, samples, provenance, out, began)
+    result = finish(config, inputs, posterior, samples, provenance, out, began)
     say(f"{samples.reason}")
     _warn(config, result, say)
     return result
@@ -196,7 +216,7 @@ def _warn(config: Config, result: Result, say: Callable[[str], None]) -> None:
 
 def _resumed_config(out: Path, config: Config) -> Config:
     """The configuration that a run was begun with; InputError if it differs in more than its budget."""
-    known = load_config(out / "config.yaml")
+    known = load_config(require_file(out, "config.yaml"))
     if resolved_yaml(known.model_copy(update={"stop": config.stop})) != resolved_yaml(config):
         raise InputError(
             f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which "
@@ -244,9 +264,6 @@ def _describe_mesh(inputs: Inputs) -> str:
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
 
-Reached = tuple[Checkpoint, Blocks]
-
-
 def _temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[[str], None]) -> Posterior:
     """The posterior that the chains are to draw from."""
     if posterior.tempered:
@@ -288,11 +305,19 @@ def _save_state(out: Path, checkpoint: Checkpoint, blocks: Blocks) -> None:
     checkpoints.save_state(out, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
 
 
-def _sample(config: Config, posterior: Posterior, reached: Reached, out: Path, progress: bool) -> Samples:
+def _sample(
+    config: Config,
+    posterior: Posterior,
+    reached: Reached,
+    out: Path,
+    progress: bool,
+    after_block: Callable[[], None] = lambda: None,
+) -> Samples:
     def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
         if is_first():
             _save_state(out, checkpoint, reached[1])
         wait(KEPT)
+        after_block()
 
     options = config.sampler
     return sample(
@@ -318,79 +343,3 @@ def _block(images: ComparedImages | None) -> int:
     """
     points = 0 if images is None else len(images.quadrature.weights)
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)
-
-
-def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
-    """The moving image on the fixed grid by the mean of the displacement, the pose included."""
-    if inputs.moving is None or inputs.fixed is None:
-        return None
-    # Where the voxels lie in the moving image's own world.
-    return warp_image(inputs.matching.pose.inverse.aligned(inputs.moving), mean_field, inputs.fixed)
-
-
-def _store_draws(posterior: Posterior, samples: Samples, path: Path, seed: int) -> Any:
-    """Write posterior.nc, with what ArviZ wants to know of the observations, and open it."""
-    save_posterior(posterior, samples.blocks, path)
-    # A file that is open is not added to.
-    with xr.open_dataset(path, group="posterior") as draws:
-        groups = predictive_groups(posterior, draws, seed)
-    append_groups(path, groups)
-    return open_posterior(path)
-
-
-def _finish(
-    config: Config,
-    inputs: Inputs,
-    posterior: Posterior,
-    samples: Samples,
-    provenance: dict[str, Any],
-    out: Path,
-    began: float,
-) -> Result:
-    """Everything after the last draw: the files of the run folder, run.json last but for the report."""
-    from bayesreg.report.html import write_report
-
-    idata = _store_draws(posterior, samples, out / "posterior.nc", config.seed)
-    draws, judged = dataset(idata, "posterior"), convergence(idata)
-    grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
-    metrics = None
-    if inputs.truth is not None:
-        metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
-    mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
-    predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
-
-    def transform(most: int) -> Transform:
-        u = nodal_draws(config.model, inputs, draws, most)
-        return Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
-
-    many = transform(POINT_DRAWS)
-    predicted = with_unresolved(predicted, many)
-    if config.evaluation is not None:
-        held_out = evaluate_landmarks(inputs.points[NAME], many, config.evaluation.sd)
-        predicted = predicted._replace(**held_out)
-    total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
-    total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
-    moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
-    some = transform(config.results.draws)
-    field = displacement_on(some.mean, grid).field
-    mean_field = total_displacement(pose, grid.grid_points(), field)
-    finished = Run(
-        manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
-        | {"displacement_sd": moments.rms_sd},
-        u_mean=samples.u_mean,
-        u_sd=samples.u_sd,
-        warped=_warp(inputs, mean_field),
-        metrics=metrics,
-        predicted=predicted,
-        bodies=store.read_bodies(out),
-        **inputs._asdict(),
-    )
-    # Before run.json, which says that all is there.
-    write_transforms(out, some, grid, field)
-    store.write_results(out, finished, mean_field, moments.sd)
-    if config.results.bids is not None:
-        write_bids(out, config.results.bids)
-    checkpoints.remove_blocks(out)
-    result = Result(out, finished)
-    write_report(finished, idata, *judged, result.report)
-    return result

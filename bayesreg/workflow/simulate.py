@@ -10,6 +10,7 @@ import numpy as np
 from bayesreg.config import Config, load_config
 from bayesreg.config.data import Scan
 from bayesreg.io import store
+from bayesreg.io.ledger import locked
 from bayesreg.io.records import Inputs
 from bayesreg.io.volumes import save_image
 from bayesreg.pose import Motion, Pose
@@ -32,7 +33,8 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
     began = time.perf_counter()
     store.require_fresh(out)
     inputs, provenance = prepared_inputs(config)
-    store_inputs(Path(out), inputs, with_unsampled(provenance, began))
+    with locked(out):
+        store_inputs(Path(out), inputs, with_unsampled(provenance, began))
     if config.simulate.scan is not None:
         _write_scans(Path(out) / SCANS, inputs, config.simulate.scan, config.seed)
     return Path(out)

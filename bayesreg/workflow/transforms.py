@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from bayesreg.fem.deformation import Displaced
 from bayesreg.fem.location import Location
 from bayesreg.image import Image
 from bayesreg.io.fields import save_displacement
+from bayesreg.io.store import Place
 from bayesreg.io.transforms import save_transform
 from bayesreg.pose import Pose
 from bayesreg.transform import Transform
@@ -59,15 +59,16 @@ def return_on(displaced: Displaced, grid: Image, near: list[Location] | None = N
 
 
 def write_transforms(
-    folder: Path, transform: Transform, grid: Image, mean: Float[np.ndarray, "X Y Z 3"] | None = None
+    place: Place, transform: Transform, grid: Image, mean: Float[np.ndarray, "X Y Z 3"] | None = None
 ) -> None:
     """Write the transforms of the posterior mean, there and back, and those of the draws of a transform.
 
     Parameters
     ----------
-    folder : path
-        Of the run. Each draw gets three files in its subfolder transforms: draw-01.h5 and draw-01_inverse.h5 as
-        `bayesreg.io.transforms.save_transform` writes them, and draw-01.nii.gz, the whole displacement.
+    place : callable
+        As of `bayesreg.io.ledger.writing`. Each draw gets three files in transforms/: draw-01.h5 and
+        draw-01_inverse.h5 as `bayesreg.io.transforms.save_transform` writes them, and draw-01.nii.gz, the whole
+        displacement.
     transform : Transform
         From the fixed image's world.
     grid : Image
@@ -77,28 +78,27 @@ def write_transforms(
     """
     pose, upright = transform.pose, grid.on_orthogonal_grid(order=0)
     field = mean if mean is not None and upright is grid else displacement_on(transform.mean, upright).field
-    save_transform(folder / MEAN, field, upright, pose)
+    save_transform(place(MEAN), field, upright, pose)
     back = around_displaced(upright, transform.mesh.points + transform.u_mean)
-    save_transform(folder / MEAN_INVERSE, return_on(transform.mean, back).field, back, pose.inverse, pose_first=True)
-    if not len(transform.draws):
-        return
-    _write_ensemble(folder / ENSEMBLE, transform, upright)
+    returns = return_on(transform.mean, back).field
+    save_transform(place(MEAN_INVERSE), returns, back, pose.inverse, pose_first=True)
+    if len(transform.draws):
+        _write_ensemble(place, transform, upright)
 
 
-def _write_ensemble(folder: Path, transform: Transform, grid: Image) -> None:
-    folder.mkdir(exist_ok=True)
+def _write_ensemble(place: Place, transform: Transform, grid: Image) -> None:
     sizes = np.maximum(grid.voxel_sizes, ENSEMBLE_SPACING * transform.mesh.boundary_edge)
     there = grid.with_voxels(np.zeros(grid.shape, np.int8)).on_orthogonal_grid(sizes, order=0)
     back = around_displaced(there, transform.mesh.points + transform.u_mean)
     located, near = displacement_on(transform.mean, there).locations, return_on(transform.mean, back).locations
     points, digits = there.grid_points(), len(str(len(transform.draws)))
     for number, u in enumerate(transform.draws, start=1):
-        displaced, name = transform.deformer.displaced(u), f"draw-{number:0{digits}d}"
+        displaced, name = transform.deformer.displaced(u), f"{ENSEMBLE}/draw-{number:0{digits}d}"
         field = displacement_on(displaced, there, located).field
-        save_transform(folder / f"{name}.h5", field, there, transform.pose)
-        save_displacement(folder / f"{name}.nii.gz", total_displacement(transform.pose, points, field), there.affine)
+        save_transform(place(f"{name}.h5"), field, there, transform.pose)
+        save_displacement(place(f"{name}.nii.gz"), total_displacement(transform.pose, points, field), there.affine)
         returns = return_on(displaced, back, near).field
-        save_transform(folder / f"{name}_inverse.h5", returns, back, transform.pose.inverse, pose_first=True)
+        save_transform(place(f"{name}_inverse.h5"), returns, back, transform.pose.inverse, pose_first=True)
 
 
 def total_displacement(

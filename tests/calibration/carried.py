@@ -15,6 +15,7 @@ import numpy as np
 
 from bayesreg.fem.deformation import Deformer, Displaced
 from bayesreg.image import Image
+from bayesreg.model.submesh import submesh_variance
 from bayesreg.pose import Pose
 from bayesreg.report.landmarks import surprise
 from bayesreg.transform import Transform, spread
@@ -31,30 +32,31 @@ THERE, BACK = (0.5, 19.5), (4.0, 16.0)
 LABELS = 4
 
 
+# By the ellipsoids of points.csv; and by their parts: the draws, linear in each tetrahedron, alone, and with one of the
+# two that `Transform` adds to them.
+PARTS = ("as written", "the draws", "the draws and what the mesh cannot follow", "the nodes, interpolated")
+
+
 class Case(NamedTuple):
     """How improbable the truth is: the probability of the region about the most probable that just holds it.
 
     Attributes
     ----------
-    there, back : float
-        Of a point, by the ellipsoids of points.csv.
-    drawn_there, drawn_back : float
-        By the covariance of the displacements drawn, linear in each tetrahedron.
+    there, back : (4,) arrays
+        Of a point on its way there and back, by each of `PARTS`.
     label : float
         Of the label of a voxel, a random share of its own probability included.
     """
 
-    there: float
-    back: float
-    drawn_there: float
-    drawn_back: float
+    there: np.ndarray
+    back: np.ndarray
     label: float
 
 
 def measure(
     finer: bool, seed: int = 0, settings: sbc.Settings = SETTINGS, say: sbc.Say = lambda text: None
 ) -> np.ndarray:
-    """Every case, (r, 5), in the order of `Case`."""
+    """Every case, (r, 9), in the order of `Case`."""
     mesh = box_mesh(4) if finer else MESH
     simulator = Simulator(VARIANTS["loads"], mesh)
     rng = np.random.default_rng(seed)
@@ -71,7 +73,7 @@ def measure(
         draws = found.u[:, case]
         transform = Transform(registered, Pose.identity(), draws.mean(axis=0), draws, seed=case)
         cases.append(_case(transform, true.displaced(u), labels, rng))
-    return np.array(cases)
+    return np.array([np.hstack(case) for case in cases])
 
 
 def _seen(simulator: Simulator, truths: dict[str, np.ndarray], key: Any) -> Any:
@@ -101,25 +103,27 @@ def _case(transform: Transform, truth: Displaced, labels: Image, rng: np.random.
     there, back = rng.uniform(*THERE, (1, 3)), rng.uniform(*BACK, (1, 3))
     truly_there = there + truth.displacement(there, truth.deformer.locate(there))
     truly_back, _ = truth.sources(back)
-    found = [
-        _improbable(transform, there, truly_there),
-        _improbable(transform.inverse, back, truly_back),
-    ]
     affine = np.eye(4)
     affine[:3, 3] = rng.uniform(*BACK, 3)
     voxel = Image(np.zeros((1, 1, 1)), affine)
     source, _ = truth.sources(voxel.grid_points().reshape(-1, 3))
     told = {value: float(share.item()) for value, share in carry_labels(transform, labels, voxel).probabilities()}
-    return Case(*np.transpose(found).ravel(), _improbable_label(told, int(labels.nearest(source)[0]), rng))
+    return Case(
+        _improbable(transform, there, truly_there),
+        _improbable(transform.inverse, back, truly_back),
+        _improbable_label(told, int(labels.nearest(source)[0]), rng),
+    )
 
 
-def _improbable(transform: Transform, points: np.ndarray, truly: np.ndarray) -> tuple[float, float]:
-    """By the ellipsoids, and by that part of them which is of the draws."""
+def _improbable(transform: Transform, points: np.ndarray, truly: np.ndarray) -> np.ndarray:
+    """By each of `PARTS`."""
     found = spread(transform, points)
     _, near = transform.place(points)
     drawn = transform.covariance(near) - np.eye(3) * transform.unresolved_sd(near)[:, :, None] ** 2
-    away = truly - found.places
-    return float(surprise(away, found.covariance)[0]), float(surprise(away, drawn)[0])
+    submesh = submesh_variance(transform.mesh, transform.u_mean)[near.cell]
+    nodes = transform.covariance(near) - np.eye(3) * submesh[:, :, None]
+    every = (found.covariance, drawn, drawn + np.eye(3) * submesh[:, :, None], nodes)
+    return np.concatenate([surprise(truly - found.places, covariance) for covariance in every])
 
 
 def _improbable_label(told: dict[int, float], true: int, rng: np.random.Generator) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesreg.image import Image
-from bayesreg.io import checkpoints, store
+from bayesreg.io import checkpoints, ledger, store
 from bayesreg.io.records import Inputs, Predicted, Run, Truth
 from tests.phantoms import ball_mesh, rotated_affine
 
@@ -39,8 +39,10 @@ def inputs_of(run: Run) -> Inputs:
 def write(folder, run: Run, mean=None, sd=None) -> None:
     """All of a run, as the program writes it; displacements are zero where none are given."""
     zero = np.zeros((*run.fixed.shape, 3))
-    store.write_inputs(folder, inputs_of(run))
-    store.write_results(folder, run, zero if mean is None else mean, zero if sd is None else sd)
+    with ledger.writing(folder, "prepared") as place:
+        store.write_inputs(place, inputs_of(run))
+    with ledger.writing(folder, "finished") as place:
+        store.write_results(place, run, zero if mean is None else mean, zero if sd is None else sd)
 
 
 def assert_same(a: Run, b: Run) -> None:
@@ -107,12 +109,13 @@ def test_displacements_are_written_as_lps_transform_and_the_sd_stays_positive(ru
 
 
 def test_inputs_can_be_read_before_the_run_has_finished(run, tmp_path):
-    store.write_inputs(tmp_path, inputs_of(run))
+    with ledger.writing(tmp_path, "prepared") as place:
+        store.write_inputs(place, inputs_of(run))
     inputs = store.read_inputs(tmp_path)
     assert inputs.config == run.config
     assert inputs.mesh.digest == run.mesh.digest
     np.testing.assert_array_equal(inputs.truth.u, run.truth.u)
-    with pytest.raises(ValueError, match=r"run\.json is missing"):
+    with pytest.raises(ValueError, match=r"has not ended; .*--resume"):
         store.read_run(tmp_path)
 
 
@@ -122,13 +125,14 @@ def test_inputs_can_be_read_before_the_run_has_finished(run, tmp_path):
 def test_each_missing_part_is_named(run, tmp_path, name):
     write(tmp_path, run)
     (tmp_path / name).unlink()
-    with pytest.raises(ValueError, match=f"holds no finished run: {name} is missing"):
+    with pytest.raises(ValueError, match=f"holds no whole run: {name} is missing"):
         store.read_run(tmp_path)
 
 
 def test_a_mesh_without_results_is_no_finished_run(run, tmp_path):
     write(tmp_path, run)
-    store.save_mesh(run.mesh, tmp_path / "mesh.vtu")
+    with ledger.writing(tmp_path) as place:
+        store.save_mesh(run.mesh, place("mesh.vtu"))
     with pytest.raises(ValueError, match="holds no u_mean and no u_sd"):
         store.read_run(tmp_path)
 
@@ -202,12 +206,12 @@ def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
     checkpoints.save_state(tmp_path, {"step": np.array(1)})
     (tmp_path / name).write_bytes(b"PK half a file")
     read = {
-        "state.npz": (checkpoints.load_state, r"delete it, and the run resumes from its first step"),
-        "draws/block_00000.npz": (lambda f: list(checkpoints.StoredBlocks(f, 1)), r"delete state\.npz"),
-        "inputs/truth.npz": (store.read_inputs, r"run anew, into another folder"),
+        "state.npz": checkpoints.load_state,
+        "draws/block_00000.npz": lambda f: list(checkpoints.StoredBlocks(f, 1)),
+        "inputs/truth.npz": store.read_inputs,
     }
-    with pytest.raises(ValueError, match=f"{name} is damaged or no .npz file .*; {read[name][1]}"):
-        read[name][0](tmp_path)
+    with pytest.raises(ValueError, match=f"{name} is damaged, or was changed .*; run anew, into another folder"):
+        read[name](tmp_path)
 
 
 def test_without_a_checkpoint_there_is_no_state(tmp_path):

@@ -1,0 +1,110 @@
+"""What a run leaves when its last draw is made: the files of its folder, and the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from bayesreg.config import Config
+from bayesreg.fem.deformation import Deformer
+from bayesreg.image import Image
+from bayesreg.inference.chains.run import Samples
+from bayesreg.inference.draws.diagnostics import convergence
+from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
+from bayesreg.io import checkpoints, store
+from bayesreg.io.ledger import writing
+from bayesreg.io.records import Inputs, Run
+from bayesreg.model.posterior import Posterior
+from bayesreg.model.warp import moments_on_grid, warp_image
+from bayesreg.report.metrics import compute_metrics
+from bayesreg.transform import Transform
+from bayesreg.workflow.apply import POINT_DRAWS
+from bayesreg.workflow.assembly import nodal_draws
+from bayesreg.workflow.bids import write_bids
+from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
+from bayesreg.workflow.manifest import manifest
+from bayesreg.workflow.prediction import mean_values, predict, with_unresolved
+from bayesreg.workflow.predictive_groups import predictive_groups
+from bayesreg.workflow.result import POSTERIOR, REPORT, Result
+from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
+
+
+def finish(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    samples: Samples,
+    provenance: dict[str, Any],
+    out: Path,
+    began: float,
+) -> Result:
+    """Write everything that comes after the last draw into the folder of the run."""
+    from bayesreg.report.html import write_report
+
+    idata = _store_draws(posterior, samples, out, config.seed)
+    draws, judged = dataset(idata, "posterior"), convergence(idata)
+    grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
+    metrics = None
+    if inputs.truth is not None:
+        metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
+    mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
+    predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
+
+    def transform(most: int) -> Transform:
+        u = nodal_draws(config.model, inputs, draws, most)
+        return Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
+
+    many = transform(POINT_DRAWS)
+    predicted = with_unresolved(predicted, many)
+    if config.evaluation is not None:
+        held_out = evaluate_landmarks(inputs.points[NAME], many, config.evaluation.sd)
+        predicted = predicted._replace(**held_out)
+    total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
+    total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
+    moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
+    some = transform(config.results.draws)
+    field = displacement_on(some.mean, grid).field
+    mean_field = total_displacement(pose, grid.grid_points(), field)
+    finished = Run(
+        manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
+        | {"displacement_sd": moments.rms_sd},
+        u_mean=samples.u_mean,
+        u_sd=samples.u_sd,
+        warped=_warp(inputs, mean_field),
+        metrics=metrics,
+        predicted=predicted,
+        bodies=store.read_bodies(out),
+        **inputs._asdict(),
+    )
+    with writing(out) as place:
+        write_transforms(place, some, grid, field)
+        store.write_results(place, finished, mean_field, moments.sd)
+    with writing(out, "finished") as place:
+        if config.results.bids is not None:
+            write_bids(out, config.results.bids, place)
+        write_report(finished, idata, *judged, place(REPORT))
+    checkpoints.remove_blocks(out)
+    return Result(out, finished)
+
+
+def _store_draws(posterior: Posterior, samples: Samples, out: Path, seed: int) -> Any:
+    """Write posterior.nc, with what ArviZ wants to know of the observations, and open it."""
+    with writing(out) as place:
+        path = place(POSTERIOR)
+        save_posterior(posterior, samples.blocks, path)
+        # A file that is open is not added to.
+        with xr.open_dataset(path, group="posterior") as draws:
+            groups = predictive_groups(posterior, draws, seed)
+        append_groups(path, groups)
+    return open_posterior(out / POSTERIOR)
+
+
+def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
+    """The moving image on the fixed grid by the mean of the displacement, the pose included."""
+    if inputs.moving is None or inputs.fixed is None:
+        return None
+    # Where the voxels lie in the moving image's own world.
+    return warp_image(inputs.matching.pose.inverse.aligned(inputs.moving), mean_field, inputs.fixed)

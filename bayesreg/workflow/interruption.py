@@ -1,0 +1,84 @@
+"""A run that is asked to end, by Ctrl-C or by a queue's SIGTERM, ends after the block of draws in hand."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal has ended the program, and what is stored can be gone on with.
+
+    Parameters
+    ----------
+    number : int
+        Of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.number = int(number)
+
+    @property
+    def status(self) -> int:
+        """Of the program: 128 and the signal's number, as shells have it."""
+        return 128 + self.number
+
+
+@contextmanager
+def ending_between_blocks(say: Callable[[str], None]) -> Iterator[Callable[[], None]]:
+    """Put signals off while blocks of draws are made.
+
+    Parameters
+    ----------
+    say : callable
+        Is told that a signal has come. Another one ends the program at once.
+
+    Yields
+    ------
+    callable
+        To be called where a block is stored; it raises `Interrupted` where a signal has come.
+    """
+    came: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        if came:
+            raise Interrupted(number)
+        came.append(number)
+        say("the run ends after this block of draws; another signal ends it at once")
+
+    def require_none() -> None:
+        if came:
+            raise Interrupted(came[0])
+
+    with _handling(note):
+        yield require_none
+
+
+@contextmanager
+def ending_at_once() -> Iterator[None]:
+    """Let signals raise `Interrupted`."""
+
+    def stop(number: int, _frame: object) -> None:
+        raise Interrupted(number)
+
+    with _handling(stop):
+        yield
+
+
+@contextmanager
+def _handling(handler: Callable[[int, object], None]) -> Iterator[None]:
+    # Only there can a program say what signals do.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, known in before.items():
+            signal.signal(number, known)

@@ -1,0 +1,137 @@
+"""What stands in a run folder is whole, or told to be damaged, whoever dies or writes in between."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bayesreg.io import ledger
+from bayesreg.types import InputError
+
+
+def write(folder, stage=None, **contents):
+    """Write files; None stands for a failure."""
+    with ledger.writing(folder, stage) as place:
+        for name, content in contents.items():
+            if content is None:
+                raise ZeroDivisionError
+            place(f"{name}.txt").write_text(content)
+
+
+def read(folder, name):
+    return ledger.require_file(folder, f"{name}.txt").read_text()
+
+
+def test_files_appear_together_or_not_at_all(tmp_path):
+    out = tmp_path / "new" / "run"
+    write(out, "prepared", one="1", two="2")
+    with pytest.raises(ZeroDivisionError):
+        write(out, "finished", **{"one": "other", "deep/three": "3", "four": None})
+    assert (read(out, "one"), read(out, "two")) == ("1", "2")
+    assert not ledger.is_listed(out, "deep/three.txt")
+    assert ledger.stage_of(out) == "prepared"
+    assert not list(out.rglob(".partial*"))
+
+
+@pytest.mark.parametrize("replaced", [0, 1, 2, 3])
+def test_killed_between_two_replacements_each_file_is_whole(tmp_path, monkeypatch, replaced):
+    """Also where it happens again, and again, and other contents come then."""
+    write(tmp_path, "prepared", one="1", two="2", three="3")
+    replace = Path.replace
+    for attempt in ("a", "b"):
+        count = 0
+
+        def killed(path, target):
+            nonlocal count
+            if Path(target).suffix == ".txt":
+                if count == replaced:
+                    raise KeyboardInterrupt
+                count += 1
+            return replace(path, target)
+
+        monkeypatch.setattr(Path, "replace", killed)
+        if replaced == 3:
+            write(tmp_path, "finished", one=f"1{attempt}", two=f"2{attempt}", three=f"3{attempt}")
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                write(tmp_path, "finished", one=f"1{attempt}", two=f"2{attempt}", three=f"3{attempt}")
+        monkeypatch.undo()
+        found = [read(tmp_path, name) for name in ("one", "two", "three")]
+        assert found == [f"{k}{attempt if k <= replaced else ''}" for k in (1, 2, 3)]
+        assert ledger.stage_of(tmp_path) == ("finished" if replaced == 3 else "prepared")
+
+
+def test_damage_and_loss_are_named(tmp_path):
+    write(tmp_path, "finished", one="1", two="2")
+    (tmp_path / "one.txt").write_text("I")
+    with pytest.raises(InputError, match=r"one\.txt is damaged, or was changed"):
+        read(tmp_path, "one")
+    with pytest.raises(InputError, match=r"one\.txt is damaged"):
+        ledger.require_unchanged(tmp_path, but="two.txt")
+    ledger.require_unchanged(tmp_path, but="one.txt")
+    (tmp_path / "two.txt").unlink()
+    with pytest.raises(InputError, match=r"holds no whole run: two\.txt is missing"):
+        read(tmp_path, "two")
+    (tmp_path / "stray.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"stray\.txt is missing"):
+        read(tmp_path, "stray")
+
+
+@pytest.mark.parametrize("spoil", ["", "{}", "[1]", "{", '{"stage": "finished", "files": {}, "digest": "0"}', "stage"])
+def test_a_damaged_status_is_not_believed(tmp_path, spoil):
+    write(tmp_path, "prepared", one="1")
+    path = tmp_path / ledger.STATUS
+    if spoil == "stage":
+        spoil = json.dumps(json.loads(path.read_text()) | {"stage": "finished"})
+    path.write_text(spoil)
+    with pytest.raises(InputError, match=r"status\.json is damaged"):
+        read(tmp_path, "one")
+    path.unlink()
+    with pytest.raises(InputError, match=r"holds no run of bayesreg"):
+        read(tmp_path, "one")
+
+
+def test_what_never_stood_is_forgotten(tmp_path):
+    """A run that was killed before its inputs stood begins again, with other ones."""
+    with pytest.raises(ZeroDivisionError):
+        write(tmp_path, "prepared", one="1", two=None)
+    assert ledger.read_status(tmp_path) is None
+    write(tmp_path, None, one="1")
+    assert ledger.stage_of(tmp_path) is None
+    write(tmp_path, "prepared", two="2")
+    assert list(ledger.read_status(tmp_path).files) == ["two.txt"]
+
+
+def test_blocks_are_dropped_from_the_list_before_the_disk(tmp_path):
+    with ledger.writing(tmp_path, "prepared") as place:
+        place("draws/0.txt").write_text("0")
+        place("one.txt").write_text("1")
+    ledger.drop(tmp_path, "draws")
+    assert list(ledger.read_status(tmp_path).files) == ["one.txt"]
+    assert not list((tmp_path / "draws").iterdir())
+
+
+HOLD = """
+import sys, time
+from bayesreg.io.ledger import locked
+with locked(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_folder_is_one_process_s_until_that_is_dead(tmp_path):
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout.readline() == "held\n"
+        (tmp_path / ".partial-1-fixed.nii.gz").touch()
+        with pytest.raises(InputError, match="another process is working in"), ledger.locked(tmp_path):
+            pass
+        assert (tmp_path / ".partial-1-fixed.nii.gz").exists()
+    finally:
+        holder.kill()
+        holder.communicate()
+    with ledger.locked(tmp_path), ledger.locked(tmp_path):
+        assert not list(tmp_path.glob(".partial*"))
