@@ -47,7 +47,9 @@ class Transform:
     tetrahedron it varies by half as much as at its corners. The truth is not linear, and is not known any better there.
     A draw at a point is therefore that of the mesh and a Normal number, so that its variance is that of the nodes,
     interpolated as a standard deviation, and what the mesh cannot follow of a smooth displacement
-    (`bayesreg.model.submesh`): the standard deviation that a run writes on the grid of its image.
+    (`bayesreg.model.submesh`): the standard deviation that a run writes on the grid of its image. All points have the
+    same Normal numbers, three to a draw, so that what is told of a point does not depend on which others there are;
+    how points vary together is not told by them.
     """
 
     deformer: Deformer
@@ -71,6 +73,13 @@ class Transform:
     def mean(self) -> Displaced:
         """The mesh, displaced by the posterior mean."""
         return self.deformer.displaced(self.u_mean)
+
+    @cached_property
+    def _normal_numbers(self) -> Float[np.ndarray, "draws 3"]:
+        """One for each draw and axis, of mean zero and of variance one over the draws."""
+        numbers = np.random.default_rng(self.seed).standard_normal((len(self.draws), 3))
+        numbers -= numbers.mean(axis=0)
+        return numbers / np.maximum(numbers.std(axis=0, ddof=1), 1e-12) if len(numbers) > 1 else numbers
 
     @cached_property
     def folded(self) -> float:
@@ -99,8 +108,7 @@ class Transform:
             As `unresolved_sd` gives it there.
         """
         displaced = self.deformer.displaced(self.draws[draw])
-        rng = np.random.default_rng((self.seed, draw))
-        beside = unresolved_sd * rng.standard_normal(unresolved_sd.shape, np.float32)
+        beside = unresolved_sd * self._normal_numbers[draw]
         if self.turned:
             return displaced.sources(self.pose.inverse.place(points), near)[0] - beside
         return self.pose.place(points + displaced.displacement(points, near) + beside)
@@ -125,6 +133,16 @@ class Transform:
         found = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
         found[~self.deformer.is_inside(near)] = np.nan
         return found
+
+    def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
+        """The posterior covariance of u at the nodes, mm², and of what the mesh cannot follow about them."""
+        away = self.draws - self.draws.mean(axis=0)
+        found = np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
+        total, volume = np.zeros((len(found), 3)), np.zeros(len(found))
+        for corner in self.mesh.cells.T:
+            np.add.at(total, corner, self.mesh.volumes[:, None] * self._submesh_variance)
+            np.add.at(volume, corner, self.mesh.volumes)
+        return found + (total / volume[:, None])[:, :, None] * np.eye(3)
 
     def _drawn_covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
         """The covariance of the draws, which are linear in every tetrahedron; zero around the mesh."""
@@ -174,9 +192,10 @@ class Spread(NamedTuple):
     places : (k, 3) array
         By the posterior mean of the displacement, mm.
     covariance : (k, 3, 3) array
-        Of the draws about that, mm².
+        Of the draws about that, mm²; NaN around the mesh, where nothing is observed and draws agree with one another
+        because the displacement goes on in one way.
     far : (x, k) array
-        P(a point lies further from there than so many mm), for each such distance.
+        P(a point lies further from there than so many mm), for each such distance; NaN there, too.
     inside : (k,) bool array
         Whether what moves the point lies in the mesh: outside nothing is observed.
     """
@@ -186,11 +205,18 @@ class Spread(NamedTuple):
     far: Float[np.ndarray, "x k"]
     inside: Bool[np.ndarray, "k"]
 
+    def part(self, chosen: Bool[np.ndarray, "k"]) -> Spread:
+        """The same of some of the points."""
+        return Spread(self.places[chosen], self.covariance[chosen], self.far[:, chosen], self.inside[chosen])
+
     def ellipsoids(self, probability: float = 0.95) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
         """Half-axes, mm, the longest first, and their directions (rows) of the regions that hold a Normal point."""
-        variance, directions = np.linalg.eigh(self.covariance)
-        lengths = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 3))
-        return lengths[:, ::-1], np.swapaxes(directions, 1, 2)[:, ::-1]
+        lengths, axes = np.full((len(self.places), 3), np.nan), np.full((len(self.places), 3, 3), np.nan)
+        known = np.isfinite(self.covariance).all(axis=(1, 2))
+        variance, directions = np.linalg.eigh(self.covariance[known])
+        lengths[known] = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 3))[:, ::-1]
+        axes[known] = np.swapaxes(directions, 1, 2)[:, ::-1]
+        return lengths, axes
 
 
 def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence[float] = ()) -> Spread:
@@ -205,15 +231,20 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
         Distances, mm.
     """
     places, near = transform.place(points)
-    square, beyond_far = np.zeros((len(points), 3, 3)), np.zeros((len(far), len(points)))
-    sd = transform.unresolved_sd(near)
-    for there in transform.for_each_draw(lambda draw: transform.place_by(draw, points, near, sd)):
-        away = there - places
+    inside = transform.deformer.is_inside(near)
+    known = np.flatnonzero(inside)
+    here = Location(near.cell[known], near.barycentric[known])
+    square, beyond_far = np.zeros((len(known), 3, 3)), np.zeros((len(far), len(known)))
+    sd = transform.unresolved_sd(here)
+    for there in transform.for_each_draw(lambda draw: transform.place_by(draw, points[known], here, sd)):
+        away = there - places[known]
         square += away[:, :, None] * away[:, None]
         distance = np.linalg.norm(away, axis=1)
         beyond_far += distance > np.reshape(far, (-1, 1))
     count = len(transform.draws)
-    return Spread(places, square / max(count - 1, 1), beyond_far / count, transform.deformer.is_inside(near))
+    covariance, share = np.full((len(points), 3, 3), np.nan), np.full((len(far), len(points)), np.nan)
+    covariance[known], share[:, known] = square / max(count - 1, 1), beyond_far / count
+    return Spread(places, covariance, share, inside)
 
 
 class Distances(NamedTuple):

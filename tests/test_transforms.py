@@ -169,7 +169,7 @@ def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
 
 def test_without_a_pose_and_without_draws(tmp_path):
     transform, grid = _transform(Pose.identity(), draws=0), _grid(GRIDS["upright"])
-    write_transforms(_place(tmp_path), transform, grid, displacement_on(transform.mean, grid).field)
+    write_transforms(tmp_path.joinpath, transform, grid, displacement_on(transform.mean, grid).field)
     assert {path.name for path in tmp_path.iterdir()} == {"transform_mean.h5", "transform_mean_inverse.h5"}
     x, y, z = load_displacement(tmp_path / "transform_mean.h5")
     expected = transform.mean.displacement(*[grid.grid_points().reshape(-1, 3)] * 1, transform.deformer.locate(

@@ -16,6 +16,7 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.config import make_config
 from bayesreg.io import store
+from bayesreg.io.ledger import writing
 from bayesreg.io.quality import edge_lengths
 from bayesreg.mesh import signed_volumes
 from bayesreg.report.panels import View, ignored
@@ -238,7 +239,13 @@ def test_apply_writes_what_it_says(applied, folder):
     assert table["in_mesh"].tolist() == [1.0] * 20 + [0.0]
     there = np.stack([table[axis] for axis in "xyz"], axis=1)[:20]
     assert np.linalg.norm(there - POSE.place(points), axis=1).max() < 2.0
-    assert ((table["p_over_2mm"] <= table["p_over_01mm"]) & (table["cov_xx"][:] >= 0)).all()
+    assert ((table["p_over_2mm"] <= table["p_over_01mm"]) & (table["cov_xx"] >= 0))[:20].all()
+    # Around the mesh there is a place, and it is not said how sure that is.
+    last = table[-1]
+    assert np.isfinite(last["x"])
+    assert np.isnan([last["radius95"], last["cov_xx"], last["half_axis95_1"], last["p_over_2mm"]]).all()
+    shortest, longest = table["half_axis95_3"][:20], table["half_axis95_1"][:20]
+    assert ((0.6 * shortest < table["radius95"][:20]) & (table["radius95"][:20] <= 1.001 * longest)).all()
 
 
 def test_apply_leads_back(applied, result, folder):
@@ -262,7 +269,7 @@ def test_apply_keeps_the_space_and_the_values_of_a_surface(applied, result, fold
     assert (folder / "there" / "ball_in-moving.vtk").read_bytes().split(b"\n")[1] == b"bayesreg SPACE=RAS"
     given = pyvista.read(folder / "ball.vtk")
     assert np.linalg.norm(surface.points - POSE.place(np.asarray(given.points, float)), axis=1).max() < 2.0
-    assert {"cov_", "radius95_", "p_over_2mm", "in_mesh"} <= set(surface.point_data)
+    assert {"cov_", "radius95", "half_axis95_", "p_over_2mm", "in_mesh"} <= set(surface.point_data)
     mirrored = given.copy()
     mirrored.points = np.asarray(given.points) * (-1, -1, 1)
     mirrored.save(folder / "mirrored.vtk")
@@ -271,6 +278,49 @@ def test_apply_keeps_the_space_and_the_values_of_a_surface(applied, result, fold
     np.testing.assert_allclose(np.asarray(again.points) * (-1, -1, 1), surface.points, atol=1e-3)
     written = br.apply(result.folder, folder / "there", mesh=folder / "ball.stl", draws=2)
     assert pyvista.read(written[0]).n_cells == given.n_cells
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj", ".vtp", ".vtk"])
+def test_a_carried_surface_says_its_space_and_is_read_in_it(applied, result, folder, tmp_path, suffix):
+    mirrored = pyvista.read(folder / "ball.vtk")
+    start = np.asarray(mirrored.points, float)
+    mirrored.points = start * (-1, -1, 1)
+    mirrored.save(tmp_path / f"mirrored{suffix}")
+    (there,) = br.apply(result.folder, tmp_path, mesh=tmp_path / f"mirrored{suffix}", space="LPS", draws=2)
+    (back,) = br.apply(result.folder, tmp_path / "back", mesh=there, inverse=True, draws=2)
+    found = np.asarray(pyvista.read(back).points, float) * (-1, -1, 1)
+    np.testing.assert_allclose(found.mean(axis=0), start.mean(axis=0), atol=0.01)
+    assert np.linalg.norm(found[:, None] - start, axis=2).min(axis=1).max() < 1e-3
+    with pytest.raises(br.InputError, match="says that its coordinates are LPS"):
+        br.apply(result.folder, tmp_path, mesh=there, space="RAS", draws=2)
+
+
+def test_a_line_that_leaves_the_mesh_is_cut(applied, result, folder, tmp_path):
+    """An electrode: what is left are the runs of points inside, with the values of the file."""
+    middle = np.asarray(pyvista.read(folder / "ball.vtk").points, float).mean(axis=0)
+    steps = np.array([0.0, 1.0, 2.0, 500.0, 500.0, -1.0, -2.0, 500.0, 3.0])
+    line = pyvista.PolyData(middle + steps[:, None] * (1.0, 0, 0), lines=[9, *range(9)])
+    line.point_data["contact"] = np.arange(9.0)
+    line.save(tmp_path / "line.vtk")
+    (path,) = br.apply(result.folder, tmp_path, mesh=tmp_path / "line.vtk", around="missing", draws=2)
+    found = pyvista.read(path)
+    assert found.point_data["contact"].tolist() == [0, 1, 2, 5, 6, 8]
+    assert found.lines.tolist() == [3, 0, 1, 2, 2, 3, 4]
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtk", ".vtu"])
+def test_the_part_of_a_surface_around_the_mesh_can_be_left_out(applied, result, folder, tmp_path, suffix):
+    surface = pyvista.read(folder / "ball.vtk")
+    # Half of it is far away.
+    points = np.asarray(surface.points, float)
+    points[points[:, 0] > points[:, 0].mean()] += (500.0, 0, 0)
+    surface.points = points
+    (surface.cast_to_unstructured_grid() if suffix == ".vtu" else surface).save(tmp_path / f"half{suffix}")
+    (path,) = br.apply(result.folder, tmp_path, mesh=tmp_path / f"half{suffix}", around="missing", draws=2, space="RAS")
+    found = pyvista.read(path)
+    assert 0 < found.n_cells < surface.n_cells
+    assert np.isfinite(np.asarray(found.points)).all()
+    assert np.ptp(np.asarray(found.points)[:, 0]) < 100
 
 
 def test_what_lies_around_the_mesh_can_be_missing(applied, result, folder):
@@ -295,14 +345,24 @@ def test_what_lies_around_the_mesh_can_be_missing(applied, result, folder):
         ({"labels": "flair_fixed.nii.gz"}, "not integers"),
         ({"points": "p.csv", "draws": 1}, "at least two draws"),
         ({"points": "p.csv", "far": (0.0,)}, "above zero"),
+        ({"points": "ants.csv"}, "as ANTs writes points"),
+        ({"points": "said.csv", "space": "RAS"}, "says that its coordinates are LPS"),
+        ({"labels": "organ.nii.gz", "margins": (0,)}, "zero stands for no label"),
+        ({"labels": "nothing.nii.gz"}, "holds no label"),
+        ({"image": "organ.nii.gz", "labels": "organ.nii.gz"}, "would both be carried to"),
+        ({"points": "p.csv", "out": "p.csv"}, "is no folder that you may write"),
     ],
 )
 def test_apply_refuses(result, folder, given, message):
     (folder / "p.csv").exists() or (folder / "p.csv").write_text("x,y,z\n0,0,0")
     (folder / "broken.vtk").write_text("# vtk DataFile Version 3.0\nnothing\n")
-    files = {key: folder / value if isinstance(value, str) else value for key, value in given.items()}
+    (folder / "ants.csv").write_text("x,y,z,t,label\n1,2,3,0,1\n")
+    (folder / "said.csv").write_text("# CoordinateSystem = LPS\nx,y,z\n1,2,3\n")
+    br.save_image(MASK.with_voxels(np.zeros(MASK.shape, np.uint8)), folder / "nothing.nii.gz")
+    paths = {"points", "image", "labels", "mesh", "out"}
+    files = {key: folder / value if key in paths else value for key, value in given.items()}
     with pytest.raises(br.InputError, match=message):
-        br.apply(result.folder, folder / "refused", **files)
+        br.apply(result.folder, files.pop("out", folder / "refused"), **files)
     assert not (folder / "refused").exists()
 
 
@@ -337,16 +397,16 @@ def test_maps(result, folder):
     np.testing.assert_allclose(nib.load(written[0]).affine, sd.affine, atol=1e-6)
     total = np.sqrt((np.asarray(sd.dataobj)[..., 0, :] ** 2).sum(axis=-1))
     inside = total > 0
-    np.testing.assert_array_equal(found["radius95"] > 0, inside)
+    np.testing.assert_array_equal(np.isfinite(found["radius95"]), inside)
     # √(χ² of one degree of freedom) … √(χ² of three): 1.96 … 1.61 times the root of the summed variances.
     ratio = found["radius95"][inside] / total[inside]
     assert 1.3 < np.quantile(ratio, 0.05) < np.quantile(ratio, 0.95) < 2.3
-    assert (found["p_over_2mm"] <= found["p_over_0.1mm"]).all()
+    assert (found["p_over_2mm"] <= found["p_over_0.1mm"])[inside].all()
     mesh = result.mesh
     u = result.u_mean
-    ratio = (signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes).min(), 3 * found["jacobian_sd"].max()
+    ratio = (signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes).min(), 3 * found["jacobian_sd"][inside].max()
     assert found["jacobian_mean"][inside].min() > ratio[0] - ratio[1]
-    assert (found["p_inverted"] == 0).all()
+    assert (found["p_inverted"][inside] == 0).all()
     away = np.eye(4)
     away[:3, 3] = 900.0
     br.save_image(br.Image(np.zeros((3, 3, 3)), away), folder / "far.nii.gz")
@@ -408,7 +468,8 @@ def test_a_run_that_has_moved_is_carried_on_alone(applied, result, folder, tmp_p
     """None of the files that it was made of is needed; nodes that were not sampled are solved for again."""
     shutil.copytree(result.folder, tmp_path / "copied")
     text = (tmp_path / "copied" / "config.yaml").read_text().replace(str(folder), "/gone")
-    (tmp_path / "copied" / "config.yaml").write_text(text)
+    with writing(tmp_path / "copied") as place:
+        place("config.yaml").write_text(text)
     assert len(result.mesh.interior) > 0
     br.apply(tmp_path / "copied", tmp_path / "there", points=folder / "p.csv", draws=40, far=(0.1, 2.0))
     assert (tmp_path / "there" / "points.csv").read_bytes() == (folder / "there" / "points.csv").read_bytes()

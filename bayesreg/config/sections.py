@@ -103,6 +103,12 @@ class BidsConfig(Section):
     suffix: BidsLabel = "T1w"
     """Of the moving image."""
 
+    @model_validator(mode="after")
+    def _two_spaces(self) -> BidsConfig:
+        if self.fixed == self.moving:
+            raise ValueError(f"fixed and moving are both {self.fixed!r}; a transform leads from one space to another")
+        return self
+
 
 class ResultsConfig(Section):
     """What a run leaves for other programs, besides what it always does."""

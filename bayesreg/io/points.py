@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.io.atomic import write_text
-from bayesreg.io.spaces import TO_RAS
+from bayesreg.io.spaces import TO_RAS, Space
 from bayesreg.types import InputError
 
 FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
@@ -82,9 +82,23 @@ def read_points(path: str | Path) -> Points:
     return found
 
 
-def read_side(path: str | Path, side: Literal["fixed", "moving"]) -> Points:
-    """Read points of one space, or one side of a file of pairs; InputError as in `read_points`."""
-    found = _read(Path(path))
+def read_side(path: str | Path, side: Literal["fixed", "moving"], space: Space | None = None) -> Points:
+    """Read points of one space, or one side of a file of pairs.
+
+    Parameters
+    ----------
+    path : path
+    side : "fixed" or "moving"
+    space : "RAS" or "LPS", optional
+        Of the coordinates of a CSV or .fcsv that does not say it; the default is RAS.
+
+    Raises
+    ------
+    InputError
+        As in `read_points`; if the file says another space; if it looks as ANTs writes points, which are in LPS, and no
+        space is given.
+    """
+    found = _read(Path(path), space)
     return Points(getattr(found, side), found.names, found.sd) if isinstance(found, PointPairs) else found
 
 
@@ -141,7 +155,7 @@ def _order(found: Points, other: Points, files: str) -> list[int]:
     return [others.index(name) for name in names]
 
 
-def _read(path: Path) -> Points | PointPairs:
+def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
     name = path.name.lower()
     suffix = next((suffix for suffix in READERS if name.endswith(suffix)), None)
     if suffix is None:
@@ -152,7 +166,7 @@ def _read(path: Path) -> Points | PointPairs:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not UTF-8 text ({error.reason} at byte {error.start})") from None
-    found = READERS[suffix](text, str(path))
+    found = READERS[suffix](text, str(path), space)
     _require_sound(found, path)
     return found
 
@@ -169,16 +183,21 @@ def _require_sound(found: Points | PointPairs, path: Path) -> None:
         )
 
 
-def _read_csv(text: str, path: str) -> Points | PointPairs:
+def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
     lines = [
         (number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] != "#"
     ]
-    system = _named_system(text, "RAS", path)
+    system = _space_of(text, space, path)
     if not lines:
         raise InputError(f"{path} is empty; expected a header such as {','.join(PLAIN)}")
     header, *rows = [(number, [cell.strip() for cell in next(csv.reader([line]))]) for number, line in lines]
     columns = [column.lower() for column in header[1]]
     wanted = FIXED + MOVING if set(FIXED + MOVING) <= set(columns) else PLAIN
+    if wanted == PLAIN and "t" in columns and space is None and not _named_system(text, "", path):
+        raise InputError(
+            f"{path} has the columns x, y, z, t, as ANTs writes points, whose coordinates are LPS; say whether these "
+            "are, by --space or by a line such as # CoordinateSystem = LPS"
+        )
     if twice := [column for column in (*wanted, "sd", "name") if columns.count(column) > 1]:
         raise InputError(f"{path}: expected one column {twice[0]}; got {', '.join(header[1])}")
     if not set(wanted) <= set(columns):
@@ -204,8 +223,8 @@ def _read_csv(text: str, path: str) -> Points | PointPairs:
     return PointPairs(fixed, moving, names, sd)
 
 
-def _read_fcsv(text: str, path: str) -> Points:
-    system, columns, points, names = _named_system(text, "RAS", path), ["id", "x", "y", "z"], [], []
+def _read_fcsv(text: str, path: str, space: Space | None) -> Points:
+    system, columns, points, names = _space_of(text, space, path), ["id", "x", "y", "z"], [], []
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith("#"):
             key, _, value = line[1:].partition("=")
@@ -225,7 +244,8 @@ def _read_fcsv(text: str, path: str) -> Points:
     return Points(_in_ras(points, system, path), tuple(names))
 
 
-def _read_markups(text: str, path: str) -> Points:
+def _read_markups(text: str, path: str, space: Space | None) -> Points:
+    _require_unsaid(space, path)
     try:
         markups = json.loads(text)["markups"]
     except (json.JSONDecodeError, KeyError, TypeError):
@@ -258,8 +278,9 @@ def _position(point: Any, path: str) -> list[float]:
     return [_number(value, path) for value in position]
 
 
-def _read_tag(text: str, path: str) -> Points | PointPairs:
+def _read_tag(text: str, path: str, space: Space | None) -> Points | PointPairs:
     """MNI's tag points: one row of three coordinates for each volume, RAS, and perhaps weights, ids and a label."""
+    _require_unsaid(space, path)
     plain = "\n".join("" if line.lstrip().startswith("%") else line for line in text.splitlines())
     volumes, body = re.search(r"Volumes\s*=\s*(\d+)\s*;", plain), re.search(TAG_ROWS, plain)
     if not plain.lstrip().startswith("MNI Tag Point File") or volumes is None or body is None:
@@ -294,6 +315,19 @@ def _tag_row(line: str, wanted: int, where: str) -> tuple[list[float], str]:
     return [_number(cell, where) for cell in cells[:wanted]], quoted[0] if quoted else ""
 
 
+def _space_of(text: str, space: Space | None, path: str) -> str:
+    """The space that a file names, or else the one that is given, or else RAS."""
+    named = _named_system(text, "", path)
+    if named in SYSTEMS and space and not np.array_equal(SYSTEMS[named], SYSTEMS[space]):
+        raise InputError(f"{path} says that its coordinates are {named}, and {space} is given: leave the space out")
+    return named or space or "RAS"
+
+
+def _require_unsaid(space: Space | None, path: str) -> None:
+    if space is not None:
+        raise InputError(f"{path} says itself whether its coordinates are RAS or LPS: leave the space out")
+
+
 def _named_system(text: str, default: str, path: str) -> str:
     """The coordinate system that a line such as `# CoordinateSystem = LPS` names."""
     comments = "\n".join(re.findall(r"^\s*#.*$", text, re.MULTILINE))
@@ -316,7 +350,7 @@ def _number(value: Any, where: str) -> float:
         raise InputError(f"{where}: expected a number, got {value!r:.40}") from None
 
 
-READERS: dict[str, Callable[[str, str], Points | PointPairs]] = {
+READERS: dict[str, Callable[[str, str, Space | None], Points | PointPairs]] = {
     ".csv": _read_csv,
     ".fcsv": _read_fcsv,
     ".mrk.json": _read_markups,

@@ -55,9 +55,9 @@ class Predicted(NamedTuple):
         Mean displacement of every node, mm, chain by chain.
     far_mm : scalar
     far : (n,) array
-        P(|u − ū| > far_mm) at every node, ū the posterior mean.
+        P(|u − ū| > far_mm) at every node, ū the posterior mean, what the mesh cannot follow included.
     reach : (n,) array
-        |u − ū|, mm, that 95 % of the draws do not exceed.
+        Within which a point at each node lies about its mean place with 95 %, mm; in the same way.
     place_names : (L,) array of str
     place_points : (L, 3) array
         World mm, in the fixed image.

@@ -9,17 +9,16 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from skimage import measure
 
 from bayesreg.io.atomic import replacing
-from bayesreg.io.spaces import TO_RAS
+from bayesreg.io.spaces import TO_RAS, Space
 from bayesreg.types import AnyArray, InputError
 
-Space = Literal["RAS", "LPS"]
 SUFFIXES = (".vtk", ".vtp", ".vtu", ".stl", ".ply", ".obj")
 
 
@@ -43,6 +42,44 @@ class SurfaceFile(NamedTuple):
     space: Space
     is_said: bool
 
+    def part(self, chosen: Bool[np.ndarray, "k"]) -> SurfaceFile:
+        """The chosen points, with the cells that have no other, and what is left of lines."""
+        import pyvista
+
+        number = np.cumsum(chosen) - 1
+        if isinstance(self.content, pyvista.UnstructuredGrid):
+            cells = _split(self.content.cells)
+            kept = np.array([chosen[ids].all() for ids in cells], bool)
+            rows = [(len(ids), *number[ids]) for ids, keep in zip(cells, kept, strict=True) if keep]
+            connectivity = np.concatenate([[], *rows]).astype(int)
+            content = pyvista.UnstructuredGrid(connectivity, self.content.celltypes[kept], self.content.points[chosen])
+        else:
+            runs = [run for line in _split(self.content.lines) for run in _runs(chosen, line) if len(run) > 1]
+            faces = [ids for ids in _split(self.content.faces) if chosen[ids].all()]
+            lines, triangles = (
+                np.concatenate([[], *((len(ids), *number[ids]) for ids in kind)]).astype(int) for kind in (runs, faces)
+            )
+            content = pyvista.PolyData(self.content.points[chosen], faces=triangles, lines=lines)
+        for name, values in self.content.point_data.items():
+            content.point_data[name] = np.asarray(values)[chosen]
+        return self._replace(content=content, points=self.points[chosen])
+
+
+def _split(connectivity: np.ndarray) -> list[np.ndarray]:
+    """The points of each cell, where VTK has them in a row, each time after their number."""
+    found, start = [], 0
+    while start < len(connectivity):
+        end = start + 1 + connectivity[start]
+        found.append(np.asarray(connectivity[start + 1 : end]))
+        start = end
+    return found
+
+
+def _runs(chosen: Bool[np.ndarray, "k"], line: np.ndarray) -> list[np.ndarray]:
+    """What is left of a line where some of its points are left out."""
+    borders = np.flatnonzero(np.diff(chosen[line].astype(int))) + 1
+    return [part for part in np.split(line, borders) if chosen[part].all()]
+
 
 def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
     """Read points with what connects them.
@@ -52,12 +89,12 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
     path : path
         .vtk, .vtp, .vtu, .stl, .ply or .obj.
     space : "RAS" or "LPS", optional
-        Of its coordinates; the default is what the file says, as 3D Slicer writes it (SPACE=LPS), else RAS.
+        Of its coordinates, where the file does not say it as 3D Slicer does (SPACE=LPS); the default is RAS.
 
     Raises
     ------
     InputError
-        If there is no such file, it is of another kind or damaged, or holds no points.
+        If there is no such file, it is of another kind or damaged, or holds no points; if it says another space.
     """
     import pyvista
 
@@ -67,17 +104,19 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
     if not path.is_file():
         raise InputError(f"{path}: no such file with a surface")
     try:
-        with pyvista.VtkErrorCatcher(raise_errors=True):
+        with pyvista.VtkErrorCatcher(raise_errors=True, send_to_logging=False):
             surface = pyvista.read(path)
     except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a surface: {str(error).partition(chr(10))[0]}") from error
+        raise InputError(f"{path} cannot be read as a surface: it is damaged, or no {path.suffix} file") from error
     if not isinstance(surface, pyvista.PolyData | pyvista.UnstructuredGrid) or not surface.n_points:
         raise InputError(f"{path} cannot be read as a surface: it holds no points")
     points = np.asarray(surface.points, float)
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not finite")
-    told = _named_space(path)
-    chosen: Space = space or told or "RAS"
+    told = _named_space(path, surface)
+    if told and space and told != space:
+        raise InputError(f"{path} says that its coordinates are {told}, and {space} is given: leave the space out")
+    chosen: Space = told or space or "RAS"
     return SurfaceFile(surface, points * TO_RAS[chosen], chosen, (space or told) is not None)
 
 
@@ -91,7 +130,7 @@ def write_surface(
     path : path
         Ends as the file that the surface was read from; .stl, .ply and .obj keep no values.
     surface : SurfaceFile
-        Its space is kept; a .vtk file says which it is.
+        Its space is kept, and the file says which it is. Normals are left out: they turn, and programs find them anew.
     points : (k, 3) array
         World RAS, mm.
     values : mapping
@@ -99,12 +138,15 @@ def write_surface(
     """
     moved, path = surface.content.copy(), Path(path)
     moved.points = points * TO_RAS[surface.space]
+    for arrays in (moved.point_data, moved.cell_data):
+        if "Normals" in arrays:
+            del arrays["Normals"]
     for name, value in values.items():
         moved.point_data[name] = np.asarray(value)
+    moved.field_data["SPACE"] = [surface.space]
     with replacing(path) as temporary:
         moved.save(temporary)
-        if path.suffix.lower() == ".vtk":
-            _say_space(temporary, surface.space)
+        _say_space(temporary, surface.space)
 
 
 def save_outline(
@@ -158,14 +200,28 @@ def save_surface(
         _say_space(temporary, "RAS")
 
 
-def _named_space(path: Path) -> Space | None:
-    """The space that the head of a file names."""
+def _named_space(path: Path, surface: Any) -> Space | None:
+    """The space that the head of a file names, or a field of it."""
     with path.open("rb") as file:
         found = re.search(rb"SPACE\s*=\s*(RAS|LPS)", file.read(512))
-    return None if found is None else ("LPS" if found[1] == b"LPS" else "RAS")
+    named = str(surface.field_data["SPACE"][0]) if "SPACE" in surface.field_data else found and found[1].decode()
+    return "LPS" if named == "LPS" else "RAS" if named == "RAS" else None
 
 
 def _say_space(path: Path, space: Space) -> None:
-    """The second line of a .vtk file is a title."""
-    first, _, rest = path.read_bytes().split(b"\n", 2)
-    path.write_bytes(b"\n".join([first, f"bayesreg SPACE={space}".encode(), rest]))
+    """In the head of a file, as 3D Slicer does; those in XML have it as a field."""
+    content, said = path.read_bytes(), f"bayesreg SPACE={space}".encode()
+    suffix = path.suffix.lower()
+    if suffix == ".vtk":
+        # The second line is a title.
+        first, _, rest = content.split(b"\n", 2)
+        content = b"\n".join([first, said, rest])
+    elif suffix == ".stl":
+        # VTK writes it in binary form, of which 80 bytes are free.
+        content = said.ljust(80) + content[80:]
+    elif suffix == ".ply":
+        first, kind, rest = content.split(b"\n", 2)
+        content = b"\n".join([first, kind, b"comment " + said, rest])
+    elif suffix == ".obj":
+        content = b"# " + said + b"\n" + content
+    path.write_bytes(content)

@@ -36,6 +36,8 @@ MEANINGS = {
     "field_sd": ("standard deviation of the logarithm of stiffness", "1"),
     "t_similarity": ("temperature T_s of the images", "1"),
     "t_elastic": ("temperature T_r of the elastic prior", "1"),
+    "body_load": ("standard deviation of the random loads inside, over the root of volume", "1"),
+    "surface_load": ("standard deviation of the random loads at the surface, over the root of area", "1"),
     "points": ("nodes, world RAS", "mm"),
     "cells": ("nodes of each tetrahedron", "1"),
     "tissue": ("tissue of each tetrahedron", "1"),

@@ -113,5 +113,6 @@ def tissue_on_grid(mesh: TetMesh, voxels: int = 100) -> Image:
 def warp_image(
     moving: Image, displacement: Float[np.ndarray, "X Y Z 3"], grid: Image, method: Interpolation = "linear"
 ) -> Image:
-    """m(x + u(x)) at the voxel centres of `grid`, u in mm on that grid."""
-    return grid.with_voxels(np.asarray(moving.interpolate(grid.grid_points() + displacement, method)))
+    """m(x + u(x)) at the voxel centres of `grid`, u in mm on that grid; zero where that is beyond the grid of m."""
+    places = grid.grid_points() + displacement
+    return grid.with_voxels(np.where(moving.contains(places), np.asarray(moving.interpolate(places, method)), 0.0))

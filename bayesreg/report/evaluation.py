@@ -21,20 +21,26 @@ def evaluation_table(predicted: Predicted) -> Table | None:
     if predicted.evaluation_residual is None:
         return None
     inside, after = np.asarray(predicted.evaluation_inside), np.linalg.norm(predicted.evaluation_residual, axis=1)
+    outside = int((~inside).sum())
+    if not inside.any():
+        caption = f"None of the {outside} landmarks that were held out lies in the mesh, and nothing is told of them."
+        return Table("Target registration error", caption, [""], [])
     rows = [
         [name, *(fixed(float(value)) for value in (x.mean(), np.median(x), np.quantile(x, 0.95), x.max()))]
         for name, x in {
-            "By the headers": np.asarray(predicted.evaluation_before),
-            "By the pose alone": np.asarray(predicted.evaluation_posed),
-            "By the posterior mean": after,
+            "By the headers": np.asarray(predicted.evaluation_before)[inside],
+            "By the pose alone": np.asarray(predicted.evaluation_posed)[inside],
+            "By the posterior mean": after[inside],
         }.items()
     ]
     found = _surprise(predicted)
-    shares = ", ".join(f"{(found <= level).mean():.0%} in the {level:.0%}" for level in LEVELS).replace("%", " %")
+    shares = [f"{(found <= level).mean():.0%} lie in the regions of {level:.0%}" for level in LEVELS]
     caption = (
-        f"Distance from where {len(after)} landmarks were found in the moving image, mm; the sampler never saw them. "
-        f"Of the {int(inside.sum())} that lie in the mesh, {shares} region that the posterior gives them."
+        f"Distance from where {len(found)} landmarks were found in the moving image, mm; the sampler never saw them. "
+        f"Of these landmarks {', '.join(shares).replace('%', ' %')} that the posterior gives them."
     )
+    if outside:
+        caption += f" {outside} more lie outside the mesh, where nothing is known, and are left out."
     return Table("Target registration error", caption, ["", "Mean", "Median", "95 %", "Greatest"], [("", rows)])
 
 
@@ -43,8 +49,11 @@ def evaluation(predicted: Predicted) -> Drawing | None:
     if predicted.evaluation_residual is None or predicted.evaluation_posed is None:
         return None
     inside = np.asarray(predicted.evaluation_inside)
-    after, before = np.linalg.norm(predicted.evaluation_residual, axis=1), np.asarray(predicted.evaluation_posed)
-    radius = distances_of(np.asarray(predicted.evaluation_covariance)).radius
+    if not inside.any():
+        return None
+    after = np.linalg.norm(predicted.evaluation_residual, axis=1)[inside]
+    before = np.asarray(predicted.evaluation_posed)[inside]
+    radius = distances_of(np.asarray(predicted.evaluation_covariance)[inside]).radius
     found = np.sort(_surprise(predicted))
     count = len(found)
     with style.look():
@@ -55,8 +64,8 @@ def evaluation(predicted: Predicted) -> Drawing | None:
         left.plot(after[order], "o", ms=3, color=style.ACCENT, label="by the posterior mean")
         left.set(xlabel="landmark", ylabel="error, mm", ylim=(0, None), title="before and after")
         left.legend()
-        middle.plot(radius[inside], after[inside], "o", ms=4, color=style.ACCENT)
-        reach = 1.05 * max(radius[inside].max(initial=0.1), after[inside].max(initial=0.1))
+        middle.plot(radius, after, "o", ms=4, color=style.ACCENT)
+        reach = 1.05 * max(radius.max(initial=0.1), after.max(initial=0.1))
         middle.plot([0, reach], [0, reach], color=style.MUTED, lw=0.8)
         middle.set(
             xlabel="95 % radius, mm",

@@ -40,7 +40,7 @@ def summarise_run(run: Run, predicted: Predicted, judged: Verdict) -> list[Point
     )
     trust += "Nothing is said of what lies outside the mesh."
     if not judged.converged:
-        trust = f"Nowhere yet: the sampler has not converged, and what stands here may change. {trust}"
+        trust = f"Trust nothing yet: the sampler has not converged, and what stands here may change. {trust}"
     return [
         Point("What moved?", _pose(run)),
         Point(
@@ -60,7 +60,7 @@ def summarise_run(run: Run, predicted: Predicted, judged: Verdict) -> list[Point
 def _pose(run: Run) -> str:
     """How the organ lies, in words."""
     if run.matching.pose.is_identity:
-        return "The organ, in the world that both images share."
+        return "The organ, in the one world in which it was seen before and after."
     motion = run.matching.pose.about(run.mesh.points.mean(axis=0))
     return (
         f"The organ lies {fixed(motion.millimetres, 1)} mm and {fixed(motion.degrees, 1)}° from where the header of "

@@ -173,7 +173,7 @@ def maps(view: View, predicted: Predicted) -> Drawing:
         uri = style.data_uri(figure)
     caption = (
         "Top: posterior standard deviation (root of the summed variances of the three components). Middle: distance "
-        f"from the posterior mean that 95 % of the draws do not exceed. Bottom: {far}, in bands. " + _numbers(predicted)
+        f"from its mean place within which a point lies with 95 %. Bottom: {far}, in bands. " + _numbers(predicted)
     )
     return Drawing("uncertainty", "How far to trust the displacement", caption, "Maps of the uncertainty, mm.", uri)
 
@@ -183,7 +183,7 @@ def _numbers(predicted: Predicted) -> str:
     share = float((np.asarray(predicted.far) > 1 - LEVEL).mean())
     median, worst = (number(float(x)) for x in (np.median(predicted.reach), np.max(predicted.reach)))
     return (
-        f"At the median node 95 % of the draws lie within {median} mm of the mean, at the least certain within {worst} "
+        f"The median node lies within {median} mm of its mean place with 95 %, the least certain one within {worst} "
         f"mm; at {percent(share)} of the nodes P(|u − ū| > {predicted.far_mm:g} mm) is above 5 %."
     )
 

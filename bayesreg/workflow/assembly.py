@@ -16,7 +16,7 @@ from bayesreg.config import Config
 from bayesreg.config.observations import LandmarksSection
 from bayesreg.image import Image
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.inference.draws.predictive import push_forward, thin
+from bayesreg.inference.draws.predictive import evenly_spaced, push_forward, thin
 from bayesreg.io.alignment import find_demons
 from bayesreg.io.displacements import read_start
 from bayesreg.io.records import Inputs, Run
@@ -55,16 +55,21 @@ def posterior_of(
 def nodal_draws(
     model: ModelConfig, inputs: Inputs | Run, draws: xr.Dataset, most: int
 ) -> Float[np.ndarray, "draws nodes 3"]:
-    """The displacement of every node, mm, of up to so many evenly spaced draws of a run, those of all chains together.
+    """The displacement of every node, mm, of up to so many evenly spaced draws of a run, of all chains in turn.
 
     Nodes that are not sampled follow from those that are, and from λ and μ.
     """
     if not most:
         return np.empty((0, *inputs.mesh.points.shape))
-    some = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], most)
+    chains = draws.sizes["chain"]
+    some = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], chains * -(-most // chains))
+    # As few of each chain as there may be are still too many where the number is no multiple of theirs.
+    count = some["u_boundary"].shape[1]
+    draw, chain = np.divmod(evenly_spaced(chains * count, most), chains)
+    some = {name: values[chain, draw][None] for name, values in some.items()}
     u = some["u_boundary"]
     if u.shape[2] == len(inputs.mesh.points):
-        return u.reshape(-1, *u.shape[2:])
+        return u[0]
     body, blocks = body_of(inputs.mesh, _model(model, inputs))
     known = {name: values for name, values in some.items() if name in blocks}
 

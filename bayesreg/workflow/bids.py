@@ -52,7 +52,7 @@ def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
         target = f"{within}/{entities}_{name}"
         _link(folder / source, place(target))
         sidecar = target.removesuffix(".gz").rpartition(".")[0] + ".json"
-        write_json(place(sidecar), {"Description": description, "Sources": [f"bids::../{source}"], **more})
+        write_json(place(sidecar), {"Description": description, **more})
     generated = [{"Name": "bayesreg", "Version": __version__}]
     write_json(
         place(f"{FOLDER}/dataset_description.json"),

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from bayesreg.io.points import PointPairs
 from bayesreg.transform import Transform, spread
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 # Among the points of a run's inputs; no observation has this name.
 NAME = "evaluation"
+# Landmarks that lie no further from each other are one, mm.
+SAME = 1e-3
+
+
+def require_unseen(held_out: PointPairs, seen: Mapping[str, tuple[AnyArray, AnyArray]]) -> None:
+    """Raise InputError where a landmark that is to be held out is one of those observed, (fixed, moving) by name."""
+    for name, (fixed, moving) in seen.items():
+        away = np.linalg.norm(held_out.fixed[:, None] - np.asarray(fixed), axis=2)
+        away += np.linalg.norm(held_out.moving[:, None] - np.asarray(moving), axis=2)
+        if count := int((away.min(axis=1) < SAME).sum()):
+            raise InputError(
+                f"{count} of the {len(away)} landmarks of evaluation are in the observation {name!r}, too: what the "
+                "sampler has seen is not held out; give others, or take them out of one of the two files"
+            )
 
 
 def evaluate_landmarks(pairs: PointPairs, transform: Transform, sd: float | None) -> dict[str, AnyArray]:

@@ -15,7 +15,7 @@ from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.warp import Covered, covered_voxels
 from bayesreg.transform import Transform, distances_of
 from bayesreg.types import InputError
-from bayesreg.workflow.apply import POINT_DRAWS, transform_of
+from bayesreg.workflow.apply import POINT_DRAWS, require_distances, require_folder, transform_of
 from bayesreg.workflow.result import load_result
 
 CHUNK = 500_000
@@ -30,7 +30,7 @@ def maps(
     draws: int = POINT_DRAWS,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[Path]:
-    """Write maps of a run on the grid of its fixed image; zero where the mesh does not reach.
+    """Write maps of a run on the grid of its fixed image; NaN where the mesh does not reach, and nothing is known.
 
     Parameters
     ----------
@@ -66,9 +66,10 @@ def maps(
     InputError
         If the folder holds no run, or a distance is not above zero.
     """
-    if any(not distance > 0 for distance in far):
-        raise InputError(f"expected distances above zero, mm, got {', '.join(map(str, far))}")
-    result, out = load_result(folder), Path(out)
+    require_distances(far)
+    if draws < 2:
+        raise InputError(f"expected at least two draws, got {draws}")
+    result, out = load_result(folder), require_folder(out)
     grid = result.run.background if like is None else load_image(like)
     covered = covered_voxels(grid, result.mesh)
     if not len(covered.cell):
@@ -106,7 +107,7 @@ def _distances(transform: Transform, covered: Covered, far: Sequence[float]) -> 
 
 
 def _write(path: Path, grid: Image, covered: Covered, values: Float[np.ndarray, "k"]) -> Path:
-    voxels = np.zeros(grid.shape, np.float32)
+    voxels = np.full(grid.shape, np.nan, np.float32)
     voxels[tuple(covered.voxel.T)] = values
     write_nifti(voxels, grid.affine, path)
     return path

@@ -27,7 +27,7 @@ from bayesreg.model.state import state_of
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.pose import Pose, compose, rigid_projection
 from bayesreg.tissues import label_of
-from bayesreg.transform import Transform
+from bayesreg.transform import Transform, distances_of
 from bayesreg.types import AnyArray
 
 Places = Mapping[str, tuple[float, float, float]]
@@ -166,13 +166,16 @@ def _landmarks(posterior: Posterior, mean: dict[str, AnyArray]) -> dict[str, np.
 
 
 def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
-    """The predictions, draws of places being as unsure as the nodes about these (`bayesreg.transform.Transform`)."""
+    """The predictions, allowing for what the mesh cannot follow (`bayesreg.transform.Transform`)."""
     places = np.asarray(predicted.place_points)
     sd = transform.unresolved_sd(transform.deformer.locate(places))
     draws = np.asarray(predicted.place_draws)
     # A stream of its own: those of draws have their number.
     rng = np.random.default_rng((transform.seed, len(transform.draws)))
-    return predicted._replace(place_draws=draws + sd * rng.standard_normal(draws.shape))
+    about = distances_of(transform.nodal_covariance(), (float(predicted.far_mm),), REACH)
+    return predicted._replace(
+        place_draws=draws + sd * rng.standard_normal(draws.shape), reach=about.radius, far=about.far[0]
+    )
 
 
 def _stiffness(found: Summary) -> dict[str, np.ndarray]:

@@ -28,13 +28,14 @@ from bayesreg.io.records import Channel, Inputs, Truth
 from bayesreg.io.volumes import load_ignored, load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.options import OF_ANY_CONTRAST, require_default_image_options
+from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.pose import Pose
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
 from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
-from bayesreg.workflow.evaluation import NAME
+from bayesreg.workflow.evaluation import NAME, require_unseen
 from bayesreg.workflow.matching import Matched, match_channel, match_images
 from bayesreg.workflow.prediction import require_inside
 
@@ -180,7 +181,9 @@ def _points(config: Config) -> dict[str, PointPairs]:
                 )
             found[section.name] = pairs
     if config.evaluation is not None:
-        found[NAME] = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
+        held_out = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
+        require_unseen(held_out, {name: (pairs.fixed, pairs.moving) for name, pairs in found.items()})
+        found[NAME] = held_out
     return found
 
 
@@ -212,6 +215,9 @@ def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[I
     if not config.compares_images and not observations:
         require_default_image_options(config.model)
     prepared = prepare(config)
+    if NAME in prepared.inputs.points:
+        given = {one.name: (one.fixed_points, one.moving_points) for one in observations if isinstance(one, Landmarks)}
+        require_unseen(prepared.inputs.points[NAME], given)
     require_inside(prepared.inputs.mesh, config.report.places)
     appraisal = {} if prepared.appraisal is None else prepared.appraisal.as_json()
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair, "appraisal": appraisal}

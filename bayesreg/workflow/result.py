@@ -91,6 +91,7 @@ class Result:
 def load_result(folder: str | Path) -> Result:
     """Open a finished run; InputError where the folder holds none, or a file of it is damaged."""
     run = store.read_run(folder)
+    require_file(folder, POSTERIOR)
     require_unchanged(folder, but=REPORT)
     return Result(Path(folder), run)
 

@@ -10,9 +10,9 @@ import numpy as np
 from bayesreg.io.slicer import Item, write_markups, write_scene
 from bayesreg.io.surface_files import save_ellipsoids, save_surface
 from bayesreg.io.volumes import save_image
-from bayesreg.transform import Transform, spread
+from bayesreg.transform import Transform, distances_of, spread
 from bayesreg.types import InputError
-from bayesreg.workflow.apply import transform_of
+from bayesreg.workflow.apply import require_folder, transform_of
 from bayesreg.workflow.maps import maps
 from bayesreg.workflow.result import Result, load_result
 from bayesreg.workflow.transforms import MEAN_INVERSE
@@ -42,7 +42,7 @@ def slicer(folder: str | Path, out: str | Path) -> Path:
     InputError
         If the folder holds no run, or one that left no transforms.
     """
-    result, out = load_result(folder), Path(out)
+    result, out = load_result(folder), require_folder(out)
     if not (result.folder / MEAN_INVERSE).is_file():
         raise InputError(f"{folder} holds no {MEAN_INVERSE}: the run was made by an earlier version; run anew")
     out.mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,12 @@ def slicer(folder: str | Path, out: str | Path) -> Path:
     shutil.copyfile(result.folder / MEAN_INVERSE, out / MEAN_INVERSE)
     items += _write_images(result, out)
     maps(folder, out, far=())
-    items.append(Item("volume", "95 % radius, mm", "radius95.nii.gz", BACK))
+    items += [
+        Item("volume", "95 % radius, mm", "radius95.nii.gz", BACK),
+        Item("volume", "volume after over before", "jacobian_mean.nii.gz", BACK),
+        Item("volume", "its standard deviation", "jacobian_sd.nii.gz", BACK),
+        Item("volume", "P(inside out)", "p_inverted.nii.gz", BACK),
+    ]
     items += _write_mesh(transform, out)
     items += _write_places(result, transform, out)
     write_scene(out / SCENE, items)
@@ -73,18 +78,22 @@ def _write_mesh(transform: Transform, out: Path) -> list[Item]:
     mesh = transform.mesh
     found = spread(transform, mesh.points[mesh.boundary])
     faces = np.searchsorted(mesh.boundary, mesh.boundary_faces)
-    save_surface(out / "surface.vtk", found.places, faces, {"radius95": found.ellipsoids()[0][:, 0]})
+    save_surface(out / "surface.vtk", found.places, faces, {"radius95": distances_of(found.covariance).radius})
     return [Item("model", "organ", "surface.vtk", colour=(0.9, 0.75, 0.65, 0.3))]
 
 
 def _write_places(result: Result, transform: Transform, out: Path) -> list[Item]:
-    """The report's places, and the landmarks that were observed."""
+    """The report's places, and the landmarks that were observed or held out."""
     predicted, items = result.run.predicted, []
     if predicted is None:
         return []
     kinds = {"places": (predicted.place_names, predicted.place_points)}
     if predicted.landmark_names is not None and predicted.landmark_points is not None:
         kinds["landmarks"] = (predicted.landmark_names, predicted.landmark_points)
+    if predicted.evaluation_names is not None and predicted.evaluation_points is not None:
+        inside = np.asarray(predicted.evaluation_inside)
+        if inside.any():
+            kinds["held_out"] = (predicted.evaluation_names[inside], np.asarray(predicted.evaluation_points)[inside])
     for name, (labels, points) in kinds.items():
         found = spread(transform, np.asarray(points))
         write_markups(out / f"{name}.mrk.json", [str(label) for label in labels], found.places)

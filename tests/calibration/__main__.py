@@ -1,6 +1,6 @@
 """`make calibrate`: simulation-based calibration and Geweke's test, with figures and a JSON file.
 
-python -m tests.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share external]
+python -m tests.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share external carried]
 
 Its status is 1 where a part fails.
 """
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import bayesreg as br
-from tests.calibration import external, figures, geweke, mesh_share, pairs, sbc
+from tests.calibration import carried, external, figures, geweke, mesh_share, pairs, sbc
 from tests.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, posterior_of
 
 # Wrong on purpose, and to be found out: T_s held at 1.5 times its true value, the elastic prior without its normaliser.
@@ -126,6 +126,32 @@ def register_external_pairs(out: Path) -> dict[str, Any]:
     return external.register_pairs(out, say)
 
 
+def carry(out: Path) -> dict[str, Any]:
+    """Points and labels, by what `bayesreg apply` tells of them, on the mesh of the truth and where that is finer.
+
+    What is written must not be surer than it may be, and labels not less sure either.
+    """
+    found = {}
+    for name, finer in {"mesh of the truth": False, "finer truth": True}.items():
+        say(f"points and labels: {name}")
+        cases = carried.measure(finer, say=say)
+        levels = np.array(carried.LEVELS)
+        errors = 3 * np.sqrt(levels * (1 - levels) / len(cases))
+        inside = (cases[:, None] <= levels[:, None]).mean(axis=0)
+        names = [f"{way}, {part}" for way in ("there", "back") for part in carried.PARTS] + ["label"]
+        written = inside[:, [0, len(carried.PARTS), -1]]
+        found[name] = {
+            "as_it_should": bool(
+                (written > (levels - errors)[:, None]).all() and (inside[:, -1] < levels + errors).all()
+            ),
+            "cases": len(cases),
+            "three binomial errors": errors.tolist(),
+            "inside": {name: column.tolist() for name, column in zip(names, inside.T, strict=True)},
+        }
+        say(json.dumps(found[name]["inside"]))
+    return found
+
+
 PARTS = {
     "sbc": calibrate_by_simulation,
     "geweke": compare_simulators,
@@ -133,6 +159,7 @@ PARTS = {
     "same_mesh": register_on_one_mesh,
     "mesh_share": share_of_the_mesh,
     "external": register_external_pairs,
+    "carried": carry,
 }
 
 

@@ -80,7 +80,9 @@ function start() {
   };
   const resize = () => {
     const width = stage.clientWidth, height = Math.round(Math.min(0.62 * width, 620));
-    renderer.setSize(width, height);
+    // The page may get narrower without a word, as in print: the canvas follows it, and the labels are in per cent.
+    renderer.setSize(width, height, false);
+    stage.style.aspectRatio = `${width} / ${height}`;
     camera.aspect = width / height;
     camera.updateProjectionMatrix();
     render();
