@@ -113,6 +113,10 @@ Around = Annotated[
 Like = Annotated[
     Path | None, typer.Option("--like", metavar="FILE", help="An image on whose grid images and labels are written.")
 ]
+MapsLike = Annotated[
+    Path | None,
+    typer.Option("--like", metavar="FILE", help="An image of FIXED's world on whose grid maps are written."),
+]
 Far = Annotated[
     list[float] | None,
     typer.Option("--far", metavar="MM", help="Give P(further off than this); 2 if left out; may be repeated."),
@@ -124,7 +128,8 @@ Margin = Annotated[
 ]  # fmt: skip
 Draws = Annotated[int | None, typer.Option(help="How many draws at most; 1,000, for labels 200, if left out.")]
 Space = Annotated[
-    Literal["RAS", "LPS"] | None, typer.Option("--space", help="Of the coordinates of --mesh, where it does not say.")
+    Literal["RAS", "LPS"] | None,
+    typer.Option("--space", help="Of the coordinates of --points and --mesh, where a file does not say."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
 Samplers = Annotated[str | None, typer.Option(metavar="NAME,NAME...", help="Which ones; all of them if left out.")]
@@ -263,7 +268,7 @@ def apply(
 
 
 @app.command()
-def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: Like = None, quiet: Quiet = False) -> None:
+def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: MapsLike = None, quiet: Quiet = False) -> None:
     """Write maps of a run: how sure every point is, how volume changes, how stiff the tissue is."""
     from bayesreg.workflow.maps import maps
 

@@ -113,11 +113,19 @@ def test_landmarks_are_held_out(folder, tmp_path):
     np.testing.assert_allclose(found.evaluation_before[:2], np.linalg.norm(SHIFT), atol=1.0)
     after = np.linalg.norm(found.evaluation_residual[:2], axis=1)
     assert (after < found.evaluation_before[:2]).all()
-    assert (np.sqrt(np.einsum("kii->ki", found.evaluation_covariance)) >= 0.2).all()
+    assert (np.sqrt(np.einsum("kii->ki", found.evaluation_covariance))[:2] >= 0.2).all()
+    assert np.isnan(found.evaluation_covariance[2]).all()
     page = result.report.read_text(encoding="utf-8")
     assert 'id="evaluation"' in page
     assert "Target registration error" in page
     assert plain.run.predicted.evaluation_residual is None
+    # They may be found later.
+    with without_reports():
+        later = br.run(file, tmp_path / "plain", resume=True, progress=False).run.predicted
+    np.testing.assert_allclose(later.evaluation_residual, found.evaluation_residual, atol=1e-5)
+    with pytest.raises(br.InputError, match="6 of the 6 landmarks of evaluation are in the observation"):
+        br.run(configuration(folder, seen, evaluation={"landmarks": "six.csv"}), tmp_path / "never", progress=False)
+    assert not (tmp_path / "never").exists()
     with pytest.raises(br.InputError, match=r"evaluation.landmarks"):
         br.load_config(configuration(folder, seen, evaluation={"landmarks": "none.csv"}))
     with pytest.raises(br.InputError, match="this name is taken"):

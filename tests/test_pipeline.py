@@ -185,6 +185,20 @@ def test_a_finished_run_is_continued_with_more_draws(finished, folder):
     assert (folder / "continued" / "run.json").exists()
 
 
+@pytest.mark.usefixtures("no_report")
+def test_a_finished_run_leaves_other_files_when_asked(finished, folder):
+    shutil.copytree(folder / "out", folder / "others")
+    config = br.load_config(folder / "run.yaml", ["results={draws: 3, bids: {subject: '01'}}"])
+    found = br.run(config, folder / "others", resume=True, progress=False)
+    np.testing.assert_array_equal(found.idata.posterior.u_boundary, finished.idata.posterior.u_boundary)
+    np.testing.assert_allclose(found.u_sd, finished.u_sd, rtol=1e-5)
+    assert len(list((folder / "others" / "transforms").glob("*.nii.gz"))) == 3
+    assert len(list((folder / "out" / "transforms").glob("*.nii.gz"))) == 20
+    assert (folder / "others" / "bids" / "dataset_description.json").exists()
+    with pytest.raises(br.InputError, match="only the sections stop, results, report, evaluation may change"):
+        br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "others", resume=True, progress=False)
+
+
 def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):
     monkeypatch.setattr(preparation, "make_pair", None)
     np.savez(folder / "other.npz", u=np.zeros((9, 3)))

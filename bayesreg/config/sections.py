@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData, Mni152Data, PaperPair
 from bayesreg.config.observations import ImagesSection, Observations
@@ -88,7 +89,13 @@ class DistributedConfig(Section):
     """Which this is, from 0."""
 
 
-BidsLabel = Annotated[str, Field(strict=True, pattern=r"^[A-Za-z0-9]+$")]
+def _require_letters_and_digits(label: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9]+", label):
+        raise ValueError("expected letters and digits alone, as BIDS wants its labels")
+    return label
+
+
+BidsLabel = Annotated[str, Field(strict=True), AfterValidator(_require_letters_and_digits)]
 
 
 class BidsConfig(Section):

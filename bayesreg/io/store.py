@@ -63,12 +63,17 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
         save_arrays(place("inputs/truth.npz"), known)
     if inputs.boundary is not None:
         save_arrays(place("inputs/boundary.npz"), {"u_boundary": inputs.boundary})
-    if inputs.points:
-        save_arrays(place("inputs/points.npz"), _points_as_arrays(inputs.points))
+    write_points(place, inputs.points)
     channels = {name: channel.one_contrast for name, channel in inputs.channels.items()}
     write_json(place("inputs/matching.json"), inputs.matching.as_json() | {"channels": channels})
     save_mesh(inputs.mesh, place("inputs/mesh.vtu"))
     write_text(place("config.yaml"), inputs.config)
+
+
+def write_points(place: Place, points: Mapping[str, PointPairs]) -> None:
+    """Write inputs/points.npz, if there are any."""
+    if points:
+        save_arrays(place("inputs/points.npz"), _points_as_arrays(points))
 
 
 def read_inputs(folder: str | Path) -> Inputs:

@@ -15,7 +15,7 @@ from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
 from bayesreg.io import checkpoints, store
-from bayesreg.io.ledger import writing
+from bayesreg.io.ledger import drop, writing
 from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import moments_on_grid, warp_image
@@ -23,13 +23,13 @@ from bayesreg.report.metrics import compute_metrics
 from bayesreg.transform import Transform
 from bayesreg.workflow.apply import POINT_DRAWS
 from bayesreg.workflow.assembly import nodal_draws
-from bayesreg.workflow.bids import write_bids
+from bayesreg.workflow.bids import FOLDER, write_bids
 from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
 from bayesreg.workflow.manifest import manifest
 from bayesreg.workflow.prediction import mean_values, predict, with_unresolved
 from bayesreg.workflow.predictive_groups import predictive_groups
 from bayesreg.workflow.result import POSTERIOR, REPORT, Result
-from bayesreg.workflow.transforms import displacement_on, total_displacement, write_transforms
+from bayesreg.workflow.transforms import ENSEMBLE, displacement_on, total_displacement, write_transforms
 
 
 def finish(
@@ -79,6 +79,9 @@ def finish(
         bodies=store.read_bodies(out),
         **inputs._asdict(),
     )
+    # Those of a run that left more of them.
+    for folder in (ENSEMBLE, FOLDER):
+        drop(out, folder)
     with writing(out) as place:
         write_transforms(place, some, grid, field)
         store.write_results(place, finished, mean_field, moments.sd)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -180,11 +180,17 @@ def _points(config: Config) -> dict[str, PointPairs]:
                     f"{section.file} a column sd"
                 )
             found[section.name] = pairs
-    if config.evaluation is not None:
-        held_out = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
-        require_unseen(held_out, {name: (pairs.fixed, pairs.moving) for name, pairs in found.items()})
-        found[NAME] = held_out
-    return found
+    return with_held_out(found, config)
+
+
+def with_held_out(observed: Mapping[str, PointPairs], config: Config) -> dict[str, PointPairs]:
+    """Points that are observed, and those of the section evaluation; InputError where one is both."""
+    found = {name: pairs for name, pairs in observed.items() if name != NAME}
+    if config.evaluation is None:
+        return found
+    held_out = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
+    require_unseen(held_out, {name: (pairs.fixed, pairs.moving) for name, pairs in found.items()})
+    return found | {NAME: held_out}
 
 
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
@@ -215,12 +221,17 @@ def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[I
     if not config.compares_images and not observations:
         require_default_image_options(config.model)
     prepared = prepare(config)
-    if NAME in prepared.inputs.points:
-        given = {one.name: (one.fixed_points, one.moving_points) for one in observations if isinstance(one, Landmarks)}
-        require_unseen(prepared.inputs.points[NAME], given)
+    require_all_unseen(prepared.inputs, observations)
     require_inside(prepared.inputs.mesh, config.report.places)
     appraisal = {} if prepared.appraisal is None else prepared.appraisal.as_json()
     return prepared.inputs, {"timings": prepared.timings, "pair": prepared.pair, "appraisal": appraisal}
+
+
+def require_all_unseen(inputs: Inputs, observations: Sequence[Any]) -> None:
+    """Raise InputError where a landmark that is held out is among observations that no configuration names."""
+    if NAME in inputs.points:
+        given = {one.name: (one.fixed_points, one.moving_points) for one in observations if isinstance(one, Landmarks)}
+        require_unseen(inputs.points[NAME], given)
 
 
 def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:

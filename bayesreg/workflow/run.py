@@ -38,7 +38,14 @@ from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.finish import finish
 from bayesreg.workflow.interruption import ending_between_blocks
-from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs, store_inputs, with_unsampled
+from bayesreg.workflow.preparation import (
+    PROVENANCE,
+    prepared_inputs,
+    require_all_unseen,
+    store_inputs,
+    with_held_out,
+    with_unsampled,
+)
 from bayesreg.workflow.result import REPORT, Result, load_result, report
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
@@ -51,6 +58,9 @@ BEGUN, KEPT, SAMPLED, ENDED = (
     "all draws are judged",
     "the run has ended",
 )
+
+# Sections of the configuration that do not change what is drawn.
+MAY_CHANGE = ("stop", "results", "report", "evaluation")
 
 Reached = tuple[Checkpoint, Blocks]
 
@@ -70,8 +80,9 @@ def run(
     out : path
         The run folder, new or empty; with `resume`, that of a run that was cut off, or of a finished one.
     resume : bool
-        Continue after the last draws that were stored. Where the section `stop` differs from the one that the run was
-        begun with, the new one holds: a finished run is given more draws so.
+        Continue after the last draws that were stored. Where the sections `stop`, `results`, `report` and
+        `evaluation` differ from those that the run was begun with, the new ones hold: a finished run is given more
+        draws so, leaves other files, or is held against landmarks that were found later.
     progress : bool
         Say what is being done, and show a progress bar.
     observations : sequence
@@ -156,7 +167,7 @@ def _resume(
 ) -> Result:
     known = _resumed_config(out, config)
     finished = stage_of(out) == "finished"
-    if finished and known.stop == config.stop:
+    if finished and all(getattr(known, name) == getattr(config, name) for name in MAY_CHANGE):
         say(f"{out} holds a finished run already; another budget (stop) would continue it")
         if not is_sound(out, REPORT):
             report(out)
@@ -171,11 +182,15 @@ def _resume(
     if finished:
         checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
+    if known.evaluation != config.evaluation:
+        inputs = inputs._replace(points=with_held_out(inputs.points, config))
+        require_all_unseen(inputs, observations)
     reached = _load_reached(config, inputs, posterior, out, progress)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
     with writing(out) as place:
         write_text(place("config.yaml"), inputs.config)
+        store.write_points(place, inputs.points)
         store.write_json(place(PROVENANCE), with_unsampled(provenance, began + sampled))
     return _go_on(config, inputs, posterior, reached, provenance, out, began, progress, say)
 
@@ -215,12 +230,13 @@ def _warn(config: Config, result: Result, say: Callable[[str], None]) -> None:
 
 
 def _resumed_config(out: Path, config: Config) -> Config:
-    """The configuration that a run was begun with; InputError if it differs in more than its budget."""
+    """The configuration that a run was begun with; InputError if it differs in more than `MAY_CHANGE`."""
     known = load_config(require_file(out, "config.yaml"))
-    if resolved_yaml(known.model_copy(update={"stop": config.stop})) != resolved_yaml(config):
+    given = {name: getattr(config, name) for name in MAY_CHANGE}
+    if resolved_yaml(known.model_copy(update=given)) != resolved_yaml(config):
         raise InputError(
             f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which "
-            "only the section stop may change, or name another folder"
+            f"only the sections {', '.join(MAY_CHANGE)} may change, or name another folder"
         )
     return known
 
