@@ -181,7 +181,7 @@ start: {field: truth}
         ("[1, 2]", "expected keys with values"),
         ("seed: 1\nseed: 2\n" + SMALL, "line 2: not valid YAML: found duplicate key"),
         ("seed: [1\ndata: 2", "line 2: not valid YAML"),
-        ("seed: !!python/object 1", "not valid YAML"),
+        ("seed: !!python/object 1", "tags such as"),
         ("data: {}", "data.source: missing"),
         ("data: {source: mars}", "data.source = \"mars\": expected one of 'mni152', 'brainweb', 'files'"),
         ("data: 3", "data = 3: expected keys with values"),

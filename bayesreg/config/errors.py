@@ -15,6 +15,9 @@ from bayesreg.types import InputError
 
 Keys = tuple[str | int, ...]
 
+# More are counted, and not told.
+MOST_ERRORS = 100
+
 _KEYS, _NUMBER, _WHOLE, _LIST, _TRUTH = "keys with values", "a number", "a whole number", "a list", "true or false"
 _EXPECTED = {
     "bool_type": _TRUTH,
@@ -50,13 +53,15 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
     origins : dict
         Where each key was written ("run.yaml:3"), by its path.
     """
-    found = [(_path(details, data, model), details) for details in error.errors(include_url=False)]
+    errors = error.errors(include_url=False)
+    found = [(_path(details, data, model), details) for details in errors[:MOST_ERRORS]]
     messages: dict[Keys, list[str]] = {}
     for path, details in found:
         if not any(_explains(*other, path, details["type"]) for other in found):
             messages.setdefault(path, []).append(_message(details, model))
     lines = [f"  {_head(path, data, origins)}: {_join(some)}" for path, some in messages.items()]
-    return "\n".join(lines)
+    more = len({details["loc"] for details in errors}) - MOST_ERRORS
+    return "\n".join([*lines, *([f"  and {more:,} more"] if more > 0 else [])])
 
 
 def _explains(other: Keys, by: ErrorDetails, path: Keys, kind: str) -> bool:

@@ -10,13 +10,13 @@ from typing import Any
 
 from pydantic import ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from bayesreg.config.errors import ConfigError, Keys, explain
 from bayesreg.config.sections import Config
 from bayesreg.config.values import search_folders
+from bayesreg.config.yaml_text import DEEPEST, parse
 from bayesreg.model.options import ModelConfig
 
 # A section of another kind replaces the one that it extends: their keys have nothing in common.
@@ -99,7 +99,7 @@ def resolved_yaml(config: Config) -> str:
 
 def model_of(text: str) -> ModelConfig:
     """The model of a configuration as `resolved_yaml` writes it; the files that it names need not be there any more."""
-    return ModelConfig.model_validate(_parse(text, "config.yaml")[0]["model"])
+    return ModelConfig.model_validate(parse(text, "config.yaml")[0]["model"])
 
 
 def schema() -> dict[str, Any]:
@@ -122,7 +122,9 @@ def _read(path: Path, seen: tuple[Path, ...]) -> _Document:
     path = path.absolute()
     if path in seen:
         raise ConfigError(f"{path} extends itself, by way of {seen[-1]}")
-    data, node = _parse(_text(path), str(path))
+    if len(seen) > DEEPEST:
+        raise ConfigError(f"{seen[0]} extends a file that extends another, and so on, over more than {DEEPEST} files")
+    data, node = parse(_text(path), str(path))
     data = {} if data is None else data
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: expected keys with values, such as 'seed: 1'; got {data!r:.60}")
@@ -146,17 +148,6 @@ def _text(path: Path) -> str:
         raise ConfigError(f"{path} is not UTF-8 text ({error.reason} at byte {error.start})") from None
     except PermissionError:
         raise ConfigError(f"the configuration {path} may not be read; see its permissions") from None
-
-
-def _parse(text: str, name: str) -> tuple[Any, Node | None]:
-    """The content of a YAML text, and its nodes, which know their lines."""
-    try:
-        return YAML(typ="safe", pure=True).load(text), YAML(typ="safe", pure=True).compose(text)
-    except MarkedYAMLError as error:
-        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise ConfigError(f"{name}{line}: not valid YAML: {error.problem}") from None
-    except YAMLError as error:
-        raise ConfigError(f"{name}: not valid YAML: {str(error).splitlines()[0]}") from None
 
 
 def _lines(node: Node, path: Keys = ()) -> Iterator[tuple[Keys, int]]:
@@ -189,8 +180,10 @@ def _override(document: _Document, overrides: Sequence[str]) -> _Document:
         path, equals, value = text.partition("=")
         keys = tuple(path.strip().split("."))
         if not equals or not all(keys):
-            raise ConfigError(f"--set {text}: expected a dotted path and a value, such as sampler.chains=4")
-        data = _with_value(data, keys, _parse(value, f"--set {text}")[0], text)
+            raise ConfigError(f"--set {text:.200}: expected a dotted path and a value, such as sampler.chains=4")
+        if len(keys) > DEEPEST:
+            raise ConfigError(f"--set {text:.200}: a path of more than {DEEPEST} keys")
+        data = _with_value(data, keys, parse(value, f"--set {text}")[0], text)
         origins[tuple(int(key) if key.isdecimal() else key for key in keys)] = f"--set {text}"
     return _Document(data, origins, document.folders)
 

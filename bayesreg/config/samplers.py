@@ -9,11 +9,13 @@ from pydantic import BaseModel, Field, TypeAdapter
 from bayesreg.config.values import Count
 from bayesreg.inference.samplers import settings
 
+Chains = Annotated[int, Field(strict=True, ge=1, le=65_536)]
+
 
 class _Chains(BaseModel):
     """The options that all samplers' sections share."""
 
-    chains: Count = 4
+    chains: Chains = 4
     thin: Count = 1
     """Every how many transitions a draw is kept."""
     block: Count | None = None
@@ -37,7 +39,7 @@ class RandomWalk(settings.RandomWalk, _Thinned):
     """The kernel of the paper, random-walk Metropolis."""
 
     name: Literal["rwmh"]
-    chains: Count = 3
+    chains: Chains = 3
 
 
 class Hmc(settings.Hmc, _Chains):

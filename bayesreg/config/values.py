@@ -30,8 +30,11 @@ def _find(value: object, info: ValidationInfo, serves: Callable[[Path], bool]) -
     folders = (info.context or {}).get("folders", ()) or search_folders()
     places = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
     for place in places:
-        if serves(place):
-            return place
+        try:
+            if serves(place):
+                return place
+        except (OSError, ValueError) as error:
+            raise ValueError(f"no path of a file: {getattr(error, 'strerror', None) or error}") from None
     hint = "" if Path(value).is_absolute() or os.environ.get(DATA_FOLDER) else f" (and {DATA_FOLDER} is not set)"
     raise ValueError(f"no such file; looked for {' and '.join(map(str, places))}{hint}")
 
@@ -86,7 +89,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 Number = Annotated[float, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0)]
 NotNegative = Annotated[float, Field(strict=True, ge=0)]
-Count = Annotated[int, Field(strict=True, ge=1)]
+Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000_000)]
 Label = Annotated[int, Field(strict=True)]
 Labels = Annotated[tuple[Label, ...], BeforeValidator(_as_list), Field(min_length=1)]
 FoundFile = Annotated[Path, BeforeValidator(_find_file)]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gzip
 import logging
 import os
+from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -149,9 +151,22 @@ def _open(path: Path) -> SpatialImage:
         raise InputError(f"image {path} cannot be read: {_first_line(error)}") from error
     if not isinstance(source, SpatialImage) or source.affine is None:
         raise InputError(f"{path} holds no image on a grid, but {type(source).__name__}")
-    if 0 in _shape(source):
+    if min(_shape(source)) < 1:
         raise InputError(f"image {path} cannot be read: its header gives the shape {source.shape}")
+    _require_memory(_shape(source), path)
     return source
+
+
+def _require_memory(shape: Sequence[int], path: Path) -> None:
+    """Raise InputError where a header speaks of more voxels than the machine could hold."""
+    needed = 8 * prod(map(int, shape))
+    held = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 2**36
+    if needed > held:
+        grid = " × ".join(map(str, shape))
+        raise InputError(
+            f"image {path} has a grid of {grid} voxels by its header, which need {needed / 1e9:,.0f} GB; this machine "
+            f"has {held / 1e9:,.0f} GB"
+        )
 
 
 def _shape(source: SpatialImage) -> tuple[int, ...]:
@@ -234,17 +249,23 @@ def _voxels(source: SpatialImage, path: Path) -> np.ndarray:
             data = ArrayProxy(str(path), (shape, data.dtype, max(data.offset, least), data.slope, data.inter))
     try:
         if path.name.lower().endswith(".gz"):
-            _require_whole(path)
+            _require_whole(path, int(data.offset) + prod(shape) * data.dtype.itemsize)
         return np.array(np.asarray(data))
     except Exception as error:  # As above.
         raise InputError(f"image {path}: the file is cut short or damaged ({_first_line(error)})") from error
 
 
-def _require_whole(path: Path) -> None:
-    """Read a compressed file to its end, where its checksum stands; an error of gzip or zlib if it is damaged."""
+def _require_whole(path: Path, expected: int) -> None:
+    """Read a compressed file to its end, where its checksum stands.
+
+    An error of gzip or zlib tells of damage; a ValueError that the file holds much more bytes than expected.
+    """
+    count = 0
     with gzip.open(path) as file:
-        while file.read(2**22):
-            pass
+        while part := file.read(2**22):
+            count += len(part)
+            if count > 1.1 * expected + 2**20:
+                raise ValueError("it holds far more than its header says")
 
 
 def _first_line(error: Exception) -> str:
@@ -253,6 +274,10 @@ def _first_line(error: Exception) -> str:
 
 def _read_by_itk(path: Path) -> Volume:
     try:
+        header = SimpleITK.ImageFileReader()
+        header.SetFileName(str(path))
+        header.ReadImageInformation()
+        _require_memory(header.GetSize(), path)
         image = SimpleITK.ReadImage(str(path))
     except RuntimeError as error:
         raise InputError(

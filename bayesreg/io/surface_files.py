@@ -6,6 +6,8 @@ PyVista takes seconds to import, which nothing else need wait for: hence inside 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -19,6 +21,7 @@ from bayesreg.io.atomic import replacing
 from bayesreg.io.spaces import TO_RAS, Space
 from bayesreg.types import AnyArray, InputError
 
+TRIAL = "import sys, pyvista; pyvista.read(sys.argv[1])"
 SUFFIXES = (".vtk", ".vtp", ".vtu", ".stl", ".ply", ".obj")
 
 
@@ -103,6 +106,7 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
         raise InputError(f"{path}: unknown kind of file with a surface; known are {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file with a surface")
+    _require_harmless(path)
     try:
         with pyvista.VtkErrorCatcher(raise_errors=True, send_to_logging=False):
             surface = pyvista.read(path)
@@ -118,6 +122,16 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
         raise InputError(f"{path} says that its coordinates are {told}, and {space} is given: leave the space out")
     chosen: Space = told or space or "RAS"
     return SurfaceFile(surface, points * TO_RAS[chosen], chosen, (space or told) is not None)
+
+
+def _require_harmless(path: Path) -> None:
+    """Let another process read a file first, and raise InputError where that fails.
+
+    VTK's readers believe what a file says of its own size, and the process dies where that is wrong.
+    """
+    trial = subprocess.run([sys.executable, "-c", TRIAL, str(path.absolute())], capture_output=True, check=False)
+    if trial.returncode:
+        raise InputError(f"{path} cannot be read as a surface: it is damaged, or no {path.suffix} file")
 
 
 def write_surface(

@@ -1,0 +1,99 @@
+"""YAML from anywhere: read within bounds of size, depth and number, and without tags; errors name the line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from bayesreg.config.errors import ConfigError
+
+# A configuration spelled out has some 150 lines, three levels below a list, and a label table a thousand entries.
+# Controls but for tabs and ends of lines, line separators that read back as others, and halves of characters.
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufffe\uffff]")
+
+MOST_CHARACTERS, MOST_ENTRIES, DEEPEST, LONGEST_PLAIN = 1_000_000, 20_000, 20, 4_000
+
+
+def parse(text: str, name: str) -> tuple[Any, Node | None]:
+    """The content of a YAML text, and its nodes, which know their lines.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        Of the text, for messages.
+
+    Raises
+    ------
+    ConfigError
+        If it is no YAML, or too long, too deep or too many.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise ConfigError(f"{name}: {len(text):,} characters are more than the {MOST_CHARACTERS:,} that are read")
+    try:
+        _require_bounds(text, name)
+        node = YAML(typ="safe", pure=True).compose(text)
+        _require_tree(node, name)
+        return YAML(typ="safe", pure=True).load(text), node
+    except MarkedYAMLError as error:
+        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ConfigError(f"{name}{line}: not valid YAML: {error.problem}") from None
+    except ConfigError:
+        raise
+    except Exception as error:
+        # The reader raises what its parts do, such as ValueError for a date like 2026-13-01.
+        first = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"{name}: not valid YAML: {first:.200}") from None
+
+
+def _require_bounds(text: str, name: str) -> None:
+    """Raise ConfigError for what would take the next steps too long, or too deep for them."""
+    depth = entries = 0
+    for event in YAML(typ="safe", pure=True).parse(text):
+        if not isinstance(event, NodeEvent | CollectionEndEvent):
+            continue
+        where = f"{name}, line {event.start_mark.line + 1}"
+        depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+        entries += not isinstance(event, CollectionEndEvent)
+        if depth > DEEPEST:
+            raise ConfigError(f"{where}: more than {DEEPEST} levels, one in another")
+        if entries > MOST_ENTRIES:
+            raise ConfigError(f"{where}: more than {MOST_ENTRIES:,} entries")
+        if isinstance(event, ScalarEvent) and len(event.value) > LONGEST_PLAIN and event.style is None:
+            raise ConfigError(f"{where}: a value of {len(event.value):,} characters; put a text so long in quotes")
+        if isinstance(event, ScalarEvent) and (odd := _UNPRINTABLE.search(event.value)):
+            raise ConfigError(f"{where}: a character that cannot be printed, U+{ord(odd[0]):04X}")
+        tag = event.tag if isinstance(event, ScalarEvent | CollectionStartEvent) else None
+        if tag is not None and str(tag) != "!":
+            raise ConfigError(f"{where}: tags such as {tag} are not read; write the value alone")
+
+
+def _require_tree(node: Node | None, name: str) -> None:
+    """Raise ConfigError where anchors lead round, or make more of a text than it holds."""
+    count = 0
+    # The nodes on the way to each, of which none may come again.
+    waiting: list[tuple[Node, frozenset[int]]] = [] if node is None else [(node, frozenset())]
+    while waiting:
+        one, above = waiting.pop()
+        count += 1
+        if id(one) in above:
+            raise ConfigError(f"{name}, line {one.start_mark.line + 1}: an anchor that holds itself")
+        if count > MOST_ENTRIES:
+            raise ConfigError(f"{name}: aliases make more than {MOST_ENTRIES:,} entries")
+        if isinstance(one, MappingNode) and (odd := [key for key, _ in one.value if not isinstance(key, ScalarNode)]):
+            raise ConfigError(f"{name}, line {odd[0].start_mark.line + 1}: a key that is no text")
+        waiting += [(child, above | {id(one)}) for child in _children(one)]
+
+
+def _children(node: Node) -> Iterator[Node]:
+    if isinstance(node, MappingNode):
+        for pair in node.value:
+            yield from pair
+    elif isinstance(node, SequenceNode):
+        yield from node.value
