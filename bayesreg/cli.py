@@ -286,6 +286,28 @@ def slicer(folder: RunFolder, out: OutFolder) -> None:
 
 
 @app.command()
+def reproduce(folder: RunFolder, out: OutFolder, quiet: Quiet = False) -> None:
+    """Run again what a run's folder holds, and tell whether the draws are the same, bit for bit."""
+    from bayesreg.workflow.reproduce import reproduce
+
+    found = reproduce(folder, out, progress=not quiet, say=(lambda text: None) if quiet else typer.echo)
+    typer.echo("\n".join(found.lines))
+    if not found.same:
+        raise typer.Exit(1)
+
+
+@app.command()
+def serve(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG|DIR", help="Configuration, or the folder of a run.")],
+    port: Annotated[int, typer.Option(help="On loopback.", min=1, max=65_535)] = 4242,
+) -> None:
+    """Offer log posterior, gradient and forward model to clients of UM-Bridge on this machine."""
+    from bayesreg.workflow.serve import serve
+
+    serve(config, port, say=typer.echo)
+
+
+@app.command()
 def report(folder: RunFolder) -> None:
     """Write the report of a run once more."""
     from bayesreg.workflow.result import report

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import meshio
+import netCDF4
 import nibabel as nib
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from bayesreg.workflow import preparation
 from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.check import check
+from bayesreg.workflow.reproduce import reproduce
 from bayesreg.workflow.result import compare, report
 from bayesreg.workflow.simulate import simulate
 from tests.phantoms import ball_mesh
@@ -197,6 +199,26 @@ def test_a_finished_run_leaves_other_files_when_asked(finished, folder):
     assert (folder / "others" / "bids" / "dataset_description.json").exists()
     with pytest.raises(br.InputError, match="only the sections stop, results, report, evaluation may change"):
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "others", resume=True, progress=False)
+
+
+@pytest.mark.usefixtures("no_report")
+def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
+    found = reproduce(folder / "out", folder / "again", progress=False)
+    assert found.same
+    assert found.lines == ["the draws are the same, bit for bit"]
+    shutil.copytree(folder / "out", folder / "doubtful")
+    with ledger.writing(folder / "doubtful") as place:
+        shutil.copy(folder / "out" / "posterior.nc", place("posterior.nc"))
+        with netCDF4.Dataset(place("posterior.nc"), "a") as file:
+            file["posterior/u_boundary"][1, 3, 5, 0] += 1e-3
+        manifest = store.read_json(folder / "out" / "run.json")
+        manifest["versions"]["jax"] = "0.0.1"
+        store.write_json(place("run.json"), manifest)
+    found = reproduce(folder / "doubtful", folder / "once_more", progress=False)
+    assert list(found.apart) == ["u_boundary"]
+    assert found.lines[0] == "the draws are not the same"
+    assert "versions was" in found.lines[-1]
+    assert "0.0.1" in found.lines[-1]
 
 
 def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):

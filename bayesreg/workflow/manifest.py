@@ -77,6 +77,8 @@ def manifest(
         "config_digest": hashlib.sha256(inputs.config.encode()).hexdigest(),
         "devices": [str(device) for device in jax.devices()],
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        "machine": platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "timings": {
             **provenance["timings"],
             "sampling": samples.seconds,

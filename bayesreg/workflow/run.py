@@ -150,7 +150,7 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
     posterior = posterior_of(config, inputs, observations)
     provenance["observations"] = _fingerprint(posterior, observations)
     searching = time.perf_counter()
-    posterior = _temper(config, inputs, posterior, say)
+    posterior = temper(config, inputs, posterior, say)
     provenance["independent_points"] = posterior.independent_points
     reached = _first(config, inputs, posterior, out, progress, time.perf_counter() - searching)
     inputs = with_initial(inputs, config)
@@ -177,7 +177,7 @@ def _resume(
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(out, provenance, posterior, observations)
     # What `simulate` has made is not tempered yet.
-    posterior = _temper(config, inputs, posterior, say)
+    posterior = temper(config, inputs, posterior, say)
     provenance["independent_points"] = posterior.independent_points
     if finished:
         checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
@@ -280,7 +280,7 @@ def _describe_mesh(inputs: Inputs) -> str:
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
 
-def _temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[[str], None]) -> Posterior:
+def temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[[str], None]) -> Posterior:
     """The posterior that the chains are to draw from."""
     if posterior.tempered:
         return posterior

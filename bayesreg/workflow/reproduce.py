@@ -1,0 +1,113 @@
+"""A run once more, from what its folder holds, and whether it comes to the same bits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesreg.config import load_config, resolved_yaml
+from bayesreg.config.sections import Config, StopConfig
+from bayesreg.inference.draws.inference_data import dataset
+from bayesreg.io import store
+from bayesreg.io.ledger import locked, require_file
+from bayesreg.types import InputError
+from bayesreg.workflow.preparation import PROVENANCE, store_inputs
+from bayesreg.workflow.result import Result, load_result
+from bayesreg.workflow.run import run
+
+# What stands in run.json of where a run was made; the same of all of these makes the same bits.
+WHERE = ("versions", "devices", "xla_flags", "machine", "cores")
+GROUPS = ("posterior", "sample_stats")
+
+
+class Comparison(NamedTuple):
+    """How a run and its repetition compare.
+
+    Attributes
+    ----------
+    result : Result
+        The repetition.
+    same : bool
+        Whether all draws have the same bits.
+    apart : dict
+        Variable to the greatest difference of a draw, in units of its standard deviation, where there is one.
+    moved : dict
+        What of `WHERE` is another now: (then, now) by name.
+    """
+
+    result: Result
+    same: bool
+    apart: dict[str, float]
+    moved: dict[str, tuple[Any, Any]]
+
+    @property
+    def lines(self) -> list[str]:
+        """In words."""
+        found = [f"{name} was {then or 'none'}, and is {now or 'none'}" for name, (then, now) in self.moved.items()]
+        if self.same:
+            return ["the draws are the same, bit for bit", *found]
+        told = [f"{name} is up to {distance:.2g} sd apart" for name, distance in self.apart.items()]
+        return ["the draws are not the same", *told, *(found or ["nothing that run.json records tells why"])]
+
+
+def reproduce(
+    folder: str | Path, out: str | Path, progress: bool = True, say: Callable[[str], None] = lambda text: None
+) -> Comparison:
+    """Run again what the folder of a run holds, with its seed and as many draws, and compare.
+
+    Parameters
+    ----------
+    folder : path
+        Of a finished run; the files that it was made of may be gone. Preparation is not repeated: mesh, images and
+        pose are those of the folder.
+    out : path
+        Folder of the repetition, new or empty.
+    progress : bool
+        As in `bayesreg.run`.
+    say : callable
+        Told what is done.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished run, or one that had observations besides those of its configuration.
+    """
+    first, out = load_result(folder), Path(out)
+    provenance = store.read_json(require_file(folder, PROVENANCE))
+    if provenance.get("observations"):
+        raise InputError(
+            f"the run in {folder} had the observations {list(provenance['observations'])} from Python, which its "
+            "folder does not hold"
+        )
+    store.require_fresh(out)
+    config = _as_many(load_config(require_file(folder, "config.yaml")), int(first.run.manifest["steps_per_chain"]))
+    inputs = store.read_inputs(folder)._replace(config=resolved_yaml(config))
+    with locked(out):
+        store_inputs(out, inputs, provenance)
+    say(f"{first.run.manifest['steps_per_chain']:,} steps of {config.sampler.chains} chains, with seed {config.seed}")
+    return _compare(first, run(config, out, resume=True, progress=progress))
+
+
+def _as_many(config: Config, steps: int) -> Config:
+    """The configuration with a budget in steps alone: where a clock ends a run is not repeated."""
+    stop = StopConfig(rhat=None, ess=None, max_steps=steps, max_minutes=None)
+    return config.model_copy(update={"stop": stop})
+
+
+def _compare(first: Result, second: Result) -> Comparison:
+    apart = {}
+    for group in GROUPS:
+        one, other = dataset(first.idata, group), dataset(second.idata, group)
+        for name in one.data_vars:
+            then, now = one[name].to_numpy(), other[name].to_numpy()
+            if then.shape != now.shape:
+                apart[str(name)] = np.inf
+            elif not np.array_equal(then, now, equal_nan=True):
+                then, now = then.astype(float), now.astype(float)
+                apart[str(name)] = float(np.nanmax(np.abs(then - now)) / max(np.nanstd(then), np.finfo(float).tiny))
+    pairs = {name: (first.run.manifest.get(name), second.run.manifest.get(name)) for name in WHERE}
+    moved = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    return Comparison(second, not apart, apart, moved)

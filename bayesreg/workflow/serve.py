@@ -1,0 +1,188 @@
+"""The posterior over HTTP on loopback, for clients of UM-Bridge in any language.
+
+Seelinger et al., "UM-Bridge: Uncertainty quantification and modeling bridge", Journal of Open Source Software 8(83),
+2023. The package umbridge is optional, and imported where it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bayesreg.config import Config, load_config
+from bayesreg.inference.layout import slices, unravel
+from bayesreg.io import store
+from bayesreg.io.ledger import require_file, stage_of
+from bayesreg.model.posterior import Posterior
+from bayesreg.model.problem import Problem
+from bayesreg.model.single_node import images_of
+from bayesreg.types import InputError
+from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs
+from bayesreg.workflow.run import temper
+
+LOOPBACK, PORT = "127.0.0.1", 4242
+# JSON has no infinity: what is outside the support has the least number that it has.
+IMPOSSIBLE = float(np.finfo(float).min)
+
+Vectors = Sequence[Sequence[float]]
+
+
+class Served:
+    """A function of a position as a model of UM-Bridge.
+
+    Parameters
+    ----------
+    name : str
+    function : callable
+        From data and a flat position to the outputs, a list of vectors.
+    data : Problem
+    inputs : sequence of int
+        Sizes of the parts that a position comes in; none of a model that has no input.
+    """
+
+    def __init__(
+        self, name: str, function: Callable[[Any, Any], list[Any]], data: Problem, inputs: Sequence[int]
+    ) -> None:
+        self.name, self.data, self.inputs = name, data, list(inputs)
+        self.outputs = [int(np.prod(one.shape)) for one in jax.eval_shape(function, data, jnp.zeros(sum(inputs)))]
+
+        def pull(data: Any, position: Any, sensitivities: list[Any]) -> Any:
+            return jax.vjp(partial(function, data), position)[1](sensitivities)[0]
+
+        self._value, self._pulled = jax.jit(function), jax.jit(pull)
+
+    def get_input_sizes(self, config: Any = None) -> list[int]:
+        """How long each input is."""
+        return self.inputs
+
+    def get_output_sizes(self, config: Any = None) -> list[int]:
+        """How long each output is."""
+        return self.outputs
+
+    def supports_evaluate(self) -> bool:
+        """Values are given."""
+        return True
+
+    def supports_gradient(self) -> bool:
+        """So are gradients, where there is an input."""
+        return bool(self.inputs)
+
+    def supports_apply_jacobian(self) -> bool:
+        """Not given."""
+        return False
+
+    def supports_apply_hessian(self) -> bool:
+        """Not given."""
+        return False
+
+    def __call__(self, parameters: Vectors, config: Any = None) -> list[list[float]]:
+        """The outputs at a position."""
+        return [_plain(one) for one in self._value(self.data, self._position(parameters))]
+
+    def gradient(
+        self, out_wrt: int, in_wrt: int, parameters: Vectors, sens: Sequence[float], config: Any = None
+    ) -> list[float]:
+        """Sensitivity to an output, as one to an input: sensᵀ ∂output/∂input."""
+        sensitivities = [jnp.zeros(size) for size in self.outputs]
+        sensitivities[out_wrt] = jnp.asarray(sens, float)
+        pulled = self._pulled(self.data, self._position(parameters), sensitivities)
+        first = sum(self.inputs[:in_wrt])
+        return _plain(pulled[first : first + self.inputs[in_wrt]])
+
+    def _position(self, parameters: Vectors) -> Any:
+        return jnp.concatenate([jnp.asarray(part, float) for part in parameters]) if parameters else jnp.zeros(0)
+
+
+def models_of(posterior: Posterior) -> list[Served]:
+    """What is served of a posterior.
+
+    Returns
+    -------
+    list of Served
+        "log_posterior", of a position, whose parts are the inputs: u_boundary and the parameters, mapped to the real
+        line, the logarithm of the Jacobian included. "forward", of the same: the displacement of every node, mm, node
+        by node, and the intensities that the moving image has at the quadrature points, where there are images.
+        "start", of nothing: the parts of the position at rest, to begin from.
+    """
+    back, parts = unravel(posterior), slices(posterior)
+    sizes = [part.stop - part.start for part in parts.values()]
+
+    # Data are handed in: in a closure they would be constants of what is compiled.
+    def log_posterior(data: Any, position: Any) -> list[Any]:
+        return [replace(posterior, data=data).logdensity(back(position))[None]]
+
+    def forward(data: Any, position: Any) -> list[Any]:
+        here = replace(posterior, data=data)
+        estimands, images = here.constrain(back(position)), images_of(data)
+        u = here.evaluate(estimands).u
+        return [u.ravel(), *([] if images is None else [images.predicted(u, here.fill(estimands))])]
+
+    def start(data: Any, _: Any) -> list[Any]:
+        at_rest = posterior.coordinates.unconstrain(data, posterior.estimands(posterior.reference()))
+        return [jnp.ravel(at_rest[name]) for name in parts]
+
+    functions = {"log_posterior": (log_posterior, sizes), "forward": (forward, sizes), "start": (start, [])}
+    return [Served(name, function, posterior.data, inputs) for name, (function, inputs) in functions.items()]
+
+
+def serve(config: str | Path | Config, port: int = PORT, say: Callable[[str], None] = lambda text: None) -> None:
+    """Serve the posterior of a configuration, or of a run's folder, until the process is stopped.
+
+    Parameters
+    ----------
+    config : path or Config
+        A configuration, or the folder of a run, whose inputs are taken.
+    port : int
+        On loopback alone: other machines do not reach it.
+    say : callable
+        Told what is served, and where.
+
+    Raises
+    ------
+    InputError
+        If the configuration or the folder is wrong, the package umbridge is missing, or the port is taken.
+    """
+    try:
+        from umbridge import um
+    except ImportError as error:
+        raise InputError("the package umbridge is missing: pip install 'bayesreg[serve]'") from error
+    posterior = posterior_of_run(config, say)
+    models = models_of(posterior)
+    names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior).items())
+    say(f"inputs: {names}; serving {', '.join(one.name for one in models)} at http://{LOOPBACK}:{port}")
+    # umbridge would listen to every machine.
+    run_app = partial(um.web.run_app, host=LOOPBACK, print=None)
+    try:
+        with mock.patch.object(um.web, "run_app", run_app):
+            um.serve_models(models, port)
+    except OSError as error:
+        raise InputError(f"nothing can be served at port {port}: {error.strerror}; name another one") from error
+
+
+def posterior_of_run(config: str | Path | Config, say: Callable[[str], None]) -> Posterior:
+    """What a run of a configuration would sample, or that of a folder samples."""
+    if not isinstance(config, Config) and Path(config).is_dir():
+        if stage_of(config) is None:
+            raise InputError(f"{config} holds no run of bayesreg, and is no configuration")
+        settings, inputs = load_config(require_file(config, "config.yaml")), store.read_inputs(config)
+        independent = store.read_json(require_file(config, PROVENANCE)).get("independent_points")
+        posterior = posterior_of(settings, inputs, (), independent)
+    else:
+        settings = config if isinstance(config, Config) else load_config(config)
+        inputs, _ = prepared_inputs(settings)
+        posterior = posterior_of(settings, inputs)
+    return temper(settings, inputs, posterior, say)
+
+
+def _plain(values: Any) -> list[float]:
+    found = np.asarray(values, float).ravel()
+    return np.where(np.isneginf(found), IMPOSSIBLE, np.nan_to_num(found)).tolist()
