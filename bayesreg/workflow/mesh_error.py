@@ -10,6 +10,7 @@ from rich.progress import track
 from bayesreg.config import model_of
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io import store
+from bayesreg.io.ledger import locked
 from bayesreg.io.meshing import MeshOptions, build_mesh, load_mesh, save_mesh
 from bayesreg.mesh import TetMesh
 from bayesreg.report.bodies import allowing, enough, mesh_table, sound
@@ -55,9 +56,10 @@ def mesh_error(folder: str | Path, bodies: int = 24, progress: bool = True) -> T
         raise InputError(f"bodies must be at least {least}, got {bodies}")
     found = list(result.run.bodies or [])
     subject = _subject(result)
-    for seed in track(range(len(found), bodies), "bodies", disable=not progress):
-        found.append(register_body(subject, seed)._asdict())
-        store.write_bodies(folder, found)
+    with locked(folder):
+        for seed in track(range(len(found), bodies), "bodies", disable=not progress):
+            found.append(register_body(subject, seed)._asdict())
+            store.write_bodies(folder, found)
     if not enough(found):
         why = next(body["failed"] for body in reversed(found) if body["failed"])
         raise InputError(f"only {len(sound(found))} of {len(found)} bodies are registered, {least} are needed; {why}")

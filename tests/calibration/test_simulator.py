@@ -55,6 +55,7 @@ def test_displacements_have_the_pseudo_inverse_for_covariance():
     require_covariance(draws, expected)
 
 
+@pytest.mark.long
 def test_displacements_by_random_loads_have_the_pseudo_inverse_for_covariance():
     """(K D⁻¹ K)⁺ of the software's own matrices, and the rigid motions."""
     posterior, values = simulator("loads").posterior, {"lam": LAM, "mu": MU, "body_load": 0.03, "surface_load": 0.02}

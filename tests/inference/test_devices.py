@@ -60,6 +60,7 @@ def programs(target, sampler, settings):
     return run_block._cache_size() - before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sampler", ["hmc", "rwmh"])
 def test_the_same_draws_on_two_devices(sampler):
     """To rounding; and the same bits on as many devices."""

@@ -127,6 +127,7 @@ def test_blocks_of_unequal_lengths_come_back_from_the_file(found, tmp_path):
                                   np.concatenate([block["lam"] for block in given], axis=1))  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
     """Keeping, judging and writing ten times the draws, hardly more is held at once: temporaries of one estimand."""

@@ -179,6 +179,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     assert (found.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     post = posterior()

@@ -224,6 +224,7 @@ def test_posterior_file_round_trip(tmp_path):
     np.testing.assert_array_equal(found.constant_data.cells, MESH.cells)
 
 
+@pytest.mark.long
 def test_solves_of_samplers_about_the_mode_are_those_of_their_draws():
     samples = br.sample(posterior(), "mala", chains=2, draws=3, thin=2, progress=False, warm_up=4)
     told = samples.idata.sample_stats.solver_iterations.to_numpy()

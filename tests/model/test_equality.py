@@ -24,6 +24,7 @@ def mode(of):
     return find_mode(of, np.asarray(ravel_pytree(of.unconstrain(of.reference()))[0]))
 
 
+@pytest.mark.long
 def test_what_was_compiled_for_one_finds_the_mode_of_the_other():
     first, second = posterior(seed=1), posterior(seed=3)
     assert first == second

@@ -168,6 +168,7 @@ def test_residuals_tell_of_voxels_alone():
         br.ModelConfig(independent_points="residual")
 
 
+@pytest.mark.long
 def test_draws_are_resumed_with_the_posterior_that_they_are_of():
     post = posterior(independent_points="residual")
     checkpoint = first_checkpoint(post.with_independent_points({"images": 20.0}), "hmc", 2, 0, warm_up=2)

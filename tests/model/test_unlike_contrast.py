@@ -68,6 +68,7 @@ def test_an_inverted_contrast_is_registered_where_squared_differences_fail():
     assert warmth == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_trajectories_agree_with_the_approximation():
     error, away, found = registered("lncc", INVERTED, "hmc", chains=2, draws=60, warm_up=30, block=60)

@@ -37,4 +37,4 @@ def test_the_caption_says_how_much_is_how_uncertain(study):
     caption = maps(View.of(study.run), study.run.predicted).caption
     share = (study.run.predicted.far > 0.05).mean()
     assert f"at {100 * share:.1f} % of the nodes" in caption
-    assert "within 1.25 mm of the mean" in caption
+    assert "within 1.25 mm of its mean place" in caption
