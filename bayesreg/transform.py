@@ -17,6 +17,7 @@ from scipy.stats.qmc import MultivariateNormalQMC
 
 from bayesreg.fem.deformation import Deformer, Displaced
 from bayesreg.fem.location import Location
+from bayesreg.image import slices
 from bayesreg.mesh import TetMesh
 from bayesreg.model.submesh import submesh_variance
 from bayesreg.pose import Pose
@@ -177,10 +178,12 @@ class Transform:
         """The covariance of u between the corners of every tetrahedron."""
         away, cells = self.draws - self.draws.mean(axis=0), self.mesh.cells
         found = np.empty((len(cells), 4, 4, 3, 3))
-        for a, b in combinations_with_replacement(range(4), 2):
-            one, other = (np.moveaxis(away[:, cells[:, corner]], 0, 1) for corner in (a, b))
-            found[:, a, b] = np.swapaxes(one, 1, 2) @ other / max(len(away) - 1, 1)
-            found[:, b, a] = np.swapaxes(found[:, a, b], 1, 2)
+        # A few tetrahedra at a time: all draws of their corners are in memory.
+        for some in slices(len(cells), 500):
+            corners = np.moveaxis(away[:, cells[some]], 0, 2)
+            for a, b in combinations_with_replacement(range(4), 2):
+                found[some, a, b] = np.swapaxes(corners[:, a], 1, 2) @ corners[:, b] / max(len(away) - 1, 1)
+                found[some, b, a] = np.swapaxes(found[some, a, b], 1, 2)
         return found
 
 
