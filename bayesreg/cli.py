@@ -308,6 +308,23 @@ def serve(
 
 
 @app.command()
+def batch(
+    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="Subjects and what they share, a YAML file.")],
+    out: OutFolder,
+    scheduler: Annotated[str | None, typer.Option(metavar="TCP", help="A Dask scheduler that exists, tcp://…")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run all subjects of a cohort, several at a time; those that have ended are left, others go on."""
+    from bayesreg.workflow.batch import batch
+
+    table = batch(cohort, out, scheduler, progress=not quiet)
+    failed = int((table["state"] == "failed").sum())
+    typer.echo(f"{len(table) - failed} of {len(table)} runs have finished: {out / 'cohort.html'}")
+    if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
 def report(folder: RunFolder) -> None:
     """Write the report of a run once more."""
     from bayesreg.workflow.result import report

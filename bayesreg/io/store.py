@@ -49,7 +49,7 @@ Place = Callable[[str], Path]
 
 
 def write_inputs(place: Place, inputs: Inputs) -> None:
-    """Write config.yaml and what is in inputs/, where they have their places."""
+    """Write config.yaml, mesh.vtu and what is in inputs/, where they have their places."""
     every = ("fixed", "moving", "tissue", "skull", "fixed_ignore", "moving_ignore")
     given = {name: image for name in every if (image := getattr(inputs, name)) is not None}
     for name, channel in inputs.channels.items():
@@ -67,6 +67,8 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
     channels = {name: channel.one_contrast for name, channel in inputs.channels.items()}
     write_json(place("inputs/matching.json"), inputs.matching.as_json() | {"channels": channels})
     save_mesh(inputs.mesh, place("inputs/mesh.vtu"))
+    # Where it is looked for, too; results come beside it there.
+    save_mesh(inputs.mesh, place("mesh.vtu"))
     write_text(place("config.yaml"), inputs.config)
 
 

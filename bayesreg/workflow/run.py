@@ -16,6 +16,7 @@ from rich.console import Console
 from bayesreg.config import Config, load_config, resolved_yaml
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.devices import is_first, require_joined, wait
+from bayesreg.inference.chains.progress import Showing
 from bayesreg.inference.chains.run import (
     Samples,
     checkpoint_from_arrays,
@@ -69,7 +70,7 @@ def run(
     config: str | Path | Config,
     out: str | Path,
     resume: bool = False,
-    progress: bool = True,
+    progress: Showing = True,
     observations: Sequence[Any] = (),
 ) -> Result:
     """Run a configuration from end to end.
@@ -83,8 +84,8 @@ def run(
         Continue after the last draws that were stored. Where the sections `stop`, `results`, `report` and
         `evaluation` differ from those that the run was begun with, the new ones hold: a finished run is given more
         draws so, leaves other files, or is held against landmarks that were found later.
-    progress : bool
-        Say what is being done, and show a progress bar.
+    progress : bool or callable
+        Say what is being done, and show a progress bar; or what makes one, as of `bayesreg.sample`.
     observations : sequence
         What was observed besides the two images, such as `bayesreg.Landmarks`; see `bayesreg.build_posterior`. A run
         that began with some is resumed with the same.
@@ -106,7 +107,7 @@ def run(
     return _run(config, Path(out), resume, progress, given)
 
 
-def _run_together(config: Config, out: Path, resume: bool, progress: bool, observations: list[Any]) -> Result:
+def _run_together(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
     """The first of several processes runs, and the others join it as if they resumed what it began.
 
     A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
@@ -129,7 +130,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: bool, obser
     return load_result(out)
 
 
-def _run(config: Config, out: Path, resume: bool, progress: bool, observations: list[Any]) -> Result:
+def _run(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
     began = time.perf_counter()
     say = _narrator(progress)
     if resume and stage_of(out) is not None:
@@ -163,7 +164,12 @@ def _run(config: Config, out: Path, resume: bool, progress: bool, observations: 
 
 
 def _resume(
-    config: Config, out: Path, progress: bool, observations: list[Any], began: float, say: Callable[[str], None]
+    config: Config,
+    out: Path,
+    progress: Showing,
+    observations: list[Any],
+    began: float,
+    say: Callable[[str], None],
 ) -> Result:
     known = _resumed_config(out, config)
     finished = stage_of(out) == "finished"
@@ -203,7 +209,7 @@ def _go_on(
     provenance: dict[str, Any],
     out: Path,
     began: float,
-    progress: bool,
+    progress: Showing,
     say: Callable[[str], None],
 ) -> Result:
     """Sample from where the chains stand, and write the results."""
@@ -270,8 +276,8 @@ def _require_same_observations(out: Path, provenance: dict[str, Any], posterior:
             )
 
 
-def _narrator(progress: bool) -> Callable[[str], None]:
-    console = Console(quiet=not progress, highlight=False)
+def _narrator(progress: Showing) -> Callable[[str], None]:
+    console = Console(quiet=progress is not True, highlight=False)
     return lambda text: console.print(text)
 
 
@@ -293,7 +299,7 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[[
 
 
 def _first(
-    config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool, seconds: float = 0.0
+    config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing, seconds: float = 0.0
 ) -> Reached:
     """The chains before their first step; InputError where one cannot start.
 
@@ -307,7 +313,7 @@ def _first(
     return found, checkpoints.StoredBlocks(out, 0, writes=is_first())
 
 
-def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: bool) -> Reached:
+def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing) -> Reached:
     """The chains as the run that was cut off stored them last."""
     state = checkpoints.load_state(out)
     if state is None:
@@ -326,7 +332,7 @@ def _sample(
     posterior: Posterior,
     reached: Reached,
     out: Path,
-    progress: bool,
+    progress: Showing,
     after_block: Callable[[], None] = lambda: None,
 ) -> Samples:
     def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -24,6 +24,10 @@ class Progress(Protocol):
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
         """Show how far the chains are."""
+
+
+# Whether progress is shown, or what shows it, made of draws, the most seconds and the threshold of R̂.
+Showing = bool | Callable[[int, float | None, float | None], Progress]
 
 
 class NoProgress:

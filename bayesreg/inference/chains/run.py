@@ -16,7 +16,7 @@ from bayesreg.inference.chains.block import run_block, watched_values
 from bayesreg.inference.chains.checkpoint import Checkpoint, Tally, no_steps
 from bayesreg.inference.chains.devices import devices_for, from_first, gather, is_first, on_host, share
 from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
-from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress
+from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress, Showing
 from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, out_of_time, reason
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_inference_data
@@ -81,7 +81,7 @@ def sample(
     block: int = 50,
     start: Start | None = None,
     stop: StopRule | None = None,
-    progress: bool = True,
+    progress: Showing = True,
     resume: tuple[Checkpoint, Blocks] | None = None,
     on_block: Callable[[int, Block, Checkpoint], None] | None = None,
     **settings: Any,
@@ -106,8 +106,9 @@ def sample(
     start : Start, optional
         The default starts all chains at rest, the parameters spread by 10 %.
     stop : StopRule, optional
-    progress : bool
-        Show a progress bar.
+    progress : bool or callable
+        Show a progress bar; or what makes another one of draws, seconds and R̂ that are asked for, such as
+        `bayesreg.inference.chains.progress.SamplingProgress`.
     resume : (Checkpoint, Blocks), optional
         Continue from there instead of from `start`; every new block is appended.
     on_block : callable, optional
@@ -143,7 +144,8 @@ def sample(
     else:
         checkpoint, blocks = resume
         _require_continuation(chosen, checkpoint, blocks)
-    with (SamplingProgress if progress else NoProgress)(draws, stop.max_seconds, stop.rhat) as bar:
+    shown = progress if callable(progress) else SamplingProgress if progress else NoProgress
+    with shown(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
         verdict, ended = _judge(stop, checkpoint, blocks, bar)
         while not ended and (found := next(advance, None)) is not None:

@@ -1,0 +1,80 @@
+"""A cohort's table, and a page with all runs: what came of each, and how stiff tissues are in all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bayesreg.io.atomic import replacing, write_text
+from bayesreg.report import style
+from bayesreg.report.html import render
+from bayesreg.report.style import Drawing
+from bayesreg.report.verdict import fixed, number
+
+TABLE, PARQUET, PAGE = "cohort.csv", "cohort.parquet", "cohort.html"
+# More runs than these are drawn without their names.
+MOST_NAMED = 60
+
+
+def write_cohort(table: pd.DataFrame, out: Path) -> None:
+    """Write cohort.csv, cohort.parquet and cohort.html into a folder.
+
+    Parameters
+    ----------
+    table : DataFrame
+        As `bayesreg.workflow.batch.batch` makes it.
+    out : Path
+    """
+    write_text(out / TABLE, table.to_csv(index=False))
+    with replacing(out / PARQUET) as temporary:
+        # Settings of a sweep may be of several kinds.
+        mixed = {name: table[name].astype(str) for name in table if table[name].dtype == object}
+        table.assign(**mixed).to_parquet(temporary)
+    failed = table[table["state"] == "failed"]
+    finished = table[table["state"] == "finished"]
+    converged = int((finished["converged"] == True).sum()) if len(finished) else 0  # noqa: E712 - None is not False
+    headline = f"{len(finished)} of {len(table)} runs have finished, {converged} converged; {len(failed)} failed."
+    header = ["", "R̂", "least ESS", "mean, mm", "greatest, mm", "radius, mm", "minutes"]
+    columns = ("rhat_max", "ess_min", "shift_mean_mm", "shift_max_mm", "radius95_mean_mm", "minutes")
+    rows = [
+        {"name": name, "link": f"{name}/report.html", "cells": [_text(row.get(column)) for column in columns]}
+        for name, row in zip(finished["folder"], finished.to_dict("records"), strict=True)
+    ]
+    failures = [{"name": row["folder"], "message": row.get("message", "")} for row in failed.to_dict("records")]
+    content = {
+        "title": out.name,
+        "sound": not len(failed) and converged == len(table),
+        "headline": headline,
+        "failures": failures,
+        "header": header,
+        "rows": rows,
+        "drawing": _stiffness(finished) if rows else None,
+    }
+    write_text(out / PAGE, render("cohort.html", content))
+
+
+def _text(value: Any) -> str:
+    known = value is not None and np.isfinite(value)
+    return (fixed(value) if abs(value) < 1000 else number(value)) if known else number(None)
+
+
+def _stiffness(finished: pd.DataFrame) -> Drawing:
+    """λ and μ of every tissue, a line for each run."""
+    names = [name.removesuffix("_low") for name in finished if str(name).endswith("_low")]
+    named = len(finished) <= MOST_NAMED
+    with style.look():
+        figure = style.new_figure(0.8 + 0.16 * min(len(finished), 4 * MOST_NAMED))
+        axes = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
+        place = np.arange(len(finished))[::-1]
+        for panel, name in zip(axes, names, strict=True):
+            low, middle, high = (finished[f"{name}{end}"].to_numpy(float) for end in ("_low", "", "_high"))
+            panel.hlines(place, low, high, color=style.ACCENT, lw=1.0)
+            panel.plot(middle, place, "o", ms=3, color=style.ACCENT)
+            panel.set(title=name.replace("_", " ").replace("lam", "λ").replace("mu", "μ"), xscale="log")
+        axes[0].set_yticks(place if named else [], finished["folder"] if named else [])
+        uri = style.data_uri(figure)
+    caption = "Median and 95 % interval of λ and μ by tissue, relative; a line for each run, in the order of the table."
+    return Drawing("stiffness", "λ and μ", caption, f"Stiffness of {len(finished)} runs.", uri)

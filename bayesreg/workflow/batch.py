@@ -1,0 +1,247 @@
+"""Many subjects in one command, on workers of Dask: one task, one run folder."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from bayesreg.config import load_config
+from bayesreg.config.cohort import ClusterConfig, Cohort, Task, load_cohort
+from bayesreg.inference.chains.progress import NoProgress
+from bayesreg.inference.draws.inference_data import dataset
+from bayesreg.inference.draws.moments import greatest_rhat
+from bayesreg.io.ledger import stage_of
+from bayesreg.types import InputError
+from bayesreg.workflow.result import Result
+from bayesreg.workflow.run import run
+
+TOPIC = "bayesreg"
+# Workers that may die under one subject before it is given up.
+DEATHS = 5
+# How long a scheduler is waited for.
+PATIENCE = "20s"
+
+
+def batch(
+    cohort: str | Path,
+    out: str | Path,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> pd.DataFrame:
+    """Run all subjects of a cohort; those that have ended are left as they are, others go on where they stand.
+
+    Parameters
+    ----------
+    cohort : path
+        Of its file (`bayesreg.config.cohort.CohortConfig`).
+    out : path
+        A folder. Each run has its own within, named after the subject and its settings; all workers must see it.
+    scheduler : str, optional
+        Address of a Dask scheduler that exists, such as tcp://host:8786; else workers are started as the section
+        cluster says.
+    progress : bool
+        Show how far the subjects are.
+
+    Returns
+    -------
+    DataFrame
+        A row for each run: its state ("finished" or "failed", with a message), convergence, displacement, uncertainty
+        and stiffness by tissue. Written as cohort.csv and cohort.parquet, and as a page, cohort.html.
+
+    Raises
+    ------
+    InputError
+        If the cohort's file is wrong, the packages of the extra "batch" are missing, or no scheduler answers.
+    """
+    from bayesreg.report.cohort import write_cohort
+
+    given, out = load_cohort(cohort), Path(out).absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    rows: dict[str, dict[str, Any]] = {}
+    # Workers of this machine alone share its cores.
+    shares = given.cluster.workers if scheduler is None and given.cluster.slurm is None else None
+    with _client(given.cluster, scheduler) as client, _Board(given, progress) as board:
+        client.subscribe_topic(TOPIC, board.show)
+        for task, found in _submit(client, given, out, shares):
+            rows[task.name] = {"subject": task.subject, **task.settings, "folder": task.name, **found}
+            board.end(task, found)
+    table = pd.DataFrame([rows[task.name] for task in given.tasks])
+    write_cohort(table, out)
+    return table
+
+
+def run_task(config: str, task: Task, folder: str, cores: int | None) -> dict[str, Any]:
+    """Run one task in a worker, and tell what came of it; no error leaves it but that of a process that ends."""
+    if cores is not None:
+        _take_share(cores)
+    try:
+        settings = load_config(config, task.overrides)
+        result = run(settings, folder, resume=True, progress=lambda *budget: _Reporter(task.name, *budget))
+        return {"state": "finished", **summarise(result)}
+    except InputError as error:
+        return {"state": "failed", "message": str(error)}
+    except Exception as error:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        (Path(folder) / "failed.txt").write_text(traceback.format_exc(), encoding="utf-8")
+        return {"state": "failed", "message": f"{type(error).__name__}: {error} (see failed.txt in its folder)"}
+
+
+def summarise(result: Result) -> dict[str, Any]:
+    """What a cohort's table tells of a run; stiffness as median and 95 % interval, displacement and radius in mm."""
+    manifest, mesh = result.run.manifest, result.mesh
+    share = mesh.nodal_volumes / mesh.nodal_volumes.sum()
+    length = np.linalg.norm(result.u_mean, axis=1)
+    found = {
+        "converged": result.converged,
+        "rhat_max": manifest["convergence"]["rhat_max"],
+        "ess_min": manifest["convergence"]["ess_bulk_min"],
+        "shift_mean_mm": float(share @ length),
+        "shift_max_mm": float(length.max()),
+        "minutes": manifest["timings"]["total"] / 60,
+    }
+    if result.run.predicted is not None:
+        found["radius95_mean_mm"] = float(share @ np.asarray(result.run.predicted.reach))
+    posterior = dataset(result.idata, "posterior")
+    for name in ("lam", "mu"):
+        for tissue in posterior["tissue"].to_numpy():
+            low, median, high = np.quantile(posterior[name].sel(tissue=tissue), [0.025, 0.5, 0.975])
+            found |= {f"{name}_{tissue}": median, f"{name}_{tissue}_low": low, f"{name}_{tissue}_high": high}
+    return found
+
+
+class _Reporter(NoProgress):
+    """Tells the scheduler how far a run is."""
+
+    def __init__(self, name: str, draws: int, max_seconds: float | None, threshold: float | None) -> None:
+        self.name, self.draws, self.max_seconds = name, draws, max_seconds
+
+    def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
+        """Draws, the greatest R̂, and the share of the budget that is spent."""
+        from distributed import get_worker
+
+        draws, seconds = int(checkpoint.draws), float(checkpoint.seconds)
+        spent = max(draws / self.draws, seconds / self.max_seconds if self.max_seconds else 0.0)
+        left = seconds * (1 - spent) / spent / 60 if spent else None
+        worst = float(greatest_rhat(rhat["estimands"])) if draws else None
+        get_worker().log_event(TOPIC, {"name": self.name, "spent": spent, "rhat": worst, "minutes": left})
+
+
+def _take_share(count: int) -> None:
+    """Keep to a fair share of the cores, before JAX counts them."""
+    from distributed import get_worker
+
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    name = get_worker().name
+    cores = sorted(_CORES)
+    number = int(name) if str(name).isdecimal() else 0
+    os.sched_setaffinity(0, set(cores[number % count :: count]) or set(cores))
+
+
+# Those of the process before it took a share.
+_CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+
+
+def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Iterator[tuple[Task, dict[str, Any]]]:
+    """Tasks with what came of them, as they end; those that were begun first come first."""
+    from distributed import as_completed
+
+    begun = sorted(cohort.tasks, key=lambda task: stage_of_or_none(out / task.name) != "prepared")
+    config, futures = str(cohort.config), {}
+    for task in begun:
+        future = client.submit(run_task, config, task, str(out / task.name), shares, key=f"run-{task.name}")
+        futures[future] = task
+    for future in as_completed(futures):
+        task = futures.pop(future)
+        try:
+            found = future.result()
+        except Exception as error:
+            # Workers have died under it again and again, or could not be reached.
+            found = {"state": "failed", "message": f"{type(error).__name__}: {error}"}
+        # What is known here is not done again where the worker that did it dies.
+        future.release()
+        yield task, found
+
+
+def stage_of_or_none(folder: Path) -> str | None:
+    """The stage of a run; None where there is none, or its status is damaged, which the run itself tells of."""
+    try:
+        return stage_of(folder)
+    except InputError:
+        return None
+
+
+@contextmanager
+def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
+    """A client of the workers: those of a scheduler that exists, of SLURM, or processes of this machine."""
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise InputError("batches need Dask: pip install 'bayesreg[batch]'") from error
+    dask.config.set({"distributed.scheduler.allowed-failures": DEATHS})
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=PATIENCE)
+        except (OSError, ValueError) as error:
+            raise InputError(f"no Dask scheduler answers at {scheduler}: {error}") from error
+        with client:
+            yield client
+        return
+    if cluster.slurm is not None:
+        from dask_jobqueue import SLURMCluster
+
+        workers: Any = SLURMCluster(**cluster.slurm)
+        workers.scale(cluster.workers)
+    else:
+        # A run needs what it needs: no worker is ended for its memory.
+        own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
+        workers = LocalCluster(n_workers=cluster.workers, **own)
+    with workers, Client(workers) as client:
+        yield client
+
+
+class _Board:
+    """What is shown while a cohort runs: how many have ended, and a line for each that has not."""
+
+    def __init__(self, cohort: Cohort, shown: bool) -> None:
+        self._bar = Progress(
+            TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(),
+            TextColumn("{task.fields[figures]}"), TimeElapsedColumn(), disable=not shown,
+        )  # fmt: skip
+        self._all = self._bar.add_task("runs", total=len(cohort.tasks), figures="")
+        self._lines: dict[str, Any] = {}
+        self._failed = 0
+
+    def __enter__(self) -> _Board:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def show(self, event: tuple[float, dict[str, Any]]) -> None:
+        """Show how far a run is."""
+        _, said = event
+        if said["name"] not in self._lines:
+            self._lines[said["name"]] = self._bar.add_task(said["name"], total=100, figures="")
+        rhat = "" if said["rhat"] is None else f"R̂ {said['rhat']:.2f}"
+        left = "" if said["minutes"] is None else f"  {said['minutes']:.1f} min to the budget"
+        self._bar.update(self._lines[said["name"]], completed=round(100 * min(said["spent"], 1)), figures=rhat + left)
+
+    def end(self, task: Task, found: dict[str, Any]) -> None:
+        """Count a run that has ended, and say what is wrong with one that failed."""
+        if (line := self._lines.pop(task.name, None)) is not None:
+            self._bar.remove_task(line)
+        if found["state"] == "failed":
+            self._failed += 1
+            self._bar.console.print(f"{task.name} failed: {found['message']}", highlight=False)
+        self._bar.update(self._all, advance=1, figures=f"{self._failed} failed" if self._failed else "")
