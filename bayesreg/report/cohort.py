@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 
 from bayesreg.io.atomic import replacing, write_text
 from bayesreg.report import style
@@ -17,6 +18,8 @@ from bayesreg.report.verdict import fixed, number
 TABLE, PARQUET, PAGE = "cohort.csv", "cohort.parquet", "cohort.html"
 # More runs than these are drawn without their names.
 MOST_NAMED = 60
+# Where values are further apart than this their axis is logarithmic.
+DECADES = 30
 
 
 def write_cohort(table: pd.DataFrame, out: Path) -> None:
@@ -73,7 +76,11 @@ def _stiffness(finished: pd.DataFrame) -> Drawing:
             low, middle, high = (finished[f"{name}{end}"].to_numpy(float) for end in ("_low", "", "_high"))
             panel.hlines(place, low, high, color=style.ACCENT, lw=1.0)
             panel.plot(middle, place, "o", ms=3, color=style.ACCENT)
-            panel.set(title=name.replace("_", " ").replace("lam", "λ").replace("mu", "μ"), xscale="log")
+            panel.set(title=name.replace("_", " ").replace("lam", "λ").replace("mu", "μ"))
+            if high.max() > DECADES * low.min() > 0:
+                panel.set_xscale("log")
+            else:
+                panel.xaxis.set_major_locator(MaxNLocator(3))
         axes[0].set_yticks(place if named else [], finished["folder"] if named else [])
         uri = style.data_uri(figure)
     caption = "Median and 95 % interval of λ and μ by tissue, relative; a line for each run, in the order of the table."
