@@ -121,7 +121,7 @@ def test_exact_draws_stay_exact(name):
     assert least_p(moved) > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", STEPS)
 def test_a_wrong_sign_in_the_acceptance_is_found(name, monkeypatch):
     """exp(−Δ) for exp(Δ) where BlackJAX accepts, or where a move of a single node is. Such moves mend others."""

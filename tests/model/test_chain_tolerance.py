@@ -7,6 +7,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
@@ -65,6 +66,7 @@ def with_tolerances(data, solve, slope):
     return data._replace(body=data.body._replace(system=system._replace(**tolerances)))
 
 
+@pytest.mark.long
 def test_solves_a_hundred_times_as_exact_give_the_same_draws():
     conditioned, draws = chains()
     found, rate = draws(conditioned)

@@ -97,7 +97,7 @@ def grid_posterior():
     return [(axis, weights / weights.sum()) for axis, weights in ((lam, mass.sum(axis=1)), (mu, mass.sum(axis=0)))]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_draws_follow_the_posterior_on_a_grid():
     draws = br.sample(posterior(), "hmc", chains=4, draws=300, seed=0, warm_up=40, block=300, progress=False)
     found = convergence(draws.idata)

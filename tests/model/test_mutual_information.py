@@ -77,6 +77,7 @@ def test_the_gradient_is_that_of_differences():
     assert_gradient(post.logdensity, post.initial(jax.random.key(0)))
 
 
+@pytest.mark.long
 def test_the_mode_of_a_pair_of_unlike_contrast_is_as_near_as_that_of_one_contrast():
     assert error_of(moved(other_contrast), one_contrast=False, similarity="mi") < 0.4
 
