@@ -28,9 +28,11 @@ def test_time_left_tells_both():
     assert time_left(-1.0, 5.0) == "0.0 min to the budget"
 
 
-def test_arviz_is_imported_without_its_announcement(tmp_path):
-    """It makes the announcement once a day: with a new cache it has not been made yet."""
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+@pytest.mark.parametrize("cache", ["new", "a file/in its place"])
+def test_arviz_is_imported_without_its_announcement(tmp_path, cache):
+    """It makes the announcement once a day: with a new cache it has not been made yet, and one may not be writable."""
+    (tmp_path / "a file").touch()
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / cache)}
     program = "from bayesreg.inference.draws.inference_data import arviz; arviz()"
     done = subprocess.run(
         [sys.executable, "-W", "always::FutureWarning", "-c", program],

@@ -7,11 +7,14 @@ wait for: hence inside the functions.
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
 import netCDF4
 import numpy as np
@@ -99,10 +102,16 @@ def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
 
 
 def arviz() -> Any:
-    """ArviZ, without its announcement of version 1, which is written for those who call it themselves."""
-    with warnings.catch_warnings():
+    """ArviZ, without its announcement of version 1, which is written for those who call it themselves.
+
+    That it was shown ArviZ notes in the user's cache, and cannot be imported where that is full or read-only.
+    """
+    if "arviz" in sys.modules:
+        return sys.modules["arviz"]
+    with warnings.catch_warnings(), TemporaryDirectory() as folder:
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-        import arviz
+        with mock.patch("platformdirs.user_cache_dir", return_value=folder):
+            import arviz
 
     return arviz
 
