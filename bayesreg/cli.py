@@ -12,7 +12,7 @@ from bayesreg.compilation import compile_quickly, keep_compiled_programs
 from bayesreg.label_tables import TABLES
 
 NOT_CONVERGED = 3
-STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
 
 
 class _Commands(TyperGroup):

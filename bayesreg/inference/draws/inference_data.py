@@ -7,9 +7,12 @@ wait for: hence inside the functions.
 
 from __future__ import annotations
 
+import errno
+import shutil
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -130,13 +133,26 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
-        _begin(to_inference_data(target, [blocks[0]]), partial)
-        with netCDF4.Dataset(partial, "a") as file:
-            for index in range(1, len(blocks)):
-                _extend(file, to_inference_data(target, [blocks[index]]))
+        with _storing(path):
+            _begin(to_inference_data(target, [blocks[0]]), partial)
+            with netCDF4.Dataset(partial, "a") as file:
+                for index in range(1, len(blocks)):
+                    _extend(file, to_inference_data(target, [blocks[index]]))
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def _storing(path: Path) -> Iterator[None]:
+    """Raise OSError where NetCDF cannot write, which says so by a RuntimeError, and not why."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "NetCDF" not in str(error):
+            raise
+        full = shutil.disk_usage(path.parent).free < 2**20
+        raise OSError(errno.ENOSPC if full else errno.EIO, f"cannot be written ({error})", str(path)) from error
 
 
 def _begin(idata: Any, path: Path) -> None:
@@ -176,7 +192,8 @@ def append_groups(path: str | Path, groups: Mapping[str, xr.Dataset]) -> None:
     """Add groups, such as `log_likelihood`, to a file of `save_posterior`, those of the same names being replaced."""
     for name, data in groups.items():
         encoding = {variable: {"zlib": True, "complevel": 1} for variable in data.data_vars}
-        data.to_netcdf(path, mode="a", group=name, engine="netcdf4", encoding=encoding)
+        with _storing(Path(path)):
+            data.to_netcdf(path, mode="a", group=name, engine="netcdf4", encoding=encoding)
 
 
 def _groups(idata: Any) -> list[str]:
