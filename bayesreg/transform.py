@@ -209,7 +209,7 @@ class Spread(NamedTuple):
     inside: Bool[np.ndarray, "k"]
 
     def part(self, chosen: Bool[np.ndarray, "k"]) -> Spread:
-        """The same of some of the points."""
+        """Take some of the points."""
         return Spread(self.places[chosen], self.covariance[chosen], self.far[:, chosen], self.inside[chosen])
 
     def ellipsoids(self, probability: float = 0.95) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:

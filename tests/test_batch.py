@@ -39,8 +39,8 @@ def test_a_table_times_a_sweep(write, tmp_path):
         f"{subject}/sampler.name-hmc_seed-{seed}" for subject in ("anna", "bea") for seed in (1, 2)
     ]
     fixed = f"data.fixed={tmp_path / 'a' / 't1.nii.gz'}"
-    assert found.tasks[0].overrides == (fixed, "model.preset=paper", "sampler.name=hmc", "seed=1")
-    assert found.tasks[3].overrides == (fixed, "sampler.name=hmc", "seed=2")
+    assert found.tasks[0].overrides == (fixed, "model.preset=paper", 'sampler.name="hmc"', "seed=1")
+    assert found.tasks[3].overrides == (fixed, 'sampler.name="hmc"', "seed=2")
     assert found.tasks[3].settings == {"seed": 2, "sampler.name": "hmc"}
 
 

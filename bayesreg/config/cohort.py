@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator, Mapping
 from itertools import product
@@ -22,7 +23,7 @@ _NAME = re.compile(r"[A-Za-z0-9._-]+")
 
 
 class ClusterConfig(Section):
-    """Who does the work."""
+    """The workers that share the runs among them."""
 
     workers: Count = 1
     """How many subjects at a time, each in a process of its own, which a fair share of the cores is for."""
@@ -159,12 +160,13 @@ def _tasks(subject: str, given: Mapping[str, str], sweep: Mapping[str, list[Any]
     for values in product(*sweep.values()):
         settings = dict(zip(sweep, values, strict=True))
         parts = [re.sub(r"[^A-Za-z0-9._-]+", "-", f"{key}-{value}") for key, value in settings.items()]
-        overrides = [f"{key}={_quoted(value)}" for key, value in (*given.items(), *settings.items())]
-        yield Task("/".join([subject, *(["_".join(parts)] if parts else [])]), subject, settings, tuple(overrides))
+        # JSON is YAML: a value of the sweep comes back as what it was. A cell of a table is read as YAML.
+        values_of = {**{key: _quoted(cell) for key, cell in given.items()},
+                     **{key: json.dumps(value, default=str) for key, value in settings.items()}}  # fmt: skip
+        overrides = tuple(f"{key}={value}" for key, value in values_of.items())
+        yield Task("/".join([subject, *(["_".join(parts)] if parts else [])]), subject, settings, overrides)
 
 
-def _quoted(value: Any) -> str:
-    """A value as YAML reads it back."""
-    if not isinstance(value, str):
-        return repr(value) if isinstance(value, dict | list) else str(value).lower() if value is None else f"{value}"
-    return value if re.fullmatch(r"[\w./+\-]+", value) else "'" + value.replace("'", "''") + "'"
+def _quoted(cell: str) -> str:
+    """A cell in quotes, where YAML would take a part of it for something else."""
+    return cell if re.fullmatch(r"[\w./+\-]+", cell) else "'" + cell.replace("'", "''") + "'"

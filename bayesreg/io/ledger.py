@@ -158,7 +158,7 @@ def _replace(folder: Path, temporaries: Mapping[str, Path], stage: Stage | None)
 
 
 def _standing(folder: Path, name: str, digests: tuple[str, ...]) -> tuple[str, ...]:
-    """Which of the contents that were announced there is."""
+    """Tell which of the contents that were announced stands there."""
     if len(digests) == 1:
         return digests
     found = digest_of(folder / name)

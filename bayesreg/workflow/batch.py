@@ -1,4 +1,7 @@
-"""Many subjects in one command, on workers of Dask: one task, one run folder."""
+"""Many subjects in one command, on workers of Dask: one task, one run folder.
+
+Dask is optional, and imported where it is used.
+"""
 
 from __future__ import annotations
 
@@ -89,6 +92,7 @@ def run_task(config: str, task: Task, folder: str, cores: int | None) -> dict[st
     except InputError as error:
         return {"state": "failed", "message": str(error)}
     except Exception as error:
+        # Whatever it is that ends one subject, it must not end the others.
         Path(folder).mkdir(parents=True, exist_ok=True)
         (Path(folder) / "failed.txt").write_text(traceback.format_exc(), encoding="utf-8")
         return {"state": "failed", "message": f"{type(error).__name__}: {error} (see failed.txt in its folder)"}
@@ -154,7 +158,7 @@ def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Itera
     """Tasks with what came of them, as they end; those that were begun first come first."""
     from distributed import as_completed
 
-    begun = sorted(cohort.tasks, key=lambda task: stage_of_or_none(out / task.name) != "prepared")
+    begun = sorted(cohort.tasks, key=lambda task: _stage_of(out / task.name) != "prepared")
     config, futures = str(cohort.config), {}
     for task in begun:
         future = client.submit(run_task, config, task, str(out / task.name), shares, key=f"run-{task.name}")
@@ -171,7 +175,7 @@ def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Itera
         yield task, found
 
 
-def stage_of_or_none(folder: Path) -> str | None:
+def _stage_of(folder: Path) -> str | None:
     """The stage of a run; None where there is none, or its status is damaged, which the run itself tells of."""
     try:
         return stage_of(folder)

@@ -25,7 +25,7 @@ class Interrupted(KeyboardInterrupt):
 
     @property
     def status(self) -> int:
-        """Of the program: 128 and the signal's number, as shells have it."""
+        """The status that the program ends with: 128 and the signal's number, as shells have it."""
         return 128 + self.number
 
 

@@ -104,7 +104,7 @@ def _observe(term: ComparedImages | ComparedPoints, state: State, key: AnyArray)
 
 
 def _log_likelihood(posterior: Posterior, draws: xr.Dataset) -> Variables:
-    """Of every landmark by every draw."""
+    """The log likelihood of every landmark by every draw."""
     names = [name for name, term in posterior.data.terms.items() if isinstance(term, ComparedPoints)]
     if not names:
         return {}
