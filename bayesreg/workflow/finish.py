@@ -12,7 +12,6 @@ from bayesreg.config import Config
 from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.inference.chains.run import Samples
-from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
 from bayesreg.io import checkpoints, store
 from bayesreg.io.ledger import drop, writing
@@ -45,7 +44,7 @@ def finish(
     from bayesreg.report.html import write_report
 
     idata = _store_draws(posterior, samples, out, config.seed)
-    draws, judged = dataset(idata, "posterior"), convergence(idata)
+    draws, judged = dataset(idata, "posterior"), samples.convergence
     grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
     metrics = None
     if inputs.truth is not None:
@@ -69,7 +68,7 @@ def finish(
     field = displacement_on(some.mean, grid).field
     mean_field = total_displacement(pose, grid.grid_points(), field)
     finished = Run(
-        manifest=manifest(config, inputs, posterior, samples, mean, judged, provenance, began)
+        manifest=manifest(config, inputs, posterior, samples, many.draws, mean, judged, provenance, began)
         | {"displacement_sd": moments.rms_sd},
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,

@@ -13,13 +13,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy import stats
 
 from bayesreg import __version__
 from bayesreg.config import Config
 from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.run import Samples
-from bayesreg.inference.draws.blocks import Blocks
 from bayesreg.inference.draws.diagnostics import Convergence
 from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.inference.target import clearance
@@ -41,6 +41,7 @@ def manifest(
     inputs: Inputs,
     posterior: Posterior,
     samples: Samples,
+    draws: Float[np.ndarray, "draws nodes 3"],
     mean: Values,
     judged: Convergence,
     provenance: dict[str, Any],
@@ -54,6 +55,8 @@ def manifest(
     inputs : Inputs
     posterior : Posterior
     samples : Samples
+    draws : (d, n, 3) array
+        Some draws of the displacement of every node, mm.
     mean : mapping
         Values of all blocks at the mean of the draws.
     judged : Convergence
@@ -106,7 +109,7 @@ def manifest(
         "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
         "contact_nodes": _contact_nodes(inputs, posterior, samples),
         "inverted_elements": _inverted_elements(posterior, samples),
-        "inverted_share_of_draws": inverted_share(posterior.mesh, samples.blocks),
+        "inverted_share_of_draws": inverted_share(posterior.mesh, draws),
         "solver": {
             "failed": int(tally.solver_failed.sum()),
             "iterations_mean": float(tally.solver_iterations.sum()) / steps,
@@ -181,15 +184,9 @@ def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
     return int((signed_volumes(mesh.points + samples.u_mean, mesh.cells) <= 0).sum())
 
 
-def inverted_share(mesh: TetMesh, blocks: Blocks) -> float | None:
-    """The share of tetrahedra that are inside out, over all draws; None where not every node is sampled."""
-    shares = []
-    for block in blocks:
-        if block["u_boundary"].shape[2] < len(mesh.points):
-            return None
-        draws = block["u_boundary"].reshape(-1, *mesh.points.shape)
-        shares += [float((signed_volumes(mesh.points + u, mesh.cells) <= 0).mean()) for u in draws]
-    return float(np.mean(shares))
+def inverted_share(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> float:
+    """The share of tetrahedra that are inside out, over draws of the displacement of every node, mm."""
+    return float(np.mean([(signed_volumes(mesh.points + u, mesh.cells) <= 0).mean() for u in draws]))
 
 
 def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:

@@ -47,7 +47,7 @@ class Coordinates:
 
 
 class Variables:
-    dims: ClassVar = {"u_boundary": ("node", "axis")}
+    dims: ClassVar = {"u_boundary": ("node", "axis"), "lam": ("tissue",), "mu": ("tissue",)}
     coords: ClassVar = {"node": np.arange(NODES), "axis": list("xyz"), "tissue": ["tissue"]}
     constants: ClassVar = {}
     attributes: ClassVar = {}

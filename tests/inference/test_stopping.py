@@ -1,12 +1,14 @@
 """The stop rule: suspects first, and all estimands before it holds."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from bayesreg.inference.chains import stopping
 from bayesreg.inference.chains.checkpoint import Checkpoint, no_steps
-from bayesreg.inference.chains.stopping import StopRule, judge, reason
-from bayesreg.inference.draws.diagnostics import worst
+from bayesreg.inference.chains.stopping import StopRule, judge, judge_all, reason
+from bayesreg.inference.draws.diagnostics import figures, worst
 from bayesreg.inference.draws.moments import Moments, greatest_rhat
 
 RULE = StopRule(rhat=1.01, ess=400)
@@ -33,9 +35,9 @@ def asked(monkeypatch):
 
     def counted(blocks, chosen=None):
         counts.append(63 if chosen is None else len(chosen))
-        return worst(blocks, chosen)
+        return figures(blocks, chosen)
 
-    monkeypatch.setattr(stopping, "worst", counted)
+    monkeypatch.setattr(stopping, "figures", counted)
     monkeypatch.setattr(stopping, "SUSPECTS", 5)
     return counts
 
@@ -45,9 +47,8 @@ def test_the_rule_holds_of_all_estimands(asked):
     verdict = judge(RULE, checkpoint, blocks)
     assert verdict.holds
     assert asked == [5, 63]
-    assert verdict.found == worst(blocks)
-    assert f"greatest R̂ {verdict.found.rhat:.3f}" in reason(RULE, checkpoint, blocks, verdict, DRAWS)
-    assert len(asked) == 2
+    assert verdict.found.worst == worst(blocks)
+    assert f"greatest R̂ {verdict.found.worst.rhat:.3f}" in reason(RULE, checkpoint, verdict, DRAWS)
 
 
 @pytest.mark.parametrize("node", [0, 17])
@@ -58,7 +59,9 @@ def test_the_suspect_is_judged_alone(asked, node):
     assert (verdict.holds, verdict.found) == (False, None)
     # Sorted by name: the three of lam stand before it.
     assert worst(blocks, np.array([3 + 3 * node + 1])).rhat == worst(blocks).rhat > RULE.rhat
-    assert f"greatest R̂ {worst(blocks).rhat:.3f}" in reason(RULE, checkpoint, blocks, verdict, DRAWS)
+    verdict = judge_all(RULE, checkpoint, blocks)
+    assert not verdict.holds
+    assert f"greatest R̂ {worst(blocks).rhat:.3f}" in reason(RULE, checkpoint, verdict, DRAWS)
 
 
 def test_what_no_suspect_shows_is_seen_with_all(asked):
@@ -70,7 +73,7 @@ def test_what_no_suspect_shows_is_seen_with_all(asked):
     verdict = judge(RULE, checkpoint, blocks)
     assert asked == [5, 63]
     assert not verdict.holds
-    assert verdict.found == worst(blocks)
+    assert verdict.found.worst == worst(blocks)
 
 
 def test_nothing_is_said_of_one_chain_or_of_no_estimand():
@@ -86,3 +89,18 @@ def test_what_is_far_off_is_not_judged(asked):
     assert not judge(RULE, checkpoint._replace(draws=np.array(50)), blocks).holds
     assert not judge(StopRule(), checkpoint, blocks).holds
     assert asked == []
+
+
+def test_long_runs_are_judged_when_they_have_grown(asked):
+    """All looks of a run together read its draws so many times, however long it is."""
+    checkpoint, blocks = drawn()
+    due = [count for count in range(1, 1000) if stopping._is_due(count)]
+    assert due[:20] == list(range(1, 21))
+    assert all(after / before < 1.11 for before, after in pairwise(due[20:]))
+    assert sum(due) < 25 * due[-1]
+    late = next(count for count in range(100, 200) if not stopping._is_due(count))
+    parts = np.array_split(np.arange(DRAWS), late)
+    many = [{name: np.concatenate([b[name] for b in blocks], axis=1)[:, part] for name in blocks[0]} for part in parts]
+    assert judge(RULE, checkpoint, many) == (False, None)
+    assert asked == []
+    assert judge_all(RULE, checkpoint, many).holds

@@ -12,7 +12,6 @@ from bayesreg.inference.chains.initialise import Start
 from bayesreg.inference.chains.run import Samples, first_checkpoint, sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block
-from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 
@@ -120,7 +119,7 @@ def efficiency(
 
 
 def _reckon(sampler: str, samples: Samples, preparing: float, ends: list[tuple[int, float]]) -> Efficiency:
-    judged = convergence(samples.idata)
+    judged = samples.convergence
     bulk, tail = (_extreme(ess, np.nanmin) for ess in (judged.ess_bulk, judged.ess_tail))
     least = None if bulk is None or tail is None else min(bulk, tail)
     steps, gradients, densities = (

@@ -17,8 +17,9 @@ from bayesreg.inference.chains.checkpoint import Checkpoint, Tally, no_steps
 from bayesreg.inference.chains.devices import devices_for, from_first, gather, is_first, on_host, share
 from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress, Showing
-from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, out_of_time, reason
+from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, judge_all, out_of_time, reason
 from bayesreg.inference.draws.blocks import Block, Blocks
+from bayesreg.inference.draws.diagnostics import Convergence, Figures, figures, labelled
 from bayesreg.inference.draws.inference_data import to_inference_data
 from bayesreg.inference.draws.moments import pool, scale_reduction, zero_moments
 from bayesreg.inference.gaussian.modes import temper
@@ -51,6 +52,8 @@ class Samples:
         Spent sampling, compilation included.
     exact : bool
         Whether the sampler leaves the posterior unchanged.
+    figures : Figures or None
+        Of all estimands, where the stop rule has asked for them.
     """
 
     posterior: Target
@@ -63,11 +66,17 @@ class Samples:
     reason: str
     seconds: float
     exact: bool
+    figures: Figures | None = None
 
     @cached_property
     def idata(self) -> Any:
         """All draws in memory, as ArviZ opens them (InferenceData or DataTree): posterior and sample_stats."""
         return to_inference_data(self.posterior, self.blocks)
+
+    @cached_property
+    def convergence(self) -> Convergence:
+        """R̂ and effective sample sizes of every estimand."""
+        return labelled(self.posterior, self.blocks, self.figures or figures(self.blocks))
 
 
 def sample(
@@ -310,6 +319,9 @@ def _gather_samples(
     verdict: Verdict,
     draws: int,
 ) -> Samples:
+    if stop.ess is not None and verdict.found is None:
+        # The last look may have been some blocks ago.
+        verdict = judge_all(stop, checkpoint, blocks)
     mean, sd = pool(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
     return Samples(
@@ -320,7 +332,8 @@ def _gather_samples(
         rhat=rhat,
         tally=jax.tree.map(np.asarray, checkpoint.tally),
         converged=None if stop.rhat is None else verdict.holds,
-        reason=reason(stop, checkpoint, blocks, verdict, draws),
+        reason=reason(stop, checkpoint, verdict, draws),
         seconds=float(checkpoint.seconds),
         exact=exact,
+        figures=verdict.found,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -9,12 +10,14 @@ import numpy as np
 
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.draws.blocks import Blocks
-from bayesreg.inference.draws.diagnostics import Worst, worst
+from bayesreg.inference.draws.diagnostics import Figures, Worst, figures
 from bayesreg.inference.draws.moments import greatest_rhat, scale_reduction
 from bayesreg.types import AnyArray
 
 # Estimands that are judged before all others.
 SUSPECTS = 32
+# So much longer is a run when its draws are judged again.
+LONGER = 1.05
 
 
 class StopRule(NamedTuple):
@@ -43,7 +46,7 @@ class Verdict(NamedTuple):
     """Whether a rule holds, and the figures of all estimands where these had to be worked out."""
 
     holds: bool
-    found: Worst | None = None
+    found: Figures | None = None
 
 
 def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
@@ -56,10 +59,25 @@ def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
         return Verdict(running < stop.rhat)
     # The running R̂ is cheap and close to the strict one: where it is far off, that need not be worked out. Nor need it
     # for all estimands where one of the suspects fails.
-    if not running < 1 + 1.5 * (stop.rhat - 1) or not _meets(worst(blocks, _suspects(rhat)), stop):
+    if not running < 1 + 1.5 * (stop.rhat - 1) or not _is_due(len(blocks)):
         return Verdict(holds=False)
-    found = worst(blocks)
-    return Verdict(_meets(found, stop), found)
+    if not _meets(figures(blocks, _suspects(rhat)).worst, stop):
+        return Verdict(holds=False)
+    return judge_all(stop, checkpoint, blocks)
+
+
+def judge_all(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
+    """The verdict on all draws, of all estimands by a rule with effective sample sizes."""
+    found = figures(blocks)
+    return Verdict(int(checkpoint.draws) >= stop.min_draws and _meets(found.worst, stop), found)
+
+
+def _is_due(count: int) -> bool:
+    """Whether draws are judged after so many blocks: all of them are read for it, so that those must be 5 % more.
+
+    After every one of the first 20; all looks of a run together read some twenty times its draws, however long it is.
+    """
+    return count <= 20 or math.floor(math.log(count, LONGER)) > math.floor(math.log(count - 1, LONGER))
 
 
 def _suspects(rhat: Mapping[str, AnyArray]) -> np.ndarray:
@@ -68,8 +86,8 @@ def _suspects(rhat: Mapping[str, AnyArray]) -> np.ndarray:
 
 
 def _meets(found: Worst, stop: StopRule) -> bool:
-    assert stop.rhat is not None
-    assert stop.ess is not None
+    if stop.rhat is None or stop.ess is None:
+        return False
     return found.rhat < stop.rhat and min(found.ess_bulk, found.ess_tail) > stop.ess
 
 
@@ -80,13 +98,17 @@ def out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
     return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
 
 
-def reason(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, verdict: Verdict, draws: int) -> str:
-    """Why sampling stopped, in words; `draws` is the greatest number for each chain."""
+def reason(stop: StopRule, checkpoint: Checkpoint, verdict: Verdict, draws: int) -> str:
+    """Why sampling stopped, in words; `draws` is the greatest number for each chain.
+
+    Of a rule with effective sample sizes the verdict tells the figures of all estimands.
+    """
     if stop.ess is None:
         greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
         state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"it below {stop.rhat}"
     else:
-        found = verdict.found or worst(blocks)
+        assert verdict.found is not None
+        found = verdict.found.worst
         state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"
         rule = f"R̂ below {stop.rhat} and both ESS above {stop.ess:g}"
     if verdict.holds:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from bayesreg.inference.draws.blocks import Block, Blocks
-from bayesreg.inference.draws.inference_data import DERIVED, STATISTICS, arviz, dataset
+from bayesreg.inference.draws.inference_data import DERIVED, PIECE, STATISTICS, arviz, dataset
+from bayesreg.inference.target import Target
 
-# Numbers (8 MB of them) that are judged at once, so that memory does not grow with the draws: ArviZ takes many times as
-# much.
-AT_ONCE = 2**20
+# Memory does not grow with the draws. Numbers that are judged at once (8 MB): ArviZ takes many times as much. Numbers
+# that are read at once (256 MB): for each part of the estimands every block of draws is read anew.
+AT_ONCE, READ_AT_ONCE = 2**20, 2**25
+# Threads: sorting and Fourier transforms, which take the time, let each other run.
+MOST_THREADS = 4
 
 
 class Convergence(NamedTuple):
@@ -33,6 +39,39 @@ class Convergence(NamedTuple):
     ess_tail: xr.Dataset
 
 
+class Worst(NamedTuple):
+    """The greatest rank-normalised split R̂ and the least effective sample sizes of all estimands."""
+
+    rhat: float
+    ess_bulk: float
+    ess_tail: float
+
+
+class Figures(NamedTuple):
+    """Diagnostics of estimands side by side; NaN where there are too few draws, or one that stands still.
+
+    Attributes
+    ----------
+    rhat : (k,) array
+        Rank-normalised split R̂.
+    ess_bulk, ess_tail : (k,) arrays
+        Effective sample sizes.
+    """
+
+    rhat: Float[np.ndarray, "k"]
+    ess_bulk: Float[np.ndarray, "k"]
+    ess_tail: Float[np.ndarray, "k"]
+
+    @property
+    def worst(self) -> Worst:
+        """The worst of each: infinite R̂ and no effective sample where one is not known, or none is there."""
+        if not self.rhat.size:
+            return Worst(np.inf, 0.0, 0.0)
+        unknown = np.isnan(self.rhat)
+        least = (float(np.where(unknown, 0.0, ess).min()) for ess in (self.ess_bulk, self.ess_tail))
+        return Worst(float(np.where(unknown, np.inf, self.rhat).max()), *least)
+
+
 def convergence(idata: Any) -> Convergence:
     """R̂ and effective sample sizes of every estimand; of few draws (below 4) all NaN.
 
@@ -45,56 +84,75 @@ def convergence(idata: Any) -> Convergence:
 
 def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
     """R̂, bulk and tail ESS of one variable."""
-    others = [dim for dim in draws.dims if dim not in ("chain", "draw")]
-    if draws.sizes["draw"] < 4 or draws.size == 0:
-        return [xr.full_like(draws.isel(chain=0, draw=0, drop=True), np.nan, float)] * 3
-    if not others:
-        return _figures(draws.astype(float))
-    along = others[0]
-    width = max(1, AT_ONCE // (draws.size // draws.sizes[along]))
-    parts = [
-        _figures(draws.isel({along: slice(first, first + width)}).astype(float))
-        for first in range(0, draws.sizes[along], width)
+    draws = draws.transpose("chain", "draw", ...)
+    like = draws.isel(chain=0, draw=0, drop=True)
+    parts = [_diagnose(part.to_numpy().reshape(*part.shape[:2], -1)) for part in _parts(draws)]
+    return [
+        xr.DataArray(np.concatenate([np.zeros(0), *found]).reshape(like.shape), like.coords, like.dims, like.name)
+        for found in zip(*parts, strict=True)
     ]
-    return [xr.concat(found, along) for found in zip(*parts, strict=True)]
 
 
-def _figures(draws: xr.DataArray) -> list[xr.DataArray]:
-    draws = draws.compute()
-    constant = draws.min(("chain", "draw")) == draws.max(("chain", "draw"))
-    return [found[draws.name].where(~constant) for found in _diagnose(draws.to_dataset())]
+def _parts(draws: xr.DataArray) -> Iterator[xr.DataArray]:
+    """All draws of some of the entries, then of others, in whole pieces of a file."""
+    if draws.ndim == 2:
+        yield draws
+        return
+    along, of_entry = draws.dims[2], math.prod(draws.shape[:2]) * math.prod(draws.shape[3:])
+    width = max(1, READ_AT_ONCE // max(1, of_entry))
+    width = width // PIECE * PIECE or width
+    for first in range(0, max(1, draws.sizes[along]), width):
+        yield draws.isel({along: slice(first, first + width)})
 
 
-class Worst(NamedTuple):
-    """The greatest rank-normalised split R̂ and the least effective sample sizes of all estimands."""
+def figures(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Figures:
+    """The figures of blocks of draws (see `to_inference_data`), of all estimands or of those chosen.
 
-    rhat: float
-    ess_bulk: float
-    ess_tail: float
+    Estimands are numbered in the order of their names, each as it lies in memory.
+    """
+    parts = [_diagnose(part) for part in _columns(blocks, chosen)] if len(blocks) else []
+    return Figures(*map(np.concatenate, zip(*parts, strict=True))) if parts else Figures(*(np.zeros(0),) * 3)
 
 
 def worst(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Worst:
-    """The worst figures of blocks of draws (see `to_inference_data`), of all estimands or of those chosen.
+    """The worst of all estimands, or of those chosen, as `figures` numbers them."""
+    return figures(blocks, chosen).worst
 
-    Estimands are numbered in the order of their names, each as it lies in memory.
 
-    R̂ is infinite, and the effective sample sizes are zero, where there are too few draws, one is not a number, or an
-    estimand has stood still in all chains.
-    """
-    parts = [_worst(part) for part in _columns(blocks, chosen)] if len(blocks) else []
-    return Worst(
-        max((part.rhat for part in parts), default=np.inf),
-        min((part.ess_bulk for part in parts), default=0.0),
-        min((part.ess_tail for part in parts), default=0.0),
-    )
+def labelled(target: Target, blocks: Blocks, found: Figures) -> Convergence:
+    """The figures of all estimands as `convergence` has them of the same draws."""
+    variables, first = target.variables, blocks[0]
+    names = _names(first)
+    shapes = [first[name].shape[2:] for name in names]
+    ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
+
+    def values(figure: np.ndarray) -> dict[str, np.ndarray]:
+        entries = zip(names, np.split(figure, ends), shapes, strict=True)
+        given = variables.values({name: part.reshape(shape) for name, part, shape in entries})
+        return {name: np.asarray(value, float) for name, value in given.items() if name not in DERIVED}
+
+    # What is the same whatever the estimands are is known.
+    count = len(found.rhat)
+    zeros, ones = values(np.zeros(count)), values(np.ones(count))
+
+    def labels(figure: np.ndarray) -> xr.Dataset:
+        shown = {
+            name: (variables.dims.get(name, ()), np.where(zeros[name] == ones[name], np.nan, value))
+            for name, value in values(figure).items()
+        }
+        dims = {dim for own, _ in shown.values() for dim in own}
+        return xr.Dataset(shown, {dim: label for dim, label in variables.coords.items() if dim in dims})
+
+    return Convergence(*map(labels, found))
 
 
 def _columns(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None) -> Iterator[np.ndarray]:
     """All draws of some of the estimands, (chain, draw, estimand), then of others."""
     first, last = _flat(blocks[0]), _flat(blocks[len(blocks) - 1])
-    longest = max(first.shape[1], last.shape[1])
-    width = max(1, AT_ONCE // (first.shape[0] * longest * len(blocks)))
-    places = np.arange(first.shape[-1]) if chosen is None else chosen
+    chains, length, count = first.shape
+    draws = length * (len(blocks) - 1) + last.shape[1]
+    places = np.arange(count) if chosen is None else chosen
+    width = max(1, READ_AT_ONCE // max(1, chains * draws))
     for low in range(0, len(places), width):
         # Taken by their numbers and so copied: a view would keep its whole block.
         yield np.concatenate([_flat(block)[..., places[low : low + width]] for block in blocks], axis=1)
@@ -102,24 +160,31 @@ def _columns(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None) -> Iterator[np
 
 def _flat(block: Block) -> np.ndarray:
     """All estimands of a block side by side, by name: blocks of one run need not agree in their order."""
-    draws = [block[name] for name in sorted(block) if name not in STATISTICS]
-    return np.concatenate([values.reshape(*values.shape[:2], -1) for values in draws], axis=-1)
+    return np.concatenate([block[name].reshape(*block[name].shape[:2], -1) for name in _names(block)], axis=-1)
 
 
-def _worst(draws: np.ndarray) -> Worst:
-    if draws.shape[1] < 4:
-        return Worst(np.inf, 0.0, 0.0)
-    data = xr.Dataset({"draws": (["chain", "draw", "estimand"], draws)})
-    rhat, bulk, tail = (found["draws"] for found in _diagnose(data))
-    least = (float(ess.where(rhat.notnull(), 0.0).min()) for ess in (bulk, tail))
-    return Worst(float(rhat.fillna(np.inf).max()), *least)
+def _names(block: Block) -> list[str]:
+    return sorted(name for name in block if name not in STATISTICS)
 
 
-def _diagnose(draws: xr.Dataset) -> list[xr.Dataset]:
-    """R̂, bulk and tail ESS of every variable."""
+def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
+    """R̂, bulk and tail ESS of estimands side by side."""
+    chains, length, count = draws.shape
+    if length < 4 or not count:
+        return Figures(*(np.full(count, np.nan),) * 3)
     # It takes a second to import, for which the first draws need not wait.
     az = arviz()
-    # ArviZ divides zero by zero for what has stood still.
-    with np.errstate(invalid="ignore"):
-        found = (az.rhat(draws), az.ess(draws, method="bulk"), az.ess(draws, method="tail"))
-    return [one if isinstance(one, xr.Dataset) else one.to_dataset() for one in found]
+    width = max(1, AT_ONCE // (chains * length))
+
+    def judge(low: int) -> Figures:
+        part = draws[..., low : low + width].astype(float)
+        moved = part.min(axis=(0, 1)) != part.max(axis=(0, 1))
+        data = xr.Dataset({"draws": (["chain", "draw", "estimand"], part)})
+        # ArviZ divides zero by zero for what has stood still.
+        with np.errstate(invalid="ignore"):
+            found = az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail")
+        return Figures(*(np.where(moved, one["draws"].to_numpy(), np.nan) for one in found))
+
+    with ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+        parts = list(pool.map(judge, range(0, count, width)))
+    return Figures(*map(np.concatenate, zip(*parts, strict=True)))

@@ -47,9 +47,11 @@ MEANINGS = {
 }
 # Functions of estimands that stand beside them.
 DERIVED = ("ratio",)
-# The file's pieces hold so many nodes (or modes, elements) of a block of draws: both few nodes of all draws and all
-# nodes of few draws are to be read at little cost.
-PIECE = 64
+# The file's pieces hold so many nodes (or modes, elements) and so many draws of every chain: both few nodes of all
+# draws and all nodes of few draws are to be read at little cost.
+PIECE, STRETCH = 64, 100
+# Numbers (32 MB) that are written at once, unless a block has more: each time costs as much as some thousands of them.
+WRITTEN_AT_ONCE = 2**22
 
 
 def to_inference_data(target: Target, blocks: Blocks) -> Any:
@@ -126,7 +128,7 @@ def dataset(idata: Any, group: str) -> xr.Dataset:
 
 
 def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
-    """Write draws as NetCDF, displacements in single precision and compressed; one block is in memory at a time.
+    """Write draws as NetCDF, displacements in single precision and compressed; few blocks are in memory at a time.
 
     The file opens as what `to_inference_data` makes of all of them.
     """
@@ -134,13 +136,26 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         with _storing(path):
-            _begin(to_inference_data(target, [blocks[0]]), partial)
+            some = _together(blocks)
+            _begin(to_inference_data(target, next(some)), partial)
             with netCDF4.Dataset(partial, "a") as file:
-                for index in range(1, len(blocks)):
-                    _extend(file, to_inference_data(target, [blocks[index]]))
+                for following in some:
+                    _extend(file, to_inference_data(target, following))
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _together(blocks: Blocks) -> Iterator[list[Block]]:
+    """Blocks that follow one another, as many as are written at once."""
+    some: list[Block] = []
+    for block in blocks:
+        size = sum(values.size for values in block.values())
+        if some and sum(values.size for one in some for values in one.values()) + size > WRITTEN_AT_ONCE:
+            yield some
+            some = []
+        some.append(block)
+    yield some
 
 
 @contextmanager
@@ -172,7 +187,7 @@ def _begin(idata: Any, path: Path) -> None:
 
 
 def _piece(dim: str, size: int) -> int:
-    return size if dim in ("chain", "draw") else min(size, PIECE)
+    return {"chain": size, "draw": STRETCH}.get(dim, min(size, PIECE))
 
 
 def _extend(file: netCDF4.Dataset, idata: Any) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Int
 
+from bayesreg.inference.draws.inference_data import STRETCH
 from bayesreg.inference.draws.moments import Moments, extend, pool, zero_moments
 from bayesreg.types import AnyArray
 
@@ -64,9 +65,18 @@ def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np
     dict
         Arrays (chain, draw, …).
     """
-    chosen = evenly_spaced(posterior.sizes["draw"], max(1, most // posterior.sizes["chain"]))
-    some = posterior[list(names)].isel(draw=chosen).transpose("chain", "draw", ...)
-    return {str(name): np.asarray(some[name].to_numpy(), float) for name in some.data_vars}
+    total = posterior.sizes["draw"]
+    chosen = evenly_spaced(total, max(1, most // posterior.sizes["chain"]))
+    given = posterior[list(names)].transpose("chain", "draw", ...)
+    found: dict[str, list[np.ndarray]] = {str(name): [] for name in given.data_vars}
+    # A file holds stretches of draws: a single one costs as much to read as all that lie about it.
+    for first in range(0, total, STRETCH):
+        within = chosen[(chosen >= first) & (chosen < first + STRETCH)] - first
+        if len(within):
+            stretch = given.isel(draw=slice(first, first + STRETCH))
+            for name, parts in found.items():
+                parts.append(np.asarray(stretch[name].to_numpy()[:, within], float))
+    return {name: np.concatenate(parts, axis=1) for name, parts in found.items()}
 
 
 def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, block: int = BLOCK) -> Iterator[Any]:
