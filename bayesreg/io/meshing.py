@@ -22,7 +22,7 @@ from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, tissue_surfaces
 from bayesreg.io.tetwild import tetrahedralize
-from bayesreg.mesh import TetMesh
+from bayesreg.mesh import FACES, TetMesh
 from bayesreg.tissues import BRAIN, BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import AnyArray, InputError
 
@@ -223,7 +223,7 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
     ------
     InputError
         If there is no such file, it cannot be read, holds other cells than tetrahedra or none, has no "tissue"
-        per cell, or is no valid mesh.
+        per cell, is no valid mesh, or has a tetrahedron twice.
     """
     path = Path(path)
     if not path.is_file():
@@ -241,9 +241,23 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
     cells = np.concatenate([block.data for block in content.cells])
     tissue = np.concatenate(content.cell_data["tissue"])
     try:
-        return TetMesh.from_arrays(content.points, cells, tissue, _stored_names(content) or names)
+        mesh = TetMesh.from_arrays(content.points, cells, tissue, _stored_names(content) or names)
     except ValueError as error:
         raise InputError(f"mesh {path}: {error}") from error
+    _require_one_body(mesh, path)
+    return mesh
+
+
+def _require_one_body(mesh: TetMesh, path: Path) -> None:
+    """Raise InputError where tetrahedra lie on one another, as far as their faces tell."""
+    cells, times = np.unique(np.sort(mesh.cells, axis=1), axis=0, return_counts=True)
+    if (times > 1).any():
+        raise InputError(
+            f"mesh {path} holds the tetrahedron of the nodes {cells[times > 1][0].tolist()} more than once"
+        )
+    faces, times = np.unique(np.sort(mesh.cells[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
+    if (times > 2).any():
+        raise InputError(f"mesh {path}: more than two tetrahedra share the face {faces[times > 2][0].tolist()}")
 
 
 def _attempt(

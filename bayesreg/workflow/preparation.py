@@ -18,6 +18,7 @@ from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
+from bayesreg.io.agreement import require_agreement
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels
 from bayesreg.io.displacements import IDENTITY, read_boundary, require_displacement
 from bayesreg.io.domain import size_of_solid, without_ridges
@@ -95,6 +96,8 @@ def prepare(config: Config) -> Prepared:
     clock.lap("images")
     settings = _sized(config.mesh, size)
     mesh = _mesh(anatomy, domain, settings)
+    if settings.file is not None:
+        require_agreement(mesh, tissue, settings.file)
     clock.lap("mesh")
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))

@@ -13,7 +13,7 @@ import xarray as xr
 from jaxtyping import Float, Int
 
 from bayesreg.inference.draws.blocks import Block, Blocks
-from bayesreg.inference.draws.inference_data import DERIVED, PIECE, STATISTICS, arviz, dataset
+from bayesreg.inference.draws.inference_data import DERIVED, PIECE, STATISTICS, arviz, dataset, to_inference_data
 from bayesreg.inference.target import Target
 
 # Memory does not grow with the draws. Numbers that are judged at once (8 MB): ArviZ takes many times as much. Numbers
@@ -121,29 +121,21 @@ def worst(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Worst:
 
 def labelled(target: Target, blocks: Blocks, found: Figures) -> Convergence:
     """The figures of all estimands as `convergence` has them of the same draws."""
-    variables, first = target.variables, blocks[0]
-    names = _names(first)
+    first = blocks[0]
+    names, statistics = _names(first), {name: np.zeros((1, 1)) for name in STATISTICS}
     shapes = [first[name].shape[2:] for name in names]
     ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
 
-    def values(figure: np.ndarray) -> dict[str, np.ndarray]:
+    def variables(figure: np.ndarray) -> xr.Dataset:
+        """The variables of one draw."""
         entries = zip(names, np.split(figure, ends), shapes, strict=True)
-        given = variables.values({name: part.reshape(shape) for name, part, shape in entries})
-        return {name: np.asarray(value, float) for name, value in given.items() if name not in DERIVED}
+        block = {name: part.reshape(1, 1, *shape) for name, part, shape in entries}
+        data = dataset(to_inference_data(target, [block | statistics]), "posterior")
+        return data.isel(chain=0, draw=0, drop=True).drop_vars(DERIVED, errors="ignore")
 
     # What is the same whatever the estimands are is known.
-    count = len(found.rhat)
-    zeros, ones = values(np.zeros(count)), values(np.ones(count))
-
-    def labels(figure: np.ndarray) -> xr.Dataset:
-        shown = {
-            name: (variables.dims.get(name, ()), np.where(zeros[name] == ones[name], np.nan, value))
-            for name, value in values(figure).items()
-        }
-        dims = {dim for own, _ in shown.values() for dim in own}
-        return xr.Dataset(shown, {dim: label for dim, label in variables.coords.items() if dim in dims})
-
-    return Convergence(*map(labels, found))
+    zeros, ones = (variables(np.full(found.rhat.shape, value)) for value in (0.0, 1.0))
+    return Convergence(*(variables(figure).where(zeros != ones) for figure in found))
 
 
 def _columns(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None) -> Iterator[np.ndarray]:
