@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from bayesreg.printable import require_printable
 from bayesreg.tissues import BRAIN
 from bayesreg.types import AnyArray, InputError
 
@@ -46,7 +47,7 @@ class TetMesh:
         ------
         ValueError
             If shapes or indices are off, a coordinate is not finite, a tetrahedron has no positive volume,
-            or a node belongs to no tetrahedron. The topology is not looked at.
+            a node belongs to no tetrahedron, or a name cannot be printed. The topology is not looked at.
         """
         points, cells, tissue = np.array(points, float), np.array(cells), np.array(tissue)
         _require_shapes(points, cells, tissue)
@@ -57,6 +58,7 @@ class TetMesh:
             raise InputError(f"cells name nodes {cells.min()} to {cells.max()}, but there are {len(points)} points")
         if tissue.min() < 0 or tissue.max() >= len(names):
             raise InputError(f"tissue holds {tissue.min()} to {tissue.max()}, but names has {len(names)} entries")
+        require_printable(names, "tissues")
         mesh = cls(points, cells, tissue, tuple(names))
         bad = np.flatnonzero(~(mesh.volumes > 0))
         if len(bad):

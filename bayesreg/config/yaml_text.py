@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,11 +11,9 @@ from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, NodeEve
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from bayesreg.config.errors import ConfigError
+from bayesreg.printable import find_unprintable
 
 # A configuration spelled out has some 150 lines, three levels below a list, and a label table a thousand entries.
-# Controls but for tabs and ends of lines, line separators that read back as others, and halves of characters.
-_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufffe\uffff]")
-
 MOST_CHARACTERS, MOST_ENTRIES, DEEPEST, LONGEST_PLAIN = 1_000_000, 20_000, 20, 4_000
 
 
@@ -67,8 +64,8 @@ def _require_bounds(text: str, name: str) -> None:
             raise ConfigError(f"{where}: more than {MOST_ENTRIES:,} entries")
         if isinstance(event, ScalarEvent) and len(event.value) > LONGEST_PLAIN and event.style is None:
             raise ConfigError(f"{where}: a value of {len(event.value):,} characters; put a text so long in quotes")
-        if isinstance(event, ScalarEvent) and (odd := _UNPRINTABLE.search(event.value)):
-            raise ConfigError(f"{where}: a character that cannot be printed, U+{ord(odd[0]):04X}")
+        if isinstance(event, ScalarEvent) and (odd := find_unprintable(event.value)):
+            raise ConfigError(f"{where}: a character that cannot be printed, {odd}")
         tag = event.tag if isinstance(event, ScalarEvent | CollectionStartEvent) else None
         if tag is not None and str(tag) != "!":
             raise ConfigError(f"{where}: tags such as {tag} are not read; write the value alone")

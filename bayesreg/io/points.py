@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from bayesreg.io.atomic import write_text
 from bayesreg.io.spaces import TO_RAS, Space
+from bayesreg.printable import require_printable
 from bayesreg.types import InputError
 
 FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
@@ -175,6 +176,7 @@ def _require_sound(found: Points | PointPairs, path: Path) -> None:
     places = found.points if isinstance(found, Points) else np.hstack([found.fixed, found.moving])
     if not len(places):
         raise InputError(f"{path} holds no point")
+    require_printable(found.names, str(path))
     if not np.isfinite(places).all():
         raise InputError(f"{path}: point {1 + int(np.argwhere(~np.isfinite(places))[0, 0])} is not finite")
     if found.sd is not None and len(bad := np.flatnonzero(~(np.isfinite(found.sd) & (found.sd > 0)))):

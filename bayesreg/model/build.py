@@ -106,6 +106,9 @@ def require_observations(given: Any) -> list[Any]:
                 f"an observation needs a name (text) and a function log(state); got {type(one).__name__}: use "
                 "ImagePair, Landmarks, or an object of your own with both"
             )
+        # It names variables in files.
+        if not name.isidentifier():
+            raise InputError(f"an observation is named {name!r}; expected letters, digits and _, such as left_lobe")
     return list(given)
 
 

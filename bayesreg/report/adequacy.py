@@ -163,7 +163,13 @@ def _histogram(axes: Axes, view: View, fit: Fit) -> None:
         inside = z[np.asarray(fit.residual_tissue) == index]
         if len(inside) >= LEAST_POINTS:
             density = np.histogram(inside, edges)[0] / len(inside) / np.diff(edges)
-            axes.stairs(density, edges, color=colour, lw=1.3, label=f"{label_of(name)}, sd {number(inside.std(), 2)}")
+            axes.stairs(
+                density,
+                edges,
+                color=colour,
+                lw=1.3,
+                label=f"{style.literal(label_of(name))}, sd {number(inside.std(), 2)}",
+            )
     x = np.linspace(-reach, reach, 300)
     expected = noise_of(view.run.manifest)
     axes.fill_between(x, expected.density(x), color=style.FAINT, lw=0, label=expected.name, zorder=0)

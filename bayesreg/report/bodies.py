@@ -137,6 +137,6 @@ def _panel(panel: Axes, it: Allowed, index: int) -> None:
     panel.plot([own_low, own_high], [foot] * 2, color=style.ACCENT, linewidth=4, solid_capstyle="butt")
     panel.plot([own], [foot], "o", color="white", markeredgecolor=style.ACCENT, markersize=6, zorder=4)
     panel.set(xscale="log", yscale="log", xlim=reach, ylim=heights)
-    panel.set(title=label_of(it.names[index]), xlabel="λ/μ of the body")
+    panel.set(title=style.literal(label_of(it.names[index])), xlabel="λ/μ of the body")
     if index == 0:
         panel.set_ylabel("λ/μ found")

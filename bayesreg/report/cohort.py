@@ -76,7 +76,7 @@ def _stiffness(finished: pd.DataFrame) -> Drawing:
             low, middle, high = (finished[f"{name}{end}"].to_numpy(float) for end in ("_low", "", "_high"))
             panel.hlines(place, low, high, color=style.ACCENT, lw=1.0)
             panel.plot(middle, place, "o", ms=3, color=style.ACCENT)
-            panel.set(title=name.replace("_", " ").replace("lam", "λ").replace("mu", "μ"))
+            panel.set(title=style.literal(name.replace("_", " ").replace("lam", "λ").replace("mu", "μ")))
             if high.max() > DECADES * low.min() > 0:
                 panel.set_xscale("log")
             else:

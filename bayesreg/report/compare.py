@@ -163,7 +163,7 @@ def _maps(named: dict[str, Study]) -> Drawing:
         _fill_divergence(axes[-1], views)
         _fill_last(axes[:, -1], views, known)
         for panel, name in zip(axes[0], named, strict=False):
-            panel.set_title(name, weight="bold")
+            panel.set_title(style.literal(name), weight="bold")
         uri = style.data_uri(figure)
     caption = f"The paper’s Fig. 3 for these runs, {plane.title}. " + (
         "Top: norm of the error of the posterior mean. Middle: " if known else "Top: "
@@ -218,7 +218,7 @@ def _ratios(named: dict[str, Study]) -> Drawing:
         figure = style.new_figure(2.5 * len(named))
         parts = figure.subfigures(len(named), 1, squeeze=False)
         for part, (name, groups) in zip(parts[:, 0], grouped.items(), strict=True):
-            part.suptitle(name, fontsize=9, weight="bold", x=0.005, ha="left")
+            part.suptitle(style.literal(name), fontsize=9, weight="bold", x=0.005, ha="left")
             for panel, group in zip(part.subplots(1, len(groups), squeeze=False)[0], groups, strict=True):
                 ratio_panel(panel, named[name].run, group)
         uri = style.data_uri(figure, "svg")
@@ -247,6 +247,6 @@ def _cumulate(axes: Axes, named: dict[str, Study], figure: str, label: str) -> N
     for (name, study), colour in zip(named.items(), RUN_COLOURS * len(named), strict=False):
         values = np.array([getattr(entry, figure) for entry in study.entries])
         if np.isfinite(values).any():
-            axes.ecdf(values[np.isfinite(values)], label=name, color=colour, lw=1.4)
+            axes.ecdf(values[np.isfinite(values)], label=style.literal(name), color=colour, lw=1.4)
     axes.set(xlabel=label, ylabel="share of estimands", xscale="log")
     plain_log_axis(axes)

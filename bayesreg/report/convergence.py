@@ -93,6 +93,7 @@ def _choose(posterior: xr.Dataset, sample_stats: xr.Dataset, entries: Sequence[E
 
 def symbolic(name: str) -> str:
     """ "u_x of node 3" with a proper index, for a figure."""
+    name = style.literal(name)
     for plain in ("u_x", "u_y", "u_z", "T_s", "T_r"):
         name = name.replace(plain, f"${plain}$") if name.startswith(plain) else name
     return name

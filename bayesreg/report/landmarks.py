@@ -85,7 +85,7 @@ def residuals(predicted: Predicted) -> Drawing | None:
     """Distances with each landmark and without it, beside what the model expects of them."""
     if predicted.landmark_names is None:
         return None
-    names = [str(name) for name in predicted.landmark_names]
+    names = [style.literal(str(name)) for name in predicted.landmark_names]
     sd, fitted = np.asarray(predicted.landmark_sd), np.linalg.norm(np.asarray(predicted.landmark_residual), axis=1)
     rows = np.arange(len(names))
     with style.look():

@@ -69,11 +69,11 @@ def ratio_panel(axes: Axes, run: Run, group: Group) -> None:
     truths = _true_ratios(run, group.name)
     one = len(truths) == 1
     marks = [
-        Mark(value, "truth" if one else f"truth {name}", style.TRUTH if one else _colour(run, name))
+        Mark(value, "truth" if one else f"truth {style.literal(name)}", style.TRUTH if one else _colour(run, name))
         for name, value in truths.items()
     ]
     histogram(axes, group.ratio.reshape(len(group.ratio), -1), colour, marks, ratio=True)
-    axes.set_title(label_of(group.name), weight="bold")
+    axes.set_title(style.literal(label_of(group.name)), weight="bold")
     axes.set_xlabel("λ / μ")
 
 

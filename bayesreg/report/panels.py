@@ -232,7 +232,10 @@ def colourbar(figure: FigureBase, drawn: ScalarMappable, axes: Axes | Sequence[A
 
 def tissue_legend(names: Sequence[str], skull: bool) -> list[Patch]:
     """Handles for the tissues, and the skull."""
-    handles = [Patch(color=colour, label=label_of(name)) for name, colour in zip(names, colours_of(names), strict=True)]
+    handles = [
+        Patch(color=colour, label=style.literal(label_of(name)))
+        for name, colour in zip(names, colours_of(names), strict=True)
+    ]
     return handles + ([Patch(color=style.SKULL, label="skull (forbidden)")] if skull else [])
 
 

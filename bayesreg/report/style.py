@@ -119,6 +119,11 @@ def grey_uri(picture: Float[np.ndarray, "Y X"]) -> str:
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
+def literal(text: str) -> str:
+    """Text that a user gave, which Matplotlib is not to set as a formula."""
+    return text.replace("$", r"\$")
+
+
 def chain_colours(count: int) -> list[str]:
     """A colour per chain."""
     if count <= len(_FEW_CHAINS):

@@ -102,7 +102,7 @@ def places(view: View, predicted: Predicted) -> Drawing:
             band, column = divmod(k, COLUMNS)
             for row, axis in enumerate((2, 1, 0)):
                 _place(axes[3 * band + row, column], view, predicted, k, axis, limits)
-            axes[3 * band, column].set_title(str(name), fontsize=8)
+            axes[3 * band, column].set_title(style.literal(str(name)), fontsize=8)
         for band in range(bands):
             for row, axis in enumerate((2, 1, 0)):
                 axes[3 * band + row, 0].set_ylabel(NAMES[axis], fontsize=8, color=style.MUTED)

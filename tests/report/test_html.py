@@ -276,3 +276,29 @@ def test_separate_chains_and_an_approximate_sampler_are_told_first(tmp_path, stu
     assert "The chains lie in 2 groups, each shown by itself" in found.text
     assert set(found.figures) == FIGURES | FORWARD | {"modes"}
     assert found.text.index("Approximate: a quick look") < found.text.index("Converged")
+
+
+def test_names_from_anywhere_are_shown_as_they_are(study, tmp_path):
+    """None is markup, a script or a formula to the page and its figures."""
+    tissues = ("<script>alert(1)</script>", "$x_{$", "a & b \\frac{")
+    mesh = replace(study.run.mesh, names=tissues)
+    names = ["$x_{$", "</script><script>alert(2)</script>", *study.run.predicted.place_names[2:]]
+    landmarks = {
+        "landmark_names": np.array(["$x_{$", "$\\frac$ <b>"]),
+        "landmark_points": mesh.points[:2],
+        "landmark_sd": np.ones(2),
+        "landmark_residual": np.ones((2, 3)),
+    }
+    predicted = study.run.predicted._replace(place_names=np.array(names), **landmarks)
+    posterior = study.idata.posterior.assign_coords(tissue=list(tissues))
+    manifest = study.run.manifest | {"name": "<img src=x onerror=alert(3)> $x_{$"}
+    run = replace(study.run, mesh=mesh, predicted=predicted, manifest=manifest, metrics=None)
+    figures = [one.assign_coords(tissue=list(tissues)) for one in (study.rhat, study.ess_bulk, study.ess_tail)]
+    write_report(run, study.idata._replace(posterior=posterior), *figures, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "<img src=x" not in text
+    page = Page(text)
+    assert "b" not in page.tags
+    for name in (*tissues, *names[:2], *landmarks["landmark_names"]):
+        assert name in page.text or any(name in cell for row in page.rows for cell in row), name

@@ -16,6 +16,7 @@ from bayesreg.model.blocks import Scale, Values
 from bayesreg.model.options import ScalePrior
 from bayesreg.model.state import State
 from bayesreg.model.terms.term import Label, PointCurvature
+from bayesreg.printable import require_printable
 from bayesreg.types import AnyArray, InputError, Scalar
 
 
@@ -41,7 +42,7 @@ class Landmarks:
     Raises
     ------
     InputError
-        If shapes differ, a number is not finite, or an sd is not positive.
+        If shapes differ, a number is not finite, an sd is not positive, or a label cannot be printed.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Landmarks:
         if isinstance(labels, str) or (labels is not None and len(labels) != count):
             raise InputError(f"{name}: labels must be a list of {count}, one for each point; got {labels!r:.60}")
         self.name, self.labels = name, tuple(map(str, range(1, count + 1) if labels is None else labels))
+        require_printable(self.labels, f"{name}: labels")
         self.prior = sd if isinstance(sd, ScalePrior) else None
         self.sd = _known_sd(self.prior.median if self.prior else sd, count, name)
 
