@@ -201,6 +201,19 @@ def test_a_finished_run_leaves_other_files_when_asked(finished, folder):
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "others", resume=True, progress=False)
 
 
+def test_a_run_whose_files_have_changed_is_told(finished, folder):
+    """Also where it has ended; one that is gone, or whose content is the same, does not matter."""
+    path = folder / "moving.nii.gz"
+    content = path.read_bytes()
+    try:
+        br.save_image(br.load_image(folder / "fixed.nii.gz"), path)
+        with pytest.raises(br.InputError, match=r"data\.moving \(.*moving\.nii\.gz\) has changed since the run in"):
+            br.run(folder / "run.yaml", folder / "out", resume=True, progress=False)
+    finally:
+        path.write_bytes(content)
+    assert br.run(folder / "run.yaml", folder / "out", resume=True, progress=False).folder == folder / "out"
+
+
 @pytest.mark.usefixtures("no_report")
 def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
     found = reproduce(folder / "out", folder / "again", progress=False)

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Literal, NamedTuple
 
 from filelock import FileLock, Timeout
@@ -49,7 +49,7 @@ def read_status(folder: str | Path) -> Status | None:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         status = Status(content["stage"], {name: tuple(digests) for name, digests in content["files"].items()})
-        sound = content["digest"] == _digest_of(status)
+        sound = content["digest"] == _digest_of(status) and not any(map(_leads_out, status.files))
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError, AttributeError):
@@ -57,6 +57,18 @@ def read_status(folder: str | Path) -> Status | None:
     if not sound:
         raise InputError(f"{path} is damaged, and nothing in its folder can be relied on without it; {ANEW}")
     return status
+
+
+def _leads_out(name: str) -> bool:
+    return PurePath(name).is_absolute() or ".." in PurePath(name).parts
+
+
+def _path_of(folder: Path, name: str) -> Path:
+    """The path of a file of a run; InputError where a link leads out of its folder, which may be a stranger's."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{path} leads out of its folder by a link; put the file itself there")
+    return path
 
 
 def stage_of(folder: str | Path) -> Stage | None:
@@ -83,13 +95,14 @@ def require_file(folder: str | Path, name: str) -> Path:
     status = read_status(folder)
     if status is None:
         raise InputError(f"{folder} holds no run of bayesreg: {STATUS} is missing")
-    found = digest_of(folder / name) if name in status.files else None
+    path = _path_of(folder, name)
+    found = digest_of(path) if name in status.files else None
     if found is None:
         state = "no finished run" if status.stage != "finished" else "no whole run"
         raise InputError(f"{folder} holds {state}: {name} is missing")
     if found not in status.files[name]:
-        raise InputError(f"{folder / name} is damaged, or was changed after the run had written it; {ANEW}")
-    return folder / name
+        raise InputError(f"{path} is damaged, or was changed after the run had written it; {ANEW}")
+    return path
 
 
 def is_sound(folder: str | Path, name: str) -> bool:
@@ -129,7 +142,7 @@ def writing(folder: str | Path, stage: Stage | None = None) -> Iterator[Callable
     folder, temporaries = Path(folder), dict[str, Path]()
 
     def place(name: str) -> Path:
-        target = folder / name
+        target = _path_of(folder, name)
         target.parent.mkdir(parents=True, exist_ok=True)
         # The name's end stays, since writers choose the format by it.
         temporaries[name] = target.with_name(f"{PARTIAL}{os.getpid()}-{target.name}")
@@ -173,7 +186,7 @@ def drop(folder: str | Path, within: str) -> None:
         names = [name for name in status.files if name.startswith(f"{within}/")]
         _write(folder, Status(status.stage, {name: it for name, it in status.files.items() if name not in names}))
         for name in names:
-            (folder / name).unlink(missing_ok=True)
+            _path_of(folder, name).unlink(missing_ok=True)
 
 
 @contextmanager

@@ -86,7 +86,8 @@ def reproduce(
     config = _as_many(load_config(require_file(folder, "config.yaml")), int(first.run.manifest["steps_per_chain"]))
     inputs = store.read_inputs(folder)._replace(config=resolved_yaml(config))
     with locked(out):
-        store_inputs(out, inputs, provenance)
+        # Those files may have changed, or be gone.
+        store_inputs(out, inputs, provenance | {"sources": {}})
     say(f"{first.run.manifest['steps_per_chain']:,} steps of {config.sampler.chains} chains, with seed {config.seed}")
     return _compare(first, run(config, out, resume=True, progress=progress))
 

@@ -48,6 +48,7 @@ from bayesreg.workflow.preparation import (
     with_unsampled,
 )
 from bayesreg.workflow.result import REPORT, Result, load_result, report
+from bayesreg.workflow.sources import digests_of_sources, require_same_sources
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
 # whole state is written.
@@ -150,6 +151,7 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
     # Nothing is written before all input has proved sound, and all of it before the first step is taken.
     posterior = posterior_of(config, inputs, observations)
     provenance["observations"] = _fingerprint(posterior, observations)
+    provenance["sources"] = digests_of_sources(config, MAY_CHANGE)
     searching = time.perf_counter()
     posterior = temper(config, inputs, posterior, say)
     provenance["independent_points"] = posterior.independent_points
@@ -172,6 +174,8 @@ def _resume(
     say: Callable[[str], None],
 ) -> Result:
     known = _resumed_config(out, config)
+    provenance = store.read_json(require_file(out, PROVENANCE))
+    require_same_sources(config, provenance.get("sources", {}), MAY_CHANGE, out)
     finished = stage_of(out) == "finished"
     if finished and all(getattr(known, name) == getattr(config, name) for name in MAY_CHANGE):
         say(f"{out} holds a finished run already; another budget (stop) would continue it")
@@ -179,7 +183,7 @@ def _resume(
             report(out)
         wait(BEGUN)
         return load_result(out)
-    inputs, provenance = store.read_inputs(out), store.read_json(require_file(out, PROVENANCE))
+    inputs = store.read_inputs(out)
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(out, provenance, posterior, observations)
     # What `simulate` has made is not tempered yet.

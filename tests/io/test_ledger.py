@@ -135,3 +135,35 @@ def test_a_folder_is_one_process_s_until_that_is_dead(tmp_path):
         holder.communicate()
     with ledger.locked(tmp_path), ledger.locked(tmp_path):
         assert not list(tmp_path.glob(".partial*"))
+
+
+@pytest.mark.parametrize("name", ["../outside.txt", "bids/../../outside.txt", "/tmp/outside.txt"])
+def test_a_list_does_not_lead_out_of_its_folder(tmp_path, name):
+    """A folder from a stranger: what it lists beyond itself is neither read nor removed."""
+    out, outside = tmp_path / "run", tmp_path / "outside.txt"
+    outside.write_text("mine")
+    write(out, "finished", one="1")
+    status = ledger.Status("finished", {**ledger.read_status(out).files, name: ("0" * 64,)})
+    ledger._write(out, status)
+    for act in (lambda: ledger.drop(out, "bids"), lambda: ledger.require_file(out, name)):
+        with pytest.raises(InputError, match="damaged"):
+            act()
+    assert outside.read_text() == "mine"
+
+
+def test_a_link_does_not_lead_out_of_its_folder(tmp_path):
+    out, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "mine.txt").write_text("mine")
+    write(out, "finished", **{"one": "1", "bids/mine": "mine"})
+    (out / "bids" / "mine.txt").unlink()
+    (out / "bids").rmdir()
+    (out / "bids").symlink_to(elsewhere)
+    for act in (
+        lambda: ledger.drop(out, "bids"),
+        lambda: ledger.require_file(out, "bids/mine.txt"),
+        lambda: write(out, **{"bids/mine": "other"}),
+    ):
+        with pytest.raises(InputError, match="leads out of its folder by a link"):
+            act()
+    assert (elsewhere / "mine.txt").read_text() == "mine"

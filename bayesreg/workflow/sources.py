@@ -1,0 +1,40 @@
+"""The files that a configuration names, which a run that goes on must find as they were, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from bayesreg.config import Config
+from bayesreg.io.ledger import digest_of
+from bayesreg.types import InputError
+
+
+def digests_of_sources(config: Config, but: tuple[str, ...]) -> dict[str, str]:
+    """SHA-256 of every file that the configuration names, by its key, as data.fixed; some sections are left out."""
+    named = _paths(config.model_dump(exclude=set(but)))
+    return {key: digest for key, path in named if (digest := digest_of(path)) is not None}
+
+
+def require_same_sources(config: Config, known: Mapping[str, str], but: tuple[str, ...], folder: Path) -> None:
+    """Raise InputError where a file has another content than when the run in a folder was begun.
+
+    One that is gone does not matter: the folder holds what was made of it.
+    """
+    now = digests_of_sources(config, but)
+    if changed := [key for key, digest in known.items() if now.get(key, digest) != digest]:
+        named = dict(_paths(config.model_dump(exclude=set(but))))
+        listed = ", ".join(f"{key} ({named[key]})" for key in changed)
+        raise InputError(
+            f"{listed} has changed since the run in {folder} was begun, which goes on with what it was: name another "
+            "folder for a run of the new content, or put the former one back"
+        )
+
+
+def _paths(value: Any, key: str = "") -> Iterator[tuple[str, Path]]:
+    if isinstance(value, Path):
+        yield key, value
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list | tuple) else ()
+    for name, entry in items:
+        yield from _paths(entry, f"{key}.{name}".removeprefix("."))
