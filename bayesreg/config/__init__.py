@@ -4,7 +4,25 @@ A configuration holds no arrays and builds nothing; `bayesreg.workflow.run` does
 """
 
 from bayesreg.config.errors import ConfigError
-from bayesreg.config.loading import load_config, make_config, model_of, read_mapping, resolved_yaml, schema
+from bayesreg.config.loading import (
+    load_config,
+    load_stored_config,
+    make_config,
+    model_of,
+    read_mapping,
+    resolved_yaml,
+    schema,
+)
 from bayesreg.config.sections import Config
 
-__all__ = ["Config", "ConfigError", "load_config", "make_config", "model_of", "read_mapping", "resolved_yaml", "schema"]
+__all__ = [
+    "Config",
+    "ConfigError",
+    "load_config",
+    "load_stored_config",
+    "make_config",
+    "model_of",
+    "read_mapping",
+    "resolved_yaml",
+    "schema",
+]

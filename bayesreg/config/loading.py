@@ -57,6 +57,11 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     return _validated(_override(_read(Path(path), ()), overrides), f"the configuration {path}")
 
 
+def load_stored_config(path: str | Path) -> Config:
+    """Read a configuration as `resolved_yaml` wrote it into a run folder; the files that it names may be gone."""
+    return _validated(_read(Path(path), ()), f"the configuration {path}", stored=True)
+
+
 def make_config(sections: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
     """Complete and check a configuration that is in no file.
 
@@ -80,16 +85,17 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
     return _read(Path(path), ()).data
 
 
-def _validated(document: _Document, title: str) -> Config:
+def _validated(document: _Document, title: str, *, stored: bool = False) -> Config:
     try:
-        return Config.model_validate(document.data, context={"folders": search_folders(*document.folders)})
+        context = {"folders": search_folders(*document.folders), "stored": stored}
+        return Config.model_validate(document.data, context=context)
     except ValidationError as error:
         reasons = explain(error, Config, document.data, document.origins)
         raise ConfigError(f"{title} cannot be run:\n{reasons}") from None
 
 
 def resolved_yaml(config: Config) -> str:
-    """The configuration as YAML, every default spelled out; `load_config` reads it back."""
+    """The configuration as YAML, every default spelled out; `load_config` and `load_stored_config` read it back."""
     yaml, text = YAML(), io.StringIO()
     yaml.Representer = _Representer
     yaml.width = 120

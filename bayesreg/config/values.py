@@ -15,6 +15,11 @@ from bayesreg.tissues import BACKGROUND, tissue_names
 from bayesreg.types import DATA_FOLDER
 
 
+def _is_stored(info: ValidationInfo) -> bool:
+    """Whether a configuration is that of a run folder, which holds what was made of the files that it names."""
+    return bool((info.context or {}).get("stored"))
+
+
 def _find_file(value: object, info: ValidationInfo) -> Path:
     return _find(value, info, Path.is_file)
 
@@ -27,6 +32,8 @@ def _find_image(value: object, info: ValidationInfo) -> Path:
 def _find(value: object, info: ValidationInfo, serves: Callable[[Path], bool]) -> Path:
     if not isinstance(value, str | Path) or not str(value):
         raise ValueError("expected the path of a file")
+    if _is_stored(info):
+        return Path(value)
     folders = (info.context or {}).get("folders", ()) or search_folders()
     places = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
     for place in places:
@@ -123,7 +130,9 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
 
 def _named_table(value: object, info: ValidationInfo) -> object:
     """The table of a program by its name; in others, names of labels that a lookup table lists become their values."""
-    if isinstance(value, dict) and (known := info.data.get("label_names")) is not None:
+    known = info.data.get("label_names")
+    # A stored table has numbers alone.
+    if isinstance(value, dict) and known is not None and not _is_stored(info):
         names = read_label_names(known)
         return {tissue: name_values(entry, names) for tissue, entry in value.items()}
     if not isinstance(value, str):

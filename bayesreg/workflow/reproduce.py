@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesreg.config import load_config, resolved_yaml
+from bayesreg.config import load_stored_config, resolved_yaml
 from bayesreg.config.sections import Config, StopConfig
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io import store
@@ -83,7 +83,8 @@ def reproduce(
             "folder does not hold"
         )
     store.require_fresh(out)
-    config = _as_many(load_config(require_file(folder, "config.yaml")), int(first.run.manifest["steps_per_chain"]))
+    config = load_stored_config(require_file(folder, "config.yaml"))
+    config = _as_many(config, int(first.run.manifest["steps_per_chain"]))
     inputs = store.read_inputs(folder)._replace(config=resolved_yaml(config))
     with locked(out):
         # Those files may have changed, or be gone.

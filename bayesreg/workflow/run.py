@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.config import Config, load_config, load_stored_config, resolved_yaml
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.devices import is_first, require_joined, wait
 from bayesreg.inference.chains.progress import Showing
@@ -122,7 +122,7 @@ def _run_together(config: Config, out: Path, resume: bool, progress: Showing, ob
         return result
     wait(BEGUN)
     if stage_of(out) != "finished":
-        begun, inputs = load_config(out / "config.yaml"), store.read_inputs(out)
+        begun, inputs = load_stored_config(out / "config.yaml"), store.read_inputs(out)
         found = store.read_json(require_file(out, PROVENANCE)).get("independent_points")
         posterior = posterior_of(begun, inputs, observations, found)
         _sample(begun, posterior, _load_reached(begun, inputs, posterior, out, progress=False), out, progress=False)
@@ -241,7 +241,7 @@ def _warn(config: Config, result: Result, say: Callable[[str], None]) -> None:
 
 def _resumed_config(out: Path, config: Config) -> Config:
     """The configuration that a run was begun with; InputError if it differs in more than `MAY_CHANGE`."""
-    known = load_config(require_file(out, "config.yaml"))
+    known = load_stored_config(require_file(out, "config.yaml"))
     given = {name: getattr(config, name) for name in MAY_CHANGE}
     if resolved_yaml(known.model_copy(update=given)) != resolved_yaml(config):
         raise InputError(

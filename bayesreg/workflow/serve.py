@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.config import Config, load_config
+from bayesreg.config import Config, load_config, load_stored_config
 from bayesreg.inference.layout import slices, unravel
 from bayesreg.io import store
 from bayesreg.io.ledger import require_file, stage_of
@@ -173,7 +173,7 @@ def posterior_of_run(config: str | Path | Config, say: Callable[[str], None]) ->
     if not isinstance(config, Config) and Path(config).is_dir():
         if stage_of(config) is None:
             raise InputError(f"{config} holds no run of bayesreg, and is no configuration")
-        settings, inputs = load_config(require_file(config, "config.yaml")), store.read_inputs(config)
+        settings, inputs = load_stored_config(require_file(config, "config.yaml")), store.read_inputs(config)
         independent = store.read_json(require_file(config, PROVENANCE)).get("independent_points")
         posterior = posterior_of(settings, inputs, (), independent)
     else:
