@@ -214,6 +214,13 @@ def test_a_run_whose_files_have_changed_is_told(finished, folder):
     assert br.run(folder / "run.yaml", folder / "out", resume=True, progress=False).folder == folder / "out"
 
 
+def test_blocks_that_no_memory_holds_are_refused_before_any_draw(folder):
+    config = br.load_config(folder / "run.yaml", ["sampler.block=100000000", "stop.max_steps=1000000000"])
+    with pytest.raises(br.InputError, match=r"blocks of 100,000,000 draws .* GB, and this machine has"):
+        br.run(config, folder / "too_much", progress=False)
+    assert not (folder / "too_much").exists()
+
+
 @pytest.mark.usefixtures("no_report")
 def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
     # What it was made of may be gone.

@@ -18,6 +18,7 @@ from nibabel.arrayproxy import ArrayProxy
 from nibabel.spatialimages import SpatialImage
 
 from bayesreg.io.mrtrix import is_mrtrix, read_mrtrix
+from bayesreg.memory import memory_of_machine
 from bayesreg.types import InputError
 
 # What SimpleITK reads and nibabel does not.
@@ -160,7 +161,7 @@ def _open(path: Path) -> SpatialImage:
 def _require_memory(shape: Sequence[int], path: Path) -> None:
     """Raise InputError where a header speaks of more voxels than the machine could hold."""
     needed = 8 * prod(map(int, shape))
-    held = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 2**36
+    held = memory_of_machine()
     if needed > held:
         grid = " × ".join(map(str, shape))
         raise InputError(

@@ -88,7 +88,7 @@ class Check:
                 f"  speed     about {self.steps_per_second:.0f} steps per second and chain",
                 f"  time      {self.hours:.1f} h for all the steps that stop.max_steps allows",
                 f"  memory    {self.device_bytes / 1e6:.0f} MB on the device, whatever the number of draws; "
-                f"{self.draws_bytes / 1e6:.0f} MB of draws on the host at most",
+                f"{self.draws_bytes / 1e6:.0f} MB of draws in the run's folder at most",
             ]
         )
 

@@ -31,6 +31,7 @@ from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
 from bayesreg.io.ledger import is_sound, locked, read_status, require_file, stage_of, writing
 from bayesreg.io.records import Inputs
+from bayesreg.memory import memory_of_machine
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.single_node import images_of
@@ -150,6 +151,7 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
         say(f"beware: {sentence}")
     # Nothing is written before all input has proved sound, and all of it before the first step is taken.
     posterior = posterior_of(config, inputs, observations)
+    _require_memory(config, posterior)
     provenance["observations"] = _fingerprint(posterior, observations)
     provenance["sources"] = digests_of_sources(config, MAY_CHANGE)
     searching = time.perf_counter()
@@ -360,6 +362,21 @@ def _sample(
         on_block=keep,
         **options.settings,
     )
+
+
+def _require_memory(config: Config, posterior: Posterior) -> None:
+    """Raise InputError where a block of draws, or the chains' moments alone, are more than the machine could hold."""
+    options = config.sampler
+    estimands = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values())
+    block = min(options.block or _block(images_of(posterior.data)), config.stop.max_steps // options.thin)
+    # Moments are two numbers for each, and are made anew beside the old ones.
+    needed = 8 * options.chains * (block * estimands + 4 * (estimands + posterior.mesh.points.size))
+    if needed > (held := memory_of_machine()):
+        raise InputError(
+            f"sampler.chains = {options.chains:,} with blocks of {block:,} draws of {estimands:,} estimands need "
+            f"{needed / 1e9:,.0f} GB, and this machine has {held / 1e9:,.0f} GB; give fewer chains, or fewer draws to "
+            "a block (sampler.block)"
+        )
 
 
 def _block(images: ComparedImages | None) -> int:
