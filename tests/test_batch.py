@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.config.cohort import load_cohort
 from bayesreg.io.ledger import digest_of
-from bayesreg.workflow.batch import batch
+from bayesreg.workflow.batch import batch, share_of_devices
 from tests.endurance.damage import quick_reports
 from tests.endurance.small_run import write_pair
 
@@ -119,3 +119,12 @@ def test_sound_subjects_finish_and_broken_ones_are_named(tmp_path):
     page = (tmp_path / "out" / "cohort.html").read_text(encoding="utf-8")
     assert "1 of 2 runs have finished" in page
     assert 'href="sound/report.html"' in page
+
+
+def test_workers_share_the_devices():
+    """Each sees one; where there are more workers, they share its memory."""
+    assert share_of_devices(1, 3, ()) == {}
+    seen = [share_of_devices(number, 3, ("0", "GPU-5")) for number in range(3)]
+    assert [one["CUDA_VISIBLE_DEVICES"] for one in seen] == ["0", "GPU-5", "0"]
+    assert {one["XLA_PYTHON_CLIENT_MEM_FRACTION"] for one in seen} == {"0.375"}
+    assert share_of_devices(1, 2, ("0", "1"))["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.750"

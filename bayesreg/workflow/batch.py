@@ -6,9 +6,11 @@ Dask is optional, and imported where it is used.
 from __future__ import annotations
 
 import os
+import subprocess
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from bayesreg.workflow.result import Result
 from bayesreg.workflow.run import run
 
 TOPIC = "bayesreg"
+VISIBLE = "CUDA_VISIBLE_DEVICES"
 # Workers that may die under one subject before it is given up.
 DEATHS = 5
 # How long a scheduler is waited for.
@@ -139,19 +142,41 @@ class _Reporter(NoProgress):
 
 
 def _take_share(count: int) -> None:
-    """Keep to a fair share of the cores, before JAX counts them."""
+    """Keep to a fair share of the cores, and to one of the devices, before JAX counts them."""
     from distributed import get_worker
 
-    if not hasattr(os, "sched_setaffinity"):
-        return
     name = get_worker().name
-    cores = sorted(_CORES)
     number = int(name) if str(name).isdecimal() else 0
-    os.sched_setaffinity(0, set(cores[number % count :: count]) or set(cores))
+    os.environ |= share_of_devices(number, count, _devices())
+    if hasattr(os, "sched_setaffinity"):
+        cores = sorted(_CORES)
+        os.sched_setaffinity(0, set(cores[number % count :: count]) or set(cores))
 
 
 # Those of the process before it took a share.
 _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+
+
+@cache
+def _devices() -> tuple[str, ...]:
+    """Names of NVIDIA's devices that the process might use before it took a share, as CUDA_VISIBLE_DEVICES has them."""
+    given = os.environ.get(VISIBLE)
+    if given is not None:
+        return tuple(name for name in given.split(",") if name)
+    try:
+        listed = subprocess.run(["nvidia-smi", "--list-gpus"], capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return ()
+    return tuple(str(index) for index in range(len(listed.splitlines())))
+
+
+def share_of_devices(number: int, workers: int, devices: Sequence[str]) -> dict[str, str]:
+    """The environment in which a worker of so many sees one device alone, and takes a share of its memory."""
+    if not devices:
+        return {}
+    # JAX takes three quarters of a device at once where nothing is said.
+    beside = -(-workers // len(devices))
+    return {VISIBLE: devices[number % len(devices)], "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.75 / beside:.3f}"}
 
 
 def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Iterator[tuple[Task, dict[str, Any]]]:

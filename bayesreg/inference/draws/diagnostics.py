@@ -177,6 +177,8 @@ def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
             found = az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail")
         return Figures(*(np.where(moved, one["draws"].to_numpy(), np.nan) for one in found))
 
-    with ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+    # Of a machine that is shared the process may have some cores alone.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(min(MOST_THREADS, cores)) as pool:
         parts = list(pool.map(judge, range(0, count, width)))
     return Figures(*map(np.concatenate, zip(*parts, strict=True)))
