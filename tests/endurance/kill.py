@@ -1,9 +1,10 @@
 """Kill a run at random moments, resume it, and compare what it leaves with a run that was left alone.
 
-    python -m tests.endurance.kill -o DIR [--times 50] [--signal KILL|TERM|INT]
+    python -m tests.endurance.kill -o DIR [--times 50] [--signal KILL|TERM|INT] [--meshing]
 
 The moments are uniform over the time that a run takes from its first import to its report. Its status is 1 where a run
-does not come to the same draws, bit for bit.
+does not come to the same draws, bit for bit; with --meshing, where every run makes a mesh of its own, where it does not
+come to a whole run.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from pathlib import Path
 
 import netCDF4
 import numpy as np
+from ruamel.yaml import YAML
 
+import bayesreg as br
 from bayesreg.io.ledger import read_status
 from tests.endurance.small_run import finish, start, write_pair
 
@@ -34,15 +37,28 @@ def contents(path: Path) -> dict[str, bytes]:
         }
 
 
+def is_whole(out: Path) -> bool:
+    """Whether a folder holds a finished run, as it was written, with as many draws as were asked for."""
+    try:
+        result = br.load_result(out)
+    except br.InputError:
+        return False
+    return result.idata.posterior.sizes["draw"] == 120 and bool(np.isfinite(result.u_mean).all())
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--times", type=int, default=50)
     parser.add_argument("--signal", choices=("KILL", "TERM", "INT"), default="KILL")
+    parser.add_argument("--meshing", action="store_true", help="no mesh is stored")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     number, rng = signal.Signals[f"SIG{given.signal}"], np.random.default_rng(given.seed)
     config = write_pair(given.out)
+    if given.meshing:
+        settings = YAML(typ="safe").load(config)
+        YAML(typ="safe").dump(settings | {"mesh": {"edge_length": 18.0}}, config)
     alone = given.out / "alone"
     # The first fills the cache of compiled programs.
     for _ in range(2):
@@ -63,18 +79,19 @@ def main() -> int:
         blocks = len(list(out.glob("draws/*.npz")))
         again, second = finish("run", config, "-o", out, "-q", "--resume")
         same = (out / "posterior.nc").exists() and contents(out / "posterior.nc") == expected
+        right = is_whole(out) if given.meshing else same
         left = [path.name for path in out.rglob(".partial-*")]
         report = (out / "report.html").exists()
-        good = same and report and not left and again in (0, 3) and "Traceback" not in first + second
+        good = right and report and not left and again in (0, 3) and "Traceback" not in first + second
         failures += not good
         print(
             f"{moment:5.1f} of {whole:.1f} s, status {process.returncode}, stage {stage}, {blocks} blocks; "
-            f"resumed with status {again}: {'same bits' if same else 'OTHER BITS'}{'' if good else ' FAILED'}",
+            f"resumed with status {again}: {'same' if same else 'other'} bits{'' if good else ' FAILED'}",
             flush=True,
         )
         if not good:
             print(first, second, left, sep="\n")
-    print(f"{given.times - failures} of {given.times} came to the same bits")
+    print(f"{given.times - failures} of {given.times} came to {'a whole run' if given.meshing else 'the same bits'}")
     return int(failures > 0)
 
 
