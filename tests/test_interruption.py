@@ -1,11 +1,14 @@
 """Signals end a run between two blocks, or at once where it is not sampling."""
 
 import signal
+import sys
+import time
 
 import pytest
 from typer.testing import CliRunner
 
 from bayesreg.cli import app
+from bayesreg.workflow import interruption
 from bayesreg.workflow.interruption import Interrupted, ending_at_once, ending_between_blocks
 
 
@@ -34,3 +37,22 @@ def test_the_command_line_says_how_to_go_on(monkeypatch, tmp_path):
     assert result.exit_code == 143
     assert result.stderr.startswith("bayesreg: stopped by SIGTERM; a run goes on")
     assert "--resume" in result.stderr
+
+
+def test_a_signal_that_python_drops_comes_again(capsys, monkeypatch):
+    """As in a callback of the garbage collector."""
+    monkeypatch.setattr(interruption, "AGAIN", 0.05)
+
+    class Dropping:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    hook = sys.unraisablehook
+    with pytest.raises(Interrupted), ending_at_once():
+        Dropping()
+        began = time.monotonic()
+        while time.monotonic() < began + 20:
+            time.sleep(0.01)
+    assert time.monotonic() < began + 10
+    assert "Interrupted" not in capsys.readouterr().err
+    assert sys.unraisablehook is hook

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
+# Seconds after which a signal comes again.
+AGAIN = 0.5
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -61,13 +65,32 @@ def ending_between_blocks(say: Callable[[str], None]) -> Iterator[Callable[[], N
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Let signals raise `Interrupted`."""
+    """Let signals raise `Interrupted`, where that is not lost.
+
+    Python drops what is raised in a callback of its garbage collector (JAX has one) or in a `__del__`: the signal comes
+    again, until this block has ended.
+    """
+    again: list[threading.Timer] = []
+    show = sys.unraisablehook
 
     def stop(number: int, _frame: object) -> None:
+        again.append(threading.Timer(AGAIN, signal.raise_signal, [number]))
+        again[-1].daemon = True
+        again[-1].start()
         raise Interrupted(number)
 
+    def show_others(dropped: Any) -> None:
+        if not isinstance(dropped.exc_value, Interrupted):
+            show(dropped)
+
     with _handling(stop):
-        yield
+        sys.unraisablehook = show_others
+        try:
+            yield
+        finally:
+            sys.unraisablehook = show
+            for timer in again:
+                timer.cancel()
 
 
 @contextmanager
