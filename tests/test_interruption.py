@@ -47,12 +47,14 @@ def test_a_signal_that_python_drops_comes_again(capsys, monkeypatch):
         def __del__(self):
             signal.raise_signal(signal.SIGTERM)
 
-    hook = sys.unraisablehook
-    with pytest.raises(Interrupted), ending_at_once():
+    def work():
         Dropping()
-        began = time.monotonic()
         while time.monotonic() < began + 20:
             time.sleep(0.01)
+
+    hook, began = sys.unraisablehook, time.monotonic()
+    with pytest.raises(Interrupted), ending_at_once():
+        work()
     assert time.monotonic() < began + 10
     assert "Interrupted" not in capsys.readouterr().err
     assert sys.unraisablehook is hook
