@@ -40,7 +40,9 @@ class _Commands(TyperGroup):
         except OSError as error:
             if error.errno not in STORAGE_FAILURES:
                 raise
-            typer.echo(f"bayesreg: {error}; what was stored before is kept, and a run goes on with --resume", err=True)
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+            kept = "; what was stored before is kept, and a run goes on with --resume" if full else ""
+            typer.echo(f"bayesreg: {error}{kept}", err=True)
             raise typer.Exit(1) from None
 
 
@@ -316,8 +318,13 @@ def batch(
 ) -> None:
     """Run all subjects of a cohort, several at a time; those that have ended are left, others go on."""
     from bayesreg.workflow.batch import batch
+    from bayesreg.workflow.interruption import Interrupted
 
-    table = batch(cohort, out, scheduler, progress=not quiet)
+    try:
+        table = batch(cohort, out, scheduler, progress=not quiet)
+    except Interrupted as signal:
+        typer.echo(f"bayesreg: {signal}; the same command goes on where each run stands", err=True)
+        raise typer.Exit(signal.status) from None
     failed = int((table["state"] == "failed").sum())
     typer.echo(f"{len(table) - failed} of {len(table)} runs have finished: {out / 'cohort.html'}")
     if failed:

@@ -57,9 +57,42 @@ def test_patterns_of_bids(write, tmp_path):
     }
     one, other = load_cohort(write(subjects=patterns)).tasks
     assert (one.name, other.name) == ("01", "02")
-    # What is missing shows when the subject is run.
     assert [text.partition("=")[0] for text in one.overrides] == ["data.fixed", "data.moving"]
-    assert [text.partition("=")[0] for text in other.overrides] == ["data.fixed"]
+    # What is missing shows when the subject is run: nothing is taken of the configuration that all share.
+    with pytest.raises(
+        br.InputError, match=r"data.moving = .*sub-02/ses-post/anat/sub-02_\*_T1w.nii.gz.*: no such file"
+    ):
+        br.load_config(tmp_path / "run.yaml", [*other.overrides, "data.source=files"])
+    # The same by absolute patterns.
+    whole = {key: f"{tmp_path}/{pattern}" for key, pattern in patterns.items()}
+    assert load_cohort(write(subjects=whole)).tasks == [one, other]
+
+
+def test_cells_are_read_as_what_they_are(write, tmp_path):
+    """A number is no file, even where one has its name; lists are lists; an empty cell leaves what all share."""
+    (tmp_path / "1").mkdir()
+    (tmp_path / "b b.nii.gz").touch()
+    header = "\ufeffsubject, seed,data.fixed,data.moving,data.label_table.wm,description\n"
+    (tmp_path / "table.csv").write_text(f'{header}a,1,1,b b.nii.gz,"[3, 4]",[x: y\nb,2,,,,\n')
+    one, other = load_cohort(write(subjects="table.csv")).tasks
+    assert one.overrides == (
+        "seed=1",
+        f"data.fixed={tmp_path / '1'}",
+        f"data.moving='{tmp_path / 'b b.nii.gz'}'",
+        "data.label_table.wm=[3, 4]",
+        "description='[x: y'",
+    )
+    assert other.overrides == ("seed=2",)
+
+
+def test_values_that_are_alike_have_folders_of_their_own(write, tmp_path):
+    (tmp_path / "one.csv").write_text("subject\na\n")
+    values = ["a b.nii.gz", "a-b.nii.gz", [0.4, 0.6], "x" * 300]
+    names = [task.name for task in load_cohort(write(subjects="one.csv", sweep={"data.moving": values})).tasks]
+    assert len(set(names)) == 4
+    assert names[1] == "a/data.moving-a-b.nii.gz"
+    assert max(map(len, names)) < 120
+    assert names == [task.name for task in load_cohort(tmp_path / "cohort.yaml").tasks]
 
 
 @pytest.mark.parametrize(
@@ -68,18 +101,27 @@ def test_patterns_of_bids(write, tmp_path):
         ({"subjects": "none.csv"}, "there is no table"),
         ({"subjects": "run.yaml"}, "ends in .csv or .tsv"),
         ({"subjects": "odd.csv"}, "no column subject"),
-        ({"subjects": "twice.csv"}, "line 3: subject a is there twice"),
+        ({"subjects": "twice.csv"}, "row 3: subject a is there twice"),
         ({"subjects": "path.csv"}, "a subject is named by letters"),
         ({"subjects": "empty.csv"}, "has no subject"),
         ({"subjects": {"data.fixed": "t1.nii.gz"}}, "does not hold {subject}"),
         ({"subjects": "twice.csv", "sweeps": {}}, "did you mean sweep"),
         ({"subjects": "twice.csv", "config": "other.yaml"}, "there is no file"),
+        ({"subjects": "one.csv", "sweep": {"seed": [1, "1"]}}, "two values of the sweep are one and the same"),
+        ({"subjects": "one.csv", "sweep": {"seed": []}}, "sweep.seed has no value"),
+        ({"subjects": "ragged.csv"}, "row 3: 3 cells under 2 columns"),
+        ({"subjects": "header.csv"}, "has the column 'seed' twice"),
+        ({"subjects": "reserved.csv"}, "and not as a table of the batch"),
+        ({"subjects": "long.csv"}, "up to 100 of them"),
+        ({"subjects": "control.csv"}, "cannot be printed"),
         ({"subjects": "one.csv", "sweep": {f"k{n}": list(range(100)) for n in range(3)}}, "more than the 100,000"),
     ],
 )
 def test_what_is_refused(write, tmp_path, content, message):
     files = {"odd": "name\na\n", "twice": "subject\na\na\n", "path": "subject\n../a\n", "empty": "subject\n",
-             "one": "subject\na\n"}  # fmt: skip
+             "one": "subject\na\n", "ragged": "subject,seed\na,1\nb,2,3\n", "header": "subject,seed, seed\na,1,2\n",
+             "reserved": "subject\ncohort.csv\n", "long": f"subject\n{'a' * 300}\n",
+             "control": "subject,description\na,\x1b[2J\n"}  # fmt: skip
     for name, text in files.items():
         (tmp_path / f"{name}.csv").write_text(text)
     with pytest.raises(br.InputError, match=message):

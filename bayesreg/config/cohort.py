@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -10,16 +12,26 @@ from math import prod
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import pandas as pd
 from pydantic import Field, ValidationError
 
 from bayesreg.config.errors import ConfigError, explain
 from bayesreg.config.loading import read_mapping
 from bayesreg.config.values import Count, Section
+from bayesreg.config.yaml_text import parse
+from bayesreg.printable import find_unprintable
 
 SUBJECT = "subject"
 MOST_TASKS = 100_000
-_NAME = re.compile(r"[A-Za-z0-9._-]+")
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
+# What a batch itself writes beside the folders of its subjects.
+RESERVED = ("cohort.csv", "cohort.parquet", "cohort.html")
+# Keys of a configuration that name files, by their last part.
+FILES = (
+    "fixed", "moving", "labels", "intracranial", "fixed_ignore", "moving_ignore", "label_names", "t1", "file",
+    "moving_file", "field", "known_boundary", "landmarks", "moving_landmarks",
+)  # fmt: skip
+# Folders named after longer values get a digest in their place.
+LONGEST_NAME = 100
 
 
 class ClusterConfig(Section):
@@ -38,7 +50,8 @@ class CohortConfig(Section):
     """The configuration that all subjects share, a file beside this one."""
     subjects: str | dict[str, str]
     """A table (.csv, .tsv) beside this file, with a column subject and columns named after keys of the configuration,
-    such as data.fixed; or a pattern for each of such keys, such as "bids/sub-{subject}/ses-pre/anat/*_T1w.nii.gz"."""
+    such as data.fixed (an empty cell leaves what all share); or a pattern for each of such keys, such as
+    "bids/sub-{subject}/ses-pre/anat/*_T1w.nii.gz"."""
     sweep: dict[str, list[Any]] = Field(default_factory=dict)
     """Values of further keys; every subject is run with each combination of them."""
     cluster: ClusterConfig = ClusterConfig()
@@ -94,9 +107,16 @@ def load_cohort(path: str | Path) -> Cohort:
     assert rows is not None
     if not rows:
         raise ConfigError(f"the cohort {path} has no subject")
+    if empty := [key for key, values in cohort.sweep.items() if not values]:
+        raise ConfigError(f"the cohort {path}: sweep.{empty[0]} has no value")
     if (count := len(rows) * prod(map(len, cohort.sweep.values()))) > MOST_TASKS:
         raise ConfigError(f"the cohort {path} has {count:,} runs, more than the {MOST_TASKS:,} of one batch")
     tasks = [task for subject, given in rows.items() for task in _tasks(subject, given, cohort.sweep)]
+    names: set[str] = set()
+    for task in tasks:
+        if task.name in names:
+            raise ConfigError(f"the cohort {path}: two values of the sweep are one and the same: {task.name}")
+        names.add(task.name)
     return Cohort(config, tasks, cohort.cluster)
 
 
@@ -106,21 +126,37 @@ def _of_table(path: Path) -> dict[str, dict[str, str]]:
     if not path.is_file():
         raise ConfigError(f"subjects: there is no table {path}")
     try:
-        table = pd.read_csv(path, sep="\t" if path.suffix == ".tsv" else ",", dtype=str, keep_default_na=False)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise ConfigError(f"subjects: {path} is no table: {str(error).splitlines()[0]}") from None
-    if SUBJECT not in table:
-        raise ConfigError(f"subjects: {path} has no column {SUBJECT}; its columns are {', '.join(table.columns)}")
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = [line for line in csv.reader(file, delimiter="\t" if path.suffix == ".tsv" else ",") if any(line)]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ConfigError(f"subjects: {path} is no table: {error}") from None
+    header = [name.strip() for name in lines[0]] if lines else []
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise ConfigError(f"subjects: {path} has the column {twice[0]!r} twice")
+    if SUBJECT not in header:
+        raise ConfigError(f"subjects: {path} has no column {SUBJECT}; its columns are {', '.join(header) or 'none'}")
     found: dict[str, dict[str, str]] = {}
-    for number, row in enumerate(table.to_dict("records"), start=2):
-        subject = str(row.pop(SUBJECT)).strip()
-        if not _NAME.fullmatch(subject) or subject.startswith("."):
-            raise ConfigError(f"{path}, line {number}: a subject is named by letters, digits, . _ -, got {subject!r}")
+    for number, line in enumerate(lines[1:], start=2):
+        if len(line) != len(header):
+            raise ConfigError(f"{path}, row {number}: {len(line)} cells under {len(header)} columns")
+        if odd := [cell for cell in line if find_unprintable(cell)]:
+            raise ConfigError(f"{path}, row {number}: a cell cannot be printed: {odd[0]!r:.80}")
+        row = dict(zip(header, (cell.strip() for cell in line), strict=True))
+        subject = row.pop(SUBJECT)
+        if not _NAME.fullmatch(subject) or subject in RESERVED:
+            raise ConfigError(
+                f"{path}, row {number}: a subject is named by letters, digits, . _ -, up to 100 of them, and not as a "
+                f"table of the batch; got {subject!r:.120}"
+            )
         if subject in found:
-            raise ConfigError(f"{path}, line {number}: subject {subject} is there twice")
-        cells = {str(key): str(value).strip() for key, value in row.items()}
-        found[subject] = {key: _beside(path.parent, value) for key, value in cells.items() if value}
+            raise ConfigError(f"{path}, row {number}: subject {subject} is there twice")
+        given = {key: cell for key, cell in row.items() if cell}
+        found[subject] = {key: _beside(path.parent, cell) if _names_file(key) else cell for key, cell in given.items()}
     return found
+
+
+def _names_file(key: str) -> bool:
+    return key.rpartition(".")[2] in FILES
 
 
 def _beside(folder: Path, value: str) -> str:
@@ -133,7 +169,7 @@ def _beside(folder: Path, value: str) -> str:
 
 
 def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[str, str]]:
-    """Subjects for which all patterns name one file each."""
+    """The files of every subject for which one of the patterns names one."""
     found: dict[str, dict[str, str]] = {}
     for key, pattern in patterns.items():
         if "{subject}" not in pattern:
@@ -142,16 +178,23 @@ def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[st
             if key in found.setdefault(subject, {}):
                 raise ConfigError(f"subjects: {key}: {found[subject][key]} and {path} are both of subject {subject}")
             found[subject][key] = str(path)
-    return {subject: found[subject] for subject in sorted(found)}
+    # Where a subject lacks a file it is told of the pattern, and takes none of the configuration that all share.
+    return {
+        subject: {key: str(folder / pattern.replace("{subject}", subject)) for key, pattern in patterns.items()}
+        | found[subject]
+        for subject in sorted(found)
+    }
 
 
 def _matches(pattern: str, folder: Path) -> Iterator[tuple[str, Path]]:
+    whole = folder / Path(pattern).expanduser()
+    root, pattern = Path(whole.anchor), whole.relative_to(whole.anchor).as_posix()
     # As a glob, and as an expression that tells which part of a path is the subject.
     own = re.escape(pattern).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
     own = own.replace(re.escape("{subject}"), "(?P<subject>[A-Za-z0-9]+)", 1)
     expression = re.compile(own.replace(re.escape("{subject}"), "(?P=subject)"))
-    for path in sorted(folder.glob(pattern.replace("{subject}", "*"))):
-        match = expression.fullmatch(path.relative_to(folder).as_posix())
+    for path in sorted(root.glob(pattern.replace("{subject}", "*"))):
+        match = expression.fullmatch(path.relative_to(root).as_posix())
         if match:
             yield match["subject"], path
 
@@ -159,14 +202,28 @@ def _matches(pattern: str, folder: Path) -> Iterator[tuple[str, Path]]:
 def _tasks(subject: str, given: Mapping[str, str], sweep: Mapping[str, list[Any]]) -> Iterator[Task]:
     for values in product(*sweep.values()):
         settings = dict(zip(sweep, values, strict=True))
-        parts = [re.sub(r"[^A-Za-z0-9._-]+", "-", f"{key}-{value}") for key, value in settings.items()]
         # JSON is YAML: a value of the sweep comes back as what it was. A cell of a table is read as YAML.
         values_of = {**{key: _quoted(cell) for key, cell in given.items()},
                      **{key: json.dumps(value, default=str) for key, value in settings.items()}}  # fmt: skip
         overrides = tuple(f"{key}={value}" for key, value in values_of.items())
-        yield Task("/".join([subject, *(["_".join(parts)] if parts else [])]), subject, settings, overrides)
+        name = f"{subject}/{_folder_of(settings)}" if settings else subject
+        yield Task(name, subject, settings, overrides)
+
+
+def _folder_of(settings: Mapping[str, Any]) -> str:
+    """The name of a folder, by the values; with a digest of them where it does not hold them as they are."""
+    plain = "_".join(f"{key}-{value}" for key, value in settings.items())
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", plain)
+    if name == plain and len(name) <= LONGEST_NAME:
+        return name
+    content = json.dumps(settings, default=str, sort_keys=True)
+    return f"{name[:LONGEST_NAME]}-{hashlib.sha256(content.encode()).hexdigest()[:8]}"
 
 
 def _quoted(cell: str) -> str:
-    """A cell in quotes, where YAML would take a part of it for something else."""
-    return cell if re.fullmatch(r"[\w./+\-]+", cell) else "'" + cell.replace("'", "''") + "'"
+    """A cell in quotes, where YAML would take a part of it for something else; lists stay lists."""
+    try:
+        is_list = cell.startswith("[") and isinstance(parse(cell, "a cell")[0], list)
+    except ConfigError:
+        is_list = False
+    return cell if is_list or re.fullmatch(r"[\w./+\-]+|~", cell) else "'" + cell.replace("'", "''") + "'"

@@ -19,6 +19,12 @@ UNITS = {1.0: "mm", 10.0: "cm", 1000.0: "m"}
 # A mesh of these labels agrees with them in four fifths of its volume, less where tissues are thin; what is reversed in
 # a brain from left to right loses .07 of it.
 LEAST, BETTER = 0.3, 0.05
+# Advice is given where a reading disagrees in so much less of the volume.
+LESS = 0.8
+# How unusual a reading is: of those that agree about as well (an organ is much the same reversed) the most usual is
+# meant. Formats differ by LPS and RAS, and by units; single axes are reversed, and tissues renumbered, by mistake.
+COSTS: dict[tuple[int, ...], int] = {(1, 1, 1): 0, (-1, -1, 1): 1}
+COST_OF_UNIT, COST_OF_SIGNS, COST_OF_ORDER = 1, 2, 2
 
 
 class _Reading(NamedTuple):
@@ -43,9 +49,10 @@ def require_agreement(mesh: TetMesh, tissue: Image, path: str | Path) -> None:
     """
     as_is = tuple(range(len(mesh.names)))
     own = float(np.trace(_volumes(mesh, tissue, 1.0, (1, 1, 1))))
-    readings = (_best_order(mesh, tissue, unit, signs) for unit in UNITS for signs in product((1, -1), repeat=3))
-    best = max(readings, key=lambda reading: reading.share)
-    if best.share > own + BETTER:
+    readings = [_best_order(mesh, tissue, unit, signs) for unit in UNITS for signs in product((1, -1), repeat=3)]
+    highest = max(reading.share for reading in readings)
+    best = min((one for one in readings if one.share >= highest - BETTER), key=lambda one: (_cost(one), -one.share))
+    if best.share > own + BETTER and 1 - best.share < LESS * (1 - own):
         parts = []
         if best.unit != 1:
             parts.append(f"in {UNITS[best.unit]} (write it in mm)")
@@ -64,6 +71,11 @@ def require_agreement(mesh: TetMesh, tissue: Image, path: str | Path) -> None:
             f"mesh {path} has the tissue of the labels in no more than {own:.0%} of its volume; give a mesh of these "
             "labels in the world of the fixed image (RAS, mm), or leave mesh.file out"
         )
+
+
+def _cost(reading: _Reading) -> int:
+    renumbered = reading.order != tuple(range(len(reading.order)))
+    return COST_OF_UNIT * (reading.unit != 1) + COSTS.get(reading.signs, COST_OF_SIGNS) + COST_OF_ORDER * renumbered
 
 
 def _best_order(mesh: TetMesh, tissue: Image, unit: float, signs: tuple[int, ...]) -> _Reading:

@@ -50,9 +50,9 @@ def read_status(folder: str | Path) -> Status | None:
         content = json.loads(path.read_text(encoding="utf-8"))
         status = Status(content["stage"], {name: tuple(digests) for name, digests in content["files"].items()})
         sound = content["digest"] == _digest_of(status) and not any(map(_leads_out, status.files))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, IsADirectoryError):
         sound = False
     if not sound:
         raise InputError(f"{path} is damaged, and nothing in its folder can be relied on without it; {ANEW}")
@@ -198,21 +198,34 @@ def locked(folder: str | Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        If another process holds it.
+        If another process holds it, or nothing can be written there.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK, timeout=0, is_singleton=True)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout as error:
         raise InputError(f"another process is working in {folder}; wait until it has ended") from error
+    except (PermissionError, FileExistsError, NotADirectoryError) as error:
+        raise InputError(
+            f"nothing can be written into {folder} ({error.strerror}), where a run keeps its files"
+        ) from error
     try:
-        for path in folder.rglob(f"{PARTIAL}*"):
+        for path in _half_written(folder):
             path.unlink(missing_ok=True)
         yield
     finally:
         lock.release()
+
+
+def _half_written(folder: Path) -> list[Path]:
+    """What was being written to a folder, but not to those of other runs within it, which may be written to now."""
+    found = []
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not (Path(place, name, LOCK).exists())]
+        found += [Path(place, name) for name in files if name.startswith(PARTIAL)]
+    return found
 
 
 def digest_of(path: Path) -> str | None:

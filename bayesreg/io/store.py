@@ -32,6 +32,10 @@ def require_fresh(folder: str | Path) -> None:
     """Raise InputError where a folder (or a file in its place) already holds a run, or cannot be written."""
     folder = Path(folder)
     nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if folder.is_symlink() and not folder.exists():
+        raise InputError(f"the output folder {folder} is a link that leads nowhere")
+    if within := [place for place in folder.absolute().parents if (place / STATUS).exists()]:
+        raise InputError(f"the output folder {folder} lies in that of another run, {within[0]}; name another one")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"the output folder {folder} is a file; name a folder that is new or empty")
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):

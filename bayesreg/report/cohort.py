@@ -18,6 +18,8 @@ from bayesreg.report.verdict import fixed, number
 TABLE, PARQUET, PAGE = "cohort.csv", "cohort.parquet", "cohort.html"
 # More runs than these are drawn without their names.
 MOST_NAMED = 60
+# Panels side by side.
+MOST_COLUMNS = 6
 # Where values are further apart than this their axis is logarithmic.
 DECADES = 30
 
@@ -67,12 +69,16 @@ def _text(value: Any) -> str:
 def _stiffness(finished: pd.DataFrame) -> Drawing:
     """λ and μ of every tissue, a line for each run."""
     names = [name.removesuffix("_low") for name in finished if str(name).endswith("_low")]
-    named = len(finished) <= MOST_NAMED
+    named, columns = len(finished) <= MOST_NAMED, min(len(names), MOST_COLUMNS)
+    rows = -(-len(names) // columns)
     with style.look():
-        figure = style.new_figure(0.8 + 0.16 * min(len(finished), 4 * MOST_NAMED))
-        axes = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
+        figure = style.new_figure(rows * (0.8 + 0.16 * min(len(finished), 4 * MOST_NAMED)))
+        grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+        axes = grid.ravel()
+        for panel in axes[len(names) :]:
+            panel.remove()
         place = np.arange(len(finished))[::-1]
-        for panel, name in zip(axes, names, strict=True):
+        for panel, name in zip(axes, names, strict=False):
             low, middle, high = (finished[f"{name}{end}"].to_numpy(float) for end in ("_low", "", "_high"))
             panel.hlines(place, low, high, color=style.ACCENT, lw=1.0)
             panel.plot(middle, place, "o", ms=3, color=style.ACCENT)
@@ -81,7 +87,9 @@ def _stiffness(finished: pd.DataFrame) -> Drawing:
                 panel.set_xscale("log")
             else:
                 panel.xaxis.set_major_locator(MaxNLocator(3))
-        axes[0].set_yticks(place if named else [], finished["folder"] if named else [])
+        labels = [style.literal(name) for name in finished["folder"]]
+        for panel in grid[:, 0]:
+            panel.set_yticks(place if named else [], labels if named else [])
         uri = style.data_uri(figure)
     caption = "Median and 95 % interval of λ and μ by tissue, relative; a line for each run, in the order of the table."
     return Drawing("stiffness", "λ and μ", caption, f"Stiffness of {len(finished)} runs.", uri)

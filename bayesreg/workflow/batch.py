@@ -5,6 +5,7 @@ Dask is optional, and imported where it is used.
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import traceback
@@ -23,7 +24,8 @@ from bayesreg.config.cohort import ClusterConfig, Cohort, Task, load_cohort
 from bayesreg.inference.chains.progress import NoProgress
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.inference.draws.moments import greatest_rhat
-from bayesreg.io.ledger import stage_of
+from bayesreg.io.ledger import STATUS, stage_of
+from bayesreg.report.estimands import parameter_groups
 from bayesreg.types import InputError
 from bayesreg.workflow.result import Result
 from bayesreg.workflow.run import run
@@ -70,7 +72,10 @@ def batch(
     from bayesreg.report.cohort import write_cohort
 
     given, out = load_cohort(cohort), Path(out).absolute()
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{out} cannot be a folder: {error.strerror}; name another one") from None
     rows: dict[str, dict[str, Any]] = {}
     # Workers of this machine alone share its cores.
     shares = given.cluster.workers if scheduler is None and given.cluster.slurm is None else None
@@ -93,7 +98,8 @@ def run_task(config: str, task: Task, folder: str, cores: int | None) -> dict[st
         result = run(settings, folder, resume=True, progress=lambda *budget: _Reporter(task.name, *budget))
         return {"state": "finished", **summarise(result)}
     except InputError as error:
-        return {"state": "failed", "message": str(error)}
+        begun = (Path(folder) / STATUS).exists()
+        return {"state": "failed", "message": f"{error} (to begin it anew, remove {folder})" if begun else str(error)}
     except Exception as error:
         # Whatever it is that ends one subject, it must not end the others.
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -116,11 +122,10 @@ def summarise(result: Result) -> dict[str, Any]:
     }
     if result.run.predicted is not None:
         found["radius95_mean_mm"] = float(share @ np.asarray(result.run.predicted.reach))
-    posterior = dataset(result.idata, "posterior")
-    for name in ("lam", "mu"):
-        for tissue in posterior["tissue"].to_numpy():
-            low, median, high = np.quantile(posterior[name].sel(tissue=tissue), [0.025, 0.5, 0.975])
-            found |= {f"{name}_{tissue}": median, f"{name}_{tissue}_low": low, f"{name}_{tissue}_high": high}
+    for group in parameter_groups(mesh, dataset(result.idata, "posterior")):
+        for name, draws in (("lam", group.lam), ("mu", group.mu)):
+            low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
+            found |= {f"{name}_{group.name}{end}": x for end, x in (("", median), ("_low", low), ("_high", high))}
     return found
 
 
@@ -204,7 +209,7 @@ def _stage_of(folder: Path) -> str | None:
     """The stage of a run; None where there is none, or its status is damaged, which the run itself tells of."""
     try:
         return stage_of(folder)
-    except InputError:
+    except (InputError, OSError):
         return None
 
 
@@ -232,7 +237,8 @@ def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
         workers.scale(cluster.workers)
     else:
         # A run needs what it needs: no worker is ended for its memory.
-        own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None}
+        own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None,
+               "silence_logs": logging.ERROR}  # fmt: skip
         workers = LocalCluster(n_workers=cluster.workers, **own)
     with workers, Client(workers) as client:
         yield client
@@ -272,5 +278,5 @@ class _Board:
             self._bar.remove_task(line)
         if found["state"] == "failed":
             self._failed += 1
-            self._bar.console.print(f"{task.name} failed: {found['message']}", highlight=False)
+            self._bar.console.print(f"{task.name} failed: {found['message']}", highlight=False, markup=False)
         self._bar.update(self._all, advance=1, figures=f"{self._failed} failed" if self._failed else "")

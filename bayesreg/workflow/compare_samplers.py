@@ -79,7 +79,7 @@ def compare_samplers(
                 thin=own.thin,
                 block=own.block or BLOCK,
                 start=start,
-                say=lambda text: console.print(f"  {text}"),
+                say=lambda text: console.print(f"  {text}", markup=False),
                 **own.settings,
             )
         )

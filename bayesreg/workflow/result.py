@@ -100,6 +100,8 @@ def report(folder: str | Path) -> Path:
     """Write the report of a finished run anew, and return its path."""
     from bayesreg.report.html import write_report
 
+    # A folder that is none of a run is not locked, and so not made.
+    store.require_finished(folder)
     with locked(folder):
         result = load_result(folder)
         with writing(folder) as place:

@@ -284,7 +284,7 @@ def _require_same_observations(out: Path, provenance: dict[str, Any], posterior:
 
 def _narrator(progress: Showing) -> Callable[[str], None]:
     console = Console(quiet=progress is not True, highlight=False)
-    return lambda text: console.print(text)
+    return lambda text: console.print(text, markup=False)
 
 
 def _describe_mesh(inputs: Inputs) -> str:

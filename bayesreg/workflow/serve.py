@@ -29,8 +29,9 @@ from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs
 from bayesreg.workflow.run import temper
 
+LOG_POSTERIOR = "log_posterior"
 LOOPBACK, PORT = "127.0.0.1", 4242
-# JSON has no infinity: what is outside the support has the least number that it has.
+# JSON has no infinity, nor what is no number: both have the least number that there is, which no sampler accepts.
 IMPOSSIBLE = float(np.finfo(float).min)
 
 Vectors = Sequence[Sequence[float]]
@@ -85,18 +86,36 @@ class Served:
         return False
 
     def __call__(self, parameters: Vectors, config: Any = None) -> list[list[float]]:
-        """The outputs at a position."""
-        return [_plain(one) for one in self._value(self.data, self._position(parameters))]
+        """The outputs at a position.
+
+        Raises
+        ------
+        InputError
+            If there are none there, as where λ is not a number; but the log posterior has its least number there.
+        """
+        found = [np.asarray(one, float).ravel() for one in self._value(self.data, self._position(parameters))]
+        if self.name == LOG_POSTERIOR:
+            found = [np.where(np.isfinite(one), one, IMPOSSIBLE) for one in found]
+        return [_finite(one, self.name).tolist() for one in found]
 
     def gradient(
         self, out_wrt: int, in_wrt: int, parameters: Vectors, sens: Sequence[float], config: Any = None
     ) -> list[float]:
-        """Sensitivity to an output, as one to an input: sensᵀ ∂output/∂input."""
+        """Sensitivity to an output, as one to an input: sensᵀ ∂output/∂input.
+
+        Raises
+        ------
+        InputError
+            If there is none there; but that of the log posterior is zero there.
+        """
         sensitivities = [jnp.zeros(size) for size in self.outputs]
         sensitivities[out_wrt] = jnp.asarray(sens, float)
         pulled = self._pulled(self.data, self._position(parameters), sensitivities)
         first = sum(self.inputs[:in_wrt])
-        return _plain(pulled[first : first + self.inputs[in_wrt]])
+        found = np.asarray(pulled[first : first + self.inputs[in_wrt]], float)
+        if self.name == LOG_POSTERIOR and not np.isfinite(found).all():
+            found = np.zeros_like(found)
+        return _finite(found, f"the gradient of {self.name}").tolist()
 
     def _position(self, parameters: Vectors) -> Any:
         return jnp.concatenate([jnp.asarray(part, float) for part in parameters]) if parameters else jnp.zeros(0)
@@ -130,7 +149,7 @@ def models_of(posterior: Posterior) -> list[Served]:
         at_rest = posterior.coordinates.unconstrain(data, posterior.estimands(posterior.reference()))
         return [jnp.ravel(at_rest[name]) for name in parts]
 
-    functions = {"log_posterior": (log_posterior, sizes), "forward": (forward, sizes), "start": (start, [])}
+    functions = {LOG_POSTERIOR: (log_posterior, sizes), "forward": (forward, sizes), "start": (start, [])}
     return [Served(name, function, posterior.data, inputs) for name, (function, inputs) in functions.items()]
 
 
@@ -183,6 +202,7 @@ def posterior_of_run(config: str | Path | Config, say: Callable[[str], None]) ->
     return temper(settings, inputs, posterior, say)
 
 
-def _plain(values: Any) -> list[float]:
-    found = np.asarray(values, float).ravel()
-    return np.where(np.isneginf(found), IMPOSSIBLE, np.nan_to_num(found)).tolist()
+def _finite(values: np.ndarray, name: str) -> np.ndarray:
+    if not np.isfinite(values).all():
+        raise InputError(f"{name} is not a finite number at this position")
+    return values

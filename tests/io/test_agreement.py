@@ -57,6 +57,32 @@ def test_a_mesh_that_lies_elsewhere_is_told(given, points, order, said):
         require_agreement(moved, labels, "mesh.vtu")
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda x: x / 1000, r"% in m \(write it in mm\)$"),
+        (lambda x: x * (-1, -1, 1), r"% with x and y reversed \(it may be in LPS: write it in RAS\)$"),
+        (lambda x: x + 25, "in no more than .*% of its volume; give a mesh of these labels"),
+    ],
+)
+def test_of_readings_that_agree_about_as_well_the_most_usual_is_told(change, said):
+    """Shells are much the same reversed."""
+    centre = np.array([5.0, -3.0, 8.0])
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = centre - 50
+    grid = br.Image(np.zeros((51, 51, 51)), affine)
+
+    def label(points):
+        return np.select([(away := np.linalg.norm(points - centre, axis=-1)) < 20, away < 32, away < 41], [3, 2, 1], 0)
+
+    ball = ball_mesh(spacing=9.0)
+    tissue = label(ball.points[ball.cells].mean(axis=1)) - 1
+    labels = grid.with_voxels(label(grid.grid_points()))
+    require_agreement(TetMesh(ball.points, ball.cells, tissue, ball.names), labels, "mesh.vtu")
+    with pytest.raises(br.InputError, match=said):
+        require_agreement(TetMesh(change(ball.points), ball.cells, tissue, ball.names), labels, "mesh.vtu")
+
+
 def test_a_tetrahedron_that_is_there_twice_is_told(tmp_path):
     mesh = ball_mesh(spacing=30.0)
     cells = np.concatenate([mesh.cells, mesh.cells[[7]][:, [1, 2, 0, 3]]])

@@ -167,3 +167,30 @@ def test_a_link_does_not_lead_out_of_its_folder(tmp_path):
         with pytest.raises(InputError, match="leads out of its folder by a link"):
             act()
     assert (elsewhere / "mine.txt").read_text() == "mine"
+
+
+def test_what_another_run_within_is_writing_stays(tmp_path):
+    """As of a folder of runs, which is taken for a run by mistake."""
+    inner = tmp_path / "subject"
+    stale = tmp_path / f"{ledger.PARTIAL}7-one.txt"
+    with ledger.locked(inner), ledger.writing(inner, "prepared") as place:
+        place("one.txt").write_text("1")
+        stale.write_text("0")
+        with ledger.locked(tmp_path):
+            assert not stale.exists()
+    assert read(inner, "one") == "1"
+
+
+@pytest.mark.parametrize("content", [None, "[" * 200_000])
+def test_a_status_that_is_none_is_told(tmp_path, content):
+    path = tmp_path / "status.json"
+    path.mkdir() if content is None else path.write_text(content)
+    with pytest.raises(InputError, match="damaged"):
+        ledger.read_status(tmp_path)
+
+
+def test_a_file_in_place_of_a_folder_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert ledger.read_status(tmp_path / "file") is None
+    with pytest.raises(InputError, match="nothing can be written"), ledger.locked(tmp_path / "file"):
+        pass
