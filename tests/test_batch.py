@@ -59,9 +59,7 @@ def test_patterns_of_bids(write, tmp_path):
     assert (one.name, other.name) == ("01", "02")
     assert [text.partition("=")[0] for text in one.overrides] == ["data.fixed", "data.moving"]
     # What is missing shows when the subject is run: nothing is taken of the configuration that all share.
-    with pytest.raises(
-        br.InputError, match=r"data.moving = .*sub-02/ses-post/anat/sub-02_\*_T1w.nii.gz.*: no such file"
-    ):
+    with pytest.raises(br.InputError, match=r"sub-02/ses-post/anat/sub-02_\*_T1w.nii.gz.*: no such file"):
         br.load_config(tmp_path / "run.yaml", [*other.overrides, "data.source=files"])
     # The same by absolute patterns.
     whole = {key: f"{tmp_path}/{pattern}" for key, pattern in patterns.items()}
@@ -138,7 +136,8 @@ def test_without_a_scheduler(write, tmp_path, monkeypatch):
 def test_sound_subjects_finish_and_broken_ones_are_named(tmp_path):
     """Workers of a scheduler that exists; what has ended is not run twice."""
     write_pair(tmp_path, steps=40)
-    rows = "subject,seed,data.fixed\nsound,4,\nbroken,5,none.nii.gz\n"
+    # To the terminal's markup this name would close what was never opened.
+    rows = "subject,seed,data.fixed\nsound,4,\nbroken,5,[/x]none.nii.gz\n"
     (tmp_path / "table.csv").write_text(rows)
     YAML(typ="safe").dump({"config": "run.yaml", "subjects": "table.csv"}, tmp_path / "cohort.yaml")
     with quick_reports(), LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:

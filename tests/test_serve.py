@@ -94,3 +94,17 @@ def test_what_is_impossible_is_a_number(address):
 def test_a_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(br.InputError, match="holds no run of bayesreg"):
         serve.serve(tmp_path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e160])
+def test_what_is_no_number_is_never_accepted(posterior, value):
+    """A trajectory that diverges comes to such places."""
+    log_posterior, forward, start = serve.models_of(posterior)
+    position = start([])
+    sound = log_posterior(position)[0][0]
+    which = list(slices(posterior)).index("mu")
+    position[which] = [value] * len(position[which])
+    assert log_posterior(position)[0][0] == serve.IMPOSSIBLE < sound
+    assert not np.any(log_posterior.gradient(0, which, position, [1.0]))
+    with pytest.raises(br.InputError, match="forward is not a finite number"):
+        forward(position)

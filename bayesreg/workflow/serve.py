@@ -142,7 +142,9 @@ def models_of(posterior: Posterior) -> list[Served]:
     def forward(data: Any, position: Any) -> list[Any]:
         here = replace(posterior, data=data)
         estimands, images = here.constrain(back(position)), images_of(data)
-        u = here.evaluate(estimands).u
+        evaluation = here.evaluate(estimands)
+        # A solve that has failed leaves numbers, too.
+        u = jnp.where(evaluation.solver_failed, jnp.nan, evaluation.u)
         return [u.ravel(), *([] if images is None else [images.predicted(u, here.fill(estimands))])]
 
     def start(data: Any, _: Any) -> list[Any]:
