@@ -106,5 +106,5 @@ def test_what_is_no_number_is_never_accepted(posterior, value):
     position[which] = [value] * len(position[which])
     assert log_posterior(position)[0][0] == serve.IMPOSSIBLE < sound
     assert not np.any(log_posterior.gradient(0, which, position, [1.0]))
-    with pytest.raises(br.InputError, match="forward is not a finite number"):
+    with pytest.raises(br.InputError, match="forward is no finite number"):
         forward(position)

@@ -143,8 +143,8 @@ def models_of(posterior: Posterior) -> list[Served]:
         here = replace(posterior, data=data)
         estimands, images = here.constrain(back(position)), images_of(data)
         evaluation = here.evaluate(estimands)
-        # A solve that has failed leaves numbers, too.
-        u = jnp.where(evaluation.solver_failed, jnp.nan, evaluation.u)
+        # A solve that has failed leaves numbers, too, and so does one that was not begun, outside the support.
+        u = jnp.where(evaluation.solver_failed | evaluation.outside_support, jnp.nan, evaluation.u)
         return [u.ravel(), *([] if images is None else [images.predicted(u, here.fill(estimands))])]
 
     def start(data: Any, _: Any) -> list[Any]:
@@ -206,5 +206,5 @@ def posterior_of_run(config: str | Path | Config, say: Callable[[str], None]) ->
 
 def _finite(values: np.ndarray, name: str) -> np.ndarray:
     if not np.isfinite(values).all():
-        raise InputError(f"{name} is not a finite number at this position")
+        raise InputError(f"{name} is no finite number at this position, which may lie outside the support")
     return values
