@@ -7,6 +7,7 @@ replaced in one step. Whoever dies in between leaves a folder in which each file
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -52,7 +53,13 @@ def read_status(folder: str | Path) -> Status | None:
         sound = content["digest"] == _digest_of(status) and not any(map(_leads_out, status.files))
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, IsADirectoryError):
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            return None
+        if not isinstance(error, IsADirectoryError):
+            raise
+        sound = False
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         sound = False
     if not sound:
         raise InputError(f"{path} is damaged, and nothing in its folder can be relied on without it; {ANEW}")

@@ -232,7 +232,8 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
         # Not `meshio.read`, which ends the program where it fails.
         content = meshio.vtu.read(path)
     except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
-        raise InputError(f"mesh {path} cannot be read: {str(error) or type(error).__name__}") from error
+        reason = str(error) or "it is cut short, or no .vtu file"
+        raise InputError(f"mesh {path} cannot be read: {reason}") from error
     kinds = sorted({block.type for block in content.cells})
     if kinds != ["tetra"]:
         raise InputError(f"mesh {path} must consist of tetrahedra, got {', '.join(kinds) or 'no cells'}")

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from bayesreg.io import ledger
+from bayesreg.io.store import require_fresh
 from bayesreg.types import InputError
 
 
@@ -187,6 +188,20 @@ def test_a_status_that_is_none_is_told(tmp_path, content):
     path.mkdir() if content is None else path.write_text(content)
     with pytest.raises(InputError, match="damaged"):
         ledger.read_status(tmp_path)
+
+
+def test_a_link_that_leads_nowhere_is_told(tmp_path):
+    for name in ("round", "gone"):
+        (tmp_path / name).symlink_to(tmp_path / ("round" if name == "round" else "nothing"))
+        assert ledger.read_status(tmp_path / name) is None
+        with pytest.raises(InputError, match="is a link that leads nowhere"):
+            require_fresh(tmp_path / name)
+
+
+def test_a_run_within_a_run_is_refused(tmp_path):
+    write(tmp_path / "run", "finished", one="1")
+    with pytest.raises(InputError, match="lies in that of another run"):
+        require_fresh(tmp_path / "run" / "again")
 
 
 def test_a_file_in_place_of_a_folder_is_told(tmp_path):

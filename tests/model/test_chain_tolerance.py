@@ -76,6 +76,7 @@ def test_solves_a_hundred_times_as_exact_give_the_same_draws():
     assert 0 < abs(found - expected).max() < 0.01
 
 
+@pytest.mark.long
 def test_slopes_a_million_times_as_exact_are_accepted_no_more_often():
     """A slope only proposes: what it is off by may cost acceptance, and does not."""
     conditioned, draws = chains()

@@ -49,6 +49,7 @@ def test_the_map_at_rest_is_the_contrast_of_the_other_image():
     assert np.corrcoef(np.asarray(FIXED.interpolate(inside)), other)[0, 1] < 0.2
 
 
+@pytest.mark.long
 def test_the_mode_of_a_pair_of_unlike_contrast_is_as_near_as_that_of_one_contrast():
     one, other = error_of(moved(), one_contrast=True), error_of(moved(other_contrast), one_contrast=False)
     # The mesh itself is as coarse as that: it moves by 1.8 mm in the mean.

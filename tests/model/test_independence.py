@@ -137,6 +137,7 @@ def test_scores_are_what_the_images_pull_with():
     assert -scores.sum(axis=0) @ shift == pytest.approx(slope, rel=1e-6)
 
 
+@pytest.mark.long
 def test_residuals_temper_the_likelihood_where_that_is_wanted():
     post = posterior(independent_points="residual")
     assert not post.tempered

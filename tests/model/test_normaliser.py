@@ -136,6 +136,7 @@ def mean_of_level(log_p):
     return weights @ LEVELS / weights.sum(axis=1)
 
 
+@pytest.mark.long
 def test_the_proper_density_recovers_stiffness_and_the_papers_drives_it_to_zero():
     """Over draws of (θ, u) from the model the posterior mean of θ is right on average, if the posterior is."""
     errors = dict(zip(("paper", "proper"), replicated(), strict=True))
