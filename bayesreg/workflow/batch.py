@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import subprocess
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -237,11 +239,27 @@ def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
         workers.scale(cluster.workers)
     else:
         # A run needs what it needs: no worker is ended for its memory.
-        own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": None,
-               "silence_logs": logging.ERROR}  # fmt: skip
+        own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": "127.0.0.1:0",
+               "silence_logs": logging.CRITICAL}  # fmt: skip
         workers = LocalCluster(n_workers=cluster.workers, **own)
     with workers, Client(workers) as client:
+        if cluster.slurm is None:
+            client.register_plugin(_deaf_to_interrupts())
         yield client
+
+
+def _deaf_to_interrupts() -> Any:
+    """A plugin of workers that leaves Ctrl-C, which a terminal sends to them, too, to the process that began them."""
+    from distributed import WorkerPlugin
+
+    class Deaf(WorkerPlugin):
+        name = "bayesreg-deaf-to-interrupts"
+
+        def setup(self, worker: Any) -> None:
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    return Deaf()
 
 
 class _Board:
