@@ -84,6 +84,14 @@ def stage_of(folder: str | Path) -> Stage | None:
     return None if status is None else status.stage
 
 
+def holds_run(folder: str | Path) -> bool:
+    """Whether there is a run in a folder; another program's status.json is none."""
+    try:
+        return read_status(folder) is not None
+    except InputError:
+        return False
+
+
 def is_listed(folder: str | Path, name: str) -> bool:
     """Whether a file belongs to the run in a folder."""
     status = read_status(folder)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
 from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
-from bayesreg.io.ledger import ANEW, STATUS, is_listed, require_file, stage_of, writing
+from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of, writing
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.points import PointPairs
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
@@ -34,7 +34,7 @@ def require_fresh(folder: str | Path) -> None:
     nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if folder.is_symlink() and not folder.exists():
         raise InputError(f"the output folder {folder} is a link that leads nowhere")
-    if within := [place for place in folder.absolute().parents if (place / STATUS).exists()]:
+    if within := [place for place in folder.absolute().parents if holds_run(place)]:
         raise InputError(f"the output folder {folder} lies in that of another run, {within[0]}; name another one")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"the output folder {folder} is a file; name a folder that is new or empty")

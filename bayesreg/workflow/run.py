@@ -144,6 +144,8 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
     say("reading the files, meshing")
     if config.has_images and not config.compares_images:
         say("the images are shown and not compared: observations does not name them ({kind: images})")
+    # Before they are read: what changes meanwhile is told when the run goes on.
+    sources = digests_of_sources(config, MAY_CHANGE)
     inputs, provenance = prepared_inputs(config, observations)
     for line in provenance["appraisal"].get("notes", ()):
         say(line)
@@ -153,7 +155,7 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
     posterior = posterior_of(config, inputs, observations)
     _require_memory(config, posterior)
     provenance["observations"] = _fingerprint(posterior, observations)
-    provenance["sources"] = digests_of_sources(config, MAY_CHANGE)
+    provenance["sources"] = sources
     searching = time.perf_counter()
     posterior = temper(config, inputs, posterior, say)
     provenance["independent_points"] = posterior.independent_points

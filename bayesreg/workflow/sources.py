@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ from bayesreg.types import InputError
 
 
 def digests_of_sources(config: Config, but: tuple[str, ...]) -> dict[str, str]:
-    """SHA-256 of every file that the configuration names, by its key, as data.fixed; some sections are left out."""
+    """SHA-256 of every file or folder that the configuration names, by its key; some sections are left out."""
     named = _paths(config.model_dump(exclude=set(but)))
-    return {key: digest for key, path in named if (digest := digest_of(path)) is not None}
+    return {key: digest for key, path in named if (digest := _digest_of(path)) is not None}
 
 
 def require_same_sources(config: Config, known: Mapping[str, str], but: tuple[str, ...], folder: Path) -> None:
@@ -24,12 +25,20 @@ def require_same_sources(config: Config, known: Mapping[str, str], but: tuple[st
     """
     now = digests_of_sources(config, but)
     if changed := [key for key, digest in known.items() if now.get(key, digest) != digest]:
-        named = dict(_paths(config.model_dump(exclude=set(but))))
+        named = dict(_paths(config.model_dump()))
         listed = ", ".join(f"{key} ({named[key]})" for key in changed)
         raise InputError(
             f"{listed} has changed since the run in {folder} was begun, which goes on with what it was: name another "
             "folder for a run of the new content, or put the former one back"
         )
+
+
+def _digest_of(path: Path) -> str | None:
+    """That of a file, or of all files of a folder, such as a DICOM series; None where there is neither."""
+    if not path.is_dir():
+        return digest_of(path)
+    content = [f"{file.relative_to(path)}\0{digest_of(file)}" for file in sorted(path.rglob("*")) if file.is_file()]
+    return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
 
 def _paths(value: Any, key: str = "") -> Iterator[tuple[str, Path]]:

@@ -202,6 +202,9 @@ def test_a_run_within_a_run_is_refused(tmp_path):
     write(tmp_path / "run", "finished", one="1")
     with pytest.raises(InputError, match="lies in that of another run"):
         require_fresh(tmp_path / "run" / "again")
+    # A file of this name that another program wrote is no run.
+    (tmp_path / "status.json").write_text("{}")
+    require_fresh(tmp_path / "other")
 
 
 def test_a_file_in_place_of_a_folder_is_told(tmp_path):

@@ -149,12 +149,14 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
 def _together(blocks: Blocks) -> Iterator[list[Block]]:
     """Blocks that follow one another, as many as are written at once."""
     some: list[Block] = []
+    held = 0
     for block in blocks:
         size = sum(values.size for values in block.values())
-        if some and sum(values.size for one in some for values in one.values()) + size > WRITTEN_AT_ONCE:
+        if some and held + size > WRITTEN_AT_ONCE:
             yield some
-            some = []
+            some, held = [], 0
         some.append(block)
+        held += size
     yield some
 
 
