@@ -28,18 +28,13 @@ class _Chains(BaseModel):
         return self.model_dump(exclude={"name", *_Chains.model_fields})
 
 
-class _Thinned(_Chains):
-    """Chains whose transitions are short."""
-
-    thin: Count = 10
-    """Every how many transitions a draw is kept."""
-
-
-class RandomWalk(settings.RandomWalk, _Thinned):
+class RandomWalk(settings.RandomWalk, _Chains):
     """The kernel of the paper, random-walk Metropolis."""
 
     name: Literal["rwmh"]
     chains: Chains = 3
+    thin: Count = 10
+    """Every how many transitions a draw is kept."""
 
 
 class Hmc(settings.Hmc, _Chains):
@@ -54,40 +49,10 @@ class Nuts(settings.Nuts, _Chains):
     name: Literal["nuts"]
 
 
-class Mclmc(settings.Mclmc, _Chains):
-    """Adjusted microcanonical trajectories."""
-
-    name: Literal["mclmc"]
-
-
 class Smc(settings.Smc, _Chains):
     """Sequential Monte Carlo."""
 
     name: Literal["smc"]
-
-
-class Mala(settings.Mala, _Thinned):
-    """Langevin steps."""
-
-    name: Literal["mala"]
-
-
-class Barker(settings.Barker, _Thinned):
-    """Barker's proposal."""
-
-    name: Literal["barker"]
-
-
-class RwmhAdaptive(settings.RwmhAdaptive, _Thinned):
-    """A random walk in whitened coordinates."""
-
-    name: Literal["rwmh_adaptive"]
-
-
-class Pcn(settings.Pcn, _Thinned):
-    """Preconditioned Crank–Nicolson."""
-
-    name: Literal["pcn"]
 
 
 class Laplace(settings.Laplace, _Chains):
@@ -96,13 +61,7 @@ class Laplace(settings.Laplace, _Chains):
     name: Literal["laplace"]
 
 
-class Pathfinder(settings.Pathfinder, _Chains):
-    """Pathfinder's approximation."""
-
-    name: Literal["pathfinder"]
-
-
-SamplerConfig = Hmc | Nuts | Mclmc | Smc | Mala | Barker | RwmhAdaptive | Pcn | Laplace | Pathfinder | RandomWalk
+SamplerConfig = Hmc | Nuts | Smc | Laplace | RandomWalk
 
 
 def sampler_section(name: str) -> SamplerConfig:

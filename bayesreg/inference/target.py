@@ -10,9 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-import jax.numpy as jnp
-
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.types import AnyArray, InputError, Scalar
 
 Estimands = Mapping[str, AnyArray]
 
@@ -75,17 +73,6 @@ class Variables(Protocol):
 
 
 @runtime_checkable
-class Walls(Protocol):
-    """A region in which no sampled node may lie."""
-
-    def clearance(self, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
-        """Signed distance (…, nodes), mm, of rows of "u_boundary" displaced by u (…, nodes, 3) to that region."""
-
-    def without(self, data: Any) -> Any:
-        """The data of the same problem in which a node may be anywhere."""
-
-
-@runtime_checkable
 class Normaliser(Protocol):
     """A factor of the density that depends on estimands other than "u_boundary" alone."""
 
@@ -108,31 +95,16 @@ class Normaliser(Protocol):
 
 
 @runtime_checkable
-class SingleNodes(Protocol):
-    """Cheap and approximate densities of single nodes, for nodes that the data are conditioned for."""
-
-    def log_density(self, data: Any, estimands: Estimands, which: AnyArray) -> Callable[[AnyArray], AnyArray]:
-        """Approximate log density, up to a constant, as a function of the displacement (3,) of one node, mm.
-
-        The sum over all these nodes is one function of where they are: it must not matter to any of them where another
-        one is.
-        """
-
-    def equilibrium(self, data: Any, estimands: Estimands, which: AnyArray) -> AnyArray:
-        """Displacement (3,), mm, at which one of these nodes feels no elastic force while all others stay."""
-
-
-@runtime_checkable
 class Curvature(Protocol):
     """The curvature of minus a log density: a positive semidefinite part, and what the exact one has besides."""
 
     @property
     def gauss_newton(self) -> AnyArray:
-        """The former."""
+        """The positive semidefinite part."""
 
     @property
     def remainder(self) -> AnyArray:
-        """The latter."""
+        """The rest of the exact curvature."""
 
 
 @runtime_checkable
@@ -189,24 +161,16 @@ class Target(Hashable, Protocol):
     def supports(self, data: Any, estimands: Estimands) -> AnyArray:
         """Whether the density may be positive there; much cheaper than an evaluation."""
 
-    def condition(self, estimands: Estimands, alone: Any = (), quick: bool = False) -> Any:
-        """The data of the same problem, prepared for fast densities near these estimands.
-
-        They serve `single_nodes` for the nodes in the rows `alone` of "u_boundary". Where there may be many, `quick` is
-        about as good and cheap.
-        """
+    def condition(self, estimands: Estimands) -> Any:
+        """The data of the same problem, prepared for fast densities near these estimands."""
 
     @property
-    def walls(self) -> Walls | None:
-        """Where no sampled node may lie; None where it may lie anywhere."""
+    def hard_wall(self) -> Callable[[Any, AnyArray], AnyArray] | None:
+        """From the data and "u_boundary" (b, 3) to the nodes (b,) where the density is zero; None: no such wall."""
 
     @property
     def normaliser(self) -> Normaliser | None:
         """The normaliser of the prior of "u_boundary"; None where the density leaves it out."""
-
-    @property
-    def single_nodes(self) -> SingleNodes | None:
-        """Densities of single nodes; None where none are known."""
 
     @property
     def mode_search(self) -> ModeSearch | None:
@@ -224,14 +188,13 @@ def estimands_of(target: Target, data: Any, position: Estimands) -> dict[str, An
     return target.coordinates.constrain(data, position)[0]
 
 
-def clearance(target: Target, data: Any, u: AnyArray, nodes: AnyArray) -> AnyArray:
-    """Signed distances of nodes to the walls, mm (see `Walls`); infinite where there are none."""
-    return jnp.full(u.shape[:-1], jnp.inf) if target.walls is None else target.walls.clearance(data, u, nodes)
-
-
-def without_walls(target: Target, data: Any) -> Any:
-    """The data of the same problem without walls."""
-    return data if target.walls is None else target.walls.without(data)
+def require_soft_wall(target: Target) -> None:
+    """Raise InputError where the target has a hard wall: no gradient tells of it."""
+    if target.hard_wall is not None:
+        raise InputError(
+            "samplers that follow the gradient need a soft wall of the skull, and model.skull_width is 0: set it to "
+            "half a voxel, model.skull_width: 0.5, or take the paper's sampler, sampler.name: rwmh"
+        )
 
 
 def without_normaliser(target: Target, data: Any) -> Any:

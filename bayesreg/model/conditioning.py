@@ -1,25 +1,18 @@
-"""A problem prepared for chains near some estimands: where solves are fast, and how single nodes move."""
+"""A problem prepared for chains near some estimands, where its solves are fast."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
 from bayesreg.fem.conjugate_gradients import ElasticSystem
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.multigrid import Multigrid
-from bayesreg.interpolation import Interpolation
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.coordinates import complete
-from bayesreg.model.image_pair import ImagePair
-from bayesreg.model.neighbourhood import neighbourhoods
 from bayesreg.model.program import Problem
-from bayesreg.model.single_node import images_of
 from bayesreg.model.state import StaticMesh
 
 # Tolerance of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance
@@ -34,35 +27,18 @@ CHAIN_ADJOINT_TOLERANCE = 1e-3
 NEAR = 1e3
 
 
-def condition(problem: Problem, estimands: Values, alone: Int[np.ndarray, "k"]) -> Problem:
+def condition(problem: Problem, estimands: Values) -> Problem:
     """The problem with solves for chains, preconditioned at these λ, μ and field.
 
     (By a dense inverse, that is; a multigrid hierarchy stays that of the problem's own reference.) Solves end at
-    `CHAIN_TOLERANCE`. The nodes in the rows `alone` of "u_boundary" may be moved alone, see
-    `bayesreg.model.single_node`.
+    `CHAIN_TOLERANCE`.
     """
     body, values = problem.body, complete(problem.blocks, estimands)
     # A tissue that is next to nothing leaves K_II without a factor.
     reference = {name: np.asarray(problem.blocks[name].reference()) for name in LAME}
     near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
     lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell({**values, **near}))
-    system = _conditioned_system(body.mesh, body.system, lam, mu)
-    around = None
-    if len(alone):
-        slots, at = np.asarray(body.slots)[alone], np.asarray(estimands["u_boundary"])[alone]
-        images = images_of(problem)
-        assert images is not None
-        around = neighbourhoods(body.mesh.mesh, system, images.quadrature, lam, mu, slots, alone, at)
-    return problem._replace(body=body._replace(system=system), neighbourhoods=around)
-
-
-def compare_at_four_points(problem: Problem, observations: Mapping[str, Any], interpolation: Interpolation) -> Problem:
-    """The problem with its images compared at four points of each tetrahedron, whatever the model's quadrature."""
-    for name, pair in observations.items():
-        if isinstance(pair, ImagePair):
-            term = pair.at_four_points(problem.terms[name], problem.body.mesh.mesh, interpolation)
-            problem = problem.with_term(name, term)
-    return problem
+    return problem._replace(body=body._replace(system=_conditioned_system(body.mesh, body.system, lam, mu)))
 
 
 def _conditioned_system(mesh: StaticMesh, system: ElasticSystem, lam: np.ndarray, mu: np.ndarray) -> ElasticSystem:

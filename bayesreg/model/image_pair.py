@@ -139,11 +139,8 @@ class ImagePair:
         of_pair = "" if self.name == "images" else f" of {self.name!r}"
         require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
         require_overlap(mesh, self.moving, f"moving image{of_pair}")
-        return self._seen(mesh, quadrature_of(mesh, self.fixed, model))
-
-    def _seen(self, mesh: TetMesh, quadrature: Quadrature) -> Quadrature:
         visible = None if self.fixed_ignore is None else visibility(self.fixed, self.fixed_ignore)
-        return seen_points(mesh, quadrature, self.moving, visible)
+        return seen_points(mesh, quadrature_of(mesh, self.fixed, model), self.moving, visible)
 
     def on(self, mesh: TetMesh, model: ModelConfig, temperature: str = "t_similarity") -> ComparedImages:
         """The term on a mesh, with a T_s of this name.
@@ -189,19 +186,6 @@ class ImagePair:
         smooth = self.smoothed(sd)
         fixed_values = smooth.fixed_at(np.asarray(term.positions), interpolation)
         return term._replace(moving=smooth.moving_by(interpolation), fixed_values=fixed_values)
-
-    def at_four_points(self, term: ComparedImages, mesh: TetMesh, interpolation: Interpolation) -> ComparedImages:
-        """The term with the images compared at four points of every tetrahedron, without a shading."""
-        quadrature = self._seen(mesh, gauss_quadrature(mesh, "gauss4"))
-        positions = quadrature.positions(mesh)
-        return term._replace(
-            similarity=term.similarity.at(positions),
-            quadrature=quadrature,
-            nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
-            positions=jnp.asarray(positions),
-            fixed_values=self.fixed_at(positions, interpolation),
-            shading=None,
-        )
 
 
 @dataclass(frozen=True, eq=False)

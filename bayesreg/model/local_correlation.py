@@ -62,11 +62,6 @@ class Windows(NamedTuple):
         """The sum over the window of each point, at that point."""
         return self.members.transpose(self.members(values))
 
-    def among(self, points: Int[AnyArray, "some"]) -> SomeWindows:
-        """The partition of some of the points."""
-        label = self.label[points]
-        return SomeWindows(jnp.searchsorted(jnp.sort(label), label))
-
 
 class SomeWindows(NamedTuple):
     """A partition of few points, which are known only when the program runs (a pytree).
@@ -198,14 +193,6 @@ class LocalCorrelation(NamedTuple):
     def of_one_point(self) -> SumOfSquaredDifferences:
         """Gaussian noise."""
         return SumOfSquaredDifferences()
-
-    def at(self, positions: Float[np.ndarray, "others 3"]) -> LocalCorrelation:
-        """The similarity with windows of the same width at other points."""
-        return self._replace(windows=windows_of(positions, float(self.width)))
-
-    def among(self, points: Int[AnyArray, "some"]) -> LocalCorrelation:
-        """The similarity of some points, with a map for the part of each window that they hold."""
-        return self._replace(windows=self.windows.among(points))
 
 
 @jax.custom_jvp

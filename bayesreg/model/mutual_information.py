@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
@@ -141,14 +141,6 @@ class MutualInformation(NamedTuple):
     def of_one_point(self) -> SumOfSquaredDifferences:
         """Gaussian noise."""
         return SumOfSquaredDifferences()
-
-    def at(self, positions: Float[np.ndarray, "others 3"]) -> MutualInformation:
-        """The similarity itself."""
-        return self
-
-    def among(self, points: Int[AnyArray, "some"]) -> MutualInformation:
-        """The similarity itself, with a histogram of these points alone."""
-        return self
 
 
 def _centres(bounds: Float[AnyArray, "2"]) -> Float[AnyArray, "bins"]:

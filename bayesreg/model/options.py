@@ -124,7 +124,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "independent_points": "residual",
         "smoothing": 0.8,
         "intensity_map": 2,
-        "skull_width": 0.5,
         "least_volume": 0.1,
     },
 }
@@ -196,9 +195,9 @@ class ModelConfig(BaseModel):
         Nodes with a known displacement, mm; they are not sampled. Elastography: all boundary nodes held and
         ``sampled=[]``; only λ, μ are then sampled, and E_r, the prior of u_B, is no part of the density.
     skull_width : float
-        0: no sampled node lies in the skull. Else the depth, in voxels of its mask, to which one goes in as easily as
-        by a standard deviation, such as half a voxel: masks are no better, and nodes that rest on a soft one cost no
-        reflections.
+        Depth inside the skull, in voxels of its mask, that counts as one standard deviation: masks are no better known
+        than half a voxel. 0: no sampled node lies in the skull, as in the paper; for the sampler rwmh alone, since no
+        gradient tells of such a wall.
     least_volume : float
         0: tetrahedra may be inverted. Else a barrier, which begins where a tetrahedron is left with less than this
         share of its volume (`bayesreg.model.terms.barrier`). Like the skull it has no part in the normaliser.
@@ -231,7 +230,7 @@ class ModelConfig(BaseModel):
     intensity_map: Annotated[int, Field(strict=True, ge=0, le=6)] | None = None
     sampled: Literal["boundary", "all"] | list[Annotated[int, Field(ge=0)]] = "boundary"
     held: dict[Annotated[int, Field(ge=0)], Vector] = {}
-    skull_width: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] = 0.0
+    skull_width: Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)] = 0.5
     least_volume: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.0
     rigid_sd: Positive | None = None
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.terms.term import SharedCurvature
@@ -99,14 +99,6 @@ class Pointwise:
 
     def of_one_point(self: Same) -> Same:
         """The similarity itself."""
-        return self
-
-    def at(self: Same, positions: Float[np.ndarray, "others 3"]) -> Same:
-        """The similarity itself, which knows nothing of places."""
-        return self
-
-    def among(self: Same, points: Int[AnyArray, "some"]) -> Same:
-        """The similarity itself, which looks at each point alone."""
         return self
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,12 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bayesreg.fem.preconditioners import ReferenceInverse
-from bayesreg.interpolation import Interpolator
 from bayesreg.mesh import TetMesh
 from bayesreg.model import coordinates, evaluation, program
 from bayesreg.model.blocks import LAME, Values
-from bayesreg.model.conditioning import compare_at_four_points, condition
+from bayesreg.model.conditioning import condition
 from bayesreg.model.coordinates import Coordinates
 from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.image_pair import ImagePair
@@ -26,9 +24,8 @@ from bayesreg.model.mode_search import ModeSearch
 from bayesreg.model.normaliser import Normaliser
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.program import Problem
-from bayesreg.model.single_node import SingleNodes, images_of
-from bayesreg.model.terms.images import ComparedImages
-from bayesreg.model.terms.skull import Skull, SoftSkull, Walls
+from bayesreg.model.terms.images import ComparedImages, images_of
+from bayesreg.model.terms.skull import Skull, mark_behind_skull
 from bayesreg.model.variables import Variables
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -225,14 +222,9 @@ class Posterior:
         """Whether estimands lie where the density may be positive; costs no elastic solve."""
         return program.is_allowed(data, coordinates.complete(data.blocks, estimands))
 
-    def condition(self, estimands: Values, alone: Any = (), quick: bool = False) -> Problem:
-        """The data for chains near these estimands, see `bayesreg.model.conditioning`.
-
-        With `quick` the images are compared at four points of each tetrahedron, whatever the model's quadrature.
-        """
-        observations, interpolation = self._smooth_observations, self.options.interpolation
-        data = compare_at_four_points(self.data, observations, interpolation) if quick else self.data
-        return condition(data, estimands, np.asarray(alone, int))
+    def condition(self, estimands: Values) -> Problem:
+        """The data for chains near these estimands, see `bayesreg.model.conditioning`."""
+        return condition(self.data, estimands)
 
     @cached_property
     def coordinates(self) -> Coordinates:
@@ -247,9 +239,9 @@ class Posterior:
         return Variables(self.data.blocks, self.mesh, self.sampled, names)
 
     @property
-    def walls(self) -> Walls | None:
-        """The skull, if there is one."""
-        return Walls() if isinstance(self.data.terms.get("skull"), Skull) else None
+    def hard_wall(self) -> Callable[[Any, AnyArray], AnyArray] | None:
+        """Which sampled nodes lie in a hard skull, if there is one."""
+        return mark_behind_skull if isinstance(self.data.terms.get("skull"), Skull) else None
 
     @property
     def normaliser(self) -> Normaliser | None:
@@ -257,19 +249,6 @@ class Posterior:
         if not self.options.normalised or "elastic" not in self.data.terms:
             return None
         return Normaliser(is_costly=len(self.mesh.points) > CHEAP_NODES)
-
-    @property
-    def single_nodes(self) -> SingleNodes | None:
-        """Densities of single nodes, where a dense preconditioner says what follows a node, and there are images."""
-        system = self.data.body.system
-        knows = isinstance(system.preconditioner, ReferenceInverse) or not len(system.free)
-        # They know Boltzmann's prior, images that are seen everywhere and have no shading, and a hard skull alone.
-        knows &= self.options.elastic_prior == "boltzmann" and not isinstance(self.data.terms.get("skull"), SoftSkull)
-        images = images_of(self.data)
-        knows &= images is not None and images.shading is None and images.visible is None
-        # And no descriptors, which points compare in turn.
-        knows &= images is not None and isinstance(images.moving, Interpolator)
-        return SingleNodes() if knows else None
 
     @property
     def mode_search(self) -> ModeSearch:

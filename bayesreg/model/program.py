@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 
 from bayesreg.model import coordinates
 from bayesreg.model.blocks import Blocks, Values
-from bayesreg.model.neighbourhood import Neighbourhoods
 from bayesreg.model.state import Body, state_of
 from bayesreg.model.terms.term import Likelihood, Support, Terms
 from bayesreg.types import AnyArray
@@ -27,14 +26,11 @@ class Problem(NamedTuple):
         The blocks of unknowns by name.
     terms : dict
         The factors of the density by name.
-    neighbourhoods : Neighbourhoods or None
-        Surroundings of some nodes that are moved alone, see `bayesreg.model.single_node`.
     """
 
     body: Body
     blocks: Blocks
     terms: Terms
-    neighbourhoods: Neighbourhoods | None = None
 
     def with_term(self, name: str, term: object) -> Problem:
         """The problem with one term added or replaced."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from bayesreg.model.local_correlation import LocalCorrelation
 from bayesreg.model.mutual_information import MutualInformation
@@ -48,12 +48,6 @@ class Similarity(Protocol):
 
     def of_one_point(self) -> Pointwise:
         """The noise of a point by itself."""
-
-    def at(self, positions: Float[np.ndarray, "others 3"]) -> Similarity:
-        """The similarity with the same settings at other points, mm."""
-
-    def among(self, points: Int[AnyArray, "some"]) -> Similarity:
-        """The similarity of some of the points alone, given by their indices; traceable."""
 
 
 SIMILARITIES: Mapping[str, type[Similarity]] = {

@@ -22,14 +22,13 @@ from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.diagnostics import Convergence
 from bayesreg.inference.draws.moments import greatest_rhat
-from bayesreg.inference.target import clearance
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.blocks import Values
 from bayesreg.model.options import OF_IMAGES
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.single_node import images_of
+from bayesreg.model.terms.images import images_of
 from bayesreg.types import AnyArray
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
@@ -107,7 +106,7 @@ def manifest(
             "rhat_paper_max": greatest_rhat(samples.rhat),
         },
         "acceptance": {"overall": accepted / steps, "inside_support": accepted / max(steps - outside, 1)},
-        "contact_nodes": _contact_nodes(inputs, posterior, samples),
+        "contact_nodes": _contact_nodes(posterior, samples),
         "inverted_elements": _inverted_elements(posterior, samples),
         "inverted_share_of_draws": inverted_share(posterior.mesh, draws),
         "solver": {
@@ -189,8 +188,8 @@ def inverted_share(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> 
     return float(np.mean([(signed_volumes(mesh.points + u, mesh.cells) <= 0).mean() for u in draws]))
 
 
-def _contact_nodes(inputs: Inputs, posterior: Posterior, samples: Samples) -> int | None:
-    if inputs.skull is None:
+def _contact_nodes(posterior: Posterior, samples: Samples) -> int | None:
+    skull = posterior.data.terms.get("skull")
+    if skull is None:
         return None
-    u, rows = jnp.asarray(samples.u_mean[posterior.sampled]), jnp.arange(len(posterior.sampled))
-    return int((np.asarray(clearance(posterior, posterior.data, u, rows)) < CONTACT).sum())
+    return int((np.asarray(skull.gap(jnp.asarray(samples.u_mean[posterior.sampled]))) < CONTACT).sum())

@@ -22,8 +22,8 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
 from bayesreg.model.left_out import leave_out
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.single_node import images_of
 from bayesreg.model.state import state_of
+from bayesreg.model.terms.images import images_of
 from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.pose import Pose, compose, rigid_projection
 from bayesreg.tissues import label_of

@@ -34,8 +34,7 @@ from bayesreg.io.records import Inputs
 from bayesreg.memory import memory_of_machine
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.single_node import images_of
-from bayesreg.model.terms.images import ComparedImages
+from bayesreg.model.terms.images import ComparedImages, images_of
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.finish import finish

@@ -24,9 +24,7 @@ import bayesreg as br
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.equilibrium import equilibrium
 from bayesreg.inference.chains.run import checkpoint_from_arrays
-from bayesreg.inference.gaussian.loose import move_alone
-from bayesreg.inference.gaussian.reflection import rotate
-from bayesreg.inference.gaussian.whitened import clearance_of, whitened_density, whitened_position
+from bayesreg.inference.gaussian.whitened import whitened_density, whitened_position
 from bayesreg.inference.samplers.hamiltonian import _quarter_turn
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
@@ -78,16 +76,9 @@ def timed(name: str, of_chain: Callable[..., Any], shared: tuple[Any, ...], *cha
 def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -> None:
     """The whole, then its parts."""
     keys = jax.random.split(jax.random.key(0), len(state.position))
-    momentum = jax.random.normal(jax.random.key(1), state.position.shape)
 
     def begin(data: Any, setup: Any, xi: jax.Array) -> Any:
         return blackjax.mcmc.hmc.init(xi, whitened_density(posterior, data, setup))
-
-    def alone(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
-        return move_alone(posterior, partial(begin, data, setup), data, setup.gaussian, setup.loose, key, state)
-
-    def turned(data: Any, setup: Any, xi: jax.Array, momentum: jax.Array) -> Any:
-        return rotate(setup.walls, clearance_of(posterior, data, setup), xi, momentum, setup.step_size)
 
     def trajectory(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
         return _quarter_turn(posterior, data, setup, key, state)[0]
@@ -96,8 +87,6 @@ def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -
     timed("all but its energies", lambda *given: sampler.step(*given)[0], shared, keys, state)
     timed("  trajectory", trajectory, shared, keys, state)
     timed("    a gradient of it", begin, shared, state.position)
-    timed("    a rotation of it, with reflections", turned, shared, state.position, momentum)
-    timed("  nodes moved alone, with a gradient", alone, shared, keys, state)
     timed("its energies", sampler.observe, shared, state)
 
 

@@ -15,10 +15,8 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.inference.gaussian.laplace import Gaussian, laplace
-from bayesreg.inference.gaussian.loose import place_loose_nodes
 from bayesreg.inference.gaussian.normaliser import make_stand_in
 from bayesreg.inference.gaussian.whitened import Setup, setup_about
-from bayesreg.inference.layout import displacements
 from bayesreg.model.blocks import LAME
 from tests.calibration.simulator import MESH, Simulator, draw_data, observing
 
@@ -27,8 +25,6 @@ NODES = np.arange(0, len(MESH.boundary), 3)
 
 # So many data sets at a time: what they need together stays in the cache, four times as fast as all at once.
 BATCH = 20
-# Rows of "u_boundary" that a sampler which moves single nodes moves alone.
-ALONE = np.array([0, 16])
 
 PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load")
 
@@ -78,23 +74,21 @@ def setups_about(
     posterior: br.Posterior,
     references: list[Gaussian],
     middles: np.ndarray,
-    seen: np.ndarray,
     step_size: float,
     steps: int,
 ) -> Setup:
-    """The setups of all replications, stacked; the nodes `ALONE` have been seen at (replication, node, place, axis)."""
+    """The setups of all replications, stacked."""
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
     found = [make_stand_in(posterior, *each) for each in zip(references, middles, strict=True)]
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
-    def about(gaussian: Gaussian, middle: Any, seen: Any) -> Setup:
-        alone = place_loose_nodes(gaussian, displacements(posterior).start, ALONE, seen)
-        return setup_about(posterior, gaussian, middle)._replace(loose=alone, **size)
+    def about(gaussian: Gaussian, middle: Any) -> Setup:
+        return setup_about(posterior, gaussian, middle)._replace(**size)
 
-    return jax.vmap(about)(stacked, jnp.asarray(middles), jnp.asarray(seen))._replace(stand_in=normalisers)
+    return jax.vmap(about)(stacked, jnp.asarray(middles))._replace(stand_in=normalisers)
 
 
 def condition(posterior: br.Posterior) -> Any:
     """The data for chains: for all of them about rest."""
-    return posterior.condition(posterior.estimands(posterior.reference()), ALONE)
+    return posterior.condition(posterior.estimands(posterior.reference()))

@@ -21,7 +21,6 @@ import bayesreg as br
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import choose_sampler
 from tests.calibration.chains import (
-    ALONE,
     BATCH,
     condition,
     of_posterior,
@@ -35,8 +34,6 @@ from tests.calibration.simulator import Simulator, draw_data, observing
 SIGNIFICANCE = 0.01
 # In whitened coordinates, about a reference that knows none of the data.
 STEP_SIZE, STEPS = 0.4, 4
-# Those without gradients refuse nearly all such steps.
-SHORT_STEPS = {"rwmh_adaptive": 0.1, "pcn": 0.1}
 # Of the plain random walk, whose space is not whitened: mm, and the unit of λ and μ.
 RANDOM_WALK = {"sigma_u": 0.03, "sigma_lam": 0.15, "sigma_mu": 0.15}
 
@@ -84,10 +81,7 @@ def compare(
     if sampler != "rwmh":
         reference = prior_reference(simulator, posterior)
         centre = np.asarray(reference.centre)[None]
-        # Not where the chains start: a kernel must not know its starts.
-        others = simulator.draw_prior(np.random.default_rng(2000), chains)
-        seen = np.moveaxis(others["u_boundary"][:, ALONE], 1, 0)[None]
-        shared = setups_about(posterior, [reference], centre, seen, SHORT_STEPS.get(sampler, STEP_SIZE), STEPS)
+        shared = setups_about(posterior, [reference], centre, STEP_SIZE, STEPS)
         setup = jax.tree.map(lambda x: x[0], shared)
     run = partial(_successive, kernel, simulator.posterior, steps)
     found = run(simulator.posterior.data, data, setup, jax.random.key(seed), first)

@@ -24,13 +24,11 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.inference.gaussian.laplace import average_gaussian
 from bayesreg.inference.gaussian.mode_search import settle
-from bayesreg.inference.gaussian.reflection import rotate
-from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whiten, whitened_position
+from bayesreg.inference.gaussian.whitened import Setup, whitened_position
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
 from tests.calibration.chains import (
-    ALONE,
     BATCH,
     Estimands,
     condition,
@@ -200,11 +198,9 @@ def sample(
         say(f"a Gaussian for each replication, {stage + 1} of {settings.stages + 1}")
         about = visited[:, [0, -1]]
         references = [average_gaussian(*each) for each in zip(problems, about, strict=True)]
-        u = visited[:, :, -3 * len(posterior.sampled) :].reshape(*visited.shape[:2], -1, 3)
-        seen = np.moveaxis(u[:, :, ALONE], 2, 1)
-        setup = setups_about(posterior, references, about.mean(axis=1), seen, settings.step_size, settings.steps)
+        setup = setups_about(posterior, references, about.mean(axis=1), settings.step_size, settings.steps)
         if stage == 0:
-            states = _flown(posterior, posterior.data, setup, observed, modes, jax.random.split(key_flight, len(modes)))
+            states = _scattered(posterior, posterior.data, setup, observed, jax.random.split(key_flight, len(modes)))
         key_stage = jax.random.fold_in(key, stage)
         states, places, *found = _run(
             kernel, posterior, setup, observed, states, key_stage, settings, stage == settings.stages, say
@@ -224,23 +220,18 @@ def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def _flown(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, modes: Any, keys: Any) -> Estimands:
-    """A quarter turn away from each mode; the mode itself where the skull catches the flight.
+def _scattered(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, keys: Any) -> Estimands:
+    """A draw of each Gaussian.
 
     At a mode the elastic energy is far less than at any draw, and a T_r that comes from there is slow to recover.
     """
 
     def one(given: Any) -> Estimands:
-        setup, observed, mode, key = given
-        here = observing(data, observed)
-        begin = whiten(setup.gaussian, mode)
-        xi, _ = rotate(
-            setup.walls, clearance_of(posterior, here, setup), begin, jax.random.normal(key, begin.shape), jnp.pi / 2
-        )
-        place = whitened_position(posterior, setup.gaussian, jnp.where(jnp.isfinite(xi).all(), xi, begin))
-        return estimands_of(posterior, here, place)
+        setup, observed, key = given
+        xi = jax.random.normal(key, setup.middle.shape)
+        return estimands_of(posterior, observing(data, observed), whitened_position(posterior, setup.gaussian, xi))
 
-    return jax.lax.map(one, (setup, observed, modes, keys), batch_size=BATCH)
+    return jax.lax.map(one, (setup, observed, keys), batch_size=BATCH)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -3,7 +3,7 @@
 (λ, μ, T_s, T_r) come from their priors; u_B from the Gaussian of precision S / T_r, S the Schur complement of K, and
 that of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of the squared scale
 T_s / (2 w_q). With random loads, whose sizes come from their priors, the displacements of all nodes have the precision
-K D⁻¹ K in place of S / T_r, and the noise is Student's t. The skull belongs to the likelihood: a draw with a node in it
+K D⁻¹ K in place of S / T_r, and the noise is Student's t. The skull belongs to the likelihood: a draw with nodes in it
 is rejected whole, (λ, μ, u) together. The prior is drawn by the oracle's matrices and NumPy, and shares no code with
 the density under test.
 """
@@ -34,7 +34,7 @@ BODY_LOAD, SURFACE_LOAD = 0.25, 0.6
 DEGREES_OF_FREEDOM = 4.0
 LOG_SD = 0.5
 PRIOR = {"alpha": 3.0, "beta": 3.0, "high": 4.0}
-WALL = 20.8
+WALL, WIDTH = 20.8, 0.5
 
 
 class Variant(NamedTuple):
@@ -168,12 +168,13 @@ class Simulator:
         return values
 
     def draw_prior(self, rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
-        """Estimands, the draws leading: parameters and displacements together, no node of which is in the skull."""
+        """Estimands, the draws leading: parameters and displacements, kept as often as the skull lets them pass."""
         draws: list[dict[str, Any]] = []
         while len(draws) < count:
             values = self.draw_parameters(rng)
             u = self.draw_displacement(rng, values)
-            if not self.variant.skull or (self.mesh.points[self.mesh.boundary, 0] + u[:, 0] <= WALL).all():
+            depth = np.maximum(self.mesh.points[self.mesh.boundary, 0] + u[:, 0] - WALL, 0.0)
+            if not self.variant.skull or np.log(rng.uniform()) < -0.5 * ((depth / WIDTH) ** 2).sum():
                 blocks = self.posterior.data.blocks
                 values |= {name: values[name][blocks[name].free.index] for name in LAME}
                 draws.append({"u_boundary": u, **values})

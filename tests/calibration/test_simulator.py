@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,6 +20,7 @@ from tests.calibration.simulator import (
     T_SIMILARITY,
     VARIANTS,
     WALL,
+    WIDTH,
     Simulator,
 )
 from tests.oracles import paper
@@ -111,13 +113,18 @@ def test_data_are_the_moving_image_at_displaced_points_and_noise(name):
     assert stats.kstest(np.ravel(residuals), "norm").pvalue > 1e-3
 
 
-def test_the_skull_rejects_what_the_density_excludes():
-    """The rule of the simulator, a plane, is the support of the density, an interpolated distance."""
+def test_the_skull_lets_as_many_pass_as_its_density_says():
+    """The rule of the simulator, a plane, is the factor of the density, an interpolated distance."""
     walled = simulator("skull").posterior
-    draws = simulator().draw_prior(np.random.default_rng(4), 150)
-    inside = (MESH.points[MESH.boundary, 0] + draws["u_boundary"][..., 0] <= WALL).all(axis=1)
-    supported = jax.jit(jax.vmap(walled.supports, in_axes=(None, 0)))(walled.data, draws)
-    np.testing.assert_array_equal(supported, inside)
-    assert 0.1 < inside.mean() < 0.8
-    kept = simulator("skull").draw_prior(np.random.default_rng(4), int(inside.sum()))
-    np.testing.assert_array_equal(kept["u_boundary"][:5], draws["u_boundary"][inside][:5])
+    draws = simulator().draw_prior(np.random.default_rng(4), 600)
+    depth = np.maximum(MESH.points[MESH.boundary, 0] + draws["u_boundary"][..., 0] - WALL, 0.0)
+    expected = -0.5 * ((depth / WIDTH) ** 2).sum(axis=1)
+    rows = jnp.asarray(draws["u_boundary"])
+    found = -0.5 * (jax.vmap(walled.data.terms["skull"].depth)(rows) ** 2).sum(axis=1) / WIDTH**2
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    weights = np.exp(expected)
+    kept = simulator("skull").draw_prior(np.random.default_rng(5), 300)
+    mean = (weights @ depth.max(axis=1)) / weights.sum()
+    deepest = np.maximum(MESH.points[MESH.boundary, 0] + kept["u_boundary"][..., 0] - WALL, 0.0).max(axis=1)
+    assert 0.1 < weights.mean() < 0.8
+    assert abs(deepest.mean() - mean) < 5 * deepest.std() / np.sqrt(len(deepest) / 2)

@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesreg.model.curvature import Curvature
 
-NODES, WALL = 2, 0.6
+NODES, WALL, WIDTH = 2, 0.6, 0.2
 DIMENSION = 3 * NODES
 
 
@@ -60,30 +60,6 @@ class Variables:
         return {"u_boundary": np.asarray(values["u_boundary"], float)}
 
 
-class Walls:
-    def clearance(self, data, u, nodes):
-        return data.wall + 0.2 * jnp.sin(u[..., 1]) - u[..., 0]
-
-    def without(self, data):
-        return data._replace(wall=jnp.asarray(jnp.inf))
-
-
-class SingleNodes:
-    """As if the nodes were independent, and somewhat wider: all of them are moved alone."""
-
-    def log_density(self, data, estimands, which):
-        mean, precision = data.mean.reshape(NODES, 3)[which], data.precision.reshape(NODES, 3, NODES, 3)
-
-        def log(u):
-            inside = Walls().clearance(data, u[None], which[None])[0] >= 0
-            return jnp.where(inside, -0.4 * (u - mean) @ precision[which, :, which] @ (u - mean), -jnp.inf)
-
-        return log
-
-    def equilibrium(self, data, estimands, which):
-        return estimands["u_boundary"][which]
-
-
 class ModeSearch:
     def __init__(self, data):
         self.data = data
@@ -105,39 +81,43 @@ class ModeSearch:
 
 
 class GaussianTarget:
-    """N(0, covariance) of "u_boundary", zero where the x of a node exceeds a wall that bends with y.
+    """N(0, covariance) of "u_boundary" before a wall that bends with y, which the x of a node should not exceed.
 
-    With `apart` a mixture of two such, of equal mass, their means so far apart in the y of the first node.
+    A depth of `width` inside it counts as one standard deviation; with 0 the density is zero there. With `apart` a
+    mixture of two such, of equal mass, their means so far apart in the y of the first node.
     """
 
-    coordinates, variables, walls, normaliser, single_nodes = Coordinates(), Variables(), Walls(), None, SingleNodes()
+    coordinates, variables, normaliser = Coordinates(), Variables(), None
 
-    def __init__(self, wall: float = WALL, apart: float = 0.0):
+    def __init__(self, wall: float = WALL, apart: float = 0.0, width: float = WIDTH):
         root = np.random.default_rng(0).normal(size=(DIMENSION, DIMENSION))
         self.covariance = root @ root.T / DIMENSION + 0.3 * np.eye(DIMENSION)
         mean = jnp.zeros(DIMENSION).at[1].set(apart / 2)
         self.data = Data(mean, jnp.asarray(np.linalg.inv(self.covariance)), jnp.asarray(wall))
+        self.width = width
         self.mode_search = ModeSearch(self.data)
+        self.hard_wall = None if width else lambda data, u: gap(data, u) < 0
 
     def height(self, data, u):
         away = jnp.stack([u.ravel() - data.mean, u.ravel() + data.mean])
         heights = -0.5 * jnp.einsum("ci,ij,cj->c", away, data.precision, away)
-        return jax.nn.logsumexp(heights)
+        return jax.nn.logsumexp(heights) + self.log_wall(gap(data, u))
+
+    def log_wall(self, gap):
+        """The log of the factor of the wall at some distances (…, node) from it."""
+        if self.width:
+            return -0.5 * (jnp.minimum(gap, 0.0) ** 2).sum(axis=-1) / self.width**2
+        return jnp.where((gap >= 0).all(axis=-1), 0.0, -jnp.inf)
 
     def evaluate_estimands(self, data, estimands, guess=None):
         u = estimands["u_boundary"]
-        found = Found(jnp.where(self.supports(data, estimands), self.height(data, u), -jnp.inf), u)
-        return jax.tree.map(jnp.asarray, found)
+        return jax.tree.map(jnp.asarray, Found(self.height(data, u), u))
 
     def supports(self, data, estimands):
-        return (self.walls.clearance(data, estimands["u_boundary"], jnp.arange(NODES)) >= 0).all()
+        return jnp.isfinite(self.log_wall(gap(data, estimands["u_boundary"])))
 
-    def condition(self, estimands, alone=(), quick=False):
+    def condition(self, estimands):
         return self.data
-
-    def allowed(self, u):
-        """Which nodes (…, node), so displaced, lie before the wall."""
-        return np.asarray(self.walls.clearance(self.data, jnp.asarray(u), np.arange(NODES))) >= 0
 
     def exact_draws(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """(count, nodes, 3), by rejection."""
@@ -145,5 +125,11 @@ class GaussianTarget:
         while len(kept) < count:
             draws = rng.multivariate_normal(np.zeros(DIMENSION), self.covariance, 2 * count)
             draws = (draws + rng.choice([-1, 1], (len(draws), 1)) * np.asarray(self.data.mean)).reshape(-1, NODES, 3)
-            kept = np.concatenate([kept, draws[self.allowed(draws).all(axis=1)]])
+            allowed = np.log(rng.uniform(size=len(draws))) < np.asarray(self.log_wall(gap(self.data, draws)))
+            kept = np.concatenate([kept, draws[allowed]])
         return kept[:count]
+
+
+def gap(data, u):
+    """Distance (…, node) of every node, displaced by u (…, node, 3), to the wall."""
+    return data.wall + 0.2 * jnp.sin(u[..., 1]) - u[..., 0]

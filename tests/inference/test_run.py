@@ -25,7 +25,7 @@ OPTIONS = {"sampler": "rwmh", "chains": 3, "thin": 3, "seed": 5, "progress": Fal
 def posterior_of(seed: int) -> br.Posterior:
     fixed, moving = smooth_image(MESH.points, seed=seed), smooth_image(MESH.points, seed=seed + 1)
     skull = flat_skull(MESH.points, axis=2, wall=MESH.points[:, 2].max() + 0.05, voxel=2.0)
-    return br.build_posterior(fixed, moving, MESH, skull=skull)
+    return br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(skull_width=0.0), skull=skull)
 
 
 @cache

@@ -231,7 +231,7 @@ def test_skull_forbids_what_the_oracle_forbids():
     """Random states close to a flat wall; those with a node within 0.01 mm of it are left out."""
     wall = MESH.points[:, 1].max() + 0.4
     skull = flat_skull(MESH.points, axis=1, wall=wall, voxel=2.0)
-    post, free = posterior(skull=skull), posterior()
+    post, free = posterior(skull=skull, skull_width=0.0), posterior()
     paper = oracle(MESH.boundary, skull=(skull.voxels, skull.affine))
     seen = {True: 0, False: 0}
     for state in states(len(MESH.boundary), "tissue", count=12, seed=3):
@@ -250,7 +250,7 @@ def test_skull_forbids_what_the_oracle_forbids():
 def test_off_the_skulls_grid_is_forbidden():
     skull = flat_skull(MESH.points, axis=1, wall=200.0, voxel=2.0, margin=6.0)
     assert not skull.voxels.any()
-    post = posterior(skull=skull)
+    post = posterior(skull=skull, skull_width=0.0)
     state = states(len(MESH.boundary), "tissue")[0]
     assert np.isfinite(float(post.logdensity_constrained(state.values)))
     for step in (150.0, -150.0):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.inference.target import Estimands, Evaluation, Target, clearance
+from bayesreg.inference.target import Estimands, Evaluation, Target
 from bayesreg.types import AnyArray, InputError
 
 
@@ -23,7 +23,7 @@ class Start(NamedTuple):
         Displacement of the sampled nodes, mm, at the far end; None is no displacement.
     fraction : (float, float)
         Chains start at fractions of the field spread evenly over this range: 0 identity, 1 the field. A node
-        that this would put into the skull starts at the nearest fraction that does not.
+        that this would put behind a hard wall starts at the nearest fraction that does not.
     lam, mu : mapping of entry name to float, optional
         Centre of the start parameters, where it is not the posterior's own reference.
     spread : float
@@ -66,16 +66,16 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
 
 
 def _admissible(target: Target, field: np.ndarray, fraction: float) -> AnyArray:
-    """A fraction of the field; a node that it would put into the skull takes the nearest fraction that does not.
+    """A fraction of the field; a node that it would put behind a hard wall takes the nearest fraction that does not.
 
     Both ends of a node's path may be allowed and its middle not: a skull is not convex. At zero the node is at
     rest, where it is allowed.
     """
     chosen = np.full(len(field), fraction)
-    candidates = np.linspace(0, 1, 201)
-    for candidate in candidates[np.argsort(np.abs(candidates - fraction), kind="stable")]:
-        gap = clearance(target, target.data, jnp.asarray(chosen[:, None] * field), jnp.arange(len(field)))
-        forbidden = np.asarray(gap) < 0
+    if target.hard_wall is None:
+        return jnp.asarray(chosen[:, None] * field)
+    for candidate in sorted(np.linspace(0, 1, 201), key=lambda candidate: abs(candidate - fraction)):
+        forbidden = np.asarray(target.hard_wall(target.data, jnp.asarray(chosen[:, None] * field)))
         if not forbidden.any():
             break
         chosen[forbidden] = candidate

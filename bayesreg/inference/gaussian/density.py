@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bayesreg.inference.layout import marked, unravel
-from bayesreg.inference.target import Target, estimands_of, logdensity, without_normaliser, without_walls
+from bayesreg.inference.target import Target, estimands_of, logdensity, without_normaliser
 from bayesreg.types import AnyArray, Scalar
 
 # Step of differences between gradients, in Normal scores and logarithms.
@@ -21,7 +21,7 @@ STEP = 1e-4
 def height_and_slope(
     target: Target, data: Any, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[float, Float[np.ndarray, "dimension"]]:
-    """log π and ∇log π of the density without walls.
+    """log π and ∇log π.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def height_and_slope(
     flat : (d,) array
         Flat position.
     """
-    height, slope = _height_and_slope(target, without_walls(target, data), jnp.asarray(flat))
+    height, slope = _height_and_slope(target, data, jnp.asarray(flat))
     return float(height), np.asarray(slope)
 
 
@@ -77,7 +77,7 @@ def mark_normaliser(target: Target) -> Bool[np.ndarray, "dimension"]:
 def hessian_rows(
     target: Target, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows dimension"]:
-    """Rows of the Hessian of the log density without walls, by differences of its gradient.
+    """Rows of the Hessian of the log density, by differences of its gradient.
 
     The coordinates are Normal scores and logarithms, so that one step suits all. Exact rows would cost more to compile
     than the search. The normaliser, which may be costly, has a part in the rows of what it depends on alone.

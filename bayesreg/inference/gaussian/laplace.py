@@ -68,11 +68,10 @@ def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimensio
 
 
 def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
-    """The Gaussian of the same shape that at some places pulls, on average, as the density without walls does.
+    """The Gaussian of the same shape that at some places pulls, on average, as the density does.
 
-    Its centre is the mean of x + C ∇log π(x). Where walls hold the mode, the force that presses on them is then the
-    Gaussian's own, whose motion is reflected exactly; kicks are left with what is beyond second order. A scale stays
-    where it is: its force at the mode of what it scales is no hint (see `hierarchy`).
+    Its centre is the mean of x + C ∇log π(x). A scale stays where it is: its force at the mode of what it scales is no
+    hint (see `hierarchy`).
     """
     slopes = np.mean([slope_at(target, flat) for flat in flats], axis=0)
     factor, moving = np.asarray(gaussian.factor), 1 - mark_scales(target).astype(float)
@@ -81,7 +80,7 @@ def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarra
 
 
 def slope_at(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """∇log π of the density without walls."""
+    """∇log π."""
     return height_and_slope(target, target.data, flat)[1]
 
 

@@ -1,4 +1,4 @@
-"""The search for a mode of a posterior, in its support."""
+"""The search for a mode of a posterior."""
 
 from __future__ import annotations
 
@@ -21,21 +21,16 @@ from bayesreg.inference.gaussian.density import (
 from bayesreg.inference.gaussian.evidence import FARTHEST, Found, maximise_evidence
 from bayesreg.inference.gaussian.hierarchy import balance_field, mark_hyperparameters, mark_scales
 from bayesreg.inference.gaussian.laplace import Gaussian, gaussian_of, laplace, precision_at
-from bayesreg.inference.gaussian.pockets import leave_pockets
-from bayesreg.inference.layout import displacements, flat_position, node_count, others, unravel
-from bayesreg.inference.target import Target, clearance, without_normaliser
-from bayesreg.types import AnyArray, InputError, Scalar
+from bayesreg.inference.layout import flat_position, others
+from bayesreg.inference.target import Target, without_normaliser
+from bayesreg.types import InputError
 
-# The skull while the mode is looked for: a quadratic penalty of this standard deviation, mm, from this gap on.
-SOFTNESS, GAP = 0.05, 0.02
 # The last stage is repeated so often, at most, or until no coordinate moves by more, and no hyperparameter by more of
 # its standard deviations.
 REPEATS, SETTLED, SETTLED_SD = 20, 3e-3, 0.1
 # A stage ends where an iteration gains less than this share of the height. On the way nothing is owed to a place that
 # the next stage leaves: with that of the last, twice as many gradients led to the same modes.
 ROUGH, FINE = 1e-4, 1e-10
-# So often, at most, single nodes are moved elsewhere.
-RESCUES = 3
 
 
 def find_mode(
@@ -44,15 +39,13 @@ def find_mode(
     say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
-    """A mode of the log density of the position, in its support, by L-BFGS along the target's continuation.
-
-    Single nodes that are then far more probable elsewhere are moved there, and the search goes on (`leave_pockets`).
+    """A mode of the log density of the position, by L-BFGS along the target's continuation.
 
     Parameters
     ----------
     target : Target
     start : (d,) array
-        Flat position to start from; it need not lie in the support.
+        Flat position to start from.
     say : callable
         Told of each stage.
     iterations : int
@@ -61,24 +54,14 @@ def find_mode(
     Returns
     -------
     (d,) array
-        Flat position. Nodes that the soft skull let in are moved to its surface.
+        Flat position.
 
     Raises
     ------
     InputError
         If the density is not finite at the start.
     """
-    flat = settle(target, approach(target, start, say, iterations), say, iterations)
-    for _ in range(RESCUES):
-        elsewhere, nodes = leave_pockets(target, flat)
-        if not len(nodes):
-            break
-        named = ", ".join(map(str, np.asarray(target.variables.coords["node"])[nodes]))
-        say(f"mode: moved to where they are more probable: nodes {named}")
-        flat = settle(target, elsewhere, say, iterations)
-    else:
-        say("mode: single nodes may be more probable elsewhere")
-    return flat
+    return settle(target, approach(target, start, say, iterations), say, iterations)
 
 
 def approach(
@@ -108,16 +91,12 @@ def settle(
 
     With fewer `repeats`, a place near it.
     """
-    # The walls of the softened skull are moved inwards by as much as the nodes that press on them have gone too far
-    # (Powell 1969, "A method for nonlinear constraints in minimization problems"), so that these come to rest at the
-    # skull and not in it, however great the force that presses.
-    shift, resting, before = np.zeros(node_count(target)), mark_hyperparameters(target), flat
+    resting, before = mark_hyperparameters(target), flat
     better = Found(flat, np.inf)
     for _ in range(repeats):
-        found, pressed = _improve(target, target.data, better.flat, True, iterations, say, shift), shift
-        shift = np.maximum(shift + GAP - _gaps(target, found), 0.0)
+        found = _improve(target, target.data, better.flat, True, iterations, say)
         balanced = balance_field(target, found, partial(_factor, target, found))
-        moved = np.abs(balanced - before)[~resting].max(), np.abs(shift - pressed).max(initial=0.0)
+        moved = np.abs(balanced - before)[~resting].max()
         # Once they rest, what else moves is too little for them to follow.
         if better.moved < SETTLED_SD:
             better = better._replace(flat=balanced)
@@ -125,12 +104,11 @@ def settle(
             # The units of a search that did not end at its bounds still hold.
             better = _improve_hyperparameters(target, balanced, better.units if better.moved < FARTHEST else None)
         before = balanced
-        if max(moved) < SETTLED and better.moved < SETTLED_SD:
-            # The evidence knows nothing of walls: nodes that press on them stay where they were found.
-            return _admissible(target, balanced)
+        if moved < SETTLED and better.moved < SETTLED_SD:
+            return better.flat
     if repeats == REPEATS:
         say("mode: not settled")
-    return _admissible(target, better.flat)
+    return better.flat
 
 
 def _improve_hyperparameters(
@@ -151,12 +129,6 @@ def _improve_hyperparameters(
     return found if higher else found._replace(flat=resting)
 
 
-def _gaps(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "sampled"]:
-    """Signed distance of every sampled node to the forbidden region, mm; infinite where there is none."""
-    u = unravel(target)(jnp.asarray(flat))["u_boundary"]
-    return np.asarray(clearance(target, target.data, u, jnp.arange(node_count(target))))
-
-
 def _factor(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
     return np.asarray(laplace(target, flat).factor)
 
@@ -168,11 +140,9 @@ def _improve(
     moves: bool,
     iterations: int,
     say: Callable[[str], None],
-    shift: Float[np.ndarray, "sampled"] | None = None,
     gain: float = FINE,
 ) -> Float[np.ndarray, "dimension"]:
-    """L-BFGS in the coordinates whitened where it starts, the skull softened and moved inwards by `shift`, mm."""
-    shift = np.zeros(node_count(target)) if shift is None else shift
+    """L-BFGS in the coordinates whitened where it starts."""
     resting = mark_scales(target)
     log_normaliser = 0.0
     if not moves or resting[mark_normaliser(target)].all():
@@ -180,32 +150,29 @@ def _improve(
         data = without_normaliser(target, data)
         log_normaliser = normaliser_and_slope(target, flat)[0] if moves else 0.0
     gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves, resting), resting))
-    moving, own = 1 - resting.astype(float), displacements(target)
+    moving = 1 - resting.astype(float)
     if not moves:
         moving[others(target)] = 0.0
-    best: list[tuple[Any, float, Any, float]] = []
+    best: list[tuple[Any, float, Any]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
         there = np.asarray(_place(gaussian, moving * xi))
         height, slope = height_and_slope(target, data, there)
-        pressed, push = _penalty_with_slope(target, target.data, jnp.asarray(there[own].reshape(-1, 3)), shift)
-        value, slope = float(pressed) - height, -slope
-        slope[own] += np.asarray(push).ravel()
-        gradient = moving * np.asarray(_pull_back(gaussian, slope))
+        value, gradient = -height, -moving * np.asarray(_pull_back(gaussian, slope))
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
             # A wall for the line search: uphill from the best place so far, sloping back to it.
-            place, least, slope, _ = best[-1]
+            place, least, slope = best[-1]
             return least + 2 * abs(slope @ (xi - place)), -slope
         if not best or value < best[-1][1]:
-            best[:] = [(xi.copy(), value, gradient, float(pressed))]
+            best[:] = [(xi.copy(), value, gradient)]
         return value, gradient
 
     options = {"maxiter": iterations, "maxcor": 20, "ftol": gain, "gtol": 1e-2}
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
-    place, least, _, pressed = best[-1]
-    say(f"mode: log density {pressed - least + log_normaliser:.1f}")
+    place, least, _ = best[-1]
+    say(f"mode: log density {log_normaliser - least:.1f}")
     return np.asarray(_place(gaussian, moving * place))
 
 
@@ -222,34 +189,3 @@ def _decouple(
     precision[held] = precision[:, held] = 0.0
     precision[held, held] = 1.0
     return precision
-
-
-def penalty(target: Target, data: Any, u: Float[AnyArray, "sampled 3"], shift: AnyArray | float = 0.0) -> Scalar:
-    """The penalty on minus the log density in place of the hard skull, moved inwards by `shift`, mm."""
-    gap = clearance(target, data, u, jnp.arange(node_count(target)))
-    return 0.5 * (jnp.minimum(gap - GAP - shift, 0.0) ** 2).sum() / SOFTNESS**2
-
-
-_penalty_with_slope = jax.jit(jax.value_and_grad(penalty, argnums=2), static_argnums=0)
-
-
-def _admissible(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """Nodes inside the skull, or nearer to it than the gap, moved out along the gradient of the distance."""
-    own = displacements(target)
-    u = np.array(flat[own].reshape(-1, 3))
-    for _ in range(100):
-        gap, slope = (np.asarray(found) for found in _clearance_with_slope(target, target.data, jnp.asarray(u)))
-        inside = gap < GAP / 2
-        if not inside.any():
-            moved = np.array(flat)
-            moved[own] = u.ravel()
-            return moved
-        steepness = np.maximum((slope[inside] ** 2).sum(axis=1, keepdims=True), 0.05)
-        u[inside] += (GAP - gap[inside])[:, None] * slope[inside] / steepness
-    raise InputError(f"{int(inside.sum())} nodes of the mode cannot be moved out of the skull; start elsewhere")
-
-
-@partial(jax.jit, static_argnums=0)
-def _clearance_with_slope(target: Target, data: Any, u: AnyArray) -> tuple[AnyArray, AnyArray]:
-    gap, pullback = jax.vjp(lambda u: clearance(target, data, u, jnp.arange(len(u))), u)
-    return gap, pullback(jnp.ones_like(gap))[0]

@@ -30,8 +30,6 @@ class Tuning(NamedTuple):
         Between 0 and 1, averaged over chains.
     least, greatest : float
         Bounds of the step. Beyond a quarter turn, the default, there is nothing to gain.
-    watched : bool
-        Whether displacements of all transitions are wanted.
     quarter_turns : bool
         Whether a transition has as many steps as make a quarter turn of the Gaussian, of one size no greater than what
         the acceptance allows.
@@ -41,7 +39,6 @@ class Tuning(NamedTuple):
     acceptance: float
     least: float = 0.01
     greatest: float = float(jnp.pi / 2)
-    watched: bool = False
     quarter_turns: bool = False
 
 
@@ -62,8 +59,8 @@ class Walking(Protocol):
 def tune(
     data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False,
     say: Say = lambda text: None,
-) -> tuple[Any, Any, AnyArray | None]:  # fmt: skip
-    """The setup with its step size, where the chains then are, and if watched how their "u_boundary" came there.
+) -> tuple[Any, Any]:  # fmt: skip
+    """The setup with its step size, and where the chains then are.
 
     Parameters
     ----------
@@ -83,11 +80,11 @@ def tune(
     """
     keys = jax.random.split(key, tuning.warm_up)
     first = jax.vmap(partial(walk.init, data, setup))(starts)
-    points, sizes, rates, path = _run(walk, tuning, data, setup, first, keys, jnp.asarray(apart))
+    points, sizes, rates = _run(walk, tuning, data, setup, first, keys, jnp.asarray(apart))
     setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     say(f"warm-up: step {float(setup.step_size):.2g}{trajectory}, acceptance {late:.0%}")
-    return setup, points, path
+    return setup, points
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -99,8 +96,8 @@ def _run(
     first: Any,
     keys: AnyArray,
     apart: AnyArray,
-) -> tuple[Any, AnyArray, AnyArray, AnyArray | None]:
-    """Estimands, step size by chain, and of every transition the acceptance and, if watched, the array u by chain."""
+) -> tuple[Any, AnyArray, AnyArray]:
+    """Estimands and step size by chain, and the acceptance of every transition."""
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(jax.tree.leaves(first)[0])
 
@@ -114,12 +111,11 @@ def _run(
         states, info = jax.vmap(moved)(states, jnp.exp(averaging.log_step_size), jax.random.split(key, chains))
         rates = jnp.nan_to_num(info.acceptance_rate)
         averaging = jax.vmap(update)(averaging, jnp.where(apart, rates, rates.mean()))
-        u = jax.vmap(partial(walk.estimands, data, setup))(states)["u_boundary"] if tuning.watched else None
-        return (states, averaging), (rates.mean(), u)
+        return (states, averaging), rates.mean()
 
     averaging = jax.vmap(begin)(jnp.full(chains, setup.step_size))
-    (states, averaging), (rates, path) = jax.lax.scan(one, (first, averaging), keys)
-    return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates, path
+    (states, averaging), rates = jax.lax.scan(one, (first, averaging), keys)
+    return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates
 
 
 def _with_step_size(tuning: Tuning, setup: Any, size: AnyArray) -> Any:

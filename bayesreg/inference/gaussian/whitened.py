@@ -10,14 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.gaussian.loose import Loose, place_loose_nodes
 from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in, smooth_coordinates
-from bayesreg.inference.gaussian.reflection import Clearance, Walls, walls
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP
-from bayesreg.inference.layout import displacements, node_count, unravel
+from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import (
     Target,
-    clearance,
     has_costly_normaliser,
     logdensity,
     without_normaliser,
@@ -32,27 +29,21 @@ class Setup(NamedTuple):
     ----------
     gaussian : Gaussian
     middle : (d,) array
-        Flat position that the chains are about: the mode, or the mean of where they are. Not the Gaussian's centre,
-        which may lie behind a wall. Solves are preconditioned there.
-    walls : Walls
-        The walls of every sampled node.
+        Flat position that the chains are about: the mode, or the mean of the chains' places. Solves are preconditioned
+        there.
     step_size : scalar
         In whitened coordinates; π/2 is a quarter turn of the Gaussian's motion.
     steps : scalar integer
         Steps of a trajectory of fixed length: as many as make a quarter turn.
     stand_in : StandIn
         The stand-in of the density's normaliser, where it has one.
-    loose : Loose
-        Nodes that are moved alone, too.
     """
 
     gaussian: Gaussian
     middle: AnyArray
-    walls: Walls
     step_size: Scalar
     steps: AnyArray
     stand_in: StandIn
-    loose: Loose
 
 
 class Moved(NamedTuple):
@@ -60,29 +51,17 @@ class Moved(NamedTuple):
 
     acceptance_rate: AnyArray
     diverging: AnyArray | bool = False
-    outside_support: AnyArray | bool = False
     gradients: AnyArray | int = 0
-    densities: AnyArray | int = 0
 
 
 # (target, data, setup, key, state) → (state, Moved)
 Transition = Callable[[Target, Any, Setup, AnyArray, Any], tuple[Any, Moved]]
-# (target, data, setup) → the log density of the whitened coordinates that the transition works with
-Density = Callable[[Target, Any, Setup], Callable[[AnyArray], AnyArray]]
 
 
 @partial(jax.jit, static_argnums=0)
-def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray, alone: AnyArray | tuple[int, ...] = ()) -> Setup:
-    """A setup before its tuning; the nodes in the rows `alone` of "u_boundary" are moved alone."""
-    nodes, own = node_count(target), displacements(target)
-    centre = gaussian.centre[own].reshape(nodes, 3)
-    rows = gaussian.factor[own].reshape(nodes, 3, len(gaussian.centre))
-    nothing = no_stand_in(target)
-    held = walls(centre, rows, jnp.arange(nodes if target.walls else 0))
-    at = middle[own].reshape(nodes, 1, 3)[jnp.asarray(alone, int)]
-    nodes_alone = place_loose_nodes(gaussian, own.start, jnp.asarray(alone, int), at)
-    step_size, steps = jnp.asarray(FIRST_STEP), jnp.asarray(1, int)
-    return Setup(gaussian, jnp.asarray(middle), held, step_size, steps, nothing, nodes_alone)
+def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray) -> Setup:
+    """A setup before its tuning."""
+    return Setup(gaussian, jnp.asarray(middle), jnp.asarray(FIRST_STEP), jnp.asarray(1, int), no_stand_in(target))
 
 
 def whiten(gaussian: Gaussian, flat: AnyArray) -> AnyArray:
@@ -112,8 +91,3 @@ def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyAr
 def stand_in_at(target: Target, data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
     """The stand-in for the normaliser at a flat position."""
     return setup.stand_in(smooth_coordinates(target, data, flat))
-
-
-def clearance_of(target: Target, data: Any, setup: Setup) -> Clearance:
-    """Signed distances of the walls' nodes."""
-    return lambda u: clearance(target, data, u, setup.walls.nodes)

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import blackjax
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from bayesreg.inference.kernel import Draw, Info, Sampler
 from bayesreg.inference.samplers.settings import RandomWalk
@@ -76,7 +75,7 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
     return Sampler(
         # The setup is where the chains start, on average: the data are prepared for that neighbourhood.
         prepare=lambda points, _key, _say: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
-        data=lambda start: target.condition(start, np.zeros(0, int)),
+        data=lambda start: target.condition(start),
         blank=lambda: target.coordinates.reference(),
         init=init,
         step=step,

@@ -1,8 +1,8 @@
 """The registry of samplers, all through BlackJAX: name to record of settings and maker.
 
 The paper's kernel moves in the constrained space of the estimands; the others in the coordinates in which Laplace's
-approximation is N(0, I) (`bayesreg.inference.gaussian.whitened`), most of them reflected by the skull
-(`bayesreg.inference.gaussian.reflection`).
+approximation is N(0, I) (`bayesreg.inference.gaussian.whitened`). Any other kernel of BlackJAX is a user's own: the log
+density of a posterior is a function of a pytree (docs/samplers.md has an example).
 """
 
 from __future__ import annotations
@@ -15,12 +15,11 @@ from pydantic import ValidationError
 
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers import settings
-from bayesreg.inference.samplers.approximations import laplace, pathfinder
-from bayesreg.inference.samplers.hamiltonian import hmc, mclmc, nuts
-from bayesreg.inference.samplers.local import barker, mala, pcn, rwmh_adaptive
+from bayesreg.inference.samplers.hamiltonian import hmc, nuts
+from bayesreg.inference.samplers.laplace import laplace
 from bayesreg.inference.samplers.random_walk import rwmh
 from bayesreg.inference.samplers.settings import Settings
-from bayesreg.inference.samplers.tempering import smc
+from bayesreg.inference.samplers.smc import smc
 from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 
@@ -36,14 +35,8 @@ SAMPLERS: dict[str, Entry] = {
     "rwmh": Entry(settings.RandomWalk, rwmh),
     "hmc": Entry(settings.Hmc, hmc),
     "nuts": Entry(settings.Nuts, nuts),
-    "mclmc": Entry(settings.Mclmc, mclmc),
-    "mala": Entry(settings.Mala, mala),
-    "barker": Entry(settings.Barker, barker),
-    "rwmh_adaptive": Entry(settings.RwmhAdaptive, rwmh_adaptive),
-    "pcn": Entry(settings.Pcn, pcn),
     "smc": Entry(settings.Smc, smc),
     "laplace": Entry(settings.Laplace, laplace),
-    "pathfinder": Entry(settings.Pathfinder, pathfinder),
 }
 
 

@@ -40,11 +40,7 @@ class AboutMode(Settings):
 
 
 class Laplace(AboutMode):
-    """Draws from the Gaussian with the curvature at the mode, cut off by the skull: a quick look, approximate."""
-
-
-class Pathfinder(AboutMode):
-    """Draws from the Gaussian of the greatest evidence bound on the way to the mode: a quick look, approximate."""
+    """Draws from the Gaussian with the curvature at the mode: a quick look, approximate."""
 
 
 class Tuned(AboutMode):
@@ -67,10 +63,6 @@ class Nuts(Tuned):
     """Acceptance towards which the step size is tuned."""
 
 
-class Mclmc(Tuned):
-    """Adjusted microcanonical trajectories in coordinates whitened at the mode."""
-
-
 class Smc(Tuned):
     """Particles tempered from a broad Gaussian into the posterior; chains start there and go on as with hmc."""
 
@@ -78,34 +70,3 @@ class Smc(Tuned):
     """At least as many as chains. Many: they are what finds several modes and weighs them."""
     spread: Annotated[float, Field(strict=True, ge=1)] = 2.0
     """How much wider than Laplace's approximation the first distribution is."""
-
-
-class SingleStep(Tuned):
-    """Settings of all samplers with one evaluation a transition."""
-
-    warm_up: Count = 500
-    """Transitions that tune the step size and are not kept."""
-    target_acceptance: Share = 0.234
-    """Acceptance towards which the step size is tuned; the default is the best in many dimensions."""
-
-
-class Mala(SingleStep):
-    """The Metropolis-adjusted Langevin algorithm in coordinates whitened at the mode."""
-
-    target_acceptance: Share = 0.574
-    """Acceptance towards which the step size is tuned; the default is the best in many dimensions."""
-
-
-class Barker(SingleStep):
-    """Barker's proposal, whose gradient decides on signs alone, in coordinates whitened at the mode."""
-
-    target_acceptance: Share = 0.4
-    """Acceptance towards which the step size is tuned; the default is the best in many dimensions."""
-
-
-class RwmhAdaptive(SingleStep):
-    """Random-walk Metropolis with steps shaped like Laplace's covariance, their size tuned."""
-
-
-class Pcn(SingleStep):
-    """Preconditioned Crank–Nicolson on the Gaussian about the mode."""

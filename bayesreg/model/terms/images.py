@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -274,6 +274,11 @@ def _subtract(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
     """∇m."""
     return jax.grad(lambda x: term.moving(x).sum())(places)
+
+
+def images_of(problem: Any) -> ComparedImages | None:
+    """The first pair of images of a `Problem`, if there is one."""
+    return next((term for term in problem.terms.values() if isinstance(term, ComparedImages)), None)
 
 
 def shading_name(name: str) -> str:

@@ -40,13 +40,11 @@ class Skull(NamedTuple):
 
     def allows(self, values: Values) -> Bool[AnyArray, ""]:
         """Whether no sampled node lies in Ω_SK."""
-        return is_allowed(self.distance, self.points + values["u_boundary"]).all()
+        return (self.gap(values["u_boundary"]) >= 0).all()
 
-    def clearance(
-        self, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
-    ) -> Float[AnyArray, "*batch nodes"]:
-        """Signed distance to Ω_SK, mm, of some rows of "u_boundary" displaced by u."""
-        return self.distance(self.points[nodes] + u)
+    def gap(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
+        """Signed distance to Ω_SK of the sampled nodes, displaced by u, mm."""
+        return self.distance(self.points + u)
 
 
 class SoftSkull(NamedTuple):
@@ -70,9 +68,13 @@ class SoftSkull(NamedTuple):
         """The name of the term."""
         return self.hard.name
 
+    def gap(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
+        """See `Skull.gap`."""
+        return self.hard.gap(u)
+
     def depth(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
         """How deep the sampled nodes lie inside, displaced by u, mm; zero outside."""
-        return -jnp.minimum(self.hard.distance(self.hard.points + u), 0.0)
+        return -jnp.minimum(self.gap(u), 0.0)
 
     def log(self, state: State) -> Scalar:
         """−½ Σ (d / width)²."""
@@ -91,19 +93,9 @@ class SoftSkull(NamedTuple):
         return found._replace(matrices=jnp.zeros_like(found.matrices))
 
 
-class Walls:
-    """The skull, as the samplers see it (`bayesreg.inference.target.Walls`); the data are a `Problem`."""
-
-    def clearance(
-        self, data: Any, u: Float[AnyArray, "*batch nodes 3"], nodes: Int[AnyArray, "nodes"]
-    ) -> Float[AnyArray, "*batch nodes"]:
-        """See `Skull.clearance`; infinite in data without a skull."""
-        skull = data.terms.get("skull")
-        return skull.clearance(u, nodes) if isinstance(skull, Skull) else jnp.full(u.shape[:-1], jnp.inf)
-
-    def without(self, data: Any) -> Any:
-        """The data of the same problem without a skull."""
-        return data.without_term("skull")
+def mark_behind_skull(problem: Any, u: Float[AnyArray, "sampled 3"]) -> Bool[AnyArray, "sampled"]:
+    """Mark the sampled nodes that lie in the skull of a `Problem` where they are displaced by u, mm."""
+    return problem.terms["skull"].gap(u) < 0
 
 
 def is_allowed(distance: Interpolator, points: Float[AnyArray, "nodes 3"]) -> Bool[AnyArray, "nodes"]:

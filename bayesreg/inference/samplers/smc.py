@@ -11,27 +11,26 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
 
-from bayesreg.inference.gaussian.reflection import reflective_rotation, rotate
-from bayesreg.inference.gaussian.whitened import Setup, clearance_of, whiten, whitened_density, whitened_position
+from bayesreg.inference.gaussian.rotation import rotation
+from bayesreg.inference.gaussian.whitened import Setup, whitened_density, whitened_position
 from bayesreg.inference.kernel import Sampler, Say
-from bayesreg.inference.layout import flat_position
 from bayesreg.inference.samplers.hamiltonian import hmc
 from bayesreg.inference.samplers.settings import Hmc, Smc
 from bayesreg.inference.target import Target, estimands_of
 from bayesreg.types import AnyArray, InputError
 
-# Quarter turns that spread the first particles; trajectories of each particle at each temperature; the share of the
-# particles that a rise of the inverse temperature leaves effective; how many are moved at once; the most temperatures.
-_TURNS, _MOVES, _SHARE, _BATCH, _MOST = 20, 2, 0.7, 32, 500
+# Trajectories of each particle at each temperature; the share of the particles that a rise of the inverse temperature
+# leaves effective; how many are moved at once; the most temperatures.
+_MOVES, _SHARE, _BATCH, _MOST = 2, 0.7, 32, 500
 
 
 def smc(target: Target, settings: Smc) -> Sampler:
     """Adaptive tempered sequential Monte Carlo, whose particles are where chains of `hmc` start.
 
-    Particles drawn from Laplace's approximation π₀, widened and cut off by the skull, are reweighted, resampled and
-    moved by `hmc`'s kernel along π₀^(1−β) π^β, β rising from 0 to 1. Modes that the broad Gaussian reaches then hold
-    particles in proportion to their mass, up to the noise of so many. Chains start at a resampled few and go on with
-    `hmc`, which leaves the posterior unchanged: it, not the tempering, is what makes the draws exact.
+    Particles drawn from Laplace's approximation π₀, widened, are reweighted, resampled and moved by the kernel of `hmc`
+    along π₀^(1−β) π^β, β rising from 0 to 1. Modes that the broad Gaussian reaches then hold particles in proportion to
+    their mass, up to the noise of so many. Chains start at a resampled few and go on with `hmc`, which leaves the
+    posterior unchanged: it, not the tempering, is what makes the draws exact.
     """
     particles, spread, target_acceptance = settings.particles, settings.spread, settings.target_acceptance
     chains_of = hmc(target, Hmc(**settings.model_dump(include=set(Hmc.model_fields))))
@@ -40,36 +39,16 @@ def smc(target: Target, settings: Smc) -> Sampler:
         chains = len(next(iter(points.values())))
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
-        setup, starts = chains_of.prepare(points, key, say)
+        setup, _ = chains_of.prepare(points, key, say)
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
-        one = jax.tree.map(lambda x: x[0], starts)
-        begin = whiten(setup.gaussian, flat_position(target, data, one))
-        first = _broad(target, data, setup, begin, spread, jax.random.split(key_first, particles))
+        first = spread * jax.random.normal(key_first, (particles, len(setup.middle)))
         found, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper, say)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.gaussian, xi))(found[chosen])
         return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
 
     return chains_of._replace(prepare=prepare)
-
-
-@partial(jax.jit, static_argnums=0)
-def _broad(
-    target: Target, data: Any, setup: Setup, begin: AnyArray, spread: AnyArray | float, keys: AnyArray
-) -> AnyArray:
-    """Draws of N(0, spread² I) cut off by the skull: from a place in the support, by quarter turns."""
-    clearance = clearance_of(target, data, setup)
-
-    def draw(key: AnyArray) -> AnyArray:
-        def turn(position: AnyArray, key: AnyArray) -> tuple[AnyArray, None]:
-            momentum = spread * jax.random.normal(key, position.shape)
-            turned, _ = rotate(setup.walls, clearance, position, momentum, jnp.pi / 2)
-            return jnp.where(jnp.isfinite(turned).all(), turned, position), None
-
-        return jax.lax.scan(turn, begin, jax.random.split(key, _TURNS))[0]
-
-    return jax.lax.map(draw, keys, batch_size=_BATCH)
 
 
 def _temper(
@@ -109,7 +88,6 @@ def _rise(
 ) -> tuple[Any, AnyArray]:
     """Resample, move, and reweight for the next β; and the acceptance of the moves."""
     density = whitened_density(target, data, setup)
-    clearance = clearance_of(target, data, setup)
 
     def broad(xi: AnyArray) -> AnyArray:
         return -0.5 * (xi @ xi) / spread**2
@@ -119,7 +97,7 @@ def _rise(
     kernel = adaptive_tempered.build_kernel(
         broad,
         lambda xi: density(xi) - broad(xi),
-        blackjax.mcmc.hmc.build_kernel(reflective_rotation(setup.walls, clearance, precision)),
+        blackjax.mcmc.hmc.build_kernel(rotation(precision)),
         blackjax.mcmc.hmc.init,
         resampling.systematic,
         _SHARE,

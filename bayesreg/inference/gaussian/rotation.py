@@ -1,0 +1,45 @@
+"""Hamiltonian dynamics about a Gaussian, for BlackJAX.
+
+In coordinates ξ in which the Gaussian is N(0, I), the Hamiltonian splits into that of the Gaussian, ½|ξ|² + ½|p|²,
+whose flow is a rotation of (ξ, p), and what the posterior adds to it, −log π(ξ) − ½|ξ|², whose flow is a kick. Their
+Strang composition is exact where the posterior is Gaussian, in any dimension (Beskos et al. 2011), and so takes long
+steps where it is nearly so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from blackjax.mcmc.integrators import IntegratorState
+
+from bayesreg.types import AnyArray
+
+
+def rotation(precision: AnyArray | float = 1.0) -> Callable:
+    """An integrator for BlackJAX: half a kick, a rotation about the Gaussian N(0, I / precision), half a kick.
+
+    The mass is the precision, of which BlackJAX takes the inverse.
+    """
+
+    def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
+        density = jax.value_and_grad(logdensity_fn)
+
+        def one_step(state: IntegratorState, step_size: AnyArray | float) -> IntegratorState:
+            velocity = (state.momentum + step_size / 2 * _excess(state.logdensity_grad, state.position)) / precision
+            cosine, sine = jnp.cos(step_size), jnp.sin(step_size)
+            position = cosine * state.position + sine * velocity
+            momentum = precision * (cosine * velocity - sine * state.position)
+            logdensity, gradient = density(position)
+            momentum += step_size / 2 * _excess(gradient, position)
+            return IntegratorState(position, momentum, logdensity, gradient)
+
+        def _excess(gradient: AnyArray, position: AnyArray) -> AnyArray:
+            """The force of the density beyond that of the Gaussian."""
+            return gradient + precision * position
+
+        return one_step
+
+    return integrator
