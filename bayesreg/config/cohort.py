@@ -16,9 +16,9 @@ from pydantic import Field, ValidationError
 
 from bayesreg.config.errors import ConfigError, explain
 from bayesreg.config.loading import read_mapping
-from bayesreg.config.values import Count, Section
 from bayesreg.config.yaml_text import parse
 from bayesreg.printable import find_unprintable
+from bayesreg.settings import Count, Section
 
 SUBJECT = "subject"
 MOST_TASKS = 100_000

@@ -7,18 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, ValidationInfo, field_validator
 
-from bayesreg.config.values import (
-    ByTissue,
-    Direction,
-    FoundFile,
-    FoundImage,
-    Labels,
-    LabelTable,
-    NotNegative,
-    Positive,
-    Section,
-)
+from bayesreg.config.values import ByTissue, Direction, Labels, LabelTable
 from bayesreg.label_tables import REST
+from bayesreg.settings import FoundFile, FoundImage, NotNegative, Positive, Section
 from bayesreg.tissues import BRAIN, ORGAN, PAPER_LAM, PAPER_MU, tissue_names
 
 

@@ -11,6 +11,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from bayesreg.model.observations.registry import kinds
+from bayesreg.model.observations.section import ObservationSection
 from bayesreg.types import InputError
 
 Keys = tuple[str | int, ...]
@@ -148,7 +150,8 @@ def _fields_at(location: Keys, model: type[BaseModel]) -> dict[str, FieldInfo]:
 
 
 def _models(field: FieldInfo) -> list[type[BaseModel]]:
-    return [m for m in _leaves(field.annotation) if isinstance(m, type) and issubclass(m, BaseModel)]
+    models = [m for m in _leaves(field.annotation) if isinstance(m, type) and issubclass(m, BaseModel)]
+    return [m for one in models for m in (kinds().values() if one is ObservationSection else (one,))]
 
 
 def _tags(model: type[BaseModel]) -> set[object]:

@@ -14,10 +14,10 @@ from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from bayesreg.config.errors import ConfigError, Keys, explain
-from bayesreg.config.sections import Config
-from bayesreg.config.values import search_folders
+from bayesreg.config.sections import Config, complete
 from bayesreg.config.yaml_text import DEEPEST, parse
 from bayesreg.model.options import ModelConfig
+from bayesreg.settings import search_folders
 
 # A section of another kind replaces the one that it extends: their keys have nothing in common.
 _KINDS = ("source", "kind", "name")
@@ -181,7 +181,8 @@ def _merge(base: _Document, top: _Document) -> _Document:
 
 
 def _override(document: _Document, overrides: Sequence[str]) -> _Document:
-    data, origins = document.data, dict(document.origins)
+    # So that an override may name the first of the observations where the file lists none.
+    data, origins = complete(document.data) if overrides else document.data, dict(document.origins)
     for text in overrides:
         path, equals, value = text.partition("=")
         keys = tuple(path.strip().split("."))

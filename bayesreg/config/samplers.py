@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, TypeAdapter
 
-from bayesreg.config.values import Count
 from bayesreg.inference.samplers import settings
+from bayesreg.settings import Count
 
 Chains = Annotated[int, Field(strict=True, ge=1, le=65_536)]
 

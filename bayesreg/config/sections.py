@@ -10,21 +10,14 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData, Mni152Data, PaperPair
-from bayesreg.config.observations import ImagesSection, Observations
 from bayesreg.config.samplers import Hmc, SamplerConfig, name_hmc_where_unnamed
-from bayesreg.config.values import (
-    ByTissue,
-    Count,
-    FoundFile,
-    NotNegative,
-    Positive,
-    Range,
-    Section,
-    find_boundary,
-    find_field,
-)
-from bayesreg.model.options import ModelConfig, Vector
-from bayesreg.model.options import wrong as _wrong
+from bayesreg.config.values import ByTissue, Range, find_boundary, find_field
+from bayesreg.model.observations.images.options import ImageOptions, with_preset
+from bayesreg.model.observations.images.section import ImagesSection
+from bayesreg.model.observations.registry import Observations
+from bayesreg.model.options import ModelConfig
+from bayesreg.settings import Count, FoundFile, NotNegative, Positive, Section, Vector
+from bayesreg.settings import wrong as _wrong
 from bayesreg.tissues import BRAIN_EDGE
 
 
@@ -167,21 +160,50 @@ def _has_images(data: Mni152Data | BrainWebData | FilesData) -> bool:
 
 def _require_nothing_else(model: ModelConfig) -> None:
     """Refuse what known_boundary leaves no room for."""
-    if model.sampled != "boundary" or model.held:
-        key = "held" if model.held else "sampled"
-        raise _wrong(key, "expected the default: known_boundary holds the boundary, and no other node is sampled")
-    if model.normalised:
-        raise _wrong("normalised", "expected false with known_boundary: a given u_B has no prior to be normalised")
+    elastic = model.elastic_prior
+    if elastic.nodes != "boundary" or elastic.held:
+        key = "held" if elastic.held else "nodes"
+        message = "expected the default: known_boundary holds the boundary, and no other node is sampled"
+        raise _wrong(f"elastic_prior.{key}", message)
+    if elastic.normalised:
+        raise _wrong(
+            "elastic_prior.normalised", "expected false with known_boundary: a given u_B has no prior to be normalised"
+        )
 
 
-def _compares_files(given: Mapping[str, Any]) -> bool:
-    """Whether a configuration, before it is checked, compares a pair of images that are files."""
-    data, observations = given.get("data"), given.get("observations")
-    if not isinstance(data, Mapping) or data.get("source") != "files" or data.get("fixed") is None:
-        return False
-    if not isinstance(observations, list):
-        return True
-    return any(isinstance(one, Mapping) and one.get("kind") == "images" for one in observations)
+def complete(given: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration, before it is checked, with the preset of its model and the observations that it leaves out.
+
+    What comes from files has `preset: registration` by default; so has a known boundary `preset: paper`, and what is
+    made here. Images that are there are compared, unless the observations are listed.
+    """
+    data, found = given.get("data"), dict(given)
+    if not isinstance(data, Mapping):
+        return found
+    from_files = data.get("source") == "files"
+    if given.get("observations") is None:
+        found["observations"] = [] if from_files and data.get("fixed") is None else [{"kind": "images"}]
+    model = given.get("model") or {}
+    if isinstance(model, Mapping) and "preset" not in model:
+        registers = from_files and given.get("known_boundary") is None
+        found["model"] = {"preset": "registration" if registers else "paper", **model}
+    return found
+
+
+def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
+    """A completed configuration in which every pair of images has the options of the preset that it does not give."""
+    model, observations = given.get("model"), given.get("observations")
+    preset = model.get("preset") if isinstance(model, Mapping) else getattr(model, "preset", None)
+    if preset not in ("paper", "registration") or not isinstance(observations, list):
+        return dict(given)
+    are_images = [isinstance(one, Mapping) and one.get("kind") == "images" for one in observations]
+    return {
+        **given,
+        "observations": [
+            with_preset(preset, one) if is_images else one
+            for one, is_images in zip(observations, are_images, strict=True)
+        ],
+    }
 
 
 class Config(Section):
@@ -199,10 +221,10 @@ class Config(Section):
     known_boundary: Annotated[Literal["truth"] | Path | None, BeforeValidator(find_boundary)] = None
     """Elastography: the displacement of the boundary is known, truth (of a synthetic pair) or a file (.vtu or .npz of
     this mesh, or a displacement field .nii, .nii.gz), and λ, μ alone are sampled; null samples both."""
-    observations: Annotated[Observations, Field(validate_default=True)] = None
-    """The data of the run; null is the pair of images alone."""
+    observations: Observations = Field(default=[])
+    """The data of the run; null is the pair of images alone, where there is one."""
     model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
-    """Of a pair of images that are files, preset: registration is the default, and preset: paper of all else."""
+    """preset: registration is the default of all that comes from files, and preset: paper of what is made here."""
     sampler: Annotated[
         SamplerConfig,
         Field(discriminator="name"),
@@ -219,11 +241,8 @@ class Config(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _choose_preset(cls, given: Any) -> Any:
-        if not isinstance(given, Mapping) or given.get("known_boundary") is not None or not _compares_files(given):
-            return given
-        model = given.get("model", {})
-        return {**given, "model": {"preset": "registration", **model}} if isinstance(model, Mapping) else given
+    def _complete(cls, given: Any) -> Any:
+        return _with_image_options(complete(given)) if isinstance(given, Mapping) else given
 
     # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
 
@@ -263,7 +282,7 @@ class Config(Section):
     @classmethod
     def _are_there(cls, observations: Observations, info: ValidationInfo) -> Observations:
         data = info.data.get("data")
-        names = [one.name for one in observations or [] if isinstance(one, ImagesSection)]
+        names = [one.name for one in observations if isinstance(one, ImagesSection)]
         if names and data is not None and not _has_images(data):
             raise ValueError("images are observed, and data has none; expected data.fixed and data.moving")
         if names and "images" not in names:
@@ -278,11 +297,15 @@ class Config(Section):
         return _has_images(self.data)
 
     @property
-    def compares_images(self) -> bool:
-        """Whether the pair of images is among the observations."""
-        if self.observations is None:
-            return self.has_images
-        return any(isinstance(one, ImagesSection) for one in self.observations)
+    def pairs_of_images(self) -> list[ImagesSection]:
+        """The pairs of images among the observations, that of the section data first."""
+        pairs = [one for one in self.observations if isinstance(one, ImagesSection)]
+        return sorted(pairs, key=lambda pair: pair.fixed is not None)
+
+    @property
+    def image_options(self) -> ImageOptions:
+        """How the pair of the section data is compared; the defaults where it is not."""
+        return next(iter(self.pairs_of_images), ImageOptions())
 
     @field_validator("known_boundary")
     @classmethod
@@ -303,9 +326,12 @@ class Config(Section):
         if info.data.get("known_boundary") is not None:
             _require_nothing_else(model)
             if names is not None:
-                model.model_copy(update={"sampled": []}).require_proper_priors(names)
-        elif not isinstance(model.sampled, str) and len({*model.sampled, *model.held}) < 3:
-            raise _wrong("sampled", "expected at least three nodes, held ones included; fewer do not hold the mesh")
+                no_node = model.elastic_prior.model_copy(update={"nodes": []})
+                model.model_copy(update={"elastic_prior": no_node}).require_proper_priors(names)
+        elif not isinstance(nodes := model.elastic_prior.nodes, str) and len({*nodes, *model.elastic_prior.held}) < 3:
+            raise _wrong(
+                "elastic_prior.nodes", "expected at least three nodes, held ones included; fewer do not hold the mesh"
+            )
         if names is not None:
             model.require_proper_priors(names)
         return model

@@ -1,65 +1,26 @@
-"""Kinds of values in a configuration: numbers within bounds, files that are looked for, directions."""
+"""Kinds of values in a configuration: tables of labels, ranges, directions."""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 
 from bayesreg.label_tables import TABLES, as_range, name_values, read_label_names
+from bayesreg.settings import Positive, Vector, find_file, is_stored
 from bayesreg.tissues import BACKGROUND, tissue_names
-from bayesreg.types import DATA_FOLDER
-
-
-def _is_stored(info: ValidationInfo) -> bool:
-    """Whether a configuration is that of a run folder, which holds what was made of the files that it names."""
-    return bool((info.context or {}).get("stored"))
-
-
-def _find_file(value: object, info: ValidationInfo) -> Path:
-    return _find(value, info, Path.is_file)
-
-
-def _find_image(value: object, info: ValidationInfo) -> Path:
-    """A file, or a folder with a DICOM series."""
-    return _find(value, info, Path.exists)
-
-
-def _find(value: object, info: ValidationInfo, serves: Callable[[Path], bool]) -> Path:
-    if not isinstance(value, str | Path) or not str(value):
-        raise ValueError("expected the path of a file")
-    if _is_stored(info):
-        return Path(value)
-    folders = (info.context or {}).get("folders", ()) or search_folders()
-    places = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
-    for place in places:
-        try:
-            if serves(place):
-                return place
-        except (OSError, ValueError) as error:
-            raise ValueError(f"no path of a file: {getattr(error, 'strerror', None) or error}") from None
-    hint = "" if Path(value).is_absolute() or os.environ.get(DATA_FOLDER) else f" (and {DATA_FOLDER} is not set)"
-    raise ValueError(f"no such file; looked for {' and '.join(map(str, places))}{hint}")
-
-
-def search_folders(*beside: Path) -> list[Path]:
-    """Where relative paths are looked for, the first place first."""
-    data = os.environ.get(DATA_FOLDER)
-    return [*beside, Path.cwd(), *([Path(data)] if data else [])]
 
 
 def find_field(value: object, info: ValidationInfo) -> object:
     """A word for a displacement field as it is, anything else as a file."""
-    return value if value in ("identity", "truth", "demons") else _find_file(value, info)
+    return value if value in ("identity", "truth", "demons") else find_file(value, info)
 
 
 def find_boundary(value: object, info: ValidationInfo) -> object:
     """The word truth and null as they are, anything else as a file."""
-    return value if value in (None, "truth") else _find_file(value, info)
+    return value if value in (None, "truth") else find_file(value, info)
 
 
 def _as_pair(value: object) -> object:
@@ -93,17 +54,11 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return x, y, z
 
 
-Number = Annotated[float, Field(strict=True)]
-Positive = Annotated[float, Field(strict=True, gt=0)]
-NotNegative = Annotated[float, Field(strict=True, ge=0)]
-Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000_000)]
 Label = Annotated[int, Field(strict=True)]
 Labels = Annotated[tuple[Label, ...], BeforeValidator(_as_list), Field(min_length=1)]
-FoundFile = Annotated[Path, BeforeValidator(_find_file)]
-FoundImage = Annotated[Path, BeforeValidator(_find_image)]
 Fraction = Annotated[float, Field(strict=True, ge=0, le=2)]
 Range = Annotated[tuple[Fraction, Fraction], BeforeValidator(_as_pair), AfterValidator(_ascending)]
-Direction = Annotated[tuple[Number, Number, Number], AfterValidator(_unit)]
+Direction = Annotated[Vector, AfterValidator(_unit)]
 
 
 def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
@@ -132,7 +87,7 @@ def _named_table(value: object, info: ValidationInfo) -> object:
     """The table of a program by its name; in others, names of labels that a lookup table lists become their values."""
     known = info.data.get("label_names")
     # A stored table has numbers alone.
-    if isinstance(value, dict) and known is not None and not _is_stored(info):
+    if isinstance(value, dict) and known is not None and not is_stored(info):
         names = read_label_names(known)
         return {tissue: name_values(entry, names) for tissue, entry in value.items()}
     if not isinstance(value, str):
@@ -144,9 +99,3 @@ def _named_table(value: object, info: ValidationInfo) -> object:
 
 LabelTable = Annotated[dict[str, Labels], AfterValidator(_table), BeforeValidator(_named_table)]
 ByTissue = dict[str, Positive]
-
-
-class Section(BaseModel):
-    """A part of a configuration: no unknown keys, no changes after the making."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)

@@ -68,6 +68,15 @@ class PointPairs(NamedTuple):
     names: tuple[str, ...]
     sd: Float[np.ndarray, "k"] | None = None
 
+    def as_arrays(self) -> dict[str, np.ndarray]:
+        """The fields that there are as arrays, for files."""
+        return {name: np.asarray(value) for name, value in self._asdict().items() if value is not None}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PointPairs:
+        """What `as_arrays` made."""
+        return cls(arrays["fixed"], arrays["moving"], tuple(arrays["names"].tolist()), arrays.get("sd"))
+
 
 def read_points(path: str | Path) -> Points:
     """Read points of one space.

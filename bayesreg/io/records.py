@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.image import Image, IntensityScale
-from bayesreg.io.points import PointPairs
 from bayesreg.mesh import TetMesh
 from bayesreg.pose import Pose
 from bayesreg.types import AnyArray
@@ -34,16 +33,6 @@ class Truth(NamedTuple):
     lam: AnyArray
     mu: AnyArray
     initial: AnyArray | None = None
-
-
-class Fit(NamedTuple):
-    """How the images fit, as in `Predicted`."""
-
-    residual: AnyArray
-    residual_tissue: AnyArray
-    discrepancies: np.ndarray
-    observed: AnyArray
-    replicated: AnyArray
 
 
 class Predicted(NamedTuple):
@@ -71,18 +60,8 @@ class Predicted(NamedTuple):
     total_sd : (n, 3) array or None
         Standard deviation of the displacement of every node along the axes of the moving image's world, mm; None where
         there is no pose, and these axes are those of the fixed image.
-    residual : (q,) array or None
-        f − m(x + ū) at the quadrature points over the noise sd that T_s implies there. This and what follows up to
-        `replicated` is None without images.
-    residual_tissue : (q,) int array
-        Index into the mesh's tissue names.
-    discrepancies : (D,) array of str
-    observed, replicated : (chains, draws, D) arrays
-        Discrepancies of the standardised residuals of each draw, and of noise that follows the model.
-    landmark_names, landmark_points, landmark_sd, landmark_residual : (k,), (k, 3), (k,), (k, 3) arrays or None
-        All landmarks that were observed: names, places in the fixed image, sd and residual at the mean, mm.
-    left_out_residual, left_out_covariance : (k, 3), (k, 3, 3) arrays or None
-        The residual of each landmark, predicted by all observations but itself, where there are few.
+    observations : mapping
+        What each observation leaves for the report, by "<observation>/<array>".
     evaluation_names, evaluation_points : (k,), (k, 3) arrays or None
         Landmarks that were held out: names, and places in the fixed image.
     evaluation_before, evaluation_posed : (k,) arrays or None
@@ -108,17 +87,7 @@ class Predicted(NamedTuple):
     motion: AnyArray
     centre: AnyArray
     total_sd: AnyArray | None = None
-    residual: AnyArray | None = None
-    residual_tissue: AnyArray | None = None
-    discrepancies: np.ndarray | None = None
-    observed: AnyArray | None = None
-    replicated: AnyArray | None = None
-    landmark_names: np.ndarray | None = None
-    landmark_points: AnyArray | None = None
-    landmark_sd: AnyArray | None = None
-    landmark_residual: AnyArray | None = None
-    left_out_residual: AnyArray | None = None
-    left_out_covariance: AnyArray | None = None
+    observations: Mapping[str, AnyArray] = MappingProxyType({})
     evaluation_names: np.ndarray | None = None
     evaluation_points: AnyArray | None = None
     evaluation_before: AnyArray | None = None
@@ -131,16 +100,28 @@ class Predicted(NamedTuple):
     stiffer: AnyArray | None = None
     stiffer_probability: AnyArray | None = None
 
-    @property
-    def fit(self) -> Fit | None:
-        """How the images fit; None without images."""
-        parts = {name: getattr(self, name) for name in Fit._fields}
-        return None if self.discrepancies is None else Fit(**parts)
+    def of_observation(self, name: str) -> dict[str, AnyArray]:
+        """What the observation of this name has left."""
+        return {
+            key.removeprefix(f"{name}/"): value
+            for key, value in self.observations.items()
+            if key.startswith(f"{name}/")
+        }
 
     @property
     def known(self) -> dict[str, AnyArray]:
         """The entries that there are."""
-        return {name: value for name, value in self._asdict().items() if value is not None}
+        return {name: value for name, value in self._asdict().items() if value is not None and name != "observations"}
+
+    def as_arrays(self) -> dict[str, AnyArray]:
+        """All entries as named arrays, for files; those of observations have a slash in their names."""
+        return {**self.known, **self.observations}
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, AnyArray]) -> Predicted:
+        """What `as_arrays` made."""
+        own = {name: value for name, value in arrays.items() if "/" not in name}
+        return cls(**own, observations={name: value for name, value in arrays.items() if "/" in name})
 
     @property
     def by_cell(self) -> dict[str, AnyArray]:
@@ -211,8 +192,8 @@ class Inputs(NamedTuple):
     truth : Truth or None
     boundary : (b, 3) array or None
         Displacement of the boundary nodes, mm, where it is known and not sampled.
-    points : mapping
-        Pairs of points that were observed, by the name of the observation, and those that were held out, as
+    observed : mapping
+        Arrays that were read for each observation, by its name, and those of landmarks that were held out, as
         "evaluation"; as they were given.
     matching : Matching
     fixed_ignore, moving_ignore : Image or None
@@ -229,7 +210,7 @@ class Inputs(NamedTuple):
     skull: Image | None = None
     truth: Truth | None = None
     boundary: AnyArray | None = None
-    points: Mapping[str, PointPairs] = MappingProxyType({})
+    observed: Mapping[str, Mapping[str, np.ndarray]] = MappingProxyType({})
     matching: Matching = Matching()
     fixed_ignore: Image | None = None
     moving_ignore: Image | None = None
@@ -242,7 +223,8 @@ class Run:
 
     Attributes
     ----------
-    config, mesh, fixed, moving, tissue, skull, truth, boundary, points, matching, fixed_ignore, moving_ignore, channels
+    config, mesh, fixed, moving, tissue, skull, truth, boundary, observed, matching, fixed_ignore, moving_ignore
+    channels
         As in `Inputs`.
     manifest : dict
         The content of run.json.
@@ -270,7 +252,7 @@ class Run:
     skull: Image | None = None
     truth: Truth | None = None
     boundary: AnyArray | None = None
-    points: Mapping[str, PointPairs] = field(default_factory=dict)
+    observed: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     matching: Matching = field(default_factory=Matching)
     fixed_ignore: Image | None = None
     moving_ignore: Image | None = None

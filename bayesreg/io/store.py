@@ -16,10 +16,9 @@ from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of, writing
 from bayesreg.io.meshing import load_mesh, save_mesh
-from bayesreg.io.points import PointPairs
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
 from bayesreg.io.volumes import load_image, save_image
-from bayesreg.types import AnyArray, InputError
+from bayesreg.types import InputError
 
 BODIES = "bodies.json"
 RESULTS = (
@@ -67,7 +66,7 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
         save_arrays(place("inputs/truth.npz"), known)
     if inputs.boundary is not None:
         save_arrays(place("inputs/boundary.npz"), {"u_boundary": inputs.boundary})
-    write_points(place, inputs.points)
+    write_observed(place, inputs.observed)
     channels = {name: channel.one_contrast for name, channel in inputs.channels.items()}
     write_json(place("inputs/matching.json"), inputs.matching.as_json() | {"channels": channels})
     save_mesh(inputs.mesh, place("inputs/mesh.vtu"))
@@ -76,10 +75,11 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
     write_text(place("config.yaml"), inputs.config)
 
 
-def write_points(place: Place, points: Mapping[str, PointPairs]) -> None:
-    """Write inputs/points.npz, if there are any."""
-    if points:
-        save_arrays(place("inputs/points.npz"), _points_as_arrays(points))
+def write_observed(place: Place, observed: Mapping[str, Mapping[str, np.ndarray]]) -> None:
+    """Write inputs/observed.npz, arrays named "<observation>/<array>", if there are any."""
+    named = {f"{name}/{key}": value for name, arrays in observed.items() for key, value in arrays.items()}
+    if named:
+        save_arrays(place("inputs/observed.npz"), named)
 
 
 def read_inputs(folder: str | Path) -> Inputs:
@@ -91,17 +91,17 @@ def read_inputs(folder: str | Path) -> Inputs:
         None if (path := _file(folder, f"inputs/{name}.nii.gz")) is None else load_image(path)
         for name in ("fixed", "moving", "skull", "fixed_ignore", "moving_ignore")
     )
-    known, given, points = (
+    known, given, arrays = (
         None if (path := _file(folder, f"inputs/{name}.npz")) is None else load_arrays(path, ANEW)
-        for name in ("truth", "boundary", "points")
+        for name in ("truth", "boundary", "observed")
     )
     truth = None if known is None else Truth(**known)
     boundary = None if given is None else given["u_boundary"]
-    pairs = {} if points is None else _points_of(points)
+    observed = {} if arrays is None else _observed_of(arrays)
     known_of_images = read_json(require_file(folder, "inputs/matching.json"))
     channels = {name: _channel(folder, name, alike) for name, alike in known_of_images["channels"].items()}
     return Inputs(
-        config, mesh, fixed, moving, tissue, skull, truth, boundary, pairs, Matching.of_json(known_of_images),
+        config, mesh, fixed, moving, tissue, skull, truth, boundary, observed, Matching.of_json(known_of_images),
         fixed_ignore, moving_ignore, channels,
     )  # fmt: skip
 
@@ -113,18 +113,12 @@ def _channel(folder: str | Path, name: str, one_contrast: bool) -> Channel:
     return Channel(fixed, moving, one_contrast)
 
 
-def _points_as_arrays(points: Mapping[str, PointPairs]) -> dict[str, AnyArray]:
-    """Pairs of points as named arrays: "<observation>/<field>"."""
-    fields = {(name, field): value for name, pairs in points.items() for field, value in pairs._asdict().items()}
-    return {f"{name}/{field}": np.asarray(value) for (name, field), value in fields.items() if value is not None}
-
-
-def _points_of(arrays: Mapping[str, np.ndarray]) -> dict[str, PointPairs]:
-    found: dict[str, dict[str, Any]] = {}
+def _observed_of(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    found: dict[str, dict[str, np.ndarray]] = {}
     for key, value in arrays.items():
         name, field = key.split("/")
-        found.setdefault(name, {})[field] = tuple(value.tolist()) if field == "names" else value
-    return {name: PointPairs(**fields) for name, fields in found.items()}
+        found.setdefault(name, {})[field] = value
+    return found
 
 
 def write_results(
@@ -157,7 +151,7 @@ def write_results(
     if run.metrics is not None:
         write_json(place("metrics.json"), run.metrics)
     if run.predicted is not None:
-        save_arrays(place("predicted.npz"), run.predicted.known)
+        save_arrays(place("predicted.npz"), run.predicted.as_arrays())
     write_json(place("run.json"), run.manifest)
 
 
@@ -177,7 +171,7 @@ def read_run(folder: str | Path) -> Run:
     if warped is not None and inputs.matching.scale is not None:
         warped = inputs.matching.scale(warped)
     metrics = None if (path := _file(folder, "metrics.json")) is None else read_json(path)
-    known = None if (path := _file(folder, "predicted.npz")) is None else Predicted(**load_arrays(path, ANEW))
+    known = None if (path := _file(folder, "predicted.npz")) is None else Predicted.of_arrays(load_arrays(path, ANEW))
     return Run(
         manifest=manifest,
         u_mean=u_mean,

@@ -1,24 +1,19 @@
-"""Does the noise model hold? Residuals in units of the noise that T_s stands for, and discrepancies of them."""
+"""How well every observation fits."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 
 from bayesreg.model.blocks import Values
-from bayesreg.model.image_pair import ImagePair
+from bayesreg.model.observations.registry import kinds
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.state import state_of
-from bayesreg.model.terms.landmarks import Landmarks
-from bayesreg.model.terms.term import Outside, Standardised
-from bayesreg.types import AnyArray
+from bayesreg.model.state import State, state_of
+from bayesreg.model.term import Standardised
+from bayesreg.settings import Section
 
-KINDS = {ImagePair: "images", Landmarks: "landmarks"}
-DISCREPANCIES = ("sd", "greatest", "neighbours")
+OWN, OWN_TITLE = "own", "an observation of your own"
 
 
 def describe_observations(posterior: Posterior, values: Values) -> dict[str, dict[str, Any]]:
@@ -27,50 +22,25 @@ def describe_observations(posterior: Posterior, values: Values) -> dict[str, dic
     Returns
     -------
     dict
-        By the name of the observation its "kind" ("images", "landmarks" or "own"), the "log" of its term, and where the
-        term knows its residuals their number, "values", and the root of the mean of their squares in units of their
-        variance, "residual_rms".
+        By the name of the observation its "kind", the "title" of that in words, and its "options" where it has some;
+        the "log" of its term; where the term knows its residuals their number, "values", and the root of the mean of
+        their squares in units of their variance, "residual_rms"; and what else the observation says of itself
+        (`describe`).
     """
     filled = posterior.fill(values)
     state = state_of(posterior.data.body, posterior.data.blocks, filled)
-    found = {}
-    for name, given in posterior.observations.items():
-        term = posterior.data.terms[name]
-        # What stands for an observation from outside knows its log alone.
-        shown = given if isinstance(term, Outside) else term
-        found[name] = {"kind": KINDS.get(type(given), "own"), "log": float(term.log(state))}
-        if isinstance(shown, Standardised):
-            z = np.asarray(shown.standardised_residual(state))
-            found[name] |= {"values": z.size, "residual_rms": float(np.sqrt(np.mean(z**2)))}
-    return found
+    return {name: _describe(one, posterior.data.terms[name], state) for name, one in posterior.observations.items()}
 
 
-def discrepancies(
-    z: Float[AnyArray, "points"], cells: Int[AnyArray, "points"], neighbours: Int[AnyArray, "pairs 2"], count: int
-) -> Float[AnyArray, "3"]:
-    """Compute figures of standardised residuals that would differ if the model were wrong (see `DISCREPANCIES`).
-
-    Parameters
-    ----------
-    z : (q,) array
-        Standardised residuals.
-    cells : (q,) int array
-        The cell of each.
-    neighbours : (k, 2) int array
-        Cells that share a face.
-    count : int
-        Number of cells.
-
-    Returns
-    -------
-    (3,) array
-        "sd": √(mean z²). "greatest": max |z|. "neighbours": autocorrelation at a lag of one cell: of the sums of z
-        over cells, divided by the root of their number, between cells that share a face.
-    """
-    points = jax.ops.segment_sum(jnp.ones_like(z), cells, count)
-    means = jax.ops.segment_sum(z, cells, count) / jnp.sqrt(jnp.maximum(points, 1))
-    one, other = means[neighbours].T
-    # A cell without points (quadrature by voxels) has no say.
-    both = (points[neighbours] > 0).all(axis=1)
-    correlation = (both * one * other).sum() / (both * (one**2 + other**2) / 2).sum()
-    return jnp.stack([jnp.sqrt(jnp.mean(z**2)), jnp.abs(z).max(), correlation])
+def _describe(observation: Any, term: Any, state: State) -> dict[str, Any]:
+    kind = getattr(observation, "kind", OWN)
+    title = kinds()[kind].title if kind in kinds() else OWN_TITLE
+    found: dict[str, Any] = {"kind": kind, "title": title, "log": float(term.log(state))}
+    if isinstance(options := getattr(observation, "options", None), Section):
+        found["options"] = options.model_dump(mode="json")
+    # The term of an observation from outside knows its log alone.
+    standardised = next((one for one in (term, observation) if isinstance(one, Standardised)), None)
+    if standardised is not None:
+        z = np.asarray(standardised.standardised_residual(state))
+        found |= {"values": z.size, "residual_rms": float(np.sqrt(np.mean(z**2)))}
+    return found | (observation.describe(term, state) if hasattr(observation, "describe") else {})

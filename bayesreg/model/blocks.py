@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpyro.distributions import constraints
 
 from bayesreg.model.priors import RangeTransform, ScaledBeta
+from bayesreg.settings import ScalePrior
 from bayesreg.types import AnyArray, Scalar
 
 Values = Mapping[str, AnyArray]
@@ -296,6 +297,13 @@ class Scale(_Positive):
     def times(self, factor: float) -> Scale:
         """The scale whose values are those of this one times a factor."""
         return Scale(factor * self.median, self.log_sd, factor * self.factor)
+
+
+def scale_block(given: float | ScalePrior) -> Scale:
+    """The block of a scale that is known, a number, or inferred, with a prior."""
+    if isinstance(given, ScalePrior):
+        return Scale(jnp.asarray(given.median), jnp.asarray(given.log_sd))
+    return Scale(jnp.asarray(given))
 
 
 @jax.tree_util.register_pytree_node_class

@@ -13,36 +13,34 @@ import numpy as np
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
-from bayesreg.model.image_pair import ImagePair
+from bayesreg.model.observations.observation import Correlated, Observation, points_that_bound
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import fix_a_body, problem_of
 from bayesreg.model.state import State, state_of
-from bayesreg.model.terms.landmarks import Landmarks
-from bayesreg.model.terms.term import Outside
+from bayesreg.model.term import Outside
 from bayesreg.types import AnyArray, InputError
 
 
 def build_posterior(
-    fixed: Image | None = None,
-    moving: Image | None = None,
-    mesh: TetMesh | None = None,
+    mesh: TetMesh,
+    observations: Sequence[Any],
     model: ModelConfig | None = None,
     skull: Image | None = None,
     reference: Mapping[str, AnyArray] | None = None,
-    observations: Sequence[Any] | None = None,
 ) -> Posterior:
     """The posterior of a registration problem.
 
-    ``build_posterior(mesh=mesh, observations=[ImagePair(fixed, moving), Landmarks(p, q, sd=1.0)])``, or, short for one
-    pair of images, ``build_posterior(fixed, moving, mesh)``.
+    ``build_posterior(mesh, [ImagePair(fixed, moving), Landmarks(p, q, sd=1.0)])``
 
     Parameters
     ----------
-    fixed, moving : Image, optional
-        f and m of one pair of images; their intensities are taken as they are.
     mesh : TetMesh
         In the space of the fixed image.
+    observations : sequence
+        `ImagePair`, `Landmarks`, or any object with a `name` and a function `log(state)` that JAX can trace, the log of
+        its factor of the density. It sees the displacement of every node, `state.u` (n, 3), mm, and of points inside
+        the mesh, `state.at(points)`.
     model : ModelConfig, optional
         The default is the paper's model.
     skull : Image, optional
@@ -51,10 +49,6 @@ def build_posterior(
         "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start, and the scale of the
         coordinate of a parameter without an upper bound; the nearer to the posterior the faster. Default:
         `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01 for a fluid.
-    observations : sequence, optional
-        In place of `fixed` and `moving`: `ImagePair`, `Landmarks`, or any object with a `name` and a function
-        `log(state)` that JAX can trace, the log of its factor of the density. It sees the displacement of every node,
-        `state.u` (n, 3), mm, and of points inside the mesh, `state.at(points)`.
 
     Returns
     -------
@@ -69,27 +63,12 @@ def build_posterior(
     if not isinstance(mesh, TetMesh):
         raise InputError(f"build_posterior needs a mesh: a TetMesh; got {type(mesh).__name__}")
     model = model or ModelConfig()
-    given = [
-        one.prepared(mesh, model) if isinstance(one, ImagePair) else one
-        for one in _observations(fixed, moving, observations)
-    ]
-    problem, sampled = problem_of(mesh, given, model, skull, reference)
-    tempered = model.independent_points != "residual" or not any(isinstance(one, ImagePair) for one in given)
-    posterior = Posterior(problem, mesh, model, sampled, {one.name: one for one in given}, tempered=tempered)
+    problem, sampled, prepared = problem_of(mesh, require_observations(observations), model, skull, reference)
+    tempered = not any(isinstance(one, Correlated) and one.is_tempered_by_residuals for one in prepared.values())
+    posterior = Posterior(problem, mesh, model, sampled, prepared, tempered=tempered)
     _require_bounded(posterior)
     _require_numbers(posterior)
     return posterior
-
-
-def _observations(fixed: Image | None, moving: Image | None, observations: Sequence[Any] | None) -> list[Any]:
-    """The observations that were given in one of the two forms."""
-    if (fixed is None) != (moving is None):
-        raise InputError("a pair of images needs both, fixed and moving")
-    if fixed is not None and moving is not None and observations is not None:
-        raise InputError("give either fixed and moving, or observations; a pair of images is ImagePair(fixed, moving)")
-    if fixed is not None and moving is not None:
-        return [ImagePair(fixed, moving)]
-    return require_observations(() if observations is None else observations)
 
 
 def require_observations(given: Any) -> list[Any]:
@@ -97,10 +76,10 @@ def require_observations(given: Any) -> list[Any]:
     if not isinstance(given, Sequence):
         raise InputError(f"observations must be a list, got {type(given).__name__}; put one observation in a list, too")
     if not len(given):
-        raise InputError("there is nothing observed: give fixed and moving, or observations, such as Landmarks")
+        raise InputError("there is nothing observed: give observations, such as ImagePair(fixed, moving) or Landmarks")
     for one in given:
         name = getattr(one, "name", None)
-        known = isinstance(one, ImagePair | Landmarks) or callable(getattr(one, "log", None))
+        known = isinstance(one, Observation) or callable(getattr(one, "log", None))
         if not (known and isinstance(name, str) and name):
             raise InputError(
                 f"an observation needs a name (text) and a function log(state); got {type(one).__name__}: use "
@@ -114,12 +93,12 @@ def require_observations(given: Any) -> list[Any]:
 
 def _require_bounded(posterior: Posterior) -> None:
     """Raise InputError where nothing bounds the rigid motions: landmarks alone, too few of them, and no prior."""
-    given = posterior.observations.values()
+    bounding = [points_that_bound(one) for one in posterior.observations.values()]
     bounded = not len(posterior.sampled) or {"rigid", "skull"} & set(posterior.data.terms)
-    if bounded or not all(isinstance(one, Landmarks) for one in given):
+    if bounded or any(points is None for points in bounding):
         return
-    held = posterior.mesh.points[list(posterior.options.held)].reshape(-1, 3)
-    points = np.concatenate([*(one.fixed_points for one in given), held])
+    held = posterior.mesh.points[list(posterior.options.elastic_prior.held)].reshape(-1, 3)
+    points = np.concatenate([*(points for points in bounding if points is not None), held])
     if not fix_a_body(points):
         raise InputError(
             f"{len(points)} landmarks and held nodes do not say how the whole shifts and turns: the posterior would be "

@@ -7,10 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TypeVar
 
-from bayesreg.interpolation import Interpolation
-from bayesreg.model.image_pair import ImagePair
+from bayesreg.model.observations.observation import Eased
 from bayesreg.model.program import Problem
-from bayesreg.model.terms.elastic import SCALES
 
 Made = TypeVar("Made")
 
@@ -23,37 +21,28 @@ SMOOTHING = (
 )  # fmt: skip
 
 
-def continuation(
-    problem: Problem, observations: Mapping[str, object], interpolation: Interpolation
-) -> Iterator[Problem]:
+def continuation(problem: Problem, observations: Mapping[str, object]) -> Iterator[Problem]:
     """Every problem, each to be solved for the displacements alone.
 
     Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement of
     many times its posterior standard deviation is found step by step. The last is the posterior's own. Where no node is
     sampled there is none, and without images, no easier one.
     """
-    pairs = {name: pair for name, pair in observations.items() if isinstance(pair, ImagePair)}
+    pairs = {name: pair for name, pair in observations.items() if isinstance(pair, Eased)}
     if not len(problem.body.slots):
         return
     if pairs:
-        yield from _ahead([partial(_ease, problem, pairs, interpolation, *stage) for stage in SMOOTHING])
+        yield from _ahead([partial(_ease, problem, pairs, *stage) for stage in SMOOTHING])
     yield problem
 
 
-def _ease(
-    problem: Problem,
-    pairs: Mapping[str, ImagePair],
-    interpolation: Interpolation,
-    sd: float,
-    similarity: float,
-    elastic: float,
-) -> Problem:
+def _ease(problem: Problem, pairs: Mapping[str, Eased], sd: float, similarity: float, elastic: float) -> Problem:
     """The problem with all images smoothed, and factors on T_s and T_r, or on the loads."""
-    smooth = {name: pair.smooth_term(problem.terms[name], sd, interpolation) for name, pair in pairs.items()}
-    powers = {name: power for own in SCALES.values() for name, power in own.items()}
-    temperatures = {problem.terms[name].comparison.temperature for name in pairs}
-    factors = dict.fromkeys(temperatures, similarity) | {name: elastic**power for name, power in powers.items()}
-    scales = {name: problem.blocks[name].times(factor) for name, factor in factors.items() if name in problem.blocks}
+    smooth = {name: pair.eased(problem.terms[name], sd) for name, pair in pairs.items()}
+    easing = {**dict.fromkeys(pairs, similarity), "elastic": elastic}
+    powers = {term: problem.terms[term].powers for term in easing if term in problem.terms}
+    factors = {name: easing[term] ** power for term, scales in powers.items() for name, power in scales.items()}
+    scales = {name: problem.blocks[name].times(factor) for name, factor in factors.items()}
     return problem._replace(blocks={**problem.blocks, **scales}, terms={**problem.terms, **smooth})
 
 

@@ -19,14 +19,8 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, State, StaticMesh
-from bayesreg.model.terms.barrier import Barrier
-from bayesreg.model.terms.images import ComparedImages
-from bayesreg.model.terms.skull import SoftSkull
-from bayesreg.model.terms.term import Curved, Outside, PointCurvature
+from bayesreg.model.term import Curved, Outside, PointCurvature
 from bayesreg.types import AnyArray, Equilibrium, Matrix
-
-# Terms that are far from quadratic in the displacements.
-FAR_FROM_QUADRATIC = (Barrier, ComparedImages, SoftSkull)
 
 # With more entries of λ or μ, as by element, derivatives in each of them would cost too much.
 FEW_ENTRIES = 20
@@ -108,7 +102,7 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     """
     response = _Response.at(problem, near, u)
     K = _stiffness(problem.body, values)
-    curved = (t for t in problem.terms.values() if isinstance(t, Curved) and not isinstance(t, FAR_FROM_QUADRATIC))
+    curved = (term for term in problem.terms.values() if isinstance(term, Curved) and is_nearly_quadratic(term))
     observed = _sum(len(u), (term.gauss_newton(u, values) for term in curved))
     found = response.reduce(observed + _outside_curvatures(problem, values, u))
     energy = response.reduce(K, with_field=False)
@@ -118,6 +112,11 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     total = _dense(found) + response.place(_dense(prior))
     total[: response.modes, : response.modes] += np.eye(response.modes)
     return total
+
+
+def is_nearly_quadratic(term: object) -> bool:
+    """Whether the log of a term is quadratic in the displacements, or nearly: all but images, barrier and skull."""
+    return getattr(term, "is_nearly_quadratic", True)
 
 
 def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:

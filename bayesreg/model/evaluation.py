@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from numpyro.infer.util import log_density
 
 from bayesreg.model.program import Problem, registration
-from bayesreg.model.terms.images import ImageLikelihood
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -69,5 +68,5 @@ def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
 
 
 def _similarity_energy(trace: dict[str, Any]) -> Scalar:
-    sites = (site for site in trace.values() if isinstance(site.get("fn"), ImageLikelihood))
+    sites = (site for site in trace.values() if hasattr(site.get("fn"), "energy"))
     return sum((site["fn"].energy(site["value"]) for site in sites), jnp.zeros(()))

@@ -13,20 +13,39 @@ ones. At the surface, where the equation's flux is zero, the variance rises towa
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 from jaxtyping import Float
+from pydantic import Field
 
 from bayesreg.mesh import TetMesh
-from bayesreg.model.options import FieldConfig
+from bayesreg.settings import Positive, Section
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # Beyond this many elements the dense covariance (8 bytes × their square, a few times over) outgrows memory.
 DENSE_LIMIT = 8000
+
+
+class FieldConfig(Section):
+    """Prior of the field of log-stiffness of `elasticity: field`; see `bayesreg.model.field`.
+
+    Attributes
+    ----------
+    correlation : float
+        Distance, mm, at which the correlation of the log-stiffness of two places has fallen to 0.14.
+    sd : float
+        Scale of the half-normal prior of the field's standard deviation, which is inferred; 0.5 is a factor of e^0.5.
+    modes : int
+        Most principal components of the field that are sampled.
+    """
+
+    correlation: Positive = 20.0
+    sd: Positive = 0.5
+    modes: Annotated[int, Field(strict=True, ge=1)] = 300
 
 
 class StiffnessField(NamedTuple):

@@ -10,20 +10,18 @@ from typing import Any
 import jax
 from jaxtyping import Float
 
-from bayesreg.interpolation import Interpolation
-from bayesreg.model.blocks import LAME, Scale, Values
+from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import complete
 from bayesreg.model.curvature import (
-    FAR_FROM_QUADRATIC,
     FEW_ENTRIES,
     Curvature,
     displacement_curvature,
+    is_nearly_quadratic,
     quadratic_curvature,
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
-from bayesreg.model.terms.elastic import SCALES
 from bayesreg.types import AnyArray
 
 
@@ -35,9 +33,7 @@ class ModeSearch:
     ----------
     data : Problem
     observations : mapping
-        By name, as they were given.
-    interpolation : {"linear", "cubic"}
-        Interpolation of the moving images.
+        By name.
     approached : mapping or None
         Estimands near the mode, that a search has led to already.
     tempering : callable or None
@@ -46,7 +42,6 @@ class ModeSearch:
 
     data: Problem
     observations: Mapping[str, Any]
-    interpolation: Interpolation
     approached: Values | None = None
     tempering: Callable[[Values], Any] | None = None
 
@@ -56,19 +51,17 @@ class ModeSearch:
 
         The latter where the elastic prior is normalised and they are not too many.
         """
-        own = [name for one in self.observations.values() for name in getattr(one, "blocks", {})]
-        elastic_scales = [name for prior in SCALES.values() for name in prior]
-        names = [name for name in (*elastic_scales, *own) if isinstance(self.data.blocks.get(name), Scale)]
+        names = [name for term in self.data.terms.values() for name in getattr(term, "hyperparameters", ())]
         elastic = self.data.terms.get("elastic")
         if elastic is not None and elastic.determinant is not None:
             names += [name for name in LAME if len(self.data.blocks[name].free.index) <= FEW_ENTRIES]
-        return tuple(name for name in names if self.data.blocks[name].is_sampled)
+        return tuple(name for name in names if name in self.data.blocks and self.data.blocks[name].is_sampled)
 
     def continuation(self) -> Iterator[Problem]:
         """Problems of growing difficulty, in the displacements alone, that lead to this one; none once approached."""
         if self.approached is not None:
             return iter(())
-        return continuation(self.data, self.observations, self.interpolation)
+        return continuation(self.data, self.observations)
 
     def curvature(self, data: Problem, estimands: Values) -> Curvature:
         """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".
@@ -84,7 +77,7 @@ class ModeSearch:
 
     def quadratic_part(self, data: Problem) -> Problem:
         """The problem without images, barrier and skull: what is left is quadratic in the displacements, or nearly."""
-        others = [name for name, term in data.terms.items() if isinstance(term, FAR_FROM_QUADRATIC)]
+        others = [name for name, term in data.terms.items() if not is_nearly_quadratic(term)]
         return reduce(Problem.without_term, others, data)
 
     def quadratic_curvature(self, data: Problem, estimands: Values, near: Values) -> Any:

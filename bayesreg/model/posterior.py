@@ -17,15 +17,14 @@ from bayesreg.model import coordinates, evaluation, program
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.conditioning import condition
 from bayesreg.model.coordinates import Coordinates
+from bayesreg.model.elastic.skull import Skull, mark_behind_skull
 from bayesreg.model.evaluation import Evaluation
-from bayesreg.model.image_pair import ImagePair
-from bayesreg.model.independence import independent_scores
 from bayesreg.model.mode_search import ModeSearch
 from bayesreg.model.normaliser import Normaliser
+from bayesreg.model.observations.images.likelihood import ComparedImages, images_of
+from bayesreg.model.observations.observation import Correlated
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.program import Problem
-from bayesreg.model.terms.images import ComparedImages, images_of
-from bayesreg.model.terms.skull import Skull, mark_behind_skull
 from bayesreg.model.variables import Variables
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -54,7 +53,7 @@ class Posterior:
     sampled : (b,) int array
         The nodes whose displacements are sampled, sorted.
     observations : mapping
-        The observations by name, as they were given.
+        The observations by name, prepared for this mesh.
     approached : mapping, optional
         Estimands near the mode, where a search for it begins.
     tempered : bool
@@ -162,17 +161,14 @@ class Posterior:
     def count_independent_points(self, values: Values) -> dict[str, float]:
         """How many quadrature points of each pair of images are independent, by its residuals at these values.
 
-        They are those of the rule "voxels"; see `bayesreg.model.independence.independent_scores`.
+        They are those of the rule "voxels"; see `bayesreg.model.observations.images.independence.independent_scores`.
         """
         filled = self.fill(values)
         u = self.evaluate(filled).u
-        found = {}
-        for name, one in self.observations.items():
-            if isinstance(one, ImagePair):
-                term = self.data.terms[name]
-                voxels = np.rint(one.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
-                found[name] = independent_scores(np.asarray(term.scores(u, filled)), voxels, one.fixed)
-        return found
+        correlated = {name: one for name, one in self.observations.items() if isinstance(one, Correlated)}
+        return {
+            name: one.count_independent_points(self.data.terms[name], u, filled) for name, one in correlated.items()
+        }
 
     def with_independent_points(self, counts: Mapping[str, float]) -> Posterior:
         """The posterior with the likelihood of pairs of images tempered as for so many independent points."""
@@ -184,8 +180,8 @@ class Posterior:
     @property
     def independent_points(self) -> dict[str, float]:
         """How many quadrature points of each pair of images the likelihood counts as independent."""
-        terms = {name: self.data.terms[name] for name, one in self.observations.items() if isinstance(one, ImagePair)}
-        return {name: float(term.independent_share * len(term.positions)) for name, term in terms.items()}
+        names = [name for name, one in self.observations.items() if isinstance(one, Correlated)]
+        return {name: float(self.data.terms[name].independent_points) for name in names}
 
     @property
     def images(self) -> ComparedImages:
@@ -246,7 +242,7 @@ class Posterior:
     @property
     def normaliser(self) -> Normaliser | None:
         """The elastic prior's, where it is part of the density."""
-        if not self.options.normalised or "elastic" not in self.data.terms:
+        if not self.options.elastic_prior.normalised or "elastic" not in self.data.terms:
             return None
         return Normaliser(is_costly=len(self.mesh.points) > CHEAP_NODES)
 
@@ -254,15 +250,9 @@ class Posterior:
     def mode_search(self) -> ModeSearch:
         """The posterior as the search for a mode sees it."""
         tempering = None if self.tempered else self._temper
-        return ModeSearch(self.data, self._smooth_observations, self.options.interpolation, self.approached, tempering)
+        return ModeSearch(self.data, self.observations, self.approached, tempering)
 
     def _temper(self, estimands: Values) -> Posterior:
         """The posterior tempered by its residuals at these estimands, where a search may go on."""
         counts = self.count_independent_points(coordinates.complete(self.data.blocks, estimands))
         return replace(self.with_independent_points(counts), approached=dict(estimands))
-
-    @property
-    def _smooth_observations(self) -> dict[str, Any]:
-        """The observations, images smoothed as the options say."""
-        pairs = {name: one for name, one in self.observations.items() if isinstance(one, ImagePair)}
-        return {**self.observations, **{name: pair.smoothed_as(self.options) for name, pair in pairs.items()}}

@@ -1,4 +1,4 @@
-"""From images, a mesh and options to the arrays of a registration problem, with every input checked."""
+"""From a mesh, observations and options to the arrays of a registration problem, with every input checked."""
 
 from __future__ import annotations
 
@@ -28,31 +28,24 @@ from bayesreg.model.blocks import (
     FieldScale,
     FreeEntries,
     LameParameter,
-    Scale,
+    scale_block,
 )
+from bayesreg.model.elastic.barrier import Barrier
+from bayesreg.model.elastic.rigid import RigidPrior
+from bayesreg.model.elastic.skull import Skull, SoftSkull, is_allowed
 from bayesreg.model.field import StiffnessField, stiffness_field
-from bayesreg.model.image_pair import ImagePair
-from bayesreg.model.intensity_map import SHARE
+from bayesreg.model.observations.observation import Placed, place
 from bayesreg.model.options import (
     FieldConfig,
     Lame,
     ModelConfig,
     PriorConfig,
-    ScalePrior,
-    TemperaturePrior,
     is_taken,
     of_tissue,
-    require_default_image_options,
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
-from bayesreg.model.terms.barrier import Barrier
-from bayesreg.model.terms.elastic import SCALES, BoltzmannPrior, LoadPrior
-from bayesreg.model.terms.images import ComparedImages, shading_name
-from bayesreg.model.terms.landmarks import Landmarks
-from bayesreg.model.terms.rigid import RigidPrior
-from bayesreg.model.terms.skull import Skull, SoftSkull, is_allowed
-from bayesreg.model.terms.term import Outside, Terms
+from bayesreg.model.term import Terms
 from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
 
@@ -66,19 +59,40 @@ def problem_of(
     model: ModelConfig,
     skull: Image | None,
     reference: Mapping[str, AnyArray] | None,
-) -> tuple[Problem, Int[np.ndarray, "sampled"]]:
-    """All arrays of the problem, and the sampled nodes; see `bayesreg.build_posterior`."""
-    if all(isinstance(one, Landmarks) for one in observations):
-        require_default_image_options(model)
+) -> tuple[Problem, Int[np.ndarray, "sampled"], dict[str, Any]]:
+    """All arrays of the problem, the sampled nodes, and the prepared observations; see `bayesreg.build_posterior`."""
     sampled, held = sampled_nodes(mesh, model)
     require_proper(mesh, model)
     body, blocks = body_of(mesh, model, reference)
-    blocks |= observation_blocks(observations)
     # The observations first: what is wrong with them is told before anything that takes long.
-    terms = observation_terms(mesh, observations, model)
-    blocks |= _temperature_blocks(terms, model) | _shading_blocks(terms)
+    placed = place_observations(mesh, observations, model.preset)
+    for one in placed.values():
+        blocks |= one.blocks
+    terms: Terms = {name: one.term for name, one in placed.items()}
     terms |= _priors(mesh, model, sampled, held, skull)
-    return Problem(body, blocks, terms), sampled
+    return Problem(body, blocks, terms), sampled, {name: one.observation for name, one in placed.items()}
+
+
+def place_observations(mesh: TetMesh, observations: Sequence[Any], preset: str) -> dict[str, Placed]:
+    """The observations on a mesh, by name.
+
+    Raises
+    ------
+    InputError
+        If two have one name, or a name of an observation or of an unknown that it brings is taken.
+    """
+    placed: dict[str, Placed] = {}
+    for observation in observations:
+        if observation.name in placed or is_taken(observation.name):
+            raise InputError(f"the name {observation.name!r} of an observation is taken; give another one")
+        placed[observation.name] = place(observation, mesh, preset)
+    owners: dict[str, str] = {}
+    for name, one in placed.items():
+        for block in one.blocks:
+            if block in owners or block in placed or is_taken(block):
+                raise InputError(f"the name {block!r} of an unknown of {name!r} is taken; rename the latter")
+            owners[block] = name
+    return placed
 
 
 def body_of(mesh: TetMesh, model: ModelConfig, reference: Mapping[str, AnyArray] | None = None) -> tuple[Body, Blocks]:
@@ -100,18 +114,11 @@ def _blocks(
         "u_boundary": Displacement(jnp.asarray(mesh.points[sampled])),
         "lam": lame_parameter("lam", mesh, model, reference),
         "mu": lame_parameter("mu", mesh, model, reference),
-        "t_similarity": _scale(model.t_similarity),
-        **{name: _scale(getattr(model, name)) for name in SCALES[model.elastic_prior]},
+        **{name: scale_block(scale) for name, scale in model.elastic_prior.scales.items()},
     }
     if field is not None:
         blocks |= {"field": Coefficients(jnp.ones(field.basis.shape[1])), "field_sd": FieldScale(field.sd_scale)}
     return blocks
-
-
-def _scale(given: float | ScalePrior) -> Scale:
-    if isinstance(given, ScalePrior):
-        return Scale(jnp.asarray(given.median), jnp.asarray(given.log_sd))
-    return Scale(jnp.asarray(given))
 
 
 def _body(
@@ -139,56 +146,6 @@ def _body(
     )
 
 
-def _temperature_blocks(terms: Terms, model: ModelConfig) -> Blocks:
-    """T_s of every pair of images."""
-    pairs = [term for term in terms.values() if isinstance(term, ComparedImages)]
-    return {pair.comparison.temperature: _scale(model.t_similarity) for pair in pairs}
-
-
-def _shading_blocks(terms: Terms) -> Blocks:
-    """The coefficients of the shading of every pair of images that has one, see `bayesreg.model.intensity_map`."""
-    pairs = [term for term in terms.values() if isinstance(term, ComparedImages)]
-    bases = {shading_name(pair.name): pair.shading for pair in pairs}
-    return {name: Coefficients(jnp.full(one.shape[1], SHARE)) for name, one in bases.items() if one is not None}
-
-
-def observation_blocks(observations: Sequence[Any]) -> Blocks:
-    """The unknowns that observations bring, by name; InputError if a name is taken."""
-    found: Blocks = {}
-    for observation in observations:
-        for name, block in getattr(observation, "blocks", {}).items():
-            if name in found or is_taken(name):
-                raise InputError(f"the name {name!r} of an unknown of {observation.name!r} is taken; rename the latter")
-            found[name] = block
-    return found
-
-
-def observation_terms(mesh: TetMesh, observations: Sequence[Any], model: ModelConfig) -> Terms:
-    """The terms of observations by name.
-
-    Raises
-    ------
-    InputError
-        If one is no observation, or two have one name, or one has a name that is taken.
-    """
-    terms: Terms = {}
-    unknowns = observation_blocks(observations)
-    for observation in observations:
-        name = observation.name
-        if name in terms or name in unknowns or is_taken(name):
-            raise InputError(f"the name {name!r} of an observation is taken; give another one")
-        if isinstance(observation, ImagePair):
-            # The first pair's T_s is that of the options, and all share it where it is known.
-            first = not any(isinstance(term, ComparedImages) for term in terms.values())
-            shared = first or not isinstance(model.t_similarity, TemperaturePrior)
-            terms[name] = observation.on(mesh, model, "t_similarity" if shared else f"{name}_t_similarity")
-        elif isinstance(observation, Landmarks):
-            terms[name] = observation.on(mesh)
-        else:
-            terms[name] = Outside(observation)
-    return terms
-
-
 def _priors(
     mesh: TetMesh,
     model: ModelConfig,
@@ -200,9 +157,9 @@ def _priors(
     terms: Terms = {}
     if not len(sampled):
         return terms
-    determinant = schur_determinant(mesh, sampled, np.array(list(held), int)) if model.normalised else None
-    loads = model.elastic_prior == "loads"
-    terms["elastic"] = LoadPrior.on(mesh, determinant) if loads else BoltzmannPrior(determinant)
+    normalised = model.elastic_prior.normalised
+    determinant = schur_determinant(mesh, sampled, np.array(list(held), int)) if normalised else None
+    terms["elastic"] = model.elastic_prior.on(mesh, determinant)
     if model.rigid_sd is not None:
         terms["rigid"] = RigidPrior(jnp.asarray(rigid_modes(mesh.points[sampled])), jnp.asarray(model.rigid_sd))
     if model.least_volume:
@@ -253,31 +210,33 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
         together are fewer than three or on one line.
     """
     count = len(mesh.points)
-    if model.sampled == "boundary":
+    elastic = model.elastic_prior
+    if elastic.nodes == "boundary":
         wanted = mesh.boundary
-    elif model.sampled == "all":
+    elif elastic.nodes == "all":
         wanted = np.arange(count)
     else:
-        wanted = np.unique(np.asarray(model.sampled, int))
-    held = dict(sorted(model.held.items()))
-    for name, nodes in (("sampled", wanted), ("held", np.array(list(held), int))):
+        wanted = np.unique(np.asarray(elastic.nodes, int))
+    held = dict(sorted(elastic.held.items()))
+    for name, nodes in (("nodes", wanted), ("held", np.array(list(held), int))):
         if len(nodes) and nodes.max() >= count:
             raise InputError(
-                f"model.{name} names node {nodes.max()}, but the mesh has {count} nodes (0 to {count - 1})"
+                f"model.elastic_prior.{name} names node {nodes.max()}, but the mesh has {count} nodes (0 to "
+                f"{count - 1})"
             )
     sampled = np.setdiff1d(wanted, list(held)).astype(int)
     prescribed = mesh.points[np.union1d(sampled, list(held)).astype(int)]
     unknown = np.setdiff1d(mesh.boundary, list(held))
     if len(sampled) == 0 and len(unknown):
         raise InputError(
-            "no node is sampled: model.sampled names none that is not held. Elastography, λ and μ alone, needs every "
-            f"boundary node held (model.held); {len(unknown)} of {len(mesh.boundary)} are not, the first is node "
-            f"{unknown[0]}"
+            "no node is sampled: model.elastic_prior.nodes names none that is not held. Elastography, λ and μ alone, "
+            f"needs every boundary node held (model.elastic_prior.held); {len(unknown)} of {len(mesh.boundary)} are "
+            f"not, the first is node {unknown[0]}"
         )
     if not fix_a_body(prescribed):
         raise InputError(
             f"{len(prescribed)} sampled and held nodes do not hold the mesh in place: "
-            "give at least three that are not on one line (model.sampled, model.held)"
+            "give at least three that are not on one line (nodes and held of model.elastic_prior)"
         )
     return sampled, held
 

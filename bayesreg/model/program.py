@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from bayesreg.model import coordinates
 from bayesreg.model.blocks import Blocks, Values
 from bayesreg.model.state import Body, state_of
-from bayesreg.model.terms.term import Likelihood, Support, Terms
+from bayesreg.model.term import Likelihood, Support, Terms
 from bayesreg.types import AnyArray
 
 

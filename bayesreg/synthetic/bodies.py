@@ -15,6 +15,7 @@ from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.build import build_posterior
+from bayesreg.model.observations.images.pair import ImagePair
 from bayesreg.model.options import ModelConfig, of_tissue
 from bayesreg.model.posterior import Posterior
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
@@ -40,6 +41,8 @@ class Subject(NamedTuple):
     making, registering : TetMesh
         A finer mesh, and the one in question.
     model : ModelConfig
+    image_options : mapping
+        How the pair of images is compared (`bayesreg.ImagePair`).
         Options of the registration.
     lam, mu : mapping
         Tissue name to the value of a fluid, or to one about which those of a solid tissue lie.
@@ -53,6 +56,7 @@ class Subject(NamedTuple):
     making: TetMesh
     registering: TetMesh
     model: ModelConfig
+    image_options: Mapping[str, Any]
     lam: Mapping[str, float]
     mu: Mapping[str, float]
     displacement: float
@@ -104,7 +108,9 @@ def register_body(subject: Subject, seed: int) -> Body:
     true = {name: lam[name] / mu[name] for name in tissues}
     try:
         pair = _push(subject, rng, *(np.array([values[name] for name in names]) for values in (lam, mu)))
-        values, inverted = _mode(build_posterior(pair.fixed, pair.moving, subject.registering, model))
+        values, inverted = _mode(
+            build_posterior(subject.registering, [ImagePair(pair.fixed, pair.moving, **subject.image_options)], model)
+        )
     except InputError as error:
         return Body(seed, true, {}, str(error))
     ratios = np.asarray(values["lam"]) / np.asarray(values["mu"])

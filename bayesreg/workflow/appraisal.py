@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.image import Image
-from bayesreg.model.contrast import explained_shares
+from bayesreg.model.observations.images.contrast import explained_shares
 from bayesreg.tissues import is_fluid, label_of
 
 # Voxels that are looked at; bins of each image in the joint histogram.
@@ -120,7 +120,7 @@ class Likeness(NamedTuple):
                 f"The images are hardly alike as they lie: correlation {self.correlation:.2f}, normalised mutual "
                 f"information {self.mutual_information:.2f}. If they are of one contrast, they are not aligned, or the "
                 "axes of one are mistaken; if they are not, data.same_contrast: false compares them through a map of "
-                "intensities, and model.similarity: lncc window by window."
+                "intensities, and similarity: lncc window by window."
             )
         if one_scale and not self.is_one_scale:
             found.append(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import xarray as xr
 from jaxtyping import Float
 
 from bayesreg.config import Config
-from bayesreg.config.observations import LandmarksSection
 from bayesreg.image import Image
 from bayesreg.inference.chains.initialise import Start
 from bayesreg.inference.draws.predictive import evenly_spaced, push_forward, thin
@@ -24,12 +22,11 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Blocks
 from bayesreg.model.build import build_posterior
 from bayesreg.model.coordinates import fill
-from bayesreg.model.image_pair import ImagePair
+from bayesreg.model.elastic.boltzmann import Boltzmann
 from bayesreg.model.options import Lame, ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import body_of, cell_entries, lame_parameter
 from bayesreg.model.state import Body, state_of
-from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.types import AnyArray, InputError
 
 
@@ -45,10 +42,8 @@ def posterior_of(
     likelihood is tempered by that.
     """
     model, reference = _model(config.model, inputs), _references(config, inputs.mesh)
-    observed = [*_observations(config, inputs), *observations]
-    posterior = build_posterior(
-        mesh=inputs.mesh, observations=observed, model=model, skull=inputs.skull, reference=reference
-    )
+    observed = [one for section in config.observations for one in section.observe(inputs)]
+    posterior = build_posterior(inputs.mesh, [*observed, *observations], model, inputs.skull, reference)
     return posterior.with_independent_points(independent_points) if independent_points else posterior
 
 
@@ -81,40 +76,12 @@ def nodal_draws(
     return every.reshape(-1, *every.shape[2:])
 
 
-def _observations(config: Config, inputs: Inputs) -> list[Any]:
-    """The observations of a configuration, in its order."""
-    found: list[Any] = []
-    if config.compares_images:
-        if inputs.fixed is None or inputs.moving is None:
-            raise InputError("the run compares images, and its folder holds none: inputs/fixed.nii.gz is missing")
-        pair = ImagePair(
-            inputs.fixed,
-            inputs.moving,
-            fixed_ignore=inputs.fixed_ignore,
-            moving_ignore=inputs.moving_ignore,
-            one_contrast=inputs.matching.one_contrast,
-            tissue=inputs.tissue,
-        )
-        found.append(pair)
-        for name, channel in inputs.channels.items():
-            tissue = channel.fixed.with_voxels(inputs.tissue.nearest(channel.fixed.grid_points()))
-            found.append(replace(pair, name=name, tissue=tissue, **channel._asdict()))
-    for section in config.observations or []:
-        if isinstance(section, LandmarksSection):
-            pairs = inputs.points[section.name]
-            labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
-            sd = pairs.sd if section.sd is None else section.sd
-            moving = inputs.matching.pose.inverse.place(pairs.moving)
-            found.append(Landmarks(pairs.fixed, moving, sd, section.name, labels))
-    return found
-
-
 def _model(model: ModelConfig, inputs: Inputs | Run) -> ModelConfig:
     """The model of a configuration, its boundary held where that is known."""
     if inputs.boundary is None:
         return model
     held = dict(zip(inputs.mesh.boundary.tolist(), map(tuple, np.asarray(inputs.boundary).tolist()), strict=True))
-    return ModelConfig(**{**dict(model), "sampled": [], "held": held})
+    return model.model_copy(update={"elastic_prior": Boltzmann(nodes=[], held=held)})
 
 
 def _references(config: Config, mesh: TetMesh) -> dict[str, AnyArray]:

@@ -15,6 +15,7 @@ from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
 from bayesreg.io import checkpoints, store
 from bayesreg.io.ledger import drop, writing
+from bayesreg.io.points import PointPairs
 from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import moments_on_grid, warp_image
@@ -59,7 +60,7 @@ def finish(
     many = transform(POINT_DRAWS)
     predicted = with_unresolved(predicted, many)
     if config.evaluation is not None:
-        held_out = evaluate_landmarks(inputs.points[NAME], many, config.evaluation.sd)
+        held_out = evaluate_landmarks(PointPairs.of_arrays(inputs.observed[NAME]), many, config.evaluation.sd)
         predicted = predicted._replace(**held_out)
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
     total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))

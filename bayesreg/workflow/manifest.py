@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
 from bayesreg import __version__
 from bayesreg.config import Config
@@ -26,10 +25,7 @@ from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.blocks import Values
-from bayesreg.model.options import OF_IMAGES
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.terms.images import images_of
-from bayesreg.types import AnyArray
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
 CONTACT = 0.5
@@ -68,6 +64,9 @@ def manifest(
     steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
     accepted = float(tally.acceptance.sum())
     greatest = _extreme(judged.rhat, np.nanmax)
+    observations = describe_observations(posterior, mean)
+    # Of the first pair of images, where there is one.
+    of_images = next((one for one in observations.values() if "noise_sd" in one), {})
     return {
         "name": config.description,
         "versions": _versions(),
@@ -89,8 +88,8 @@ def manifest(
         "pair": provenance["pair"],
         "appraisal": provenance.get("appraisal", {}),
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
-        "model": _model(config, posterior),
-        "observations": describe_observations(posterior, mean),
+        "model": config.model.model_dump(mode="json"),
+        "observations": observations,
         "independent_points": posterior.independent_points,
         "exact": samples.exact,
         "stopped": {
@@ -116,46 +115,10 @@ def manifest(
         "steps_per_chain": int(tally.steps[0]),
         "gradients_per_chain": float(np.mean(tally.gradients)),
         "steps_per_second_per_chain": float(tally.steps[0]) / samples.seconds,
-        "residual_sd": _residual_sd(posterior, samples, mean),
-        "implied_noise_sd": implied_noise_sd(posterior, mean),
-        "residual_to_noise": residual_to_noise(posterior, jnp.asarray(samples.u_mean), mean),
+        "residual_sd": of_images.get("residual_sd"),
+        "implied_noise_sd": of_images.get("noise_sd"),
+        "residual_to_noise": of_images.get("residual_to_noise"),
     }
-
-
-def _model(config: Config, posterior: Posterior) -> dict[str, Any]:
-    """The options of the model, less those of images where there are none, and the priors of observations' scales."""
-    unused = () if images_of(posterior.data) is not None else OF_IMAGES
-    options = {key: value for key, value in config.model.model_dump(mode="json").items() if key not in unused}
-    return options | {
-        name: {"median": float(block.median), "log_sd": float(block.log_sd)}
-        for observation in posterior.observations.values()
-        for name, block in getattr(observation, "blocks", {}).items()
-    }
-
-
-def _residual_sd(posterior: Posterior, samples: Samples, mean: Values) -> float | None:
-    images = images_of(posterior.data)
-    return None if images is None else float(np.std(images.residuals(jnp.asarray(samples.u_mean), mean)))
-
-
-def implied_noise_sd(posterior: Posterior, mean: Values) -> float | None:
-    """The noise that T_s stands for at the mean of the draws (see `ComparedImages.noise_sd`); None without images."""
-    images = images_of(posterior.data)
-    return None if images is None else images.noise_sd(float(mean["t_similarity"]))
-
-
-def residual_to_noise(posterior: Posterior, u: AnyArray, mean: Values) -> float | None:
-    """How many times as great as T_s implies a residual is at the mean: by its sd, or by its median where outliers are.
-
-    A few outliers, which Student's t forgives, have a great share in the former.
-    """
-    images = images_of(posterior.data)
-    if images is None:
-        return None
-    z = np.asarray(images.scaled_residual(u, mean))
-    if posterior.options.similarity == "student_t":
-        return float(np.median(np.abs(z)) / stats.t(posterior.options.degrees_of_freedom).ppf(0.75))
-    return float(np.std(z) / np.sqrt(images.similarity.variance()))
 
 
 def _has_converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:

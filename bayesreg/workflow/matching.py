@@ -13,7 +13,7 @@ from bayesreg.image import Image, IntensityScale, robust_scale
 from bayesreg.io.alignment import find_pose
 from bayesreg.io.records import Channel, Matching
 from bayesreg.io.volumes import check_same_space
-from bayesreg.model.options import OF_ANY_CONTRAST
+from bayesreg.model.observations.images.similarity import AnySimilarity
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Likeness, compare_images
@@ -53,7 +53,7 @@ class Matched(NamedTuple):
 
 def match_images(
     data: FilesData,
-    similarity: str,
+    similarity: AnySimilarity,
     domain: Image,
     fixed: Image,
     moving: Image,
@@ -65,7 +65,7 @@ def match_images(
     Parameters
     ----------
     data : FilesData
-    similarity : str
+    similarity : settings of a similarity
         How the model compares them.
     domain : Image
         Not zero in Ω, on the grid of the fixed image.
@@ -188,12 +188,12 @@ def _find_pose(
     )
 
 
-def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: bool, similarity: str) -> str:
+def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: bool, similarity: AnySimilarity) -> str:
     how = "found" if found else "as data.same_contrast says"
     shares = f"a straight line explains {likeness.line_share:.0%} of the moving image, any map {likeness.map_share:.0%}"
-    if similarity in OF_ANY_CONTRAST:
+    if similarity.serves_any_contrast:
         what = "the same" if alike else "unlike"
-        return f"Contrast: {what} ({how}; {shares}); compared by {similarity}, which serves any."
+        return f"Contrast: {what} ({how}; {shares}); compared by {similarity.kind}, which serves any."
     if not alike:
         return f"Contrast: unlike ({how}; {shares}); compared through a map of the fixed image's intensities."
     scale = "on one scale" if one_scale else "each on a scale of its own"

@@ -75,7 +75,7 @@ def _require_ratios(result: Result) -> None:
             "the mesh errs in λ/μ by tissue: the run needs elasticity: tissue, and a solid tissue of which λ or μ is "
             "free"
         )
-    if run.boundary is not None or model.held or model.is_elastography:
+    if run.boundary is not None or model.elastic_prior.held or model.elastic_prior.samples_no_node:
         raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
     if list(run.manifest["observations"]) != ["images"]:
         raise InputError(
@@ -101,10 +101,11 @@ def _subject(result: Result) -> Subject:
         making=_finer(result),
         registering=run.mesh,
         model=model_of(result.run.config),
+        image_options=run.manifest["observations"]["images"]["options"],
         lam=lam,
         mu=mu,
         displacement=float(np.linalg.norm(np.asarray(run.u_mean)[run.mesh.boundary], axis=1).max()),
-        noise_sd=float(run.manifest["implied_noise_sd"]) / np.sqrt(2),
+        noise_sd=float(run.manifest["observations"]["images"]["noise_sd"]) / np.sqrt(2),
         # The image of a synthetic pair has been smoothed already.
         smoothing_mm=0.0 if run.manifest.get("pair") else 0.75,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,16 +14,12 @@ from scipy.spatial import cKDTree
 
 from bayesreg.fem.location import interpolation_at
 from bayesreg.inference.draws.predictive import Summary, push_forward, summarise, thin
-from bayesreg.inference.gaussian.about_gaussian import MOST_UNKNOWNS
-from bayesreg.inference.layout import dimension
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
-from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
-from bayesreg.model.left_out import leave_out
+from bayesreg.model import coordinates
+from bayesreg.model.observations.observation import Checked, Summarised
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import state_of
-from bayesreg.model.terms.images import images_of
-from bayesreg.model.terms.landmarks import Landmarks
 from bayesreg.pose import Pose, compose, rigid_projection
 from bayesreg.tissues import label_of
 from bayesreg.transform import Transform, distances_of
@@ -33,8 +28,6 @@ from bayesreg.types import AnyArray
 Places = Mapping[str, tuple[float, float, float]]
 
 MOST_DRAWS = 400
-# Landmarks that are left out in turn.
-MOST_LEFT_OUT = 60
 FAR = 2.0
 REACH = 0.95
 STIFFER = 1.5
@@ -80,38 +73,37 @@ def predict(
     InputError
         If a place lies outside the mesh.
     """
-    mesh, with_images = posterior.mesh, images_of(posterior.data) is not None
+    mesh = posterior.mesh
+    checked = {name: one for name, one in posterior.observations.items() if isinstance(one, Checked)}
     places = places or default_places(mesh, u_mean, u_sd)
     nodes, weights = _interpolation(mesh, places)
     centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
-    arrays = (mesh.neighbours, u_mean, nodes, weights, projection, pose.rotation)
+    arrays = (u_mean, nodes, weights, projection, pose.rotation)
     given = posterior.data, *(jnp.asarray(array) for array in arrays)
     key = jax.random.key(seed)
 
     def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
-        data, neighbours, u_mean, nodes, weights, projection, rotation = given
-        number, here = draw.pop("number"), replace(posterior, data=data)
-        u = here.evaluate(draw).u
+        data, u_mean, nodes, weights, projection, rotation = given
+        number = draw.pop("number")
+        state = state_of(data.body, data.blocks, coordinates.fill(data.blocks, draw))
+        u = state.u
         distance, stiffness = jnp.linalg.norm(u - u_mean, axis=1), data.body.stiffness_factor(draw)
         found = {"u": u, "distance": distance, "far": (distance > FAR).astype(float),
                  "places": jnp.einsum("la,lai->li", weights, u[nodes]),
                  "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
-        if with_images:
-            values, cells = here.fill(draw), here.images.quadrature.cells
-            z = here.images.scaled_residual(u, values)
-            noise = here.images.standardised_noise(jax.random.fold_in(key, number.astype(int)), u, values)
-            for name, x in (("observed", z), ("replicated", noise)):
-                found[name] = discrepancies(x, cells, neighbours, len(mesh.cells))
+        of_draw = jax.random.fold_in(key, number.astype(int))
+        for name, one in checked.items():
+            figures = one.check_draw(data.terms[name], state, of_draw)
+            found |= {f"{name}/{figure}": value for figure, value in figures.items()}
         return found
 
     some = thin(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = some["u_boundary"].shape[:2]
     some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    kept = ("places", "motion", "observed", "replicated") if with_images else ("places", "motion")
-    aside: dict[str, list[np.ndarray]] = {name: [] for name in kept}
-    found = summarise(_without(push_forward(forward, some, given), aside), (REACH,))
-    whole = {name: np.concatenate(parts, axis=1) for name, parts in aside.items()}
+    kept: dict[str, list[np.ndarray]] = {}
+    found = summarise(_keep_aside(push_forward(forward, some, given), kept), (REACH,))
+    whole = {name: np.concatenate(parts, axis=1) for name, parts in kept.items()}
     return Predicted(
         chain_mean=found.chain_mean["u"],
         far_mm=np.array(FAR),
@@ -123,45 +115,18 @@ def predict(
         motion=np.concatenate(compose(pose, centre, whole.pop("motion")), axis=-1),
         centre=centre,
         total_sd=None if pose.is_identity else found.sd["turned"],
-        **whole,
-        **(_residual(posterior, u_mean, mean) if with_images else {}),
-        **_landmarks(posterior, mean),
+        observations=whole | _summaries(posterior, mean),
         **(_stiffness(found) if posterior.data.body.field is not None else {}),
     )
 
 
-def _residual(
-    posterior: Posterior, u_mean: Float[np.ndarray, "nodes 3"], mean: Mapping[str, AnyArray]
-) -> dict[str, np.ndarray]:
-    """The residual of the images at the mean, in units of the noise."""
-    at_mean = posterior.images.scaled_residual(jnp.asarray(u_mean), mean)
+def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, np.ndarray]:
+    """What the observations leave for the report, by "<observation>/<array>"."""
+    summarised = {name: one for name, one in posterior.observations.items() if isinstance(one, Summarised)}
     return {
-        "residual": np.asarray(at_mean, np.float32),
-        "residual_tissue": posterior.mesh.tissue[np.asarray(posterior.images.quadrature.cells)].astype(np.int8),
-        "discrepancies": np.array(DISCREPANCIES),
-    }
-
-
-def _landmarks(posterior: Posterior, mean: dict[str, AnyArray]) -> dict[str, np.ndarray]:
-    """Residuals of all landmarks at the mean of the draws, and of each predicted by all else."""
-    given = {name: one for name, one in posterior.observations.items() if isinstance(one, Landmarks)}
-    if not given:
-        return {}
-    state = state_of(posterior.data.body, posterior.data.blocks, mean)
-    terms = [posterior.data.terms[name] for name in given]
-    labels = [f"{name} {label}" if len(given) > 1 else label for name, one in given.items() for label in one.labels]
-    found = {
-        "landmark_names": np.array(labels),
-        "landmark_points": np.concatenate([one.fixed_points for one in given.values()]),
-        "landmark_sd": np.concatenate([np.asarray(term.sd(state.values)) for term in terms]),
-        "landmark_residual": np.concatenate([np.asarray(term.shift - term.predicted(state)) for term in terms]),
-    }
-    if len(labels) > MOST_LEFT_OUT or not len(posterior.sampled) or dimension(posterior) > MOST_UNKNOWNS:
-        return found
-    left = [leave_out(posterior, term, posterior.estimands(mean)) for term in terms]
-    return found | {
-        "left_out_residual": np.concatenate([one.residual for one in left]),
-        "left_out_covariance": np.concatenate([one.covariance for one in left]),
+        f"{name}/{key}": value
+        for name, one in summarised.items()
+        for key, value in one.summarise(posterior, mean).items()
     }
 
 
@@ -187,11 +152,11 @@ def _stiffness(found: Summary) -> dict[str, np.ndarray]:
     }
 
 
-def _without(blocks: Iterator[dict[str, Any]], aside: dict[str, list[np.ndarray]]) -> Iterator[dict[str, Any]]:
-    """The blocks less some entries, which are small and kept whole."""
+def _keep_aside(blocks: Iterator[dict[str, Any]], kept: dict[str, list[np.ndarray]]) -> Iterator[dict[str, Any]]:
+    """The blocks less the entries that are small and kept whole: places, the motion, and checks of observations."""
     for block in blocks:
-        for name, parts in aside.items():
-            parts.append(block.pop(name))
+        for name in [name for name in block if name in ("places", "motion") or "/" in name]:
+            kept.setdefault(name, []).append(block.pop(name))
         yield block
 
 

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jax.scipy.stats import norm
 from jaxtyping import Float
 
 from bayesreg.inference.draws.predictive import evenly_spaced, push_forward, thin
 from bayesreg.model import coordinates
+from bayesreg.model.observations.observation import Recordable, Recorded
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import State, state_of
-from bayesreg.model.terms.images import ComparedImages
-from bayesreg.model.terms.landmarks import ComparedPoints
 from bayesreg.types import AnyArray
 
-# Replicated observations: draws of all chains together, and quadrature points of a pair of images.
-MOST_DRAWS, MOST_POINTS = 400, 1000
+# Draws of all chains together of which observations are replicated.
+MOST_DRAWS = 400
 
 Groups = dict[str, xr.Dataset]
 Variables = dict[str, xr.DataArray]
@@ -46,87 +44,70 @@ def predictive_groups(posterior: Posterior, draws: xr.Dataset, seed: int) -> Gro
         normaliser, as leave-one-out needs it: voxels of an image depend on one another, and one that is left out is
         told by those beside it.
     """
-    observed: Variables = {}
-    replicated: Variables = {}
-    for name, term in posterior.data.terms.items():
-        if isinstance(term, ComparedImages):
-            points = evenly_spaced(len(term.positions), MOST_POINTS)
-            dim, unit = f"{name}_point", {"units": "1", "long_name": "intensity of the fixed image, as it is compared"}
-            where = {"units": "mm", "long_name": "position of the point in the fixed image, world RAS"}
-            places = zip("xyz", np.asarray(term.positions)[points].T, strict=True)
-            labels: dict[str, Any] = {dim: points} | {f"{name}_{axis}": (dim, place, where) for axis, place in places}
-            observed[name] = xr.DataArray(np.asarray(term.fixed_values)[points], labels, [dim], attrs=unit)
-        elif isinstance(term, ComparedPoints):
-            labels = {f"{name}_point": list(posterior.observations[name].labels), "axis": list("xyz")}
-            unit = {"units": "mm", "long_name": "displacement of the landmarks, world RAS"}
-            observed[name] = xr.DataArray(np.asarray(term.shift), labels, list(labels), attrs=unit)
-    if not observed:
+    recorded = {
+        name: one.recorded(posterior.data.terms[name])
+        for name, one in posterior.observations.items()
+        if isinstance(one, Recordable)
+    }
+    if not recorded:
         return {}
     chosen = evenly_spaced(draws.sizes["draw"], max(MOST_DRAWS // draws.sizes["chain"], 1))
     some = draws.isel(draw=chosen)
-    for name, values in _replicate(posterior, some, list(observed), seed).items():
-        like = observed[name]
+    replicated = {}
+    for name, values in _replicate(posterior, some, recorded, seed).items():
+        like = recorded[name].values
         coords = {"chain": some["chain"], "draw": some["draw"], **like.coords}
         replicated[name] = xr.DataArray(values, coords, ("chain", "draw", *like.dims), attrs=like.attrs)
-    found = {"observed_data": observed, "posterior_predictive": replicated}
-    if likelihood := _log_likelihood(posterior, draws):
-        found["log_likelihood"] = likelihood
-    return {group: xr.Dataset(content) for group, content in found.items()}
+    found: dict[str, Variables] = {
+        "observed_data": {name: one.values for name, one in recorded.items()},
+        "posterior_predictive": replicated,
+        "log_likelihood": _log_likelihood(posterior, draws, recorded),
+    }
+    return {group: xr.Dataset(content) for group, content in found.items() if content}
 
 
-def _replicate(posterior: Posterior, draws: xr.Dataset, names: list[str], seed: int) -> dict[str, np.ndarray]:
+def _replicate(
+    posterior: Posterior, draws: xr.Dataset, recorded: Mapping[str, Recorded], seed: int
+) -> dict[str, np.ndarray]:
     """What each draw would have observed, (chain, draw, …) by observation."""
     key = jax.random.key(seed)
 
     def forward(draw: dict[str, AnyArray], data: Any) -> dict[str, AnyArray]:
         of_draw = jax.random.fold_in(key, draw.pop("number").astype(int))
         state = _state(posterior, data, draw)
-        keys = jax.random.split(of_draw, len(names))
-        return {name: _observe(data.terms[name], state, one) for name, one in zip(names, keys, strict=True)}
+        keys = jax.random.split(of_draw, len(recorded))
+        return {
+            name: data.terms[name].likelihood(state).sample(key)[one.chosen]
+            for (name, one), key in zip(recorded.items(), keys, strict=True)
+        }
 
     every = _all(posterior, draws)
     chains, count = every["u_boundary"].shape[:2]
     every["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
     blocks = list(push_forward(forward, every, posterior.data))
-    return {name: np.concatenate([block[name] for block in blocks], axis=1) for name in names}
+    return {name: np.concatenate([block[name] for block in blocks], axis=1) for name in recorded}
 
 
-def _observe(term: ComparedImages | ComparedPoints, state: State, key: AnyArray) -> AnyArray:
-    """One replication of an observation."""
-    if isinstance(term, ComparedPoints):
-        mean = term.predicted(state)
-        return mean + term.sd(state.values)[:, None] * jax.random.normal(key, mean.shape)
-    # The part of f that noise explains gives way to another.
-    scale = jnp.sqrt(term.temperature(state.values) / (2 * term.quadrature.weights))
-    noise = scale * term.standardised_noise(key, state.u, state.values)
-    replicated = term.fixed_values - term.residuals(state.u, state.values) + noise
-    return replicated[evenly_spaced(len(term.positions), MOST_POINTS)]
-
-
-def _log_likelihood(posterior: Posterior, draws: xr.Dataset) -> Variables:
-    """The log likelihood of every landmark by every draw."""
-    names = [name for name, term in posterior.data.terms.items() if isinstance(term, ComparedPoints)]
+def _log_likelihood(posterior: Posterior, draws: xr.Dataset, recorded: Mapping[str, Recorded]) -> Variables:
+    """The log likelihood of every value by every draw, of observations whose values are independent."""
+    terms = posterior.data.terms
+    names = [name for name in recorded if hasattr(terms[name], "pointwise_log_likelihood")]
     if not names:
         return {}
 
     def forward(draw: dict[str, AnyArray], data: Any) -> dict[str, Float[AnyArray, "points"]]:
         state = _state(posterior, data, draw)
-        terms = {name: data.terms[name] for name in names}
-        return {
-            name: norm.logpdf(term.shift, term.predicted(state), term.sd(state.values)[:, None]).sum(axis=1)
-            for name, term in terms.items()
-        }
+        return {name: data.terms[name].pointwise_log_likelihood(state) for name in names}
 
     blocks = list(push_forward(forward, _all(posterior, draws), posterior.data))
     coords = {"chain": draws["chain"].to_numpy(), "draw": draws["draw"].to_numpy()}
-    return {
-        name: xr.DataArray(
-            np.concatenate([block[name] for block in blocks], axis=1),
-            {**coords, f"{name}_point": list(posterior.observations[name].labels)},
-            ("chain", "draw", f"{name}_point"),
-        )
-        for name in names
-    }
+    found = {}
+    for name in names:
+        dim = recorded[name].values.dims[0]
+        values = np.concatenate([block[name] for block in blocks], axis=1)
+        labels = {**coords, dim: recorded[name].values[dim].to_numpy()}
+        found[name] = xr.DataArray(values, labels, ("chain", "draw", dim))
+    return found
 
 
 def _state(posterior: Posterior, data: Any, draw: dict[str, AnyArray]) -> State:

@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData
-from bayesreg.config.observations import ImagesSection, LandmarksSection
 from bayesreg.config.sections import MeshConfig
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
@@ -28,8 +27,7 @@ from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Channel, Inputs, Truth
 from bayesreg.io.volumes import load_ignored, load_image, load_mask
 from bayesreg.mesh import TetMesh
-from bayesreg.model.options import OF_ANY_CONTRAST, require_default_image_options
-from bayesreg.model.terms.landmarks import Landmarks
+from bayesreg.model.observations.section import Arrays
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.pose import Pose
 from bayesreg.synthetic.pair import SyntheticPair, make_pair
@@ -73,7 +71,7 @@ def prepare(config: Config) -> Prepared:
     """
     clock = _Clock()
     _require_start(config)
-    points = _points(config)
+    observed = with_held_out({one.name: one.read() for one in config.observations}, config)
     if isinstance(config.data, FilesData) and config.data.labels is None and config.data.fixed is None:
         assert config.mesh.file is not None
         mesh = load_mesh(config.mesh.file)
@@ -81,7 +79,7 @@ def prepare(config: Config) -> Prepared:
         clock.lap("mesh")
         boundary, skull = _known_boundary(config, mesh), _skull(config.data.intracranial)
         tissue = _as_stored(tissue_on_grid(mesh))
-        inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points)
+        inputs = Inputs(resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, observed=observed)
         return Prepared(inputs, clock.laps, {})
     anatomy = _anatomy(config)
     if anatomy.intracranial is not None:
@@ -105,7 +103,7 @@ def prepare(config: Config) -> Prepared:
         pose = IDENTITY if matched is None else matched.matching.pose
         boundary = _known_boundary(config, mesh, pose=pose)
         inputs = Inputs(
-            resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, points=points,
+            resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, observed=observed,
             fixed_ignore=fixed_ignore,
         )  # fmt: skip
         if matched is not None:
@@ -126,7 +124,7 @@ def prepare(config: Config) -> Prepared:
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
     boundary = _known_boundary(config, mesh, truth)
-    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, points)
+    inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, observed)
     return Prepared(inputs, clock.laps, _describe(config, pair), appraisal)
 
 
@@ -134,8 +132,8 @@ def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Ima
     """The pairs of images besides the first."""
     assert isinstance(config.data, FilesData)
     found = {}
-    for section in config.observations or []:
-        if isinstance(section, ImagesSection) and section.fixed is not None and section.moving is not None:
+    for section in config.pairs_of_images:
+        if section.fixed is not None and section.moving is not None:
             images = load_image(section.fixed), load_image(section.moving)
             channel = match_channel(config.data, domain, matched, section.name, *images, fixed_ignore)
             fixed, moving = _as_stored(channel.fixed), _as_stored(channel.moving)
@@ -161,7 +159,9 @@ def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image 
     if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
         return None
     images = anatomy.image, load_image(data.moving)
-    return match_images(data, config.model.similarity, domain, *images, fixed_ignore, _ignored(config, "moving"))
+    return match_images(
+        data, config.image_options.similarity, domain, *images, fixed_ignore, _ignored(config, "moving")
+    )
 
 
 def _skull(intracranial: Path | None) -> Image | None:
@@ -171,36 +171,26 @@ def _skull(intracranial: Path | None) -> Image | None:
     return _as_stored(forbidden(without_ridges(load_mask(intracranial))))
 
 
-def _points(config: Config) -> dict[str, PointPairs]:
-    """The landmarks of a configuration, those held out among them, read before anything takes long."""
-    found = {}
-    for section in config.observations or []:
-        if isinstance(section, LandmarksSection):
-            pairs = read_point_pairs(section.file, section.moving_file)
-            if section.sd is None and pairs.sd is None:
-                raise InputError(
-                    f"the observation {section.name!r} has no sd, mm: give its entry in observations an sd, or "
-                    f"{section.file} a column sd"
-                )
-            found[section.name] = pairs
-    return with_held_out(found, config)
-
-
-def with_held_out(observed: Mapping[str, PointPairs], config: Config) -> dict[str, PointPairs]:
-    """Points that are observed, and those of the section evaluation; InputError where one is both."""
-    found = {name: pairs for name, pairs in observed.items() if name != NAME}
+def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, Arrays]:
+    """What is observed, and the landmarks of the section evaluation; InputError where one is both."""
+    found = {name: arrays for name, arrays in observed.items() if name != NAME and arrays}
     if config.evaluation is None:
         return found
     held_out = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
-    require_unseen(held_out, {name: (pairs.fixed, pairs.moving) for name, pairs in found.items()})
-    return found | {NAME: held_out}
+    pairs = {
+        name: (arrays["fixed"], arrays["moving"])
+        for name, arrays in found.items()
+        if {"fixed", "moving"} <= set(arrays)
+    }
+    require_unseen(held_out, pairs)
+    return found | {NAME: held_out.as_arrays()}
 
 
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
     """What is told of labels and images before the mesh is built."""
     if matched is None or not isinstance(config.data, FilesData):
         return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
-    one_contrast = matched.matching.one_contrast and config.model.similarity not in OF_ANY_CONTRAST
+    one_contrast = matched.matching.one_contrast and not config.image_options.similarity.serves_any_contrast
     one_scale = one_contrast and config.data.same_contrast is True
     found = appraise(
         anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale, anatomy.intracranial
@@ -216,13 +206,11 @@ def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[I
     InputError
         As `prepare`; if neither the configuration nor `observations` holds anything observed.
     """
-    if not (config.compares_images or config.observations or observations):
+    if not (config.observations or observations):
         raise InputError(
             "there is nothing observed: data has no images; add data.fixed and data.moving, landmarks under "
             "observations, or give observations to bayesreg.run"
         )
-    if not config.compares_images and not observations:
-        require_default_image_options(config.model)
     prepared = prepare(config)
     require_all_unseen(prepared.inputs, observations)
     require_inside(prepared.inputs.mesh, config.report.places)
@@ -232,9 +220,11 @@ def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[I
 
 def require_all_unseen(inputs: Inputs, observations: Sequence[Any]) -> None:
     """Raise InputError where a landmark that is held out is among observations that no configuration names."""
-    if NAME in inputs.points:
-        given = {one.name: (one.fixed_points, one.moving_points) for one in observations if isinstance(one, Landmarks)}
-        require_unseen(inputs.points[NAME], given)
+    if NAME in inputs.observed:
+        points = {
+            one.name: (one.fixed_points, one.moving_points) for one in observations if hasattr(one, "fixed_points")
+        }
+        require_unseen(PointPairs.of_arrays(inputs.observed[NAME]), points)
 
 
 def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:

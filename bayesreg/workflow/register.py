@@ -10,7 +10,6 @@ import numpy as np
 
 from bayesreg.config import Config, make_config, read_mapping
 from bayesreg.config.data import FilesData
-from bayesreg.config.observations import ImagesSection
 from bayesreg.image import Image
 from bayesreg.io.volumes import load_image, load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_tables
@@ -78,8 +77,7 @@ def understand(
     }  # fmt: skip
     files = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
     sections: dict[str, Any] = {"data": {"source": "files", "label_table": chosen, **files}}
-    if channels:
-        sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
+    sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
     config = make_config(sections, overrides)
     if any(one.startswith("data.label_table") for one in overrides):
         how = "as set"
@@ -100,15 +98,15 @@ def _describe(config: Config, how: str) -> Iterator[str]:
         tissues = "; ".join(f"{name} {shorten(values, 12)}" for name, values in (data.label_table or {}).items())
         yield f"{'table':<12}{how}: {tissues}"
     yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
-    for section in config.observations or []:
-        if isinstance(section, ImagesSection) and section.fixed is not None:
+    for section in config.pairs_of_images:
+        if section.fixed is not None:
             yield f"{section.name:<12}{section.fixed} and {section.moving}, compared as well"
     for image in ("fixed", "moving"):
         if (path := getattr(data, f"{image}_ignore")) is not None:
             yield f"{'ignored':<12}what is not zero in {path} says nothing, in the {image} image"
     yield f"{'pose':<12}{'as the headers say' if data.pose == 'fixed' else 'looked for where the headers do not fit'}"
     contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
-    yield f"{'contrast':<12}{contrast}; compared by {config.model.similarity}"
+    yield f"{'contrast':<12}{contrast}; compared by {config.image_options.similarity.kind}"
     yield f"{'model':<12}preset {config.model.preset}"
 
 

@@ -34,7 +34,6 @@ from bayesreg.io.records import Inputs
 from bayesreg.memory import memory_of_machine
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.terms.images import ComparedImages, images_of
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.finish import finish
@@ -141,7 +140,7 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
     if not (resume and read_status(out) is not None):
         store.require_fresh(out)
     say("reading the files, meshing")
-    if config.has_images and not config.compares_images:
+    if config.has_images and not config.pairs_of_images:
         say("the images are shown and not compared: observations does not name them ({kind: images})")
     # Before they are read: what changes meanwhile is told when the run goes on.
     sources = digests_of_sources(config, MAY_CHANGE)
@@ -196,14 +195,14 @@ def _resume(
         checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
     if known.evaluation != config.evaluation:
-        inputs = inputs._replace(points=with_held_out(inputs.points, config))
+        inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
     reached = _load_reached(config, inputs, posterior, out, progress)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
     with writing(out) as place:
         write_text(place("config.yaml"), inputs.config)
-        store.write_points(place, inputs.points)
+        store.write_observed(place, inputs.observed)
         store.write_json(place(PROVENANCE), with_unsampled(provenance, began + sampled))
     return _go_on(config, inputs, posterior, reached, provenance, out, began, progress, say)
 
@@ -238,7 +237,7 @@ def _warn(config: Config, result: Result, say: Callable[[str], None]) -> None:
     from bayesreg.report.verdict import doubt_of_equilibrium
 
     doubt = doubt_of_equilibrium(result.run.manifest["model"], simulated=config.simulate is not None)
-    if doubt is not None and config.compares_images:
+    if doubt is not None and config.pairs_of_images:
         say(f"beware: {doubt}")
 
 
@@ -356,7 +355,7 @@ def _sample(
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or _block(images_of(posterior.data)),
+        block=options.block or _block(posterior),
         stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
         progress=progress,
         resume=reached,
@@ -369,7 +368,7 @@ def _require_memory(config: Config, posterior: Posterior) -> None:
     """Raise InputError where a block of draws, or the chains' moments alone, are more than the machine could hold."""
     options = config.sampler
     estimands = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values())
-    block = min(options.block or _block(images_of(posterior.data)), config.stop.max_steps // options.thin)
+    block = min(options.block or _block(posterior), config.stop.max_steps // options.thin)
     # Moments are two numbers for each, and are made anew beside the old ones.
     needed = 8 * options.chains * (block * estimands + 4 * (estimands + posterior.mesh.points.size))
     if needed > (held := memory_of_machine()):
@@ -380,10 +379,10 @@ def _require_memory(config: Config, posterior: Posterior) -> None:
         )
 
 
-def _block(images: ComparedImages | None) -> int:
+def _block(posterior: Posterior) -> int:
     """Fewer draws where a step costs more, or no look would come before a time limit is long over.
 
     By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
     """
-    points = 0 if images is None else len(images.quadrature.weights)
+    points = sum(len(getattr(term, "positions", ())) for term in posterior.data.terms.values())
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)

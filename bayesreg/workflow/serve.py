@@ -21,9 +21,9 @@ from bayesreg.config import Config, load_config, load_stored_config
 from bayesreg.inference.layout import slices, unravel
 from bayesreg.io import store
 from bayesreg.io.ledger import require_file, stage_of
+from bayesreg.model.observations.images.likelihood import images_of
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import Problem
-from bayesreg.model.terms.images import images_of
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs

@@ -88,8 +88,10 @@ def _write_places(result: Result, transform: Transform, out: Path) -> list[Item]
     if predicted is None:
         return []
     kinds = {"places": (predicted.place_names, predicted.place_points)}
-    if predicted.landmark_names is not None and predicted.landmark_points is not None:
-        kinds["landmarks"] = (predicted.landmark_names, predicted.landmark_points)
+    for name in result.run.manifest["observations"]:
+        known = predicted.of_observation(name)
+        if {"names", "points"} <= set(known):
+            kinds[name] = (np.asarray(known["names"]), known["points"])
     if predicted.evaluation_names is not None and predicted.evaluation_points is not None:
         inside = np.asarray(predicted.evaluation_inside)
         if inside.any():

@@ -16,8 +16,8 @@ from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.mesh import signed_volumes
 from bayesreg.model.curvature import _assemble
-from bayesreg.model.terms.barrier import QUADRATIC_BELOW, WIDTH, Barrier, cost, volume_shares
-from bayesreg.model.terms.landmarks import Landmarks
+from bayesreg.model.elastic.barrier import QUADRATIC_BELOW, WIDTH, Barrier, cost, volume_shares
+from bayesreg.model.observations.landmarks import Landmarks
 from tests.phantoms import box_mesh
 
 

@@ -10,7 +10,7 @@ import bayesreg as br
 from bayesreg.image import Image
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
-from bayesreg.model.contrast import contrast_functions, explained_shares, map_contrast
+from bayesreg.model.observations.images.contrast import contrast_functions, explained_shares, map_contrast
 from tests.phantoms import ball_mesh
 
 MESH = ball_mesh(spacing=30.0)

@@ -12,7 +12,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.image import Image
-from bayesreg.model.terms.images import ImageLikelihood
+from bayesreg.model.observations.images.likelihood import ImageLikelihood
 from bayesreg.types import InputError
 from tests.model.test_gradients import assert_gradient
 from tests.phantoms import box_mesh

@@ -12,7 +12,7 @@ from bayesreg.inference.chains.run import first_checkpoint, temper_target
 from bayesreg.inference.gaussian.mode_search import approach
 from bayesreg.inference.layout import flat_position
 from bayesreg.model.coordinates import complete
-from bayesreg.model.independence import independent_points, independent_scores
+from bayesreg.model.observations.images.independence import independent_points, independent_scores
 from bayesreg.types import InputError
 from tests.phantoms import ball_mesh, rotated_affine, smooth_image
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-from bayesreg.model.intensity_map import shading_basis
+from bayesreg.model.observations.images.intensity_map import shading_basis
 from tests.model.test_gradients import assert_gradient
 from tests.phantoms import ball_mesh, smooth_image
 

@@ -14,9 +14,9 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.inference.draws.predictive import predictive_p
-from bayesreg.model.local_correlation import LEAST, RIDGE, windows_of
-from bayesreg.model.pointwise import Intensities
-from bayesreg.model.terms.images import ImageLikelihood
+from bayesreg.model.observations.images.likelihood import ImageLikelihood
+from bayesreg.model.observations.images.local_correlation import LEAST, RIDGE, windows_of
+from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.pose import Pose
 from bayesreg.workflow.prediction import mean_values, predict
 from tests.model.test_gradients import assert_gradient

@@ -9,8 +9,8 @@ import pytest
 from scipy.interpolate import BSpline
 
 import bayesreg as br
-from bayesreg.model.mutual_information import BINS, MutualInformation
-from bayesreg.model.pointwise import Intensities
+from bayesreg.model.observations.images.mutual_information import BINS, MutualInformation
+from bayesreg.model.observations.images.pointwise import Intensities
 from tests.model.test_contrast import FIXED, MESH, error_of, moved, other_contrast
 from tests.model.test_gradients import assert_gradient
 

@@ -16,9 +16,9 @@ from bayesreg.model import curvature
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.build import require_observations
 from bayesreg.model.curvature import _assemble, _outside_curvature, _Seen
-from bayesreg.model.left_out import leave_out
+from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.state import State
-from bayesreg.model.terms.term import Outside, PointCurvature, SharedCurvature
+from bayesreg.model.term import Outside, PointCurvature, SharedCurvature
 from bayesreg.types import Equilibrium
 from tests.oracles import paper
 from tests.phantoms import box_mesh, smooth_image

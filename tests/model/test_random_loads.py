@@ -13,8 +13,8 @@ import bayesreg as br
 from bayesreg.fem.elements import boundary_areas
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.model.elastic.priors import LoadPrior
 from bayesreg.model.options import PriorConfig
-from bayesreg.model.terms.elastic import LoadPrior
 from tests.model.test_gradients import assert_gradient
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, box_mesh, refined, smooth_image

@@ -11,7 +11,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.image import Image
-from bayesreg.model.self_similarity import PATCH, InTurn, describe_self_similarity
+from bayesreg.model.observations.images.self_similarity import PATCH, InTurn, describe_self_similarity
 from tests.model.test_contrast import FIXED, MESH, error_of, moved, other_contrast
 from tests.model.test_gradients import assert_gradient
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import get_args
 
 import bayesreg as br
-from bayesreg.model.similarity import SIMILARITIES
+from bayesreg.model.observations.images.similarity import SIMILARITIES
 
 
 def test_the_options_name_the_similarities_that_there_are():

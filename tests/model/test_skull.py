@@ -13,8 +13,8 @@ from scipy import ndimage
 import bayesreg as br
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
+from bayesreg.model.elastic.skull import is_allowed
 from bayesreg.model.state import state_of
-from bayesreg.model.terms.skull import is_allowed
 from tests.oracles.paper import in_skull
 from tests.phantoms import ball_mesh, flat_skull, rotated_affine, smooth_image
 

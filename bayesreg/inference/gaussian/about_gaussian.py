@@ -134,8 +134,8 @@ def about_gaussian(
     if unknowns > MOST_UNKNOWNS:
         raise InputError(
             f"the posterior has {unknowns} unknowns; samplers about the mode keep dense matrices of their square and "
-            f"take up to {MOST_UNKNOWNS}: use a coarser mesh (mesh.edge_length), sample fewer nodes (model.sampled), "
-            "or sampler.name: rwmh"
+            f"take up to {MOST_UNKNOWNS}: use a coarser mesh (mesh.edge_length), sample fewer nodes "
+            "(model.elastic_prior: {kind: boltzmann, nodes: boundary}), or sampler.name: rwmh"
         )
 
     walk = Walk(target, transition, begin)

@@ -7,17 +7,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-Count = Annotated[int, Field(strict=True, ge=1)]
-Positive = Annotated[float, Field(strict=True, gt=0)]
+from bayesreg.settings import Count, Positive
+from bayesreg.settings import Section as Settings
+
 Share = Annotated[float, Field(strict=True, gt=0, lt=1)]
-
-
-class Settings(BaseModel):
-    """The base of all records: no unknown keys, no changes after the making."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class RandomWalk(Settings):

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Protocol
 
-import numpy as np
 from jaxtyping import Float
 
-from bayesreg.model.local_correlation import LocalCorrelation
-from bayesreg.model.mutual_information import MutualInformation
-from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import POINTWISE, Intensities, Pointwise, SumOfSquaredDifferences, ValueCurvature
+from bayesreg.model.observations.images.local_correlation import LocalCorrelation
+from bayesreg.model.observations.images.mutual_information import MutualInformation
+from bayesreg.model.observations.images.pointwise import (
+    Intensities,
+    Pointwise,
+    SquaredDifferences,
+    StudentT,
+    ValueCurvature,
+)
+from bayesreg.model.observations.images.self_similarity import SelfSimilarity
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -20,10 +24,6 @@ class Similarity(Protocol):
 
     `temperature` stands for T_s, mm³ times squared intensity.
     """
-
-    @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> Similarity:
-        """The similarity at these points, mm, of images with these intensities at rest, with the options' settings."""
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, mm³ times squared intensity."""
@@ -50,10 +50,6 @@ class Similarity(Protocol):
         """The noise of a point by itself."""
 
 
-SIMILARITIES: Mapping[str, type[Similarity]] = {
-    **POINTWISE,
-    "lncc": LocalCorrelation,
-    "mi": MutualInformation,
-    # Of the descriptors, by which a pair is then compared.
-    "mind": SumOfSquaredDifferences,
-}
+AnySimilarity = SquaredDifferences | StudentT | LocalCorrelation | MutualInformation | SelfSimilarity
+"""The settings of a similarity. Its method `on(positions, rest)` makes the `Similarity` at some points (q, 3), mm, of
+images with the `Intensities` `rest` there where nothing has moved."""

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from bayesreg.fem.elements import Elements, displacement_gradient
 from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
-from bayesreg.model.terms.term import PointCurvature, SharedCurvature
+from bayesreg.model.term import PointCurvature, SharedCurvature
 from bayesreg.types import AnyArray, Scalar
 
 # Standard deviation of the logarithm of a share below the least: 0.9 of the least costs 0.14, half of it 6.
@@ -36,6 +36,11 @@ class Barrier(NamedTuple):
 
     least: Scalar
     elements: Elements
+
+    @property
+    def is_nearly_quadratic(self) -> bool:
+        """Not in the displacements."""
+        return False
 
     @property
     def name(self) -> str:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Float
+from pydantic import Field
 
-from bayesreg.model.options import ModelConfig
-from bayesreg.model.terms.term import SharedCurvature
+from bayesreg.model.term import SharedCurvature
+from bayesreg.settings import KnownOrInferred, Section
 from bayesreg.types import AnyArray, Scalar
 
 Same = TypeVar("Same")
@@ -63,18 +64,13 @@ class ValueCurvature(NamedTuple):
 
 
 class Pointwise:
-    """Base of these similarities; see `bayesreg.model.similarity.Similarity`.
+    """Base of these similarities; see `bayesreg.model.observations.images.similarity.Similarity`.
 
     A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `energy`,
-    `log_normaliser`, `variance` and `draw`, and `on` where it has settings.
+    `log_normaliser`, `variance` and `draw`.
     """
 
     arrays: ClassVar[tuple[str, ...]] = ()
-
-    @classmethod
-    def on(cls: type[Same], model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> Same:
-        """The similarity, here without settings."""
-        return cls()
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """E_s, a sum over the points, mm³ times squared intensity."""
@@ -135,7 +131,7 @@ class SumOfSquaredDifferences(Pointwise):
 
 
 @jax.tree_util.register_pytree_node_class
-class StudentT(Pointwise):
+class StudentTNoise(Pointwise):
     """Student's t noise of the squared scale s_q² = T_s / (2 w_q), which forgives outliers.
 
     Parameters
@@ -148,11 +144,6 @@ class StudentT(Pointwise):
 
     def __init__(self, degrees_of_freedom: Any) -> None:
         self.degrees_of_freedom = degrees_of_freedom
-
-    @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> StudentT:
-        """The similarity with the model's degrees of freedom."""
-        return cls(jnp.asarray(model.degrees_of_freedom))
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """T_s (ν + 1)/2 Σ_q log(1 + 2 w_q (f − m)² / (ν T_s)).
@@ -190,7 +181,45 @@ class StudentT(Pointwise):
         return jax.random.t(key, self.degrees_of_freedom, pair.weights.shape)
 
 
-POINTWISE: dict[str, type[SumOfSquaredDifferences] | type[StudentT]] = {
-    "ssd": SumOfSquaredDifferences,
-    "student_t": StudentT,
-}
+class SimilaritySettings(Section):
+    """The base of the settings of every similarity."""
+
+    kind: str
+    temperature: KnownOrInferred = 0.05
+    """Boltzmann temperature T_s, mm³ times squared intensity, or its prior."""
+
+    serves_any_contrast: ClassVar[bool] = False
+    compares_descriptors: ClassVar[bool] = False
+    # E_s in the report, and what its residual is where that is not f − m(x + u).
+    formula: ClassVar[str]
+    residual: ClassVar[str] = ""
+
+
+class SquaredDifferences(SimilaritySettings):
+    """Sum of squared differences, eq. (1): Gaussian noise."""
+
+    formula = "∫ (<var>f</var> − <var>m</var>(<var>x</var> + <var>u</var>))² d<var>x</var>, by quadrature over the mesh"
+
+    kind: Literal["ssd"] = "ssd"
+
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> SumOfSquaredDifferences:
+        """The similarity at these points; see `AnySimilarity`."""
+        return SumOfSquaredDifferences()
+
+
+class StudentT(SimilaritySettings):
+    """Student's t noise, which forgives outliers."""
+
+    formula = (
+        "<var>T</var><sub>s</sub> (ν+1)/2 Σ log(1 + 2<var>wr</var>² / (ν<var>T</var><sub>s</sub>)), where "
+        "<var>r</var> = <var>f</var> − <var>m</var>(<var>x</var> + <var>u</var>) at a quadrature point of weight "
+        "<var>w</var>: Student’s t"
+    )
+
+    kind: Literal["student_t"] = "student_t"
+    degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
+    """ν, above 2: the fewer, the heavier the tails; many are Gaussian."""
+
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> StudentTNoise:
+        """The similarity at these points; see `AnySimilarity`."""
+        return StudentTNoise(jnp.asarray(self.degrees_of_freedom))

@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+import xarray as xr
+from jax.scipy.stats import norm
 from jaxtyping import Float, Int
 
 from bayesreg.fem.location import interpolation_at
+from bayesreg.io.points import PointPairs, read_point_pairs
+from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import Scale, Values
-from bayesreg.model.options import ScalePrior
-from bayesreg.model.state import State
-from bayesreg.model.terms.term import Label, PointCurvature
+from bayesreg.model.blocks import Values, scale_block
+from bayesreg.model.observations.left_out import leave_out
+from bayesreg.model.observations.observation import Placed, Recorded
+from bayesreg.model.observations.section import Name, ObservationSection
+from bayesreg.model.state import State, state_of
+from bayesreg.model.term import Label, PointCurvature
 from bayesreg.printable import require_printable
+from bayesreg.settings import FoundFile, KnownOrInferred, ScalePrior
 from bayesreg.types import AnyArray, InputError, Scalar
+
+# Landmarks that are left out in turn, and unknowns up to which there is memory for that.
+MOST_LEFT_OUT, MOST_UNKNOWNS = 60, 12_000
 
 
 class Landmarks:
@@ -45,6 +55,8 @@ class Landmarks:
         If shapes differ, a number is not finite, an sd is not positive, or a label cannot be printed.
     """
 
+    kind = "landmarks"
+
     def __init__(
         self,
         fixed_points: Any,
@@ -67,25 +79,41 @@ class Landmarks:
         self.prior = sd if isinstance(sd, ScalePrior) else None
         self.sd = _known_sd(self.prior.median if self.prior else sd, count, name)
 
-    @property
-    def blocks(self) -> dict[str, Scale]:
-        """The unknowns that it brings: its sd, where that is inferred."""
-        if self.prior is None:
-            return {}
-        return {f"{self.name}_sd": Scale(jnp.asarray(self.prior.median), jnp.asarray(self.prior.log_sd))}
-
-    def on(self, mesh: TetMesh) -> ComparedPoints:
-        """The term on a mesh; InputError if a fixed point lies outside it."""
+    def on(self, mesh: TetMesh, preset: str = "paper") -> Placed:
+        """The landmarks on a mesh, with their sd where that is inferred; InputError if a point lies outside it."""
         labels = [f"{self.name}: point {label}" for label in self.labels]
         nodes, weights = interpolation_at(mesh, self.fixed_points, labels)
-        return ComparedPoints(
+        scale = f"{self.name}_sd"
+        term = ComparedPoints(
             label=Label(self.name),
-            scale=None if self.prior is None else Label(f"{self.name}_sd"),
+            scale=None if self.prior is None else Label(scale),
             nodes=jnp.asarray(nodes),
             weights=jnp.asarray(weights),
             shift=jnp.asarray(self.moving_points - self.fixed_points),
             known_sd=jnp.asarray(self.sd),
         )
+        return Placed(self, term, {} if self.prior is None else {scale: scale_block(self.prior)})
+
+    def summarise(self, posterior: Any, mean: Values) -> dict[str, np.ndarray]:
+        """Residuals at the mean of the draws, and where the landmarks are few, of each as all else predicts it."""
+        term = posterior.data.terms[self.name]
+        state = state_of(posterior.data.body, posterior.data.blocks, mean)
+        found = {
+            "names": np.array(self.labels),
+            "points": self.fixed_points,
+            "sd": np.asarray(term.sd(state.values)),
+            "residual": np.asarray(term.shift - term.predicted(state)),
+        }
+        if len(self.labels) > MOST_LEFT_OUT or not len(posterior.sampled) or 3 * len(posterior.sampled) > MOST_UNKNOWNS:
+            return found
+        left_out = leave_out(posterior, term, posterior.estimands(mean))
+        return found | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
+
+    def recorded(self, term: ComparedPoints) -> Recorded:
+        """Displacements of the landmarks, mm."""
+        coords = {f"{self.name}_point": list(self.labels), "axis": list("xyz")}
+        attributes = {"units": "mm", "long_name": "displacement of the landmarks, world RAS"}
+        return Recorded(xr.DataArray(np.asarray(term.shift), coords, list(coords), attrs=attributes))
 
 
 def _points(given: Any, name: str) -> np.ndarray:
@@ -140,6 +168,11 @@ class ComparedPoints(NamedTuple):
         """The name of the term."""
         return self.label.name
 
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """The name of the sd where it is inferred: its joint mode with the displacements misleads."""
+        return () if self.scale is None else (self.scale.name,)
+
     def sd(self, values: Values) -> Float[AnyArray, "k"]:
         """The sd of every point, mm."""
         return self.known_sd if self.scale is None else jnp.full(self.known_sd.shape, values[self.scale.name])
@@ -160,6 +193,10 @@ class ComparedPoints(NamedTuple):
     def predicted(self, state: State) -> Float[AnyArray, "k 3"]:
         """u(p), mm."""
         return jnp.einsum("ka,kai->ki", self.weights, state.u[self.nodes])
+
+    def pointwise_log_likelihood(self, state: State) -> Float[AnyArray, "k"]:
+        """The log likelihood of every landmark with its normaliser, as leave-one-out needs it."""
+        return norm.logpdf(self.shift, self.predicted(state), self.sd(state.values)[:, None]).sum(axis=1)
 
     def standardised_residual(self, state: State) -> Float[AnyArray, "k 3"]:
         """(q − p − u(p)) / sd: independent standard Normal numbers where the model holds."""
@@ -184,3 +221,37 @@ class PartlyNormalised(dist.Normal):
     def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
         """−(value − loc)² / (2 scale²) − log(scale / known scale)."""
         return -0.5 * ((value - self.loc) / self.scale) ** 2 - jnp.log(self.scale / self.known_scale)
+
+
+class LandmarksSection(ObservationSection):
+    """Pairs of points that show the same place of the organ."""
+
+    title = "pairs of points"
+
+    kind: Literal["landmarks"] = "landmarks"
+    name: Name = "landmarks"
+    """The name of the observation in tables; two observations need two."""
+    file: FoundFile
+    """Both points of each pair (.csv, or .tag of two volumes), or the points in the fixed image (.csv, .fcsv,
+    .mrk.json, .tag)."""
+    moving_file: FoundFile | None = None
+    """The points in the moving image, where they stand in a file of their own."""
+    sd: KnownOrInferred | None = None
+    """Sd of the error of each coordinate, mm, or its prior; null takes the column sd of the file."""
+
+    def read(self) -> dict[str, np.ndarray]:
+        """The points of the files, world RAS mm; InputError where neither section nor file has an sd."""
+        pairs = read_point_pairs(self.file, self.moving_file)
+        if self.sd is None and pairs.sd is None:
+            raise InputError(
+                f"the observation {self.name!r} has no sd, mm: give its entry in observations an sd, or {self.file} a "
+                "column sd"
+            )
+        return pairs.as_arrays()
+
+    def observe(self, inputs: Inputs) -> Sequence[Landmarks]:
+        """The points, those of the moving image brought into the world of the fixed one."""
+        pairs = PointPairs.of_arrays(inputs.observed[self.name])
+        labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
+        sd = pairs.sd if self.sd is None else self.sd
+        return [Landmarks(pairs.fixed, inputs.matching.pose.inverse.place(pairs.moving), sd, self.name, labels)]

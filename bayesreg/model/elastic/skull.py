@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
-from bayesreg.model.terms.term import PointCurvature
+from bayesreg.model.term import PointCurvature
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -62,6 +62,11 @@ class SoftSkull(NamedTuple):
     hard: Skull
     nodes: Int[AnyArray, "sampled"]
     width: Scalar
+
+    @property
+    def is_nearly_quadratic(self) -> bool:
+        """Not in the displacements."""
+        return False
 
     @property
     def name(self) -> str:

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
 from bayesreg.model.coordinates import complete
+from bayesreg.model.observations.landmarks import ComparedPoints
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
-from bayesreg.model.terms.landmarks import ComparedPoints
 from bayesreg.types import AnyArray
 
 # Share of the curvature's trace that keeps directions finite of which nothing is known, such as free rigid motions.

@@ -17,11 +17,11 @@ from numpyro.distributions import constraints
 from bayesreg.fem.elements import Quadrature
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
-from bayesreg.model.pointwise import Intensities, ValueCurvature
-from bayesreg.model.self_similarity import InTurn
-from bayesreg.model.similarity import Similarity
+from bayesreg.model.observations.images.pointwise import Intensities, ValueCurvature
+from bayesreg.model.observations.images.self_similarity import InTurn
+from bayesreg.model.observations.images.similarity import Similarity
 from bayesreg.model.state import State
-from bayesreg.model.terms.term import PointCurvature, SharedCurvature
+from bayesreg.model.term import PointCurvature, SharedCurvature
 from bayesreg.types import AnyArray, Scalar
 
 NOTHING: Values = MappingProxyType({})
@@ -65,7 +65,7 @@ class ComparedImages(NamedTuple):
     independent_share : scalar
         Effective number of independent quadrature points over that of all: tempers the likelihood.
     shading : (q, k) array or None
-        Functions of which m has some more than f (`bayesreg.model.intensity_map`).
+        Functions of which m has some more than f (`bayesreg.model.observations.images.intensity_map`).
     visible : Interpolator or None
         1 where the moving image is looked at and 0 where it is ignored; None: it is looked at everywhere.
     """
@@ -82,9 +82,24 @@ class ComparedImages(NamedTuple):
     visible: Interpolator | None = None
 
     @property
+    def is_nearly_quadratic(self) -> bool:
+        """Not in the displacements."""
+        return False
+
+    @property
     def name(self) -> str:
         """Its name."""
         return self.comparison.name
+
+    @property
+    def powers(self) -> dict[str, float]:
+        """The name of T_s, which is the first power of a temperature."""
+        return {self.comparison.temperature: 1.0}
+
+    @property
+    def independent_points(self) -> Scalar:
+        """How many quadrature points the likelihood counts as independent."""
+        return self.independent_share * len(self.positions)
 
     def temperature(self, values: Values) -> Scalar:
         """T_s."""
@@ -190,11 +205,20 @@ class ImageLikelihood(dist.Distribution):
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
         """Replicates of the fixed image, which the tempering by `independent_share` leaves as they are."""
+        replicates = jax.vmap(self._replicate)(jax.random.split(key, sample_shape).ravel())
+        return replicates.reshape(*sample_shape, *self.event_shape)
+
+    def _replicate(self, key: AnyArray) -> Float[AnyArray, "points"]:
         similarity, pair = self.term.similarity, self.compared
-        explained = pair.fixed - similarity.residuals(pair)
-        noise = jax.vmap(lambda one: similarity.draw(one, pair))(jax.random.split(key, sample_shape).ravel())
+        key_seen, key_hidden, key_choice = jax.random.split(key, 3)
         scale = jnp.sqrt(self.temperature / (2 * pair.weights))
-        return (explained + scale * noise).reshape(*sample_shape, *self.event_shape)
+        seen = pair.fixed - similarity.residuals(pair) + scale * similarity.draw(key_seen, pair)
+        if pair.share is None:
+            return seen
+        hidden = self._hidden_pair(pair)
+        scale = jnp.sqrt(self.temperature / (2 * hidden.weights))
+        elsewhere = hidden.moving + scale * similarity.of_one_point().draw(key_hidden, hidden)
+        return jnp.where(jax.random.uniform(key_choice, seen.shape) < pair.share, seen, elsewhere)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
         """The tempered log density; its normaliser is part of it where T_s is inferred or some of m is ignored."""
@@ -203,16 +227,19 @@ class ImageLikelihood(dist.Distribution):
         if self.term.comparison.normalised or pair.share is not None:
             found += self.term.similarity.log_normaliser(pair, self.temperature)
         if pair.share is not None:
-            found += self._hidden(pair)
+            found += self._log_hidden(pair)
         return self.term.independent_share * found
 
-    def _hidden(self, pair: Intensities) -> Scalar:
-        """The log density of f where m is ignored: m is then as anywhere in the organ, which is so much more noise."""
+    def _hidden_pair(self, pair: Intensities) -> Intensities:
+        """f beside m where m is ignored: m is then as anywhere in the organ, which is so much more noise."""
         mean, variance = self.term.fixed_values.mean(), self.term.fixed_values.var()
         # T_s / (2 w) of the noise and the variance of m are those of a point with this weight.
         weights = pair.weights / (1 + 2 * pair.weights * variance / self.temperature)
-        hidden = Intensities(pair.fixed, jnp.full_like(pair.fixed, mean), weights, 1 - pair.shares)
-        noise = self.term.similarity.of_one_point()
+        return Intensities(pair.fixed, jnp.full_like(pair.fixed, mean), weights, 1 - pair.shares)
+
+    def _log_hidden(self, pair: Intensities) -> Scalar:
+        """The log density of f where m is ignored."""
+        hidden, noise = self._hidden_pair(pair), self.term.similarity.of_one_point()
         return (
             noise.log_normaliser(hidden, self.temperature) - noise.energy(hidden, self.temperature) / self.temperature
         )

@@ -19,7 +19,7 @@ var(m) is increased by `RIDGE` times the variance of m over all points, which is
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,9 +28,14 @@ import scipy.sparse
 from jaxtyping import Float, Int
 
 from bayesreg.fem.operators import SparseOperator, sparse_operator
-from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
-from bayesreg.model.terms.term import SharedCurvature
+from bayesreg.model.observations.images.pointwise import (
+    Intensities,
+    SimilaritySettings,
+    SumOfSquaredDifferences,
+    ValueCurvature,
+)
+from bayesreg.model.term import SharedCurvature
+from bayesreg.settings import Positive
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # Fewest points of a window: two of their degrees of freedom are lost.
@@ -63,22 +68,6 @@ class Windows(NamedTuple):
         return self.members.transpose(self.members(values))
 
 
-class SomeWindows(NamedTuple):
-    """A partition of few points, which are known only when the program runs (a pytree).
-
-    Attributes
-    ----------
-    label : (p,) int array
-        Below p.
-    """
-
-    label: Int[AnyArray, "points"]
-
-    def sums(self, values: Float[AnyArray, "points columns"]) -> Float[AnyArray, "points columns"]:
-        """The sum over the window of each point, at that point."""
-        return jax.ops.segment_sum(values, self.label, len(self.label))[self.label]
-
-
 class LocalFit(NamedTuple):
     """The best affine map of intensities in the window of each point, and what is known of the window (all (q,)).
 
@@ -104,36 +93,21 @@ class LocalFit(NamedTuple):
     residuals: Float[AnyArray, "points"]
 
 
-class LocalCorrelation(NamedTuple):
+class WindowCorrelation(NamedTuple):
     """Squared differences after the best affine map of intensities in each window; see `Similarity`.
 
     Attributes
     ----------
-    windows : Windows or SomeWindows
+    windows : Windows
     ridge : scalar
         Added to the variance of m within a window, squared intensity.
     width : scalar
         Longest side of a window, mm.
     """
 
-    windows: Any
+    windows: Windows
     ridge: Scalar
     width: Scalar
-
-    @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> LocalCorrelation:
-        """The similarity with windows of the model's width.
-
-        Raises
-        ------
-        InputError
-            If the moving image is constant at the points.
-        """
-        values = rest.moving
-        # The spline of a constant image varies by rounding.
-        if jnp.ptp(values) <= 1e-9 * abs(values).max():
-            raise InputError("the moving image is constant in the mesh: similarity 'lncc' has nothing to correlate")
-        return cls(windows_of(positions, model.window_mm), RIDGE * values.var(), jnp.asarray(model.window_mm))
 
     def fit(self, pair: Intensities) -> LocalFit:
         """The best map in every window."""
@@ -196,7 +170,7 @@ class LocalCorrelation(NamedTuple):
 
 
 @jax.custom_jvp
-def _energy(similarity: LocalCorrelation, pair: Intensities) -> Scalar:
+def _energy(similarity: WindowCorrelation, pair: Intensities) -> Scalar:
     found = similarity.fit(pair)
     return pair.weights @ (found.fixed * found.residuals)
 
@@ -233,3 +207,34 @@ def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Window
             boxes += np.array_split(box[along], 2)
     members = scipy.sparse.csr_array((np.ones(len(label)), (label, np.arange(len(label)))))
     return Windows(jnp.asarray(label), sparse_operator(members))
+
+
+class LocalCorrelation(SimilaritySettings):
+    """Squared differences after the best affine map of intensities in each of many windows, for unlike contrasts."""
+
+    serves_any_contrast = True
+    formula = (
+        "Σ <var>wr</var>², where <var>r</var> is what the best affine map of <var>m</var>(<var>x</var> + "
+        "<var>u</var>) leaves of <var>f</var> in the window of a quadrature point of weight <var>w</var>"
+    )
+    residual = "what the best affine map of the intensities of m in each window leaves of f"
+
+    kind: Literal["lncc"] = "lncc"
+    window_mm: Positive = 10.0
+    """Longest side of a window, mm, within which one affine map should relate the contrasts. Where the quadrature has
+    few points, windows are as much larger as to hold 16."""
+
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> WindowCorrelation:
+        """The similarity at these points; see `AnySimilarity`.
+
+        Raises
+        ------
+        InputError
+            If the moving image is constant at the points.
+        """
+        values = rest.moving
+        # The spline of a constant image varies by rounding.
+        if jnp.ptp(values) <= 1e-9 * abs(values).max():
+            raise InputError("the moving image is constant in the mesh: similarity 'lncc' has nothing to correlate")
+        ridge, width = RIDGE * values.var(), jnp.asarray(self.window_mm)
+        return WindowCorrelation(windows_of(positions, self.window_mm), ridge, width)

@@ -1,8 +1,8 @@
-"""Elastic priors of the displacements: the Boltzmann prior of eq. (12), and random loads on the right of eq. (7)."""
+"""The elastic prior of random loads: equilibrium with random forces, K u = q in place of eq. (7)."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,48 +15,40 @@ from bayesreg.fem.elements import Elements, boundary_areas
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
 from bayesreg.model.state import State
+from bayesreg.settings import KnownOrInferred, ScalePrior, Section, Vector
 from bayesreg.types import AnyArray, Matrix, Scalar
 
-# The scales of each prior, and the powers of a temperature that they are.
-SCALES = {"boltzmann": {"t_elastic": 1.0}, "loads": {"body_load": 0.5, "surface_load": 0.5}}
+# A load of any size within a factor of 400 of this one.
+WIDE = ScalePrior(median=0.1, log_sd=3.0)
 
 
-class BoltzmannPrior(NamedTuple):
-    """exp(−E_r / T_r), eq. (12), with or without its normaliser.
+class RandomLoads(Section):
+    """Equilibrium with random loads: the displacements of all nodes are sampled, and depend little on the mesh."""
 
-    Attributes
-    ----------
-    determinant : SchurDeterminant or None
-        None leaves the normaliser out, as the paper does.
-    """
+    normalised: ClassVar[bool] = True
+    nodes: ClassVar[str] = "all"
+    held: ClassVar[dict[int, Vector]] = {}
+    samples_no_node: ClassVar[bool] = False
 
-    determinant: SchurDeterminant | None
+    kind: Literal["loads"] = "loads"
+    body: KnownOrInferred = WIDE
+    """Standard deviation of the white noise of body forces (unit of μ times mm^½), or its prior."""
+    surface: KnownOrInferred = WIDE
+    """Standard deviation of the white noise of surface forces (unit of μ times mm), or its prior."""
 
     @property
-    def name(self) -> str:
-        """The name of the term."""
-        return "elastic"
+    def scales(self) -> dict[str, KnownOrInferred]:
+        """The scales of this prior by the names of their blocks."""
+        return {"body_load": self.body, "surface_load": self.surface}
 
-    def log(self, state: State) -> Scalar:
-        """−E_r / T_r, and the normaliser if it is part of the density."""
-        energy = state.strain_energy / state.values["t_elastic"]
-        return -energy + self.log_normaliser(state.elements, state.lam, state.mu, state.values)
-
-    def log_normaliser(
-        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], values: Values
-    ) -> Scalar:
-        """½ log pdet S(λ, μ) − r/2 log(2π T_r), r the rank of S; zero where it is left out."""
-        if self.determinant is None:
-            return jnp.zeros(())
-        log_pdet = log_pseudo_determinant(self.determinant, elements, lam, mu)
-        return 0.5 * (log_pdet - self.determinant.rank * jnp.log(2 * jnp.pi * values["t_elastic"]))
-
-    def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
-        """S / T_r, 1/mm², of the Schur complement S of the stiffness in the sampled nodes."""
-        return stiffness / float(values["t_elastic"])
+    def on(self, mesh: TetMesh, determinant: SchurDeterminant | None) -> LoadsTerm:
+        """The term on a mesh whose nodes are all sampled."""
+        volumes = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.points))
+        arrays = volumes, boundary_areas(mesh), rigid_modes(mesh.points)
+        return LoadsTerm(determinant, *(jnp.asarray(array) for array in arrays))
 
 
-class LoadPrior(NamedTuple):
+class LoadsTerm(NamedTuple):
     """Equilibrium with random loads: K u = q in place of eq. (7), q ~ N(0, D), D = s² M + t² A on the diagonal.
 
     The body forces are white noise of the density s, M the lumped volumes of the nodes, and the surface forces white
@@ -82,12 +74,15 @@ class LoadPrior(NamedTuple):
     areas: Float[AnyArray, "nodes"]
     rigid: Float[AnyArray, "rows 6"]
 
-    @classmethod
-    def on(cls, mesh: TetMesh, determinant: SchurDeterminant | None) -> LoadPrior:
-        """The prior on a mesh whose nodes are all sampled."""
-        volumes = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.points))
-        arrays = volumes, boundary_areas(mesh), rigid_modes(mesh.points)
-        return cls(determinant, *(jnp.asarray(array) for array in arrays))
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """The names of the scales whose joint mode with the displacements misleads."""
+        return tuple(self.powers)
+
+    @property
+    def powers(self) -> dict[str, float]:
+        """Its scales by the names of their blocks, and the powers of a temperature that they are."""
+        return {"body_load": 0.5, "surface_load": 0.5}
 
     @property
     def name(self) -> str:

@@ -127,6 +127,11 @@ class Outside:
         """The term's own."""
         return self.term.name
 
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """The names of the unknowns that the term brings."""
+        return tuple(getattr(self.term, "blocks", {}))
+
     def log(self, state: State) -> Any:
         """The term's own."""
         return self.term.log(state)

@@ -15,15 +15,20 @@ There is no noise and so no T_s to infer. The temperature of the options is that
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bayesreg.model.options import ModelConfig
-from bayesreg.model.pointwise import Intensities, SumOfSquaredDifferences, ValueCurvature
+from bayesreg.model.observations.images.pointwise import (
+    Intensities,
+    SimilaritySettings,
+    SumOfSquaredDifferences,
+    ValueCurvature,
+)
+from bayesreg.settings import Positive
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # Bins of each image; the outer ones hold what lies beyond the range.
@@ -55,7 +60,7 @@ class Histogram(NamedTuple):
         return jnp.log(self.joint) - jnp.log(self.joint.sum(axis=0))
 
 
-class MutualInformation(NamedTuple):
+class JointInformation(NamedTuple):
     """Mutual information; see `Similarity`.
 
     Attributes
@@ -69,24 +74,6 @@ class MutualInformation(NamedTuple):
     temperature: Scalar
     fixed_range: Float[AnyArray, "2"]
     moving_range: Float[AnyArray, "2"]
-
-    @classmethod
-    def on(cls, model: ModelConfig, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> MutualInformation:
-        """The similarity with bins over the ranges of both images at the points.
-
-        Raises
-        ------
-        InputError
-            If an image is constant there.
-        """
-        ranges = []
-        for name, values in (("fixed", rest.fixed), ("moving", rest.moving)):
-            low, high = (float(x) for x in np.quantile(np.asarray(values), (0.001, 0.999)))
-            if not high - low > 1e-9 * max(abs(low), abs(high)):
-                raise InputError(f"the {name} image is constant in the mesh: similarity 'mi' has nothing to compare")
-            ranges.append(jnp.array([low, high]))
-        assert isinstance(model.t_similarity, float)
-        return cls(jnp.asarray(model.t_similarity), *ranges)
 
     def histogram(self, pair: Intensities) -> Histogram:
         """The joint histogram of a pair."""
@@ -156,3 +143,34 @@ def _bins(values: Float[AnyArray, "points"], bounds: Float[AnyArray, "2"]) -> Fl
     t = jnp.abs((inside[:, None] - centres) / (centres[1] - centres[0]))
     near, far = 2 / 3 - t**2 + t**3 / 2, (2 - t) ** 3 / 6
     return jnp.where(t < 1, near, jnp.where(t < 2, far, 0.0))
+
+
+class MutualInformation(SimilaritySettings):
+    """Mutual information, for unlike contrasts; it knows no noise, and its temperature is that of the likelihood."""
+
+    serves_any_contrast = True
+    formula = (
+        "−<var>T</var><sub>s</sub> <var>N I</var>, where <var>I</var> is the mutual information of <var>f</var> and "
+        "<var>m</var>(<var>x</var> + <var>u</var>) at <var>N</var> quadrature points"
+    )
+    residual = "f less the mean of its intensities where m has the same one"
+
+    kind: Literal["mi"] = "mi"
+    temperature: Positive = 0.05
+    """Temperature of the likelihood, a number: there is no noise of which it could be inferred."""
+
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> JointInformation:
+        """The similarity at these points; see `AnySimilarity`.
+
+        Raises
+        ------
+        InputError
+            If an image is constant at the points.
+        """
+        ranges = []
+        for name, values in (("fixed", rest.fixed), ("moving", rest.moving)):
+            low, high = (float(x) for x in np.quantile(np.asarray(values), (0.001, 0.999)))
+            if not high - low > 1e-9 * max(abs(low), abs(high)):
+                raise InputError(f"the {name} image is constant in the mesh: similarity 'mi' has nothing to compare")
+            ranges.append(jnp.array([low, high]))
+        return JointInformation(jnp.asarray(self.temperature), *ranges)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.interpolation import Interpolator
+from bayesreg.model.observations.images.pointwise import Intensities, SimilaritySettings, SumOfSquaredDifferences
 from bayesreg.types import AnyArray
 
 # Standard deviation of the patch, as a share of the distance between neighbours, as in the paper.
@@ -92,3 +93,20 @@ class InTurn(NamedTuple):
         filled = jnp.pad(points, ((0, turns * images - count), (0, 0)), mode="edge").reshape(turns, images, 3)
         found = jax.lax.map(lambda one: one[0](one[1]), (self.images, jnp.moveaxis(filled, 1, 0)))
         return found.T.reshape(-1)[:count]
+
+
+class SelfSimilarity(SimilaritySettings):
+    """Squared differences of what places look like beside their neighbours, for unlike contrasts."""
+
+    serves_any_contrast = compares_descriptors = True
+    formula = (
+        "∫ (MIND<sub>r</sub>(<var>f</var>) − MIND<sub>r</sub>(<var>m</var>)(<var>x</var> + <var>u</var>))² "
+        "d<var>x</var>, by quadrature over the mesh, whose points look at one neighbour <var>r</var> each"
+    )
+    residual = "a descriptor of f less that of m, of what a place looks like beside its neighbours"
+
+    kind: Literal["mind"] = "mind"
+
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> SumOfSquaredDifferences:
+        """The similarity at these points; see `AnySimilarity`."""
+        return SumOfSquaredDifferences()

@@ -1,0 +1,1 @@
+"""A pair of images as an observation."""

@@ -1,0 +1,83 @@
+"""How a pair of images is compared: the options of the observation, and what each preset makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from bayesreg.interpolation import Interpolation
+from bayesreg.model.observations.images.pointwise import SimilaritySettings, SquaredDifferences
+from bayesreg.model.observations.images.similarity import AnySimilarity
+from bayesreg.settings import NotNegative, Positive, Section, by_kind, wrong
+
+# The kinds of similarities that bring a map of intensities of their own.
+OF_ANY_CONTRAST = [one.model_fields["kind"].default for one in get_args(AnySimilarity) if one.serves_any_contrast]
+
+# What is not given, by the name of the model's preset. The options of "paper" are the defaults of `ImageOptions`.
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    "registration": {
+        "similarity": {"kind": "student_t", "temperature": {"median": 0.05, "log_sd": 3.0}},
+        "interpolation": "cubic",
+        "quadrature": "voxels",
+        "most_points": 100_000,
+        "independent_points": "residual",
+        "smoothing": 0.8,
+        "intensity_map": 2,
+    },
+}
+
+
+class ImageOptions(Section):
+    """How two images are compared."""
+
+    similarity: Annotated[AnySimilarity, Field(discriminator="kind"), BeforeValidator(by_kind)] = SquaredDifferences()
+    """The similarity, and with it the noise and its temperature T_s: ssd, student_t, or for images of unlike contrast
+    lncc, mi or mind."""
+    interpolation: Interpolation = "linear"
+    """Interpolation of the images; cubic where gradients are used."""
+    quadrature: Literal["gauss4", "gauss32", "gauss256", "voxels"] = "gauss4"
+    """Points of the integral in eq. (1): 4, 32 or 256 for each tetrahedron, or the fixed image's voxel centres inside
+    the mesh."""
+    most_points: Annotated[int, Field(strict=True, ge=1)] | None = None
+    """With voxels: where there are more, a fixed random choice of so many of them."""
+    smoothing: NotNegative = 0.0
+    """Standard deviation, in voxels of the coarser image, of a Gaussian that both images are smoothed with. Between
+    voxel centres interpolation averages the noise of m, and at them it does not: without smoothing that draws
+    displacements towards half voxels."""
+    intensity_map: Annotated[int, Field(strict=True, ge=0, le=6)] | None = None
+    """Where the intensities of both images differ by a slow shading: f is compared with m less a polynomial of this
+    degree in x, times f, and less a constant, whose coefficients are inferred. 0 is a gain and an offset."""
+    independent_points: Positive | Literal["residual"] | None = None
+    """Effective number of independent quadrature points: the log likelihood is tempered by its share of all of them.
+    null: all are independent. residual: as many as the correlation of the residuals tells near the mode, which sampling
+    estimates before all else; with voxels."""
+
+    @model_validator(mode="after")
+    def _agree(self) -> ImageOptions:
+        kind = self.similarity.kind
+        if self.intensity_map is not None and self.similarity.serves_any_contrast:
+            raise wrong("intensity_map", f"expected null with similarity: {kind}, which has maps of its own")
+        if self.independent_points == "residual" and self.quadrature != "voxels":
+            raise wrong("independent_points", f"residual needs quadrature: voxels, which is {self.quadrature} here")
+        return self
+
+
+def with_preset(preset: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that are given, completed by those of a preset that agree with them."""
+    chosen = dict(PRESETS[preset])
+    if "similarity" in given:
+        usual = chosen.pop("similarity", {"kind": "ssd"})
+        similarity = by_kind(given["similarity"])
+        if isinstance(similarity, SimilaritySettings):
+            similarity = {"kind": similarity.kind, **similarity.model_dump(exclude_unset=True)}
+        if isinstance(similarity, Mapping):
+            kind = similarity.get("kind", usual["kind"])
+            if kind in OF_ANY_CONTRAST:
+                chosen.pop("intensity_map", None)
+            # Mutual information knows no noise to infer.
+            temperature = {} if kind == "mi" else {key: usual[key] for key in ("temperature",) if key in usual}
+            given = {**given, "similarity": {"kind": kind, **temperature, **similarity}}
+    return {**chosen, **given}

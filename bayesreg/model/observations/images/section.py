@@ -1,0 +1,54 @@
+"""The section of a configuration for a pair of images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from pydantic import model_validator
+
+from bayesreg.io.records import Inputs
+from bayesreg.model.observations.images.options import ImageOptions
+from bayesreg.model.observations.images.pair import ImagePair
+from bayesreg.model.observations.section import Name, ObservationSection
+from bayesreg.settings import FoundImage
+from bayesreg.types import InputError
+
+
+class ImagesSection(ObservationSection, ImageOptions):
+    """The pair of images of the section data, or, with a name and files, another pair of the same two visits, such as
+    FLAIR beside T1."""
+
+    title = "pair of images"
+
+    kind: Literal["images"] = "images"
+    name: Name = "images"
+    """The name of the pair in tables; images is that of the section data."""
+    fixed: FoundImage | None = None
+    """Another image in the world of data.fixed."""
+    moving: FoundImage | None = None
+    """Another image in the world of data.moving."""
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> ImagesSection:
+        if (self.fixed is None) != (self.moving is None):
+            raise ValueError("a pair of images needs both, fixed and moving")
+        if (self.fixed is None) != (self.name == "images"):
+            raise ValueError("a pair besides that of the section data needs a name, fixed and moving")
+        return self
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """How the images are compared."""
+        return {name: getattr(self, name) for name in ImageOptions.model_fields}
+
+    def observe(self, inputs: Inputs) -> Sequence[ImagePair]:
+        """The pair in one world, as it was matched."""
+        if inputs.fixed is None or inputs.moving is None:
+            raise InputError("the run compares images, and its folder holds none: inputs/fixed.nii.gz is missing")
+        images = inputs.fixed, inputs.moving, self.name, inputs.fixed_ignore, inputs.moving_ignore
+        if self.name == "images":
+            return [ImagePair(*images, inputs.matching.one_contrast, inputs.tissue, **self.options)]
+        channel = inputs.channels[self.name]
+        tissue = channel.fixed.with_voxels(inputs.tissue.nearest(channel.fixed.grid_points()))
+        return [ImagePair(channel.fixed, channel.moving, *images[2:], channel.one_contrast, tissue, **self.options)]

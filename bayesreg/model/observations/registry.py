@@ -1,0 +1,75 @@
+"""The kinds of observations that a configuration may list."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Annotated, Any, get_args
+
+from pydantic import AfterValidator, BeforeValidator, SerializeAsAny, ValidationInfo, WithJsonSchema
+
+from bayesreg.model.observations.images.section import ImagesSection
+from bayesreg.model.observations.landmarks import LandmarksSection
+from bayesreg.model.observations.section import ObservationSection
+
+GROUP = "bayesreg.observations"
+_registered: dict[str, type[ObservationSection]] = {}
+
+
+def register(section: type[ObservationSection]) -> type[ObservationSection]:
+    """Add a kind of observation, given by its section of a configuration; may decorate it.
+
+    Raises
+    ------
+    ValueError
+        If another class has the same kind.
+    """
+    (kind,) = get_args(section.model_fields["kind"].annotation)
+    if _registered.get(kind, section) is not section:
+        raise ValueError(f"the kind of observation {kind!r} is {_registered[kind].__name__}'s already")
+    _registered[kind] = section
+    return section
+
+
+for _section in (ImagesSection, LandmarksSection):
+    register(_section)
+
+
+def kinds() -> Mapping[str, type[ObservationSection]]:
+    """Every kind by its name, those of installed packages included."""
+    _load_entry_points()
+    return _registered
+
+
+@cache
+def _load_entry_points() -> None:
+    for point in entry_points(group=GROUP):
+        register(point.load())
+
+
+def _as_section(value: object, info: ValidationInfo) -> ObservationSection:
+    """An entry of the list `observations` as the section of its kind."""
+    if isinstance(value, ObservationSection):
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError("expected keys with values, such as kind: landmarks")
+    known = ", ".join(kinds())
+    if "kind" not in value:
+        raise ValueError(f"the kind is missing; expected one of {known}")
+    if value["kind"] not in kinds():
+        raise ValueError(f"there is no kind of observation {value['kind']!r:.60}; expected one of {known}")
+    return kinds()[value["kind"]].model_validate(value, context=info.context)
+
+
+def _require_different_names(given: list[Any]) -> list[Any]:
+    names = [one.name for one in given]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"two observations are named {name}; give one of them another name")
+    return given
+
+
+_SCHEMA = {"anyOf": [section.model_json_schema() for section in _registered.values()]}
+AnyObservation = Annotated[SerializeAsAny[ObservationSection], BeforeValidator(_as_section), WithJsonSchema(_SCHEMA)]
+Observations = Annotated[list[AnyObservation], AfterValidator(_require_different_names)]

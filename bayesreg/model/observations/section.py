@@ -1,0 +1,100 @@
+"""What every kind of observation in a configuration has: section of the YAML, reader, and part of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator
+
+from bayesreg.io.records import Inputs
+from bayesreg.model.options import is_taken
+from bayesreg.settings import Section
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class ReportTable(NamedTuple):
+    """A table that a kind of observation adds to the report.
+
+    Attributes
+    ----------
+    title, caption : str
+    header : list of str
+        The first is that of the names of the rows.
+    rows : list of lists
+        Text, numbers, which the report rounds, or None, which it shows as missing.
+    places : (rows, 3) array or None
+        World RAS mm in the fixed image: the report says where each row lies.
+    """
+
+    title: str
+    caption: str
+    header: list[str]
+    rows: list[list[Any]]
+    places: np.ndarray | None = None
+
+
+class ReportFigure(NamedTuple):
+    """A figure that a kind of observation adds to the report.
+
+    Attributes
+    ----------
+    name, title, caption, alt : str
+    height : float
+        Inches.
+    draw : callable
+        (Matplotlib figure, style) → None; the style has the colours of the report (`bayesreg.report.style`).
+    """
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    height: float
+    draw: Any
+
+
+def _require_free(name: str) -> str:
+    if not name.isidentifier():
+        raise ValueError("expected a name of letters, digits and _, such as left_lobe")
+    if is_taken(name):
+        raise ValueError("this name is taken; expected another one")
+    return name
+
+
+Name = Annotated[str, AfterValidator(_require_free)]
+
+
+class ObservationSection(Section):
+    """The base of the entries of the list `observations`: a subclass for each kind, with `kind: Literal["…"]`.
+
+    A kind that others define is registered by `bayesreg.model.observations.registry.register`, or by an entry point of
+    the group "bayesreg.observations".
+    """
+
+    # What the kind is called in the report.
+    title: ClassVar[str]
+
+    kind: str
+    name: Name
+    """The name of the observation in tables; two observations need two."""
+
+    def read(self) -> dict[str, np.ndarray]:
+        """Read the files that the section names, before anything takes long; the arrays are kept in the run folder."""
+        return {}
+
+    def observe(self, inputs: Inputs) -> Sequence[Any]:
+        """Make the observations: of what was read, `inputs.observed[self.name]`, and of all else that a run knows."""
+        raise NotImplementedError
+
+    @classmethod
+    def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
+        """The tables of an observation of this name, of what its method `summarise` has left."""
+        return []
+
+    @classmethod
+    def figures(cls, name: str, summary: Arrays, labels: Sequence[str]) -> list[ReportFigure]:
+        """The figures; `labels` are the names of the mesh's tissues."""
+        return []

@@ -1,1 +1,0 @@
-"""Terms: the factors of the joint density, a file each."""
