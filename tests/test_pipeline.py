@@ -27,8 +27,8 @@ from bayesreg.workflow import preparation
 from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.check import check
+from bayesreg.workflow.reports import compare, report
 from bayesreg.workflow.reproduce import reproduce
-from bayesreg.workflow.result import compare, report
 from bayesreg.workflow.simulate import simulate
 from tests.phantoms import ball_mesh
 from tests.reportless import without_reports

@@ -35,6 +35,7 @@ from bayesreg.memory import memory_of_machine
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.terms.images import ComparedImages, images_of
+from bayesreg.results.result import REPORT, Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.finish import finish
@@ -47,7 +48,7 @@ from bayesreg.workflow.preparation import (
     with_held_out,
     with_unsampled,
 )
-from bayesreg.workflow.result import REPORT, Result, load_result, report
+from bayesreg.workflow.reports import report
 from bayesreg.workflow.sources import digests_of_sources, require_same_sources
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
