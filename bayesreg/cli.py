@@ -162,13 +162,7 @@ def run(
     """Sample the posterior; write draws, images and a report."""
     from bayesreg.config import load_config
 
-    settings = load_config(config, overrides or ())
-    if settings.distributed is not None:
-        # BlackJAX computes something when it is imported, after which no process can join any more.
-        from bayesreg.inference.chains.devices import join
-
-        join(**settings.distributed.model_dump())
-    _sample(settings, out, resume, quiet)
+    _sample(load_config(config, overrides or ()), out, resume, quiet)
 
 
 @app.command()

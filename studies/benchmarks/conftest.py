@@ -32,6 +32,13 @@ def timed(benchmark: Any) -> Callable[..., None]:
     return clock
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_memory_maps():
+    """Every compiled program maps memory, of which Linux allows a process 65,530 parts."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_benchmark_update_json(output_json: dict[str, Any]) -> None:
     """Leave out what names a machine, its user or its folders, and every single time."""

@@ -97,7 +97,8 @@ def compare_samplers(
         rows = [efficiency._asdict() for efficiency in efficiencies]
         write_json(Path(out) / "samplers.json", {**setting._asdict(), "samplers": rows})
     write_text(Path(out) / "config.yaml", resolved_yaml(config))
-    console.print(in_terminal(efficiency_table(efficiencies, setting)))
+    table = efficiency_table(efficiencies, setting)
+    console.print(in_terminal(table), table.caption)
     return efficiencies
 
 

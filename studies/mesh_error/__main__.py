@@ -148,7 +148,8 @@ def main() -> None:
     parser.add_argument("-o", "--out", required=True, metavar="DIR")
     parser.add_argument("--bodies", type=int, default=24, help="how many to simulate in all")
     given = parser.parse_args()
-    Console().print(in_terminal(mesh_error(given.run, given.out, given.bodies)))
+    table = mesh_error(given.run, given.out, given.bodies)
+    Console().print(in_terminal(table), table.caption)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Bodies that tell what a mesh does to λ/μ, and the table that widens a run's by them."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def result_of(folder, run, study):
 def folder(study, tmp_path, monkeypatch):
     """The folder of the study, with a finer mesh at hand."""
     br.save_mesh(ball_mesh(spacing=13.0), tmp_path / "finer.vtu")
-    monkeypatch.setattr(module, "load_result", lambda run: result_of(run, study.run, study))
+    monkeypatch.setattr(module, "load_result", lambda run: result_of(Path(run), study.run, study))
     monkeypatch.setattr(module, "register_body", fake)
     return tmp_path
 
