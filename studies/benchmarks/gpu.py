@@ -25,7 +25,7 @@ import bayesreg as br
 from bayesreg.inference.chains.run import first_checkpoint, sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.diagnostics import convergence
-from bayesreg.inference.target import logdensity, without_walls
+from bayesreg.inference.target import logdensity
 from bayesreg.io import store
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import PROVENANCE
@@ -63,10 +63,8 @@ def throughput(posterior: br.Posterior, truth: Any, sizes: list[int]) -> None:
         at = at | {"u_boundary": jnp.asarray(truth.u[posterior.sampled])}
     data = posterior.condition(posterior.estimands(at))
     middle = posterior.unconstrain(at)
-    # Chains must not lie in the skull, where nothing is solved.
     density = jax.jit(jax.vmap(partial(logdensity, posterior), (None, 0)))
     gradient = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior), argnums=1), (None, 0)))
-    data = without_walls(posterior, data)
     print("\n| chains | ms per density | densities per second | ms per gradient | gradients per second | peak memory |")
     print("|---|---|---|---|---|---|")
     for chains in sizes:
