@@ -27,18 +27,18 @@ test-all: $(VENV)/.installed-dev
 BENCH := $(if $(ARGS),runs/benchmarks.json,docs/benchmarks.json)
 bench: $(VENV)/.installed-dev
 	@mkdir -p $(dir $(BENCH))
-	@JAXTYPING_DISABLE=1 $(BIN)/python -m pytest tests/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s \
+	@JAXTYPING_DISABLE=1 $(BIN)/python -m pytest studies/benchmarks -o python_files='bench_*.py' -o python_functions='bench_*' -n 0 -s \
 	--benchmark-columns=median,iqr,rounds --benchmark-sort=fullname --benchmark-json=$(BENCH) $(ARGS); status=$$?; \
-	$(BIN)/python -m tests.benchmarks.table $(BENCH) && exit $$status
+	$(BIN)/python -m studies.benchmarks.table $(BENCH) && exit $$status
 
 # Simulation-based calibration and Geweke's test. Threads of a linear algebra library only hinder such small matrices.
 calibrate: $(VENV)/.installed-dev
-	OPENBLAS_NUM_THREADS=1 JAX_COMPILATION_CACHE_DIR=.jax_cache $(BIN)/python -m tests.calibration -o runs/calibration
+	OPENBLAS_NUM_THREADS=1 JAX_COMPILATION_CACHE_DIR=.jax_cache $(BIN)/python -m studies.calibration -o runs/calibration
 
 # Beside Demons, B-splines and SyN, on pairs with a known truth; on others, say make peers ARGS="sag:14:0.2".
 # It needs the two images of the paper's experiment in the folder that BAYESREG_DATA names.
 peers: $(VENV)/.installed-peers
-	$(BIN)/python -m tests.external $(ARGS)
+	$(BIN)/python -m studies.external $(ARGS)
 
 # What the tests ask of the source before anything else, in half a minute.
 check: $(VENV)/.installed-dev

@@ -45,10 +45,10 @@ _HOME = {
     "build_mesh": "io.meshing",
     "load_mesh": "io.meshing",
     "save_mesh": "io.meshing",
-    "apply": "workflow.apply",
-    "maps": "workflow.maps",
+    "apply": "results.apply",
+    "maps": "results.maps",
     "load_config": "config",
-    "load_result": "workflow.result",
+    "load_result": "results.result",
     "run": "workflow.run",
 }
 

@@ -134,9 +134,6 @@ Space = Annotated[
     typer.Option("--space", help="Of the coordinates of --points and --mesh, where a file does not say."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
-Samplers = Annotated[str | None, typer.Option(metavar="NAME,NAME...", help="Which ones; all of them if left out.")]
-Minutes = Annotated[float, typer.Option(help="Budget of each sampler.")]
-Bodies = Annotated[int, typer.Option(help="How many to simulate in all.")]
 Page = Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="HTML file to write.")]
 
 
@@ -165,13 +162,7 @@ def run(
     """Sample the posterior; write draws, images and a report."""
     from bayesreg.config import load_config
 
-    settings = load_config(config, overrides or ())
-    if settings.distributed is not None:
-        # BlackJAX computes something when it is imported, after which no process can join any more.
-        from bayesreg.inference.chains.devices import join
-
-        join(**settings.distributed.model_dump())
-    _sample(settings, out, resume, quiet)
+    _sample(load_config(config, overrides or ()), out, resume, quiet)
 
 
 @app.command()
@@ -248,7 +239,7 @@ def apply(
     quiet: Quiet = False,
 ) -> None:
     """Carry points, surfaces, images or labels from the world of FIXED to that of MOVING, with what is unsure of it."""
-    from bayesreg.workflow.apply import apply
+    from bayesreg.results.apply import apply
 
     written = apply(
         folder,
@@ -272,7 +263,7 @@ def apply(
 @app.command()
 def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: MapsLike = None, quiet: Quiet = False) -> None:
     """Write maps of a run: how sure every point is, how volume changes, how stiff the tissue is."""
-    from bayesreg.workflow.maps import maps
+    from bayesreg.results.maps import maps
 
     say = (lambda text: None) if quiet else typer.echo
     written = maps(folder, out, far=far or (2.0,), like=like, say=say)
@@ -282,7 +273,7 @@ def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: MapsLike = No
 @app.command()
 def slicer(folder: RunFolder, out: OutFolder) -> None:
     """Write a run as a scene of 3D Slicer, in the world of MOVING."""
-    from bayesreg.workflow.slicer import slicer
+    from bayesreg.results.slicer import slicer
 
     typer.echo(f"Scene: {slicer(folder, out)}")
 
@@ -334,7 +325,7 @@ def batch(
 @app.command()
 def report(folder: RunFolder) -> None:
     """Write the report of a run once more."""
-    from bayesreg.workflow.result import report
+    from bayesreg.workflow.reports import report
 
     typer.echo(f"Report: {report(folder)}")
 
@@ -344,41 +335,9 @@ def compare(folders: RunFolders, out: Page = Path("compare.html")) -> None:
     """Put runs side by side, as the paper does with three tissues and one."""
     if len(folders) < 2:
         raise typer.BadParameter("expected the folders of at least two runs", param_hint="DIR DIR...")
-    from bayesreg.workflow.result import compare
+    from bayesreg.workflow.reports import compare
 
     typer.echo(f"Comparison: {compare(folders, out)}")
-
-
-@app.command()
-def compare_samplers(
-    config: ConfigFile,
-    out: OutFolder = Path("samplers"),
-    samplers: Samplers = None,
-    minutes: Minutes = 5.0,
-    overrides: Overrides = None,
-    quiet: Quiet = False,
-) -> None:
-    """Draw from one posterior with several samplers; tell what effective draws cost with each."""
-    from bayesreg.config import load_config
-
-    settings = load_config(config, overrides or ())
-    from bayesreg.workflow.compare_samplers import compare_samplers
-
-    chosen = {} if samplers is None else {"samplers": [name.strip() for name in samplers.split(",")]}
-    compare_samplers(settings, out, minutes=minutes, progress=not quiet, **chosen)
-    typer.echo(f"Comparison: {out / 'samplers.html'}")
-
-
-@app.command()
-def mesh_error(folder: RunFolder, bodies: Bodies = 24, quiet: Quiet = False) -> None:
-    """Tell what its mesh does to the λ/μ of a run: bodies of known stiffness are registered on it."""
-    from rich.console import Console
-
-    from bayesreg.report.tables import in_terminal
-    from bayesreg.workflow.mesh_error import mesh_error
-
-    Console().print(in_terminal(mesh_error(folder, bodies, progress=not quiet)))
-    typer.echo(f"Report: {folder / 'report.html'}")
 
 
 @app.command()

@@ -12,8 +12,8 @@ import bayesreg as br
 from bayesreg.config.cohort import load_cohort
 from bayesreg.io.ledger import digest_of
 from bayesreg.workflow.batch import batch, share_of_devices
-from tests.endurance.damage import quick_reports
-from tests.endurance.small_run import write_pair
+from studies.endurance.damage import quick_reports
+from studies.endurance.small_run import write_pair
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from bayesreg.types import InputError
 
 QUICK = str(Path(__file__).parent.parent / "configs" / "quickstart.yaml")
 # The module of `bayesreg.workflow` that holds each verb.
-HOMES = {"run": "run", "check": "check", "simulate": "simulate", "report": "result", "compare": "result"}
+HOMES = {"run": "run", "check": "check", "simulate": "simulate", "report": "reports", "compare": "reports"}
 PROGRAM = str(Path(sys.executable).parent / "bayesreg")
 
 
@@ -85,18 +85,6 @@ def test_other_commands_call_their_verbs(workflow):
     assert str(Path("a") / "report.html") in invoke("report", "a").output
     assert invoke("compare", "a", "b", "c", "-o", "page.html").exit_code == 0
     assert workflow.calls["compare"] == ([Path("a"), Path("b"), Path("c")], Path("page.html"))
-
-
-def test_samplers_to_compare_are_named_or_all(monkeypatch):
-    calls = []
-    verb = "bayesreg.workflow.compare_samplers.compare_samplers"
-    monkeypatch.setattr(verb, lambda *given, **options: calls.append((given, options)))
-    done = invoke("compare-samplers", QUICK, "--samplers", "hmc, nuts", "--minutes", "2", "--set", "seed=4", "-q")
-    assert done.exit_code == 0
-    (config, out), options = calls[0]
-    assert (config.seed, out) == (4, Path("samplers"))
-    assert options == {"minutes": 2.0, "progress": False, "samplers": ["hmc", "nuts"]}
-    assert "samplers" not in (invoke("compare-samplers", QUICK), calls[1])[1][1]
 
 
 def test_the_real_verbs_take_what_the_commands_give():

@@ -32,7 +32,7 @@ def test_the_first_signal_waits_and_the_second_does_not(number, status):
 
 
 def test_the_command_line_says_how_to_go_on(monkeypatch, tmp_path):
-    monkeypatch.setattr("bayesreg.workflow.result.report", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr("bayesreg.workflow.reports.report", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
     result = CliRunner().invoke(app, ["report", str(tmp_path)])
     assert result.exit_code == 143
     assert result.stderr.startswith("bayesreg: stopped by SIGTERM; a run goes on")

@@ -4,8 +4,6 @@ import errno
 import json
 import re
 import shutil
-import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -27,8 +25,8 @@ from bayesreg.workflow import preparation
 from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.check import check
+from bayesreg.workflow.reports import compare, report
 from bayesreg.workflow.reproduce import reproduce
-from bayesreg.workflow.result import compare, report
 from bayesreg.workflow.simulate import simulate
 from tests.phantoms import ball_mesh
 from tests.reportless import without_reports
@@ -397,34 +395,6 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     np.savetxt(tmp_path / "points.csv", rows, delimiter=",", header=header, comments="")
     exec(compile(of_points, "README.md", "exec"), names)
     assert names["draws"].u_mean[:, 0].mean() == pytest.approx(2.0, abs=0.8)
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_two_processes_draw_what_one_draws(finished, folder):
-    """To rounding; the first writes the folder, and the second joins what the first began."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    options = [f"distributed.coordinator=localhost:{port}", "distributed.processes=2"]
-    processes = [
-        subprocess.Popen(
-            [*BAYESREG, "run", folder / "run.yaml", "-o", folder / "together", "--quiet"]
-            + [word for option in [*options, f"distributed.process={k}"] for word in ("--set", option)],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for k in range(2)
-    ]
-    for process in processes:
-        _, told = process.communicate(timeout=300)
-        assert process.returncode == 3, told
-    together = br.load_result(folder / "together")
-    assert together.run.config == finished.run.config
-    here, there = (result.idata.posterior for result in (finished, together))
-    for name in ("u_boundary", "lam", "mu"):
-        np.testing.assert_allclose(there[name], here[name], rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(together.u_sd, finished.u_sd, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.usefixtures("no_report")

@@ -14,8 +14,8 @@ from jax.flatten_util import ravel_pytree
 import bayesreg as br
 from bayesreg.inference.layout import slices
 from bayesreg.workflow import serve
-from tests.endurance.small_run import start as start_program
-from tests.endurance.small_run import write_pair
+from studies.endurance.small_run import start as start_program
+from studies.endurance.small_run import write_pair
 
 
 @pytest.fixture(scope="module")

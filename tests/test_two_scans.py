@@ -21,10 +21,10 @@ from bayesreg.io.quality import edge_lengths
 from bayesreg.mesh import signed_volumes
 from bayesreg.report.panels import View, ignored
 from bayesreg.report.slices import planes_through
+from bayesreg.results.slicer import slicer
 from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
 from bayesreg.workflow.assembly import _observations
 from bayesreg.workflow.preparation import prepare
-from bayesreg.workflow.slicer import slicer
 from tests.io.test_alignment import FIXED, MASK, motion
 from tests.phantoms import ball_mesh
 

@@ -70,18 +70,6 @@ class StopConfig(Section):
     """Minutes of sampling, the search for the mode and the warm-up included."""
 
 
-class DistributedConfig(Section):
-    """Several processes, one per host, that run the chains of one run together; null entries are left to the cluster's
-    own variables (Slurm, Open MPI)."""
-
-    coordinator: str | None = None
-    """Address and port of the first process, such as node01:12345."""
-    processes: Count | None = None
-    """How many there are."""
-    process: Annotated[int, Field(strict=True, ge=0)] | None = None
-    """Which this is, from 0."""
-
-
 def _require_letters_and_digits(label: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9]+", label):
         raise ValueError("expected letters and digits alone, as BIDS wants its labels")
@@ -236,8 +224,6 @@ class Config(Section):
     results: ResultsConfig = ResultsConfig()
     evaluation: EvaluationConfig | None = None
     """Landmarks that are held out."""
-    distributed: DistributedConfig | None = None
-    """Other processes that share the chains; null runs alone."""
 
     @model_validator(mode="before")
     @classmethod

@@ -28,8 +28,6 @@ class StoredBlocks:
     ----------
     folder : path
     count : int
-    writes : bool
-        False where another process writes what is appended.
 
     Raises
     ------
@@ -37,8 +35,8 @@ class StoredBlocks:
         If one is missing or, when it is asked for, damaged.
     """
 
-    def __init__(self, folder: str | Path, count: int, writes: bool = True) -> None:
-        self.folder, self.count, self.writes = Path(folder), count, writes
+    def __init__(self, folder: str | Path, count: int) -> None:
+        self.folder, self.count = Path(folder), count
         for index in range(count):
             require_file(self.folder, _block_name(index))
 
@@ -55,8 +53,7 @@ class StoredBlocks:
 
     def append(self, block: Mapping[str, AnyArray], /) -> None:
         """Write one block more."""
-        if self.writes:
-            save_block(self.folder, self.count, block)
+        save_block(self.folder, self.count, block)
         self.count += 1
 
 

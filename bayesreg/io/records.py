@@ -236,8 +236,6 @@ class Run:
         The content of metrics.json, where the truth is known.
     predicted : Predicted or None
         The content of predicted.npz; None for runs of versions that wrote none.
-    bodies : list of dict or None
-        The content of bodies.json, simulated registrations on this mesh; None where there were none.
     """
 
     config: str
@@ -259,7 +257,6 @@ class Run:
     channels: Mapping[str, Channel] = field(default_factory=dict)
     metrics: dict[str, Any] | None = None
     predicted: Predicted | None = None
-    bodies: list[dict[str, Any]] | None = None
 
     @property
     def background(self) -> Image:

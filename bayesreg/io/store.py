@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,16 +13,14 @@ from jaxtyping import Float
 from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
 from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
-from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of, writing
+from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
 from bayesreg.io.volumes import load_image, save_image
 from bayesreg.types import InputError
 
-BODIES = "bodies.json"
 RESULTS = (
     STATUS, "config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html",
-    BODIES,
 )  # fmt: skip
 
 
@@ -179,7 +176,6 @@ def read_run(folder: str | Path) -> Run:
         warped=warped,
         metrics=metrics,
         predicted=known,
-        bodies=read_bodies(folder),
         **inputs._asdict(),
     )
 
@@ -191,18 +187,6 @@ def require_finished(folder: str | Path) -> None:
         raise InputError(f"the run in {folder} has not ended; bayesreg run --resume goes on with it")
     if stage is None:
         raise InputError(f"{folder} holds no run of bayesreg: {STATUS} is missing")
-
-
-def write_bodies(folder: str | Path, bodies: Sequence[Mapping[str, Any]]) -> None:
-    """Write bodies.json of a run: simulated registrations on its mesh."""
-    with writing(folder) as place:
-        write_json(place(BODIES), list(bodies))
-
-
-def read_bodies(folder: str | Path) -> list[dict[str, Any]] | None:
-    """Read what `write_bodies` wrote; None where nothing was, InputError where it is damaged."""
-    path = _file(folder, BODIES)
-    return None if path is None else read_json(path)
 
 
 def _file(folder: str | Path, name: str) -> Path | None:

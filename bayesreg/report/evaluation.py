@@ -11,7 +11,7 @@ from bayesreg.report.landmarks import surprise
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import fixed
-from bayesreg.transform import distances_of
+from bayesreg.results.transform import distances_of
 
 LEVELS = (0.5, 0.9, 0.95)
 

@@ -19,7 +19,6 @@ from bayesreg.io.records import Run
 from bayesreg.report import (
     adequacy,
     anatomy,
-    bodies,
     convergence,
     density,
     evaluation,
@@ -99,8 +98,6 @@ def write_report(
     view, predicted, groups = View.of(run), run.predicted, grouping(posterior)
     apart = groups.groups > 1
     nodes = posterior.sizes["node"]
-    simulated = run.bodies or []
-    allowed = bodies.allowing(run.mesh, posterior, simulated) if bodies.enough(simulated) else None
     fit = bool(predicted and predicted.discrepancies is not None)
     pairs = bool(predicted and predicted.landmark_names is not None)
     held_out = bool(predicted and predicted.evaluation_residual is not None)
@@ -124,7 +121,6 @@ def write_report(
         evaluation.evaluation(predicted) if predicted else None,
         modes.modes(view, groups) if apart else None,
         marginals.stiffness(run, posterior),
-        bodies.scatter(allowed) if allowed else None,
         anatomy.element_stiffness(view, posterior),
         anatomy.stiffness_field(view, predicted) if predicted else None,
         marginals.temperatures(run, posterior),
@@ -157,7 +153,6 @@ def write_report(
         "differences": modes.difference_table(run.mesh, posterior, groups) if apart else None,
         "readings": identifiability.readings(run.mesh, posterior, diagnosed, run.manifest),
         "ratios": identifiability.ratio_table(run.mesh, posterior),
-        "own": bodies.mesh_table(allowed) if allowed else None,
         "widths": identifiability.width_table(run.mesh, posterior, diagnosed, run.manifest),
         "parameters": tables.parameter_table(run, posterior, diagnosed),
         "checks": adequacy.check_table(predicted) if predicted else None,

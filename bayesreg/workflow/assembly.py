@@ -8,25 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Float
 
 from bayesreg.config import Config
 from bayesreg.image import Image
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.inference.draws.predictive import evenly_spaced, push_forward, thin
 from bayesreg.io.alignment import find_demons
 from bayesreg.io.displacements import read_start
-from bayesreg.io.records import Inputs, Run
+from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import Blocks
 from bayesreg.model.build import build_posterior
-from bayesreg.model.coordinates import fill
-from bayesreg.model.elastic.boltzmann import Boltzmann
-from bayesreg.model.options import Lame, ModelConfig
+from bayesreg.model.options import Lame
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.problem import body_of, cell_entries, lame_parameter
-from bayesreg.model.state import Body, state_of
+from bayesreg.model.problem import cell_entries, lame_parameter
+from bayesreg.results.nodal_draws import with_known_boundary
 from bayesreg.types import AnyArray, InputError
 
 
@@ -41,47 +36,10 @@ def posterior_of(
     Solves are preconditioned at the start parameters. Where a run has found how many points are independent, its
     likelihood is tempered by that.
     """
-    model, reference = _model(config.model, inputs), _references(config, inputs.mesh)
+    model, reference = with_known_boundary(config.model, inputs), _references(config, inputs.mesh)
     observed = [one for section in config.observations for one in section.observe(inputs)]
     posterior = build_posterior(inputs.mesh, [*observed, *observations], model, inputs.skull, reference)
     return posterior.with_independent_points(independent_points) if independent_points else posterior
-
-
-def nodal_draws(
-    model: ModelConfig, inputs: Inputs | Run, draws: xr.Dataset, most: int
-) -> Float[np.ndarray, "draws nodes 3"]:
-    """The displacement of every node, mm, of up to so many evenly spaced draws of a run, of all chains in turn.
-
-    Nodes that are not sampled follow from those that are, and from λ and μ.
-    """
-    if not most:
-        return np.empty((0, *inputs.mesh.points.shape))
-    chains = draws.sizes["chain"]
-    some = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], chains * -(-most // chains))
-    # As few of each chain as there may be are still too many where the number is no multiple of theirs.
-    count = some["u_boundary"].shape[1]
-    draw, chain = np.divmod(evenly_spaced(chains * count, most), chains)
-    some = {name: values[chain, draw][None] for name, values in some.items()}
-    u = some["u_boundary"]
-    if u.shape[2] == len(inputs.mesh.points):
-        return u[0]
-    body, blocks = body_of(inputs.mesh, _model(model, inputs))
-    known = {name: values for name, values in some.items() if name in blocks}
-
-    def displacement(draw: dict[str, AnyArray], given: tuple[Body, Blocks]) -> AnyArray:
-        body, blocks = given
-        return state_of(body, blocks, fill(blocks, draw)).u
-
-    every = np.concatenate(list(push_forward(displacement, known, (body, blocks))), axis=1)
-    return every.reshape(-1, *every.shape[2:])
-
-
-def _model(model: ModelConfig, inputs: Inputs | Run) -> ModelConfig:
-    """The model of a configuration, its boundary held where that is known."""
-    if inputs.boundary is None:
-        return model
-    held = dict(zip(inputs.mesh.boundary.tolist(), map(tuple, np.asarray(inputs.boundary).tolist()), strict=True))
-    return model.model_copy(update={"elastic_prior": Boltzmann(nodes=[], held=held)})
 
 
 def _references(config: Config, mesh: TetMesh) -> dict[str, AnyArray]:

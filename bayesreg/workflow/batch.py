@@ -28,8 +28,8 @@ from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.io.ledger import STATUS, stage_of
 from bayesreg.report.estimands import parameter_groups
+from bayesreg.results.result import Result
 from bayesreg.types import InputError
-from bayesreg.workflow.result import Result
 from bayesreg.workflow.run import run
 
 TOPIC = "bayesreg"

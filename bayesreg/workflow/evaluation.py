@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayesreg.io.points import PointPairs
-from bayesreg.transform import Transform, spread
+from bayesreg.results.transform import Transform, spread
 from bayesreg.types import AnyArray, InputError
 
 # Among the points of a run's inputs; no observation has this name.

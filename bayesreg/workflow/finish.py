@@ -20,16 +20,15 @@ from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import moments_on_grid, warp_image
 from bayesreg.report.metrics import compute_metrics
-from bayesreg.transform import Transform
-from bayesreg.workflow.apply import POINT_DRAWS
-from bayesreg.workflow.assembly import nodal_draws
-from bayesreg.workflow.bids import FOLDER, write_bids
+from bayesreg.results.bids import FOLDER, write_bids
+from bayesreg.results.displacement_fields import ENSEMBLE, displacement_on, total_displacement, write_transforms
+from bayesreg.results.nodal_draws import POINT_DRAWS, nodal_draws
+from bayesreg.results.result import POSTERIOR, REPORT, Result
+from bayesreg.results.transform import Transform
 from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
 from bayesreg.workflow.manifest import manifest
 from bayesreg.workflow.prediction import mean_values, predict, with_unresolved
 from bayesreg.workflow.predictive_groups import predictive_groups
-from bayesreg.workflow.result import POSTERIOR, REPORT, Result
-from bayesreg.workflow.transforms import ENSEMBLE, displacement_on, total_displacement, write_transforms
 
 
 def finish(
@@ -76,7 +75,6 @@ def finish(
         warped=_warp(inputs, mean_field),
         metrics=metrics,
         predicted=predicted,
-        bodies=store.read_bodies(out),
         **inputs._asdict(),
     )
     # Those of a run that left more of them.

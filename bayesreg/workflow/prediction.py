@@ -21,8 +21,8 @@ from bayesreg.model.observations.observation import Checked, Summarised
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import state_of
 from bayesreg.pose import Pose, compose, rigid_projection
+from bayesreg.results.transform import Transform, distances_of
 from bayesreg.tissues import label_of
-from bayesreg.transform import Transform, distances_of
 from bayesreg.types import AnyArray
 
 Places = Mapping[str, tuple[float, float, float]]
@@ -131,7 +131,7 @@ def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, 
 
 
 def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
-    """The predictions, allowing for what the mesh cannot follow (`bayesreg.transform.Transform`)."""
+    """The predictions, allowing for what the mesh cannot follow (`bayesreg.results.transform.Transform`)."""
     places = np.asarray(predicted.place_points)
     sd = transform.unresolved_sd(transform.deformer.locate(places))
     draws = np.asarray(predicted.place_draws)

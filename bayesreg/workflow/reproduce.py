@@ -13,9 +13,9 @@ from bayesreg.config.sections import Config, StopConfig
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io import store
 from bayesreg.io.ledger import locked, require_file
+from bayesreg.results.result import Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.preparation import PROVENANCE, store_inputs
-from bayesreg.workflow.result import Result, load_result
 from bayesreg.workflow.run import run
 
 # What stands in run.json of where a run was made; the same of all of these makes the same bits.

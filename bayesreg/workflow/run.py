@@ -15,7 +15,6 @@ from rich.console import Console
 
 from bayesreg.config import Config, load_config, load_stored_config, resolved_yaml
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
-from bayesreg.inference.chains.devices import is_first, require_joined, wait
 from bayesreg.inference.chains.progress import Showing
 from bayesreg.inference.chains.run import (
     Samples,
@@ -34,6 +33,7 @@ from bayesreg.io.records import Inputs
 from bayesreg.memory import memory_of_machine
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
+from bayesreg.results.result import REPORT, Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.finish import finish
@@ -46,20 +46,12 @@ from bayesreg.workflow.preparation import (
     with_held_out,
     with_unsampled,
 )
-from bayesreg.workflow.result import REPORT, Result, load_result, report
+from bayesreg.workflow.reports import report
 from bayesreg.workflow.sources import digests_of_sources, require_same_sources
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
 # whole state is written.
 BLOCK, POINTS, FEWEST = 100, 20_000, 10
-# The points at which several processes wait for one another.
-BEGUN, KEPT, SAMPLED, ENDED = (
-    "the run has begun",
-    "a block of draws is kept",
-    "all draws are judged",
-    "the run has ended",
-)
-
 # Sections of the configuration that do not change what is drawn.
 MAY_CHANGE = ("stop", "results", "report", "evaluation")
 
@@ -97,37 +89,11 @@ def run(
     Raises
     ------
     InputError
-        If the configuration, a file or an observation is wrong, or the folder holds another run; if the section
-        `distributed` is given and `bayesreg.inference.chains.devices.join` was not called.
+        If the configuration, a file or an observation is wrong, or the folder holds another run.
     """
     config = config if isinstance(config, Config) else load_config(config)
     given = require_observations(observations) if observations else []
-    if config.distributed is not None:
-        return _run_together(config, Path(out), resume, progress, given)
     return _run(config, Path(out), resume, progress, given)
-
-
-def _run_together(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
-    """The first of several processes runs, and the others join it as if they resumed what it began.
-
-    A folder that all of them see is how they come to one mesh and one start; the first alone writes to it.
-    """
-    require_joined(config.sampler.chains)
-    # The machines that share a run are no part of it.
-    config = config.model_copy(update={"distributed": None})
-    if is_first():
-        result = _run(config, out, resume, progress, observations)
-        wait(ENDED)
-        return result
-    wait(BEGUN)
-    if stage_of(out) != "finished":
-        begun, inputs = load_stored_config(out / "config.yaml"), store.read_inputs(out)
-        found = store.read_json(require_file(out, PROVENANCE)).get("independent_points")
-        posterior = posterior_of(begun, inputs, observations, found)
-        _sample(begun, posterior, _load_reached(begun, inputs, posterior, out, progress=False), out, progress=False)
-        wait(SAMPLED)
-    wait(ENDED)
-    return load_result(out)
 
 
 def _run(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
@@ -183,8 +149,7 @@ def _resume(
         say(f"{out} holds a finished run already; another budget (stop) would continue it")
         if not is_sound(out, REPORT):
             report(out)
-        wait(BEGUN)
-        return load_result(out)
+            return load_result(out)
     inputs = store.read_inputs(out)
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(out, provenance, posterior, observations)
@@ -221,10 +186,8 @@ def _go_on(
     """Sample from where the chains stand, and write the results."""
     _save_state(out, *reached)
     say(_describe_mesh(inputs))
-    wait(BEGUN)
     with ending_between_blocks(say) as require_no_signal:
         samples = _sample(config, posterior, reached, out, progress, require_no_signal)
-    wait(SAMPLED)
     say("writing the results")
     result = finish(config, inputs, posterior, samples, provenance, out, began)
     say(f"{samples.reason}")
@@ -316,7 +279,7 @@ def _first(
         posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
     )
     found = found._replace(seconds=found.seconds + seconds)
-    return found, checkpoints.StoredBlocks(out, 0, writes=is_first())
+    return found, checkpoints.StoredBlocks(out, 0)
 
 
 def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing) -> Reached:
@@ -324,7 +287,7 @@ def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Pat
     state = checkpoints.load_state(out)
     if state is None:
         return _first(config, inputs, posterior, out, progress)
-    blocks = checkpoints.StoredBlocks(out, int(state.pop("blocks")), writes=is_first())
+    blocks = checkpoints.StoredBlocks(out, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
 
@@ -342,9 +305,7 @@ def _sample(
     after_block: Callable[[], None] = lambda: None,
 ) -> Samples:
     def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
-        if is_first():
-            _save_state(out, checkpoint, reached[1])
-        wait(KEPT)
+        _save_state(out, checkpoint, reached[1])
         after_block()
 
     options = config.sampler

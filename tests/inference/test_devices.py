@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bayesreg.inference.chains.block import run_block
-from bayesreg.inference.chains.devices import devices_for, require_joined, side_by_side
+from bayesreg.inference.chains.devices import devices_for, side_by_side
 from bayesreg.inference.chains.run import first_checkpoint, sample
 from bayesreg.inference.samplers.registry import choose_sampler
 from tests.inference.gaussians import GaussianTarget
@@ -108,24 +108,3 @@ def test_chains_that_cannot_be_shared_stay_on_one_device(monkeypatch):
         monkeypatch.setattr(jax, "devices", lambda count=devices: [device] * count)
         shared = devices_for(chains)
         assert (None if shared is None else shared.size) == expected
-
-
-def test_processes_share_chains_and_their_devices_equally(monkeypatch):
-    class Device:
-        def __init__(self, process_index):
-            self.process_index = process_index
-
-    monkeypatch.setattr(jax, "process_count", lambda: 2)
-    monkeypatch.setattr(jax, "devices", lambda: [Device(process) for process in (0, 0, 0, 1, 1, 1)])
-    assert [device.process_index for device in devices_for(8).devices] == [0, 0, 1, 1]
-    assert [device.process_index for device in devices_for(10).devices] == [0, 1]
-    with pytest.raises(ValueError, match="5 chains cannot be shared by 2 processes"):
-        devices_for(5)
-    monkeypatch.setattr(jax, "devices", lambda: [Device(process) for process in (0, 0, 1)])
-    with pytest.raises(ValueError, match="equally many devices; they have 2, 1"):
-        devices_for(4)
-
-
-def test_processes_that_were_not_joined_are_told():
-    with pytest.raises(ValueError, match="not joined: use `bayesreg run`, or call"):
-        require_joined(4)

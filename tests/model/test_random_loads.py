@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.linalg
+from bayesreg.model.elastic.priors import LoadPrior
 from scipy import stats
 from scipy.optimize import minimize
 
@@ -13,7 +14,6 @@ import bayesreg as br
 from bayesreg.fem.elements import boundary_areas
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
-from bayesreg.model.elastic.priors import LoadPrior
 from bayesreg.model.options import PriorConfig
 from tests.model.test_gradients import assert_gradient
 from tests.oracles import paper

@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesreg.inference.chains.block import run_block, watched_values
 from bayesreg.inference.chains.checkpoint import Checkpoint, Tally, no_steps
-from bayesreg.inference.chains.devices import devices_for, from_first, gather, is_first, on_host, share
+from bayesreg.inference.chains.devices import devices_for, share
 from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress, Showing
 from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, judge_all, out_of_time, reason
@@ -147,7 +147,7 @@ def sample(
     chosen = choose_sampler(sampler, posterior, **settings)
     if resume is None:
         checkpoint = first_checkpoint(posterior, sampler, chains, seed, start, **settings)
-        checkpoint = from_first(checkpoint._replace(seconds=np.array(time.perf_counter() - began)))
+        checkpoint = checkpoint._replace(seconds=np.array(time.perf_counter() - began))
         blocks: Blocks = []
         began = time.perf_counter()
     else:
@@ -275,39 +275,33 @@ def _advance(
     """Blocks of draws, until there are `draws` of them."""
     spent = float(checkpoint.seconds)
     devices = devices_for(chains)
-    data = on_host(chosen.sampler.data(checkpoint.setup))
+    data = chosen.sampler.data(checkpoint.setup)
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
-        state, moments, tally, found = gather(
-            run_block(
-                chosen,
-                length,
-                thin,
-                devices,
-                data,
-                seed,
-                np.arange(chains),
-                int(checkpoint.draws),
-                on_host(checkpoint.setup),
-                *share(on_host(checkpoint[2:5]), devices),
-            )
+        state, moments, tally, found = run_block(
+            chosen,
+            length,
+            thin,
+            devices,
+            data,
+            seed,
+            np.arange(chains),
+            int(checkpoint.draws),
+            checkpoint.setup,
+            *share(checkpoint[2:5], devices),
         )
         found = {name: np.asarray(value) for name, value in found.items()}
-        seconds = from_first(np.array(spent + time.perf_counter() - began))
+        seconds = np.array(spent + time.perf_counter() - began)
         drawn = np.array(int(checkpoint.draws) + length)
         checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
         yield found, checkpoint
 
 
 def _judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
-    """The verdict on the draws so far, and whether they are enough or time is up; of several processes the first says.
-
-    What is known without judging them is shown.
-    """
+    """The verdict on the draws so far, and whether they are enough or time is up; show what is known before it."""
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    verdict = judge(stop, checkpoint, blocks) if is_first() else Verdict(holds=False)
-    holds, late = from_first(np.array([verdict.holds, out_of_time(stop, checkpoint)]))
-    return verdict._replace(holds=bool(holds)), bool(holds or late)
+    verdict = judge(stop, checkpoint, blocks)
+    return verdict, verdict.holds or out_of_time(stop, checkpoint)
 
 
 def _gather_samples(

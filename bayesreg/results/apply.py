@@ -1,0 +1,324 @@
+"""Carry points, surfaces, images and labels from the fixed image's world to the moving one's, or back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Bool
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.io.points import Points, read_side, write_table
+from bayesreg.io.surface_files import Space, SurfaceFile, read_surface, save_outline, write_surface
+from bayesreg.io.volumes import load_image, load_whole_numbers, save_image, write_nifti
+from bayesreg.results.carried_labels import carry_labels
+from bayesreg.results.displacement_fields import around_displaced
+from bayesreg.results.nodal_draws import POINT_DRAWS, transform_of
+from bayesreg.results.result import Result, load_result
+from bayesreg.results.transform import Spread, Transform, distances_of, spread
+from bayesreg.types import InputError
+
+Around = Literal["harmonic", "missing"]
+
+# Draws of all chains together: of points, and of labels, which take longer.
+LABEL_DRAWS = 200
+FEW_DRAWS = 30
+# The probability with which a margin holds a label, point by point.
+MARGIN = 0.95
+
+
+def apply(
+    folder: str | Path,
+    out: str | Path,
+    *,
+    points: str | Path | None = None,
+    image: str | Path | None = None,
+    labels: str | Path | None = None,
+    mesh: str | Path | None = None,
+    inverse: bool = False,
+    around: Around = "harmonic",
+    like: str | Path | None = None,
+    far: Sequence[float] = (2.0,),
+    draws: int | None = None,
+    space: Space | None = None,
+    margins: Sequence[int] = (),
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Path]:
+    """Carry what lies in the world of the fixed image to that of the moving one, over the posterior.
+
+    Parameters
+    ----------
+    folder : path
+        Of a run.
+    out : path
+        A folder; files of the same names are replaced.
+    points : path, optional
+        CSV with columns x, y, z (world RAS, mm), .fcsv, .mrk.json or .tag. Writes points.csv: places by the posterior
+        mean, covariance (mm²), the radius within which a point lies with 95 % and half-axes and axes of the ellipsoid
+        that holds as many, mm, and P(further from there than so many mm). Around the mesh, where nothing is known, all
+        but the places is NaN.
+    image : path, optional
+        Carried by the posterior mean and interpolated linearly, on the grid of the image that shows the other world.
+    labels : path, optional
+        Whole numbers. Writes the most probable label of each voxel, and a folder with the probability of every label.
+    mesh : path, optional
+        A surface or lines (.vtk, .vtp, .vtu, .stl, .ply, .obj). Writes it where the posterior mean takes it, with the
+        same values at its points as points.csv has.
+    inverse : bool
+        From the world of the moving image to that of the fixed one.
+    around : "harmonic" or "missing"
+        What becomes of all that lies around the mesh: carried on (`bayesreg.fem.surroundings`), or NaN (a label of 0;
+        points of a surface are left out).
+    like : path, optional
+        An image on whose grid images and labels are written.
+    far : sequence of float
+        Distances, mm.
+    draws : int, optional
+        How many at most; the default is 1,000, for labels 200.
+    space : "RAS" or "LPS", optional
+        Of the coordinates in `points` and `mesh`, where a file does not say it.
+    margins : sequence of int
+        Labels; of each a surface is written (.vtk, RAS) beyond which every point has it with less than 5 %.
+    say : callable
+        Told what is done, and beware of.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    InputError
+        If nothing is given to carry, or a file is wrong.
+    """
+    given = {"points": points, "image": image, "labels": labels, "mesh": mesh}
+    _require_sense(given, around, far, draws, margins)
+    result, out = load_result(folder), require_folder(out)
+    how = _How(out, "fixed" if inverse else "moving", around, tuple(far), say)
+    _require_own_names(how, given, like)
+    # All input is read before anything long begins.
+    tasks: list[Callable[[Transform], list[Path]]] = []
+    if points is not None:
+        side: Literal["fixed", "moving"] = "moving" if inverse else "fixed"
+        tasks.append(partial(_carry_points, read_side(points, side, space), Path(points), how))
+    if mesh is not None:
+        tasks.append(partial(_carry_surface, read_surface(mesh, space), Path(mesh), how))
+    if image is not None:
+        tasks.append(partial(_carry_image, load_image(image), _grid(result, like, inverse), Path(image), how))
+    if labels is not None:
+        found = load_whole_numbers(labels)
+        if not np.asarray(found.voxels).any():
+            raise InputError(f"{labels} holds no label: all its voxels are zero")
+        if absent := sorted(set(margins) - set(np.unique(found.voxels).tolist())):
+            raise InputError(f"label {absent[0]}, of which a margin is wanted, is not in {labels}")
+        grid, most = _grid(result, like, inverse), draws or LABEL_DRAWS
+        tasks.append(partial(_carry_labels, found, grid, Path(labels), how, margins, most))
+    how.out.mkdir(parents=True, exist_ok=True)
+    transform = transform_of(result, draws or (LABEL_DRAWS if points is None and mesh is None else POINT_DRAWS))
+    transform = transform.inverse if inverse else transform
+    say(_describe(transform))
+    if len(transform.draws) < FEW_DRAWS:
+        say(f"beware: {len(transform.draws)} draws tell little of how sure this is; {FEW_DRAWS} are few")
+    return [path for task in tasks for path in task(transform)]
+
+
+def _require_sense(
+    given: Mapping[str, Any], around: str, far: Sequence[float], draws: int | None, margins: Sequence[int]
+) -> None:
+    """Raise InputError where what is asked for makes none."""
+    if all(path is None for path in given.values()):
+        raise InputError("there is nothing to carry: give points, an image, labels or a mesh")
+    if around not in get_args(Around):
+        raise InputError(f"around is one of {', '.join(get_args(Around))}, got {around!r}")
+    if margins and given["labels"] is None:
+        raise InputError("a margin is that of a label: give labels, too")
+    if 0 in margins:
+        raise InputError("a margin is that of a label, and zero stands for no label")
+    if draws is not None and draws < 2:
+        raise InputError(f"expected at least two draws, got {draws}")
+    require_distances(far)
+
+
+def require_distances(far: Sequence[float]) -> None:
+    """Raise InputError where one is not above zero."""
+    if any(not distance > 0 for distance in far):
+        raise InputError(f"expected distances above zero, mm, got {', '.join(map(str, far))}")
+
+
+def require_folder(out: str | Path) -> Path:
+    """The path of a folder to write to; InputError where there is a file, or none can be made."""
+    out = Path(out)
+    nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"nothing can be written to {out}: {nearest} is no folder that you may write")
+    return out
+
+
+def _require_own_names(how: _How, given: Mapping[str, str | Path | None], like: str | Path | None) -> None:
+    """Raise InputError where one file would be replaced by another."""
+    targets: dict[Path, str] = {}
+    known = {Path(path).resolve() for path in (*given.values(), like) if path is not None}
+    for kind, path in given.items():
+        if path is None:
+            continue
+        target = how.target(kind, Path(path))
+        if target.resolve() in known:
+            raise InputError(f"{target} would be replaced by what is made of {path}; name another folder")
+        if target in targets:
+            raise InputError(f"{targets[target]} and {path} would both be carried to {target}; carry one at a time")
+        targets[target] = str(path)
+
+
+class _How(NamedTuple):
+    """What all kinds have in common."""
+
+    out: Path
+    where: str
+    around: Around
+    far: tuple[float, ...]
+    say: Callable[[str], None]
+
+    def target(self, kind: str, source: Path) -> Path:
+        """The file for what is carried of another."""
+        if kind == "points":
+            return self.out / "points.csv"
+        return self.name(source, source.suffix if kind == "mesh" else ".nii.gz")
+
+    def name(self, source: Path, end: str) -> Path:
+        """A file named after another."""
+        stem = Path(source.name.removesuffix(".gz")).stem
+        return self.out / f"{stem or 'image'}_in-{self.where}{end}"
+
+    def tell_of_outside(self, inside: Bool[np.ndarray, "k"], what: str) -> None:
+        """Say how much lies around the mesh, where nothing was observed."""
+        if inside.all():
+            return
+        then = "the displacement goes on harmonically" if self.around == "harmonic" else "no place is given"
+        count = f"{int((~inside).sum()):,} of {len(inside):,}"
+        self.say(f"{count} {what} lie around the mesh, where nothing is known: {then}, and how sure it is is not told")
+
+
+def _describe(transform: Transform) -> str:
+    """Where things are carried, and by what."""
+    ways = (
+        "the moving image to that of the fixed one" if transform.turned else "the fixed image to that of the moving one"
+    )
+    text = f"from the world of {ways}, by {len(transform.draws):,} draws"
+    if transform.folded:
+        text += f"; {transform.folded:.1%} of them turn tetrahedra inside out, where a place has several sources"
+    return text
+
+
+def _grid(result: Result, like: str | Path | None, inverse: bool) -> Image:
+    """The grid that images and labels are carried to."""
+    if like is not None:
+        return load_image(like)
+    run = result.run
+    if inverse:
+        return run.background
+    if run.moving is None:
+        # No image shows where the organ has gone.
+        return around_displaced(run.background, run.matching.pose.place(run.mesh.points + run.u_mean))
+    return run.matching.pose.inverse.aligned(run.moving)
+
+
+def _carry_points(points: Points, path: Path, how: _How, transform: Transform) -> list[Path]:
+    found = spread(transform, points.points, how.far)
+    how.tell_of_outside(found.inside, f"points of {path}")
+    columns: dict[str, Any] = {"name": points.names}
+    for name, values in _values(found, how).items():
+        axes = [name] if values.ndim == 1 else [f"{name}{end}" for end in ENDS[name]]
+        columns |= dict(zip(axes, values.reshape(len(values), -1).T, strict=True))
+    write_table(target := how.target("points", path), columns)
+    return [target]
+
+
+def _carry_surface(surface: SurfaceFile, path: Path, how: _How, transform: Transform) -> list[Path]:
+    if not surface.is_said:
+        how.say(f"{path} does not say whether its coordinates are RAS or LPS (--space); they are taken as RAS")
+    found = spread(transform, surface.points, how.far)
+    how.tell_of_outside(found.inside, f"points of {path}")
+    if how.around == "missing":
+        if not found.inside.any():
+            raise InputError(f"no point of {path} lies in the mesh, and what lies around it is to be left out")
+        surface, found = surface.part(found.inside), found.part(found.inside)
+    values = _values(found, how)
+    write_surface(target := how.target("mesh", path), surface, values.pop(""), values)
+    return [target]
+
+
+# What stands behind the name of a column, for what has several.
+ENDS = {
+    "": ("x", "y", "z"),
+    "cov_": ("xx", "xy", "xz", "yy", "yz", "zz"),
+    "half_axis95_": ("1", "2", "3"),
+    "axis": tuple(f"{axis}_{end}" for axis in "123" for end in "xyz"),
+}
+
+
+def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
+    """What is told of every point: its place, and how sure that is."""
+    lengths, directions = found.ellipsoids()
+    one, other = np.triu_indices(3)
+    places = found.places if how.around == "harmonic" else np.where(found.inside[:, None], found.places, np.nan)
+    values = {"": places, "cov_": found.covariance[:, one, other], "radius95": distances_of(found.covariance).radius}
+    values |= {"half_axis95_": lengths, "axis": directions.reshape(-1, 9)}
+    values |= {f"p_over_{distance:g}mm": share for distance, share in zip(how.far, found.far, strict=True)}
+    return values | {"in_mesh": found.inside.astype(float)}
+
+
+def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Transform) -> list[Path]:
+    """By the posterior mean, linearly interpolated; zero where the image ends."""
+    back, voxels = transform.inverse, np.empty(int(np.prod(grid.shape)), np.float32)
+    inside, given = np.empty(len(voxels), bool), np.asarray(image.voxels, float)
+    for some, places in grid.blocks():
+        source, location = back.place(places)
+        # As ITK: nearest to the outermost voxels, and zero beyond these.
+        index = image.world_to_voxel(source).T
+        values = ndimage.map_coordinates(given, index, order=1, mode="nearest")
+        voxels[some] = np.where(image.contains(source), values, 0.0)
+        inside[some] = back.deformer.is_inside(location) & image.contains(source)
+    _tell_of_nothing(inside, path, how)
+    if how.around == "missing":
+        voxels[~inside] = np.nan
+    write_nifti(voxels.reshape(grid.shape), grid.affine, target := how.target("image", path))
+    return [target]
+
+
+def _tell_of_nothing(inside: Bool[np.ndarray, "k"], path: Path, how: _How) -> None:
+    if not inside.any():
+        how.say(f"beware: nothing of {path} comes from within the mesh; is it in the world of the other image?")
+
+
+def _carry_labels(
+    labels: Image, grid: Image, path: Path, how: _How, margins: Sequence[int], most: int, transform: Transform
+) -> list[Path]:
+    count = min(len(transform.draws), most)
+    some = replace(transform, draws=transform.draws[np.linspace(0, len(transform.draws) - 1, count).astype(int)])
+    how.say(f"labels of {path}, by {len(some.draws)} draws")
+    found = carry_labels(some, labels, grid, keep_around=how.around == "harmonic")
+    _tell_of_nothing(np.asarray(found.most_probable.voxels).ravel() != 0, path, how)
+    save_image(found.most_probable, target := how.target("labels", path))
+    folder = how.name(path, "_probability")
+    folder.mkdir(exist_ok=True)
+    # Of labels that another file of this name had.
+    for stale in folder.glob("label-*.nii.gz"):
+        stale.unlink()
+    written = [target]
+    for value, probability in found.probabilities():
+        write_nifti(probability, grid.affine, part := folder / f"label-{value}.nii.gz")
+        written.append(part)
+        if value in margins and not (np.nan_to_num(probability) > 1 - MARGIN).any():
+            how.say(f"beware: label {value} is improbable everywhere, and has no margin")
+        elif value in margins:
+            target = how.name(path, f"_margin95_label-{value}.vtk")
+            save_outline(target, np.nan_to_num(probability), grid.affine, 1 - MARGIN)
+            written.append(target)
+    return written

@@ -1,0 +1,114 @@
+"""Maps of the posterior on a grid: how sure the displacement is, how volume changes, how stiff the tissue is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from bayesreg.fem.location import Location
+from bayesreg.image import Image, slices
+from bayesreg.io.volumes import load_image, write_nifti
+from bayesreg.mesh import TetMesh, signed_volumes
+from bayesreg.model.warp import Covered, covered_voxels
+from bayesreg.results.apply import require_distances, require_folder
+from bayesreg.results.nodal_draws import POINT_DRAWS, transform_of
+from bayesreg.results.result import load_result
+from bayesreg.results.transform import Transform, distances_of
+from bayesreg.types import InputError
+
+CHUNK = 500_000
+
+
+def maps(
+    folder: str | Path,
+    out: str | Path,
+    *,
+    far: Sequence[float] = (2.0,),
+    like: str | Path | None = None,
+    draws: int = POINT_DRAWS,
+    say: Callable[[str], None] = lambda text: None,
+) -> list[Path]:
+    """Write maps of a run on the grid of its fixed image; NaN where the mesh does not reach, and nothing is known.
+
+    Parameters
+    ----------
+    folder : path
+        Of a run.
+    out : path
+        A folder; files of the same names are replaced.
+    far : sequence of float
+        Distances, mm.
+    like : path, optional
+        An image in the fixed image's world on whose grid the maps are written instead.
+    draws : int
+        How many at most.
+    say : callable
+        Told what was found.
+
+    Returns
+    -------
+    list of Path
+        radius95.nii.gz
+            mm, within which a point lies about its mean place with a probability of 95 %.
+        p_over_2mm.nii.gz and so on
+            P(a point lies further from there than so many mm).
+        jacobian_mean.nii.gz, jacobian_sd.nii.gz
+            Of det F of the tetrahedron of each voxel: its volume after the deformation over that before.
+        p_inverted.nii.gz
+            P(det F < 0).
+        stiffness_mean.nii.gz, stiffness_sd.nii.gz
+            Over that of the tissue, where the model has a field of stiffness.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no run, or a distance is not above zero.
+    """
+    require_distances(far)
+    if draws < 2:
+        raise InputError(f"expected at least two draws, got {draws}")
+    result, out = load_result(folder), require_folder(out)
+    grid = result.run.background if like is None else load_image(like)
+    covered = covered_voxels(grid, result.mesh)
+    if not len(covered.cell):
+        raise InputError(f"no voxel of the grid of {like or 'the fixed image'} lies in the mesh of {folder}")
+    transform = transform_of(result, draws)
+    values = _distances(transform, covered, far)
+    by_cell = jacobians(result.mesh, transform.draws)
+    if result.run.predicted is not None:
+        by_cell |= {name: x for name, x in result.run.predicted.by_cell.items() if name != "stiffer_probability"}
+    values |= {name: np.asarray(x)[covered.cell] for name, x in by_cell.items()}
+    middle = float(np.median(values["radius95"]))
+    say(f"{len(covered.cell):,} voxels lie in the mesh; half of them have a 95 % radius above {middle:.2g} mm")
+    out.mkdir(parents=True, exist_ok=True)
+    return [_write(out / f"{name}.nii.gz", grid, covered, x) for name, x in values.items()]
+
+
+def jacobians(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> dict[str, Float[np.ndarray, "cells"]]:
+    """Mean and standard deviation of det F of every tetrahedron, and how many draws turn it inside out."""
+    count, total, square, inverted = len(draws), *np.zeros((3, len(mesh.cells)))
+    for u in draws:
+        ratio = signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes
+        total, square, inverted = total + ratio, square + ratio**2, inverted + (ratio < 0)
+    mean = total / count
+    variance = np.maximum(square / count - mean**2, 0) * count / max(count - 1, 1)
+    return {"jacobian_mean": mean, "jacobian_sd": np.sqrt(variance), "p_inverted": inverted / count}
+
+
+def _distances(transform: Transform, covered: Covered, far: Sequence[float]) -> dict[str, Float[np.ndarray, "k"]]:
+    names = ["radius95", *(f"p_over_{distance:g}mm" for distance in far)]
+    found = np.empty((len(names), len(covered.cell)), np.float32)
+    for some in slices(len(covered.cell), CHUNK):
+        at = distances_of(transform.covariance(Location(covered.cell[some], covered.barycentric[some])), far)
+        found[:, some] = np.concatenate([at.radius[None], at.far])
+    return dict(zip(names, found, strict=True))
+
+
+def _write(path: Path, grid: Image, covered: Covered, values: Float[np.ndarray, "k"]) -> Path:
+    voxels = np.full(grid.shape, np.nan, np.float32)
+    voxels[tuple(covered.voxel.T)] = values
+    write_nifti(voxels, grid.affine, path)
+    return path

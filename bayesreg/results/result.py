@@ -1,0 +1,94 @@
+"""A finished run, as its folder holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesreg.inference.draws.diagnostics import Convergence, convergence
+from bayesreg.inference.draws.inference_data import open_posterior
+from bayesreg.io import store
+from bayesreg.io.ledger import require_file, require_unchanged
+from bayesreg.io.records import Run
+from bayesreg.mesh import TetMesh
+from bayesreg.pose import Motion
+
+POSTERIOR, REPORT = "posterior.nc", "report.html"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A finished run.
+
+    Attributes
+    ----------
+    folder : Path
+    run : bayesreg.io.records.Run
+        Mesh, images, posterior mean and sd of u at every node, manifest, metrics.
+    """
+
+    folder: Path
+    run: Run
+
+    @cached_property
+    def idata(self) -> Any:
+        """The draws, as ArviZ opens them."""
+        return open_posterior(require_file(self.folder, POSTERIOR))
+
+    @cached_property
+    def convergence(self) -> Convergence:
+        """R̂ and effective sample sizes of every estimand."""
+        return convergence(self.idata)
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh of the registration."""
+        return self.run.mesh
+
+    @property
+    def u_mean(self) -> np.ndarray:
+        """Posterior mean displacement of every node, (n, 3), mm."""
+        return np.asarray(self.run.u_mean)
+
+    @property
+    def u_sd(self) -> np.ndarray:
+        """Posterior standard deviation of the displacement of every node, (n, 3), mm."""
+        return np.asarray(self.run.u_sd)
+
+    @property
+    def pose(self) -> Motion | None:
+        """The rigid part of the displacement, the pose that was found first included, of some draws of every chain.
+
+        Translation of the mesh's centre, mm, and rotation about it, degrees, each (chains, draws, 3); None for runs of
+        versions that did not keep it.
+        """
+        if self.run.predicted is None:
+            return None
+        return Motion(*np.split(np.asarray(self.run.predicted.motion), 2, axis=-1))
+
+    @property
+    def metrics(self) -> dict[str, Any] | None:
+        """The paper's Tables 1 and 2 and the coverage of intervals, where the truth is known."""
+        return self.run.metrics
+
+    @property
+    def converged(self) -> bool | None:
+        """Whether the stop rule held and the report's rank-normalised R̂ agrees; None where no rule was set."""
+        return self.run.manifest["stopped"]["converged"]
+
+    @property
+    def report(self) -> Path:
+        """The HTML report."""
+        return self.folder / REPORT
+
+
+def load_result(folder: str | Path) -> Result:
+    """Open a finished run; InputError where the folder holds none, or a file of it is damaged."""
+    run = store.read_run(folder)
+    require_file(folder, POSTERIOR)
+    require_unchanged(folder, but=REPORT)
+    return Result(Path(folder), run)

@@ -1,0 +1,35 @@
+"""Write the report of a finished run anew, and put several runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from bayesreg.io import store
+from bayesreg.io.ledger import locked, writing
+from bayesreg.results.result import REPORT, load_result
+from bayesreg.types import InputError
+
+
+def report(folder: str | Path) -> Path:
+    """Write the report of a finished run anew, and return its path."""
+    from bayesreg.report.html import write_report
+
+    # A folder that is none of a run is not locked, and so not made.
+    store.require_finished(folder)
+    with locked(folder):
+        result = load_result(folder)
+        with writing(folder) as place:
+            write_report(result.run, result.idata, *result.convergence, place(REPORT))
+    return result.report
+
+
+def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
+    """Put runs side by side on one page, and return its path."""
+    from bayesreg.report.compare import write_comparison
+
+    if not Path(out).absolute().parent.is_dir():
+        raise InputError(f"{out} cannot be written: there is no folder {Path(out).parent}")
+    results = [load_result(folder) for folder in folders]
+    write_comparison([(r.run, r.idata, *r.convergence) for r in results], out)
+    return Path(out)

@@ -1,0 +1,133 @@
+"""Where the time of a draw goes, and that of a gradient, at the end of a finished run of `hmc`.
+
+    python -m studies.benchmarks.parts RUN [--chains 16]
+
+RUN is a run's folder. A draw is timed with the run's own chains where they stand; density and gradient with so many
+chains, copies of these a little apart. Medians of nine, each part compiled by itself: together they may take less. How
+long that takes stands beside them, with the flags that XLA_FLAGS has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+
+import bayesreg as br
+from bayesreg.fem.elasticity import total_strain_energy
+from bayesreg.fem.equilibrium import equilibrium
+from bayesreg.inference.chains.run import checkpoint_from_arrays
+from bayesreg.inference.gaussian.whitened import whitened_density, whitened_position
+from bayesreg.inference.samplers.hamiltonian import _quarter_turn
+from bayesreg.inference.samplers.registry import choose_sampler
+from bayesreg.inference.target import estimands_of
+from bayesreg.io import checkpoints, store
+from bayesreg.model.coordinates import complete
+from bayesreg.workflow.assembly import posterior_of
+from studies.benchmarks.bench_sampling import _median
+
+APART = 0.01  # In whitened coordinates.
+
+
+def main() -> None:
+    """Print a line for each part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--chains", type=int, default=16)
+    given = parser.parse_args()
+    config = br.load_config(given.run / "config.yaml")
+    posterior, options = posterior_of(config, store.read_inputs(given.run)), config.sampler
+    arrays = checkpoints.load_state(given.run)
+    if (
+        options.name != "hmc"
+        or posterior.options.similarity != "ssd"
+        or posterior.data.body.field is not None
+        or not arrays
+    ):
+        parser.error("RUN must be a run of hmc that has begun, with Gaussian noise and without a field of stiffness")
+    arrays.pop("blocks")
+    end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
+    sampler = choose_sampler(options.name, posterior, **options.settings).sampler
+    data, setup = sampler.data(end.setup), end.setup
+    print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled, {int(setup.steps)} gradients a draw")
+    print(f"\nA draw, {options.chains} chains")
+    of_a_draw(posterior, sampler, data, setup, end.state)
+    print(f"\nA gradient, {given.chains} chains")
+    of_a_gradient(posterior, data, setup, end.state.position, given.chains)
+
+
+def timed(name: str, of_chain: Callable[..., Any], shared: tuple[Any, ...], *chains: Any) -> None:
+    """Print how long a function of what chains share and of what is each chain's takes for all, and to compile."""
+    axes = (*[None] * len(shared), *[0] * len(chains))
+    lowered = jax.jit(jax.vmap(of_chain, in_axes=axes)).lower(*shared, *chains)
+    began = time.perf_counter()
+    program = lowered.compile()
+    compiling = time.perf_counter() - began
+    print(f"{name:40s} {1e3 * _median(program, *shared, *chains):7.1f} ms {compiling:6.1f} s", flush=True)
+
+
+def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -> None:
+    """The whole, then its parts."""
+    keys = jax.random.split(jax.random.key(0), len(state.position))
+
+    def begin(data: Any, setup: Any, xi: jax.Array) -> Any:
+        return blackjax.mcmc.hmc.init(xi, whitened_density(posterior, data, setup))
+
+    def trajectory(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
+        return _quarter_turn(posterior, data, setup, key, state)[0]
+
+    shared = data, setup
+    timed("all but its energies", lambda *given: sampler.step(*given)[0], shared, keys, state)
+    timed("  trajectory", trajectory, shared, keys, state)
+    timed("    a gradient of it", begin, shared, state.position)
+    timed("its energies", sampler.observe, shared, state)
+
+
+def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, chains: int) -> None:
+    """Density and gradient, then their parts, each as itself and with its derivative."""
+    places = jnp.resize(positions, (chains, positions.shape[1]))
+    places += APART * jax.random.normal(jax.random.key(2), places.shape)
+
+    def density(data: Any, setup: Any, xi: jax.Array) -> jax.Array:
+        return whitened_density(posterior, data, setup)(xi)
+
+    def values_of(xi: jax.Array) -> Any:
+        estimands = estimands_of(posterior, data, whitened_position(posterior, setup.gaussian, xi))
+        values = complete(data.blocks, estimands)
+        return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
+
+    lam, mu, given = jax.jit(jax.vmap(values_of))(places)
+    u = jax.jit(jax.vmap(lambda *x: equilibrium(data.body.system, *x).u))(lam, mu, given)
+    back = jax.random.normal(jax.random.key(3), u.shape)
+
+    def solve(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
+        return equilibrium(data.body.system, lam, mu, given).u
+
+    def adjoint(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array, back: jax.Array) -> Any:
+        return jax.vjp(partial(solve, data), lam, mu, given)[1](back)
+
+    def images(data: Any, u: jax.Array) -> jax.Array:
+        return data.terms["images"].quadrature.weights @ data.terms["images"].residuals(u) ** 2
+
+    def strain(data: Any, lam: jax.Array, mu: jax.Array, u: jax.Array) -> jax.Array:
+        return total_strain_energy(data.body.system.elements, lam, mu, u)
+
+    timed("density", density, (data, setup), places)
+    timed("density and gradient", jax.value_and_grad(density, argnums=2), (data, setup), places)
+    timed("  solve", solve, (data,), lam, mu, given)
+    timed("  solve and adjoint", adjoint, (data,), lam, mu, given, back)
+    timed("  images", images, (data,), u)
+    timed("  images and slope", jax.value_and_grad(images, argnums=1), (data,), u)
+    timed("  strain energy", strain, (data,), lam, mu, u)
+    timed("  strain energy and slopes", jax.value_and_grad(strain, argnums=(1, 2, 3)), (data,), lam, mu, u)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""What the tolerance of a chain's solves costs and leaves: iterations, and the error of the log density.
+
+At forty draws of a finished run, solves preconditioned at the mean of their λ, μ (as Normal scores), like chains'. With
+--again the run is repeated, its mesh given and its solves a hundred times as exact, and the two posteriors are
+compared: differences of mean and standard deviation of every estimand, over their Monte Carlo error.
+
+    python -m studies.benchmarks.tolerance RUN [--again OUT]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from unittest import mock
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import bayesreg as br
+from bayesreg.inference.target import estimands_of
+from bayesreg.io import store
+from bayesreg.model import conditioning
+from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.run import Result
+
+DRAWS, TOLERANCES = 40, (1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
+
+
+def main() -> None:
+    """Print a line for each tolerance, and the differences of the posteriors."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--again", type=Path, metavar="OUT", help="folder for the run with tighter solves")
+    given = parser.parse_args()
+    at_draws(given.run)
+    if given.again is not None:
+        compare(br.load_result(given.run), tightened(given.run, given.again))
+
+
+def tightened(folder: Path, out: Path) -> Result:
+    """The run once more, its solves a hundred times as exact."""
+    config = br.load_config(folder / "config.yaml", [f"mesh.file={(folder / 'mesh.vtu').absolute()}"])
+    with mock.patch.object(conditioning, "CHAIN_TOLERANCE", conditioning.CHAIN_TOLERANCE / 100):
+        return br.run(config, out)
+
+
+def compare(first: Result, second: Result) -> None:
+    """Print how far apart two posteriors are."""
+    means = [result.run.manifest["solver"]["iterations_mean"] for result in (first, second)]
+    print(f"{means[0]:.1f} and {means[1]:.1f} iterations")
+    for kind in ("mean", "std"):
+        apart = []
+        for name in ("u_boundary", "lam", "mu"):
+            draws = [result.idata.posterior[name].astype(float) for result in (first, second)]
+            value = [getattr(each, kind)(("chain", "draw")).values for each in draws]
+            error = [az.mcse(each.to_dataset(), method="sd" if kind == "std" else kind)[name].values for each in draws]
+            with np.errstate(invalid="ignore"):
+                apart.append(((value[0] - value[1]) / np.hypot(*error)).ravel())
+        found = np.concatenate(apart)
+        found = abs(found[np.isfinite(found)])
+        middle, most = np.median(found), found.max()
+        print(f"{kind} of {len(found)} estimands: {middle:.2f} Monte Carlo errors apart, {most:.2f} at most")
+
+
+def at_draws(folder: Path) -> None:
+    """Print a line for each tolerance."""
+    posterior = posterior_of(br.load_config(folder / "config.yaml"), store.read_inputs(folder))
+    draws, known = br.load_result(folder).idata.posterior, posterior.reference()
+    rng = np.random.default_rng(0)
+    places = zip(
+        rng.integers(draws.sizes["chain"], size=DRAWS), rng.integers(draws.sizes["draw"], size=DRAWS), strict=True
+    )
+    at = [{n: jnp.asarray(draws[n].values[place], float) for n in known if n in draws} for place in places]
+    estimands = [posterior.estimands(known | values) for values in at]
+    positions = [posterior.coordinates.unconstrain(posterior.data, e) for e in estimands]
+    middle = jax.tree.map(lambda *x: jnp.stack(x).mean(axis=0), *positions)
+    data = posterior.condition(estimands_of(posterior, posterior.data, middle))
+    evaluate = jax.jit(posterior.evaluate_estimands)
+
+    def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        system = data.body.system._replace(tolerance=jnp.asarray(tolerance))
+        tight = data._replace(body=data.body._replace(system=system))
+        evaluations = [evaluate(tight, e) for e in estimands]
+        return np.array([(float(e.logdensity), int(e.solver_iterations)) for e in evaluations]).T
+
+    exact, _ = found(1e-12)
+    for tolerance in TOLERANCES:
+        logdensity, iterations = found(tolerance)
+        error = abs(logdensity - exact)
+        print(
+            f"{tolerance:.0e}: {iterations.mean():.1f} iterations, at most {iterations.max():.0f}; error of the log "
+            f"density {np.sqrt((error**2).mean()):.2g} (rms), {error.max():.2g} at most"
+        )
+
+
+if __name__ == "__main__":
+    main()

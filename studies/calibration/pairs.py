@@ -1,0 +1,215 @@
+"""Twenty calibrated pairs: do the 95 % intervals of λ/μ contain the truth?
+
+Each pair has its own patch and noise (sd 0.01 on each image), of the MNI152 brain; T_s is inferred. The mesh that makes
+them is finer than the one that registers them, or, to tell what of an error is the mesh's, the same. A node of the
+coarser mesh may lie a millimetre or two outside the body that was pushed, and where that slides along the skull, the
+truth takes the node into it: between different meshes the registration is therefore without a skull. Intervals of pairs
+between different meshes allow for the registering one, by bodies that are made on a third
+(`studies.mesh_error.__main__`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+import bayesreg as br
+from bayesreg.distance import forbidden
+from bayesreg.fem.location import transfer
+from bayesreg.image import robust_scale
+from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.draws.diagnostics import convergence
+from bayesreg.inference.draws.inference_data import dataset
+from bayesreg.io.atomic import write_text
+from bayesreg.io.datasets import Anatomy as AnatomyOfData
+from bayesreg.io.datasets import mni152
+from bayesreg.io.domain import without_ridges
+from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain, save_mesh
+from bayesreg.synthetic.deformation import Direction
+from bayesreg.synthetic.pair import SyntheticPair, make_pair
+from bayesreg.types import InputError
+from studies.calibration import figures
+from studies.mesh_error.bodies import PATCH_SHARE, Subject, register_body
+from studies.mesh_error.ratios import sound
+from studies.mesh_error.recalibration import Response, recalibrate, response
+
+COUNT, ENOUGH = 20, 17
+TRUE_LAM, TRUE_MU = np.array([1e-6, 10.0, 30.0]), np.array([1e-6, 1.0, 1.0])
+TISSUES = {"gm": 1, "wm": 2}
+# The pairs are made on the second mesh, the bodies that tell what the first does to λ/μ on the third.
+EDGE, MAKING_EDGE, BODIES_EDGE = 22.0, 12.0, 13.0
+BODIES = 30
+DISPLACEMENT, NOISE_SD = 10.0, 0.01
+QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+SECONDS = 90.0
+MODEL = br.ModelConfig(t_similarity={"median": 0.1, "log_sd": 1.0}, interpolation="cubic")
+
+Say = Callable[[str], None]
+Made = TypeVar("Made")
+
+
+class Anatomy(NamedTuple):
+    """What all pairs share."""
+
+    fixed: br.Image
+    tissue: br.Image
+    skull: br.Image
+    making: br.TetMesh
+    registering: br.TetMesh
+
+
+@cache
+def brain() -> tuple[AnatomyOfData, br.Image]:
+    """The MNI152 brain, and its part that is meshed."""
+    found = mni152()
+    assert found.intracranial is not None
+    found = found._replace(intracranial=without_ridges(found.intracranial))
+    return found, mesh_domain(found.tissue, found.intracranial)
+
+
+def skull() -> br.Image:
+    """Nonzero = forbidden."""
+    found, _ = brain()
+    return forbidden(found.intracranial)
+
+
+def meshes(folder: Path, edges: Sequence[float]) -> list[br.TetMesh]:
+    """Meshes of these edge lengths (mm), kept in a folder: fTetWild is not deterministic."""
+    found, domain = brain()
+    for edge in edges:
+        path = folder / f"mesh_{edge:g}mm.vtu"
+        if not path.exists():
+            save_mesh(build_mesh(found.tissue, found.intracranial, MeshOptions(edge_length=edge), domain), path)
+    return [load_mesh(folder / f"mesh_{edge:g}mm.vtu") for edge in edges]
+
+
+def anatomy(folder: Path, same_mesh: bool) -> Anatomy:
+    """The MNI152 brain, the mesh that makes the pairs and the one that registers them."""
+    found, domain = brain()
+    making, registering = meshes(folder, (EDGE if same_mesh else MAKING_EDGE, EDGE))
+    fixed = robust_scale(found.image, domain.voxels != 0)(found.image)
+    return Anatomy(fixed, domain_labels(found.tissue, domain), skull(), making, registering)
+
+
+def upwards(seed: int, attempt: Callable[[Direction], Made]) -> tuple[Made, Direction]:
+    """What is made of a random direction in the upper half, the first that inverts nothing, and that direction."""
+    rng = np.random.default_rng(seed)
+    while True:
+        direction = rng.normal(size=3)
+        direction *= np.sign(direction[2]) / np.linalg.norm(direction)
+        if direction[2] < 0.2:
+            continue
+        chosen = tuple(float(x) for x in direction)
+        try:
+            return attempt(chosen), chosen
+        except InputError:
+            continue
+
+
+def push(mesh: br.TetMesh) -> dict[str, Any]:
+    """How a patch is pushed: as large a one on every mesh."""
+    patch_nodes = round(PATCH_SHARE * len(mesh.boundary))
+    return {"lam": TRUE_LAM, "mu": TRUE_MU, "displacement": DISPLACEMENT, "patch_nodes": patch_nodes}
+
+
+def make(shared: Anatomy, seed: int) -> tuple[SyntheticPair, Direction]:
+    """A pair with a patch of its own."""
+    options = push(shared.making) | {"noise_sd": NOISE_SD, "seed": seed}
+    return upwards(seed, lambda direction: make_pair(*shared[:4], direction=direction, **options))
+
+
+def register_bodies(folder: Path, say: Say = print) -> Response:
+    """What the registering mesh does to λ/μ, by bodies of a third mesh; each is a file of its own."""
+    shared = anatomy(folder, same_mesh=False)
+    (making,) = meshes(folder, [BODIES_EDGE])
+    lam, mu = (dict(zip(making.names, values.tolist(), strict=True)) for values in (TRUE_LAM, TRUE_MU))
+    subject = Subject(*shared[:3], making, shared.registering, MODEL, lam, mu, DISPLACEMENT, NOISE_SD)
+    found = []
+    for seed in range(1, BODIES + 1):
+        path = folder / f"body_{seed:02d}.json"
+        if not path.exists():
+            write_text(path, json.dumps(register_body(subject, seed)._asdict()) + "\n")
+        found.append(json.loads(path.read_text()))
+        say(f"body {seed} of {BODIES}: λ/μ {found[-1]['true']}, found {found[-1]['found']} {found[-1]['failed']}")
+    return response(*(np.array([list(body[key].values()) for body in sound(found)]) for key in ("true", "found")))
+
+
+def allowing_for(known: Response, pair: dict[str, Any], seed: int) -> dict[str, list[float]]:
+    """Quantiles of λ/μ that allow for the mesh, each tissue's draws made of its quantiles on the mesh."""
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(QUANTILES[0], QUANTILES[-1], (200, len(TISSUES)))
+    found = [
+        np.interp(level, QUANTILES, np.log(pair["ratio"][name])) for level, name in zip(levels.T, TISSUES, strict=True)
+    ]
+    own = recalibrate(known, np.exp(np.column_stack(found)), seed)
+    return dict(zip(TISSUES, np.quantile(own, QUANTILES, axis=0).T.tolist(), strict=True))
+
+
+def register(shared: Anatomy, pair: SyntheticPair, seed: int) -> dict[str, Any]:
+    """Intervals of λ/μ on the mesh, and how well the sampling and the model do."""
+    skull = shared.skull if shared.making.digest == shared.registering.digest else None
+    posterior = br.build_posterior(pair.fixed, pair.moving, shared.registering, MODEL, skull)
+    rule = StopRule(rhat=1.01, ess=400, max_seconds=SECONDS)
+    samples = br.sample(posterior, "hmc", chains=4, draws=1500, seed=seed, stop=rule, progress=False)
+    draws, judged = dataset(samples.idata, "posterior"), convergence(samples.idata)
+    u_true = transfer(pair.u, pair.mesh, shared.registering.points)
+    ratio = {name: draws["ratio"].values[..., entry].ravel() for name, entry in TISSUES.items()}
+    return {
+        "ratio": {name: np.quantile(values, QUANTILES).tolist() for name, values in ratio.items()},
+        "t_similarity": float(draws["t_similarity"].mean()),
+        "noise_sd_of_t_similarity": posterior.images.noise_sd(float(draws["t_similarity"].mean())),
+        "residual_sd_at_truth": pair.residual_sd,
+        "residual_sd": float(np.std(posterior.images.residuals(samples.u_mean))),
+        "residual_sd_at_transferred_truth": float(np.std(posterior.images.residuals(u_true))),
+        "boundary_error_mm": float(np.median(np.linalg.norm((samples.u_mean - u_true)[posterior.sampled], axis=1))),
+        "rhat_of_ratio": float(judged.rhat["lam"].max()),
+        "rhat": float(max(float(judged.rhat[name].max()) for name in judged.rhat)),
+        "draws": int(draws.sizes["draw"]),
+        "seconds": samples.seconds,
+    }
+
+
+def covers(pair: dict[str, Any], tissue: str) -> bool:
+    """Whether the 95 % interval of λ/μ contains the truth."""
+    low, *_, high = pair["ratio"][tissue]
+    return bool(low <= truth()[tissue] <= high)
+
+
+def truth() -> dict[str, float]:
+    """λ/μ of each solid tissue."""
+    return {name: float(TRUE_LAM[entry] / TRUE_MU[entry]) for name, entry in TISSUES.items()}
+
+
+def register_pairs(out: Path, same_mesh: bool = False, say: Say = print, count: int = COUNT) -> dict[str, Any]:
+    """All pairs, and whether enough intervals contain the truth, for GM and for WM.
+
+    Each pair is a file of its own, so that what was cut short goes on where it was.
+    """
+    shared, found, name = anatomy(out, same_mesh), [], "same_mesh" if same_mesh else "pair"
+    known = None if same_mesh else register_bodies(out, say)
+    for seed in range(1, count + 1):
+        path = out / f"{name}_{seed:02d}.json"
+        if not path.exists():
+            pair, direction = make(shared, seed)
+            one = register(shared, pair, seed) | {"direction": direction, "seed": seed}
+            write_text(path, json.dumps(one) + "\n")
+            # Compiled samplers are never freed, and some forty of them exhaust a process's memory maps.
+            jax.clear_caches()
+        found.append(json.loads(path.read_text()))
+        if known is not None:
+            found[-1] |= {"ratio": allowing_for(known, found[-1], seed), "ratio_on_the_mesh": found[-1]["ratio"]}
+        inside = ", ".join(f"{name} {'in' if covers(found[-1], name) else 'OUT'}" for name in TISSUES)
+        say(f"pair {seed} of {count}: {inside}; R̂ of λ {found[-1]['rhat_of_ratio']:.3f}")
+    figures.intervals(found, truth(), out / f"{name}s.png")
+    covered = {name: sum(covers(pair, name) for pair in found) for name in TISSUES}
+    enough = ENOUGH * count / COUNT
+    return {
+        name: {"as_it_should": covered[name] >= enough, "covered": covered[name], "of": count, "pairs": found}
+        for name in TISSUES
+    }

@@ -1,0 +1,139 @@
+"""What does an effective draw cost with each sampler, on the posterior of one configuration?
+
+    python -m studies.compare_samplers CONFIG -o DIR [--samplers hmc,nuts] [--minutes 5] [--set KEY=VALUE …]
+
+Prints a table; DIR/samplers.json holds the figures, and DIR/config.yaml what they belong to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from bayesreg.config import Config, load_config, resolved_yaml
+from bayesreg.config.samplers import sampler_section
+from bayesreg.config.sections import StopConfig
+from bayesreg.inference.chains.run import temper_target
+from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.samplers.registry import SAMPLERS
+from bayesreg.io import store
+from bayesreg.io.atomic import write_json, write_text
+from bayesreg.report.tables import in_terminal
+from bayesreg.types import InputError
+from bayesreg.workflow.assembly import posterior_of, start_of
+from bayesreg.workflow.preparation import prepared_inputs
+from studies.compare_samplers.efficiency import Budget, Efficiency, measure_efficiency
+from studies.compare_samplers.table import Setting, efficiency_table
+
+BLOCK = 50
+
+
+def compare_samplers(
+    config: str | Path | Config,
+    out: str | Path,
+    samplers: Sequence[str] = tuple(SAMPLERS),
+    minutes: float = 5.0,
+    progress: bool = True,
+) -> list[Efficiency]:
+    """Draw from one posterior with each of several samplers, and write what an effective draw costs.
+
+    Parameters
+    ----------
+    config : path or Config
+        Its sampler's settings are that sampler's; the others have their defaults, and the same number of chains.
+    out : path
+        A folder, new or empty: samplers.json, config.yaml.
+    samplers : sequence of str
+        Names in `bayesreg.inference.samplers.registry.SAMPLERS`; each searches for the mode and warms up by itself.
+    minutes : float
+        Budget of each, positive; one that meets the rule of `config.stop` ends earlier.
+    progress : bool
+        Say what is being done.
+
+    Returns
+    -------
+    list of Efficiency
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, the budget is not positive, or the configuration, a file or the folder is wrong.
+    """
+    _require_sound(samplers, minutes)
+    config = config if isinstance(config, Config) else load_config(config)
+    store.require_fresh(out)
+    console = Console(quiet=not progress, highlight=False)
+    console.print("reading the images, meshing")
+    inputs = prepared_inputs(config)[0]
+    posterior, setting = posterior_of(config, inputs), _setting(config, minutes)
+    start = start_of(config, inputs, posterior)
+    target = temper_target(posterior, config.sampler.chains, config.seed, start, console.print)
+    rule = StopRule(config.stop.rhat, config.stop.ess, 60 * minutes)
+    efficiencies: list[Efficiency] = []
+    for name in samplers:
+        console.print(f"{name}:")
+        own = config.sampler if config.sampler.name == name else sampler_section(name)
+        budget = Budget(config.sampler.chains, max(config.stop.max_steps // own.thin, 4), rule)
+        efficiencies.append(
+            measure_efficiency(
+                target,
+                name,
+                budget,
+                config.seed,
+                thin=own.thin,
+                block=own.block or BLOCK,
+                start=start,
+                say=lambda text: console.print(f"  {text}", markup=False),
+                **own.settings,
+            )
+        )
+        console.print(f"  {efficiencies[-1].note or f'{efficiencies[-1].seconds:.0f} s'}")
+        # After each: a comparison that is cut off has shown the samplers up to there.
+        Path(out).mkdir(parents=True, exist_ok=True)
+        rows = [efficiency._asdict() for efficiency in efficiencies]
+        write_json(Path(out) / "samplers.json", {**setting._asdict(), "samplers": rows})
+    write_text(Path(out) / "config.yaml", resolved_yaml(config))
+    table = efficiency_table(efficiencies, setting)
+    console.print(in_terminal(table), table.caption)
+    return efficiencies
+
+
+def _require_sound(samplers: Sequence[str], minutes: float) -> None:
+    for name in samplers:
+        if name not in SAMPLERS:
+            raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
+    if not samplers or len({*samplers}) < len(samplers):
+        raise InputError(f"expected one or more samplers, none of them twice; got {', '.join(samplers) or 'none'}")
+    if not minutes > 0:
+        raise InputError(f"minutes must be positive, got {minutes:g}")
+
+
+def _setting(config: Config, minutes: float) -> Setting:
+    return Setting(config.description, config.sampler.chains, minutes, _rule(config.stop))
+
+
+def _rule(stop: StopConfig) -> str:
+    if stop.rhat is None:
+        return "there is none"
+    return f"R̂ below {stop.rhat:g}" + (f" and ESS above {stop.ess:g}" if stop.ess is not None else ", unsplit")
+
+
+def main() -> None:
+    """Read the command line, and compare."""
+    parser = argparse.ArgumentParser(prog="python -m studies.compare_samplers")
+    parser.add_argument("config", metavar="CONFIG")
+    parser.add_argument("-o", "--out", required=True, metavar="DIR")
+    parser.add_argument("--samplers", default=",".join(SAMPLERS), help="names with commas between; default: all")
+    parser.add_argument("--minutes", type=float, default=5.0, help="budget of each sampler")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override an entry")
+    given = parser.parse_args()
+    compare_samplers(load_config(given.config, given.set), given.out, given.samplers.split(","), given.minutes)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", ".jax_cache")
+    main()

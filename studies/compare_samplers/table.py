@@ -1,0 +1,58 @@
+"""The table of what effective draws cost with each sampler."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from bayesreg.report.tables import Table
+from bayesreg.report.verdict import NONE, number, rhat_text
+from studies.compare_samplers.efficiency import Efficiency
+
+HEADER = ("", "ESS/s", "ESS/s, all in", "ESS per 1,000 evaluations", "Worst R̂", "All, s", "Rule met, s")
+
+
+class Setting(NamedTuple):
+    """The conditions that all samplers have in common.
+
+    Attributes
+    ----------
+    name : str
+        The name of the posterior.
+    chains : int
+    minutes : float
+        Budget of each.
+    rule : str
+        The stop rule in words.
+    """
+
+    name: str
+    chains: int
+    minutes: float
+    rule: str
+
+
+def efficiency_table(efficiencies: Sequence[Efficiency], setting: Setting) -> Table:
+    """A row for each sampler, exact ones first, the most effective draws per second first."""
+    ranked = sorted(efficiencies, key=lambda e: -(e.ess_per_second or e.ess_per_second_in_all or 0.0))
+    exact = [_row(efficiency) for efficiency in ranked if efficiency.exact is not False]
+    approximate = [_row(efficiency) for efficiency in ranked if efficiency.exact is False]
+    caption = (
+        f"One posterior, {setting.chains} chains and {setting.minutes:g} minutes for each sampler, which stops earlier "
+        f"if its rule is met ({setting.rule}). ESS and R̂ are the worst of all estimands. All in: with the search for "
+        "the mode, the warm-up and all compilation. An evaluation is one of the density with its gradient, or without "
+        "for samplers that take none. An R̂ far above one makes the ESS beside it worthless."
+    )
+    groups = [(title, rows) for title, rows in (("Exact", exact), ("Approximate", approximate)) if rows]
+    return Table("Cost of effective draws", caption, list(HEADER), groups)
+
+
+def _row(efficiency: Efficiency) -> list[str]:
+    if efficiency.note:
+        return [efficiency.sampler, *[NONE] * (len(HEADER) - 1)]
+    ess_per_thousand = None if efficiency.ess_per_evaluation is None else 1000 * efficiency.ess_per_evaluation
+    rhat = NONE if efficiency.rhat is None else rhat_text(efficiency.rhat)
+    return [
+        efficiency.sampler, number(efficiency.ess_per_second), number(efficiency.ess_per_second_in_all),
+        number(ess_per_thousand), rhat, number(efficiency.seconds), number(efficiency.seconds_to_rule),
+    ]  # fmt: skip

@@ -1,0 +1,40 @@
+"""How often the ellipsoids of `bayesreg apply` hold the points of a pair, and how often by the draws alone.
+
+    python -m studies.external.points PAIR RUN
+
+PAIR is a folder of `studies.external.make_pair`, whose points.csv the run never saw.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from bayesreg.io.points import read_point_pairs
+from bayesreg.model.submesh import submesh_variance
+from bayesreg.report.landmarks import surprise
+from bayesreg.results.nodal_draws import transform_of
+from bayesreg.results.result import load_result
+
+LEVELS = (0.5, 0.9, 0.95)
+
+
+def main() -> None:
+    pair, run = map(Path, sys.argv[1:3])
+    points, transform = read_point_pairs(pair / "points.csv"), transform_of(load_result(run))
+    places, near = transform.place(points.fixed)
+    # Along the axes of the fixed image's world, as the covariance of u.
+    away = (points.moving - places) @ transform.pose.rotation
+    covariance = transform.covariance(near)
+    submesh = submesh_variance(transform.mesh, transform.u_mean)[near.cell]
+    drawn = covariance + (submesh - transform.unresolved_sd(near) ** 2)[:, :, None] * np.eye(3)
+    print(f"{len(places)} points, mean error {np.linalg.norm(away, axis=1).mean():.3f} mm")
+    for name, one in {"ellipsoids of points.csv": covariance, "of the draws alone": drawn}.items():
+        inside = surprise(away, one)
+        print(name, *(f"{(inside <= level).mean():.0%} in the {level:.0%}" for level in LEVELS), sep="  ")
+
+
+if __name__ == "__main__":
+    main()

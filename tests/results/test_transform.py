@@ -1,0 +1,239 @@
+"""The posterior of a transform: against closed forms, against brute force, and how often it holds the truth."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from bayesreg.fem.deformation import Deformer
+from bayesreg.image import Image
+from bayesreg.mesh import TetMesh
+from bayesreg.pose import Motion
+from bayesreg.results.carried_labels import carry_labels
+from bayesreg.results.transform import Transform, distances_of, spread
+from tests.phantoms import ball_mesh
+
+CENTRE = np.array([5.0, -3.0, 8.0])
+POSE = Motion(np.array([12.0, -3.0, 5.0]), np.array([4.0, 10.0, -6.0])).pose(CENTRE)
+
+
+def _transform(draws: int = 40, sd: float = 0.3, seed: int = 0) -> Transform:
+    mesh, rng = ball_mesh(radius=38, spacing=18.0), np.random.default_rng(seed)
+    x, y, z = (mesh.points - CENTRE).T / 25
+    u = 2.0 * np.stack([np.sin(y), np.cos(z) - 1, x * y], axis=1)
+    return Transform(Deformer(mesh), POSE, u, u + sd * rng.standard_normal((draws, *u.shape)))
+
+
+def _points(transform: Transform, count: int, radius: float, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    away = rng.normal(size=(count, 3))
+    away *= radius * rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(away, axis=1, keepdims=True)
+    return CENTRE + away
+
+
+def test_there_and_back():
+    transform = _transform()
+    points = _points(transform, 2000, 60.0)
+    there, location = transform.place(points)
+    assert 0.2 < transform.deformer.is_inside(location).mean() < 0.4
+    back, _ = transform.inverse.place(there)
+    np.testing.assert_allclose(back, points, atol=1e-9)
+    inside = transform.deformer.is_inside(location)
+    u = transform.mean.displacement(points[inside], transform.deformer.locate(points[inside]))
+    np.testing.assert_allclose(there[inside], transform.pose.place(points[inside] + u), atol=1e-12)
+
+
+def test_the_covariance_is_that_of_the_nodes_interpolated_and_turned_with_the_pose():
+    """Nodes that err alone by sd 0.3 make points err by 0.3 where the displacement is linear, not by half of it."""
+    mesh = ball_mesh(radius=38, spacing=18.0)
+    u = 0.02 * (mesh.points - CENTRE)
+    sd = np.array([0.1, 0.2, 0.4])
+    draws = u + sd * np.random.default_rng(0).standard_normal((2000, *u.shape))
+    transform = Transform(Deformer(mesh), POSE, u, draws)
+    found = spread(transform, _points(transform, 200, 25.0), far=(0.5, 1.0))
+    assert found.inside.all()
+    expected = POSE.rotation @ np.diag(sd**2) @ POSE.rotation.T
+    np.testing.assert_allclose(found.covariance.mean(axis=0), expected, atol=0.004)
+    np.testing.assert_allclose(found.covariance, np.broadcast_to(expected, found.covariance.shape), atol=0.03)
+    lengths, axes = found.ellipsoids(0.95)
+    np.testing.assert_allclose(lengths.mean(axis=0), np.sqrt(chi2.ppf(0.95, 3)) * sd[::-1], rtol=0.05)
+    np.testing.assert_allclose(np.abs(axes[:, 0] @ POSE.rotation[:, 2]), 1, atol=0.02)
+    drawn = np.linalg.norm(sd * np.random.default_rng(1).standard_normal((100_000, 3)), axis=1)
+    for share, distance in zip(found.far, (0.5, 1.0), strict=True):
+        assert share.mean() == pytest.approx((drawn > distance).mean(), abs=0.01)
+
+
+def test_the_inverse_spreads_as_far():
+    transform = _transform(draws=300)
+    points = _points(transform, 300, 25.0)
+    there = spread(transform, points)
+    back = spread(transform.inverse, there.places)
+    np.testing.assert_allclose(back.places, points, atol=1e-9)
+    sd, other = (np.sqrt(np.trace(one.covariance, axis1=1, axis2=2)) for one in (there, back))
+    assert np.median(other / sd) == pytest.approx(1, abs=0.1)
+
+
+def test_around_the_mesh_is_told():
+    transform = _transform(draws=5)
+    found = spread(transform, CENTRE + np.array([[0.0, 0, 0], [60, 0, 0], [300, 0, 0]]))
+    assert found.inside.tolist() == [True, False, False]
+    assert np.isfinite(found.places).all()
+
+
+def test_folded_draws_are_counted():
+    transform = _transform(draws=10, sd=0.0)
+    bad = transform.draws.copy()
+    node = transform.mesh.interior[0]
+    bad[3, node] += 40.0
+    assert Transform(transform.deformer, POSE, transform.u_mean, bad).folded == pytest.approx(0.1)
+
+
+def _labels(seed: int = 0) -> Image:
+    """Three labels, one of them a ball; 3 mm voxels on a left-handed grid."""
+    affine = np.diag([-3.0, 3.0, 3.0, 1.0])
+    affine[:3, 3] = CENTRE + np.array([48.0, -48.0, -48.0])
+    grid = Image(np.zeros((33, 33, 33), np.int32), affine)
+    away = grid.grid_points() - CENTRE
+    radius = np.linalg.norm(away, axis=-1)
+    return grid.with_voxels(np.select([radius < 12, radius < 30, radius < 44], [70, 2, 5], 0).astype(np.int32))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_label_probabilities_are_those_of_brute_force(turned):
+    transform = _transform(draws=12, sd=0.8)
+    transform = transform.inverse if turned else transform
+    labels = _labels()
+    grid = Image(np.zeros((20, 21, 22)), transform.pose.matrix @ labels.affine @ np.diag([1.7, 1.6, 1.5, 1.0]))
+    if turned:
+        grid = Image(grid.voxels, labels.affine @ np.diag([1.7, 1.6, 1.5, 1.0]))
+        labels = Image(labels.voxels, transform.pose.matrix @ labels.affine)
+    found = carry_labels(transform, labels, grid)
+    assert 0.02 < len(found.open) / len(found.certain) < 0.9
+    back, places = transform.inverse, grid.grid_points().reshape(-1, 3)
+    _, near = back.place(places)
+    # Every voxel by every draw; the Normal numbers are those of the open voxels.
+    open_near = type(near)(near.cell[found.open], near.barycentric[found.open])
+    sd = back.unresolved_sd(open_near)
+    brute = {value: np.zeros(len(places)) for value in (2, 5, 70)}
+    for draw, u in enumerate(back.draws):
+        if back.turned:
+            source = back.deformer.displaced(u).sources(back.pose.inverse.place(places))[0]
+        else:
+            source = back.pose.place(places + back.deformer.displaced(u).displacement(places, near))
+        source[found.open] = back.place_by(draw, places[found.open], open_near, sd.astype(np.float32))
+        for value, count in brute.items():
+            count += labels.nearest(source) == value
+    for value, probability in found.probabilities():
+        # Float32 of the spread between nodes decides where a source lies on the border of two voxels.
+        away = np.abs(probability.ravel() - brute[value] / 12)
+        assert (away > 1e-6).mean() < 1e-3
+    assert set(np.unique(found.most_probable.voxels)) <= {0, 2, 5, 70}
+    total = sum(probability for _, probability in found.probabilities())
+    assert total.max() <= 1 + 1e-6
+
+
+def test_labels_around_the_mesh_can_be_left_out():
+    transform, labels = _transform(draws=6), _labels()
+    grid = Image(np.zeros((20, 20, 20)), transform.pose.matrix @ labels.affine @ np.diag([1.65, 1.65, 1.65, 1.0]))
+    whole, alone = (carry_labels(transform, labels, grid, keep_around=keep) for keep in (True, False))
+    inside = transform.inverse.place(grid.grid_points().reshape(-1, 3))[1]
+    known = transform.deformer.is_inside(inside).reshape(grid.shape)
+    for (_, one), (_, other) in zip(whole.probabilities(), alone.probabilities(), strict=True):
+        np.testing.assert_array_equal(np.isnan(other), ~known)
+        # Other Normal numbers, of six draws.
+        assert abs((one - other)[known].mean()) < 0.01
+    assert (np.asarray(alone.most_probable.voxels)[~known] == 0).all()
+    assert (np.asarray(whole.most_probable.voxels)[~known] != 0).any()
+
+
+CASES, LEVELS = 150, (0.5, 0.9, 0.95)
+
+
+def _normal(size, rng, mesh, sd: float = 0.8, reach: float = 25.0):
+    """Displacements with a covariance that falls off with distance."""
+    gap = np.linalg.norm(mesh.points[:, None] - mesh.points, axis=-1)
+    root = np.linalg.cholesky(sd**2 * np.exp(-gap / reach) + 1e-9 * np.eye(len(gap)))
+    return np.einsum("nm,smi->sni", root, rng.standard_normal((size, len(gap), 3)))
+
+
+@pytest.mark.long
+def test_ellipsoids_and_labels_hold_the_truth_as_often_as_they_say():
+    """Truths and draws of one distribution: one point and one voxel of each case count, within 3 binomial errors."""
+    mesh = ball_mesh(radius=38, spacing=24.0)
+    rng, labels, deformer = np.random.default_rng(5), _labels(), Deformer(mesh)
+    mean = np.zeros(mesh.points.shape)
+    hits, calibrated = np.zeros((2, len(LEVELS))), []
+    for _ in range(CASES):
+        *draws, u = _normal(201, rng, mesh)
+        transform = Transform(deformer, POSE, mean, np.array(draws))
+        start = CENTRE + rng.uniform(-12, 12, (1, 3))
+        for row, way in enumerate((transform, transform.inverse)):
+            points = start if row == 0 else POSE.place(start)
+            found = spread(way, points)
+            away = _true_place(way, points, u, rng)[0] - found.places[0]
+            square = away @ np.linalg.solve(found.covariance[0], away)
+            hits[row] += [square <= chi2.ppf(level, 3) for level in LEVELS]
+        grid = Image(np.zeros((1, 1, 1)), _at(POSE.place(CENTRE + rng.uniform(-15, 15, 3))))
+        carried = carry_labels(transform, labels, grid)
+        source = _true_place(transform.inverse, grid.grid_points().reshape(-1, 3), u, rng)
+        true = labels.nearest(source)[0]
+        calibrated += [(float(share.item()), float(true == value)) for value, share in carried.probabilities()]
+    for level, share in zip(LEVELS, hits.T / CASES, strict=True):
+        assert np.abs(share - level).max() < 3 * np.sqrt(level * (1 - level) / CASES), hits / CASES
+    # Sum of Bernoulli variables of the probabilities told.
+    told, happened = np.array(calibrated).T
+    spread_of_sum = np.sqrt((told * (1 - told)).sum())
+    assert spread_of_sum > 2
+    assert abs((happened - told).sum()) < 3 * spread_of_sum
+    middle = (told > 0.1) & (told < 0.9)
+    assert middle.sum() > 20
+    assert abs((happened - told)[middle].mean()) < 3 * np.sqrt((told * (1 - told))[middle].sum()) / middle.sum()
+
+
+def _true_place(way, points, u, rng):
+    """By a displacement and what the mesh does not resolve of it."""
+    _, near = way.place(points)
+    beside = way.unresolved_sd(near) * rng.standard_normal(points.shape)
+    displaced = way.deformer.displaced(u)
+    if way.turned:
+        return displaced.sources(way.pose.inverse.place(points))[0] - beside
+    return way.pose.place(points + displaced.displacement(points, near) + beside)
+
+
+def _at(place):
+    affine = np.eye(4)
+    affine[:3, 3] = place
+    return affine
+
+
+def test_a_mesh_alone_is_enough():
+    """No more than arrays is needed to move points by a displacement of one's own."""
+    ball = ball_mesh(spacing=24.0)
+    mesh = TetMesh.from_arrays(ball.points, ball.cells, np.zeros(len(ball.cells), int), ("all",))
+    u = np.ones(mesh.points.shape)
+    points = mesh.points[:3]
+    deformer = Deformer(mesh)
+    np.testing.assert_allclose(deformer.displaced(u).displacement(points, deformer.locate(points)), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize("sd", [(1.0, 1.0, 1.0), (3.0, 0.5, 0.2), (1.0, 1.0, 0.01), (2.0, 1.0, 0.5)])
+def test_distances_of_normal_vectors_are_those_of_drawn_ones(sd):
+    turn = POSE.rotation
+    covariance = (turn @ np.diag(np.square(sd)) @ turn.T)[None]
+    drawn = np.linalg.norm(np.random.default_rng(0).standard_normal((200_000, 3)) * sd, axis=1)
+    distances = (0.3, 0.5, 1.0, 2.0, 4.0)
+    found = distances_of(np.concatenate([covariance, covariance * np.nan]), distances)
+    for share, distance in zip(found.far, distances, strict=True):
+        assert share[0] == pytest.approx((drawn > distance).mean(), abs=0.01)
+    assert found.radius[0] == pytest.approx(np.quantile(drawn, 0.95), rel=0.02)
+    assert np.isnan([found.radius[1], *found.far[:, 1]]).all()
+
+
+def test_the_covariance_in_closed_form_is_that_of_the_draws():
+    transform = _transform(draws=400)
+    points = _points(transform, 200, 28.0)
+    found = spread(transform, points)
+    _, near = transform.place(points)
+    closed = POSE.rotation @ transform.covariance(near) @ POSE.rotation.T
+    sd, drawn = (np.sqrt(np.einsum("kii->ki", one)) for one in (closed, found.covariance))
+    np.testing.assert_allclose(drawn, sd, rtol=0.15)
+    assert np.mean(drawn / sd) == pytest.approx(1, abs=0.01)
