@@ -15,7 +15,7 @@ import SimpleITK
 
 from bayesreg.image import Image
 from bayesreg.io.domain import main_part
-from bayesreg.io.readers import other_form
+from bayesreg.io.readers import read_grid
 from bayesreg.io.volumes import (
     LabelTable,
     check_same_grid,
@@ -256,7 +256,7 @@ def require_forms_taken(
 ) -> None:
     """Raise InputError where two images share a grid by the form of a header that was not taken."""
     for one, source, taken in ((grid, grid_path, image), (image, path, grid)):
-        other = other_form(source)
+        other = read_grid(source).other
         if other is not None and is_same_grid(Image(one.voxels, other), taken):
             raise InputError(
                 f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "
