@@ -24,7 +24,9 @@ from bayesreg.io.volumes import (
     load_image,
     load_labels,
     load_mask,
+    load_whole_numbers,
     on_grid_of,
+    tissues_of,
 )
 from bayesreg.label_tables import REST, TABLES
 from bayesreg.tissues import BRAIN, ORGAN, is_fluid, tissue_names
@@ -112,9 +114,10 @@ def brainweb(
     """
     labels_path = _data_file(labels_path, "brainweb_crisp_1mm.nii.gz")
     t1 = load_image(_data_file(t1_path, "colin27_t1_1mm_unedited.nii.gz"))
-    tissue = load_labels(labels_path, TABLES["brainweb"])
+    labels = load_whole_numbers(labels_path)
+    tissue = tissues_of(labels, TABLES["brainweb"], labels_path)
     check_same_grid(t1, tissue, ("T1", "label"))
-    inside = load_labels(labels_path, {"intracranial": tuple(intracranial_labels)})
+    inside = tissues_of(labels, {"intracranial": tuple(intracranial_labels)}, labels_path)
     mask = main_part(np.asarray(inside.voxels) != 0, "intracranial mask")
     return Anatomy(t1, tissue.with_voxels(tissue.voxels * mask), tissue.with_voxels(mask.astype(np.uint8)))
 

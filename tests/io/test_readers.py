@@ -297,3 +297,17 @@ def test_what_no_reader_understands_is_one_message(tmp_path, name):
     with pytest.raises(ValueError, match=r"a\.\w+.* cannot be read: \S") as caught:
         read_volume(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii.gz", ".mgz", ""])
+def test_a_grid_is_that_of_the_volume(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".mgz":
+        nib.save(nib.MGHImage(VOXELS, AFFINE), path)
+    elif suffix:
+        SimpleITK.WriteImage(itk_image(), str(path))
+    else:
+        dicom(path, tilt=0.4)
+    grid, volume = read_grid(path), read_volume(path)
+    assert grid.shape == volume.voxels.shape
+    np.testing.assert_array_equal(grid.affine, volume.affine)
