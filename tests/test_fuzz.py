@@ -158,12 +158,6 @@ def _volume(path):
         SimpleITK.WriteImage(SimpleITK.GetImageFromArray(voxels), str(path))
     elif path.suffix == ".mgz":
         nib.save(nib.MGHImage(voxels, affine), path)
-    elif path.suffix == ".mif":
-        head = (
-            "mrtrix image\ndim: 5,6,7\nvox: 2,2,3\nlayout: +0,+1,+2\ndatatype: Float32LE\n"
-            "transform: 1,0,0,0\ntransform: 0,1,0,0\ntransform: 0,0,1,0\nfile: . 200\nEND\n"
-        )
-        path.write_bytes(head.encode().ljust(200) + voxels.tobytes())
     else:
         nib.save(nib.Nifti1Image(voxels, affine), path)
 
@@ -205,7 +199,6 @@ FORMATS = {
     "a.mgz": (_volume, br.load_image),
     "a.nrrd": (_volume, br.load_image),
     "a.mha": (_volume, br.load_image),
-    "a.mif": (_volume, br.load_image),
     "a.vtu": (_mesh, br.load_mesh),
     "a.vtk": (_surface, read_surface),
     "a.stl": (_surface, read_surface),

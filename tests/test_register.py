@@ -1,5 +1,6 @@
 """`bayesreg register`: what it understands of paths alone, and what it says before it begins."""
 
+from collections import Counter
 from types import SimpleNamespace
 
 import nibabel as nib
@@ -8,7 +9,11 @@ import pytest
 from typer.testing import CliRunner
 
 from bayesreg.cli import app
+from bayesreg.io import readers
 from bayesreg.label_tables import TABLES
+from bayesreg.workflow import preparation
+from bayesreg.workflow.register import understand
+from tests.phantoms import ball_mesh
 
 SHAPE = (24, 20, 16)
 
@@ -154,3 +159,36 @@ def test_further_images_are_compared_as_well(register):
     assert (str(second.fixed), str(second.moving)) == (str(third.fixed), str(third.moving)) == tuple(other)
     assert "channel_2" in result.output
     assert "expected two paths" in register.call("--channel", other[0]).stderr
+
+
+def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):
+    """From its paths to the inputs of a run; a second time where labels have to say by which table they are meant."""
+    radius = np.linalg.norm(np.indices((24, 24, 24)) - 11.5, axis=0)
+    labels, image = np.where(radius < 9, 1.0, 0.0), np.random.default_rng(0).normal(12 - radius, 0.1)
+    contents = {
+        "fixed": image,
+        "moving": image,
+        "a,b": image,
+        "labels": labels,
+        "mask": radius < 11,
+        "cavity": radius < 2,
+    }
+    path = {name: tmp_path / f"{name}.nii.gz" for name in contents}
+    for name, voxels in contents.items():
+        nib.save(nib.Nifti1Image(np.asarray(voxels, np.float32), np.eye(4)), path[name])
+    counts, read = Counter(), readers._voxels
+
+    def counting(source, path):
+        counts[path.name.removesuffix(".nii.gz")] += 1
+        return read(source, path)
+
+    monkeypatch.setattr(readers, "_voxels", counting)
+    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=8, spacing=6))
+    pair = f"{path['a,b']},{path['a,b']}"
+    understood = understand(
+        path["fixed"], path["moving"], path["labels"], None, path["mask"], path["cavity"], path["cavity"],
+        [pair], ["data.pose=fixed"],
+    )  # fmt: skip
+    assert counts == {"labels": 1}
+    preparation.prepare(understood.config)
+    assert counts == {"fixed": 1, "moving": 1, "labels": 2, "mask": 1, "cavity": 2, "a,b": 2}

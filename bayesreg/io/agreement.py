@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from bayesreg.image import Image
+from bayesreg.io.spaces import LPS
 from bayesreg.mesh import TetMesh
 from bayesreg.types import InputError
 
@@ -23,7 +24,7 @@ LEAST, BETTER = 0.3, 0.05
 LESS = 0.8
 # How unusual a reading is: of those that agree about as well (an organ is much the same reversed) the most usual is
 # meant. Formats differ by LPS and RAS, and by units; single axes are reversed, and tissues renumbered, by mistake.
-COSTS: dict[tuple[int, ...], int] = {(1, 1, 1): 0, (-1, -1, 1): 1}
+COSTS: dict[tuple[int, ...], int] = {(1, 1, 1): 0, tuple(LPS.astype(int).tolist()): 1}
 COST_OF_UNIT, COST_OF_SIGNS, COST_OF_ORDER = 1, 2, 2
 
 

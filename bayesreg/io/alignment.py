@@ -15,6 +15,7 @@ from bayesreg.ignored import fill_ignored, ignored_voxels
 from bayesreg.image import Image
 from bayesreg.io.domain import relative_size
 from bayesreg.io.readers import from_itk
+from bayesreg.io.spaces import LPS, convert_affine, convert_motion
 from bayesreg.pose import Motion, Pose
 from bayesreg.types import InputError
 
@@ -29,7 +30,6 @@ TURNS = (-25.0, 25.0)
 DEMONS = ((4, 200), (2, 100), (1, 50))
 BINS = 32
 ITERATIONS = 200
-FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 class Alignment(NamedTuple):
@@ -126,9 +126,8 @@ def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
         method.SetStandardDeviations(1.5)
         field = method.Execute(*level) if field is None else method.Execute(*level, SimpleITK.Resample(field, level[0]))
     assert field is not None
-    lps = SimpleITK.GetArrayFromImage(field).transpose(2, 1, 0, 3)
-    affine = from_itk(SimpleITK.VectorIndexSelectionCast(field, 0)).affine
-    x, y, z = (Image(sign * lps[..., axis], affine) for axis, sign in enumerate((-1, -1, 1)))
+    volume = from_itk(field)
+    x, y, z = (Image(values, volume.affine) for values in np.moveaxis(volume.voxels * LPS, -1, 0))
     return x, y, z
 
 
@@ -222,7 +221,7 @@ def _coarser(image: Image, edge: float, order: int) -> Image:
 def _to_itk(image: Image, dtype: str) -> SimpleITK.Image:
     """An image whose axes are orthogonal."""
     found = SimpleITK.GetImageFromArray(np.asarray(image.voxels).astype(dtype).transpose(2, 1, 0))
-    affine = FLIP @ image.affine
+    affine = convert_affine(image.affine)
     found.SetSpacing(image.voxel_sizes.tolist())
     found.SetDirection((affine[:3, :3] / image.voxel_sizes).ravel().tolist())
     found.SetOrigin(affine[:3, 3].tolist())
@@ -244,7 +243,7 @@ def _mass_centre(image: Image) -> Float[np.ndarray, "3"]:
 
 def _euler(pose: Pose, centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTransform:
     """A motion of RAS as ITK's of LPS, with its centre of rotation."""
-    lps, about = FLIP @ pose.matrix @ FLIP, FLIP[:3, :3] @ centre
+    lps, about = convert_motion(pose.matrix), centre * LPS
     found = SimpleITK.Euler3DTransform()
     found.SetCenter(about.tolist())
     found.SetMatrix(lps[:3, :3].ravel().tolist())
@@ -258,4 +257,4 @@ def _pose(transform: SimpleITK.Euler3DTransform) -> Pose:
     found[:3, :3] = np.array(transform.GetMatrix()).reshape(3, 3)
     centre = np.array(transform.GetCenter())
     found[:3, 3] = np.array(transform.GetTranslation()) + centre - found[:3, :3] @ centre
-    return Pose(FLIP @ found @ FLIP)
+    return Pose(convert_motion(found))

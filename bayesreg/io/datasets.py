@@ -15,7 +15,7 @@ import SimpleITK
 
 from bayesreg.image import Image
 from bayesreg.io.domain import main_part
-from bayesreg.io.readers import other_form
+from bayesreg.io.readers import read_grid
 from bayesreg.io.volumes import (
     LabelTable,
     check_same_grid,
@@ -24,7 +24,9 @@ from bayesreg.io.volumes import (
     load_image,
     load_labels,
     load_mask,
+    load_whole_numbers,
     on_grid_of,
+    tissues_of,
 )
 from bayesreg.label_tables import REST, TABLES
 from bayesreg.tissues import BRAIN, ORGAN, is_fluid, tissue_names
@@ -112,9 +114,10 @@ def brainweb(
     """
     labels_path = _data_file(labels_path, "brainweb_crisp_1mm.nii.gz")
     t1 = load_image(_data_file(t1_path, "colin27_t1_1mm_unedited.nii.gz"))
-    tissue = load_labels(labels_path, TABLES["brainweb"])
+    labels = load_whole_numbers(labels_path)
+    tissue = tissues_of(labels, TABLES["brainweb"], labels_path)
     check_same_grid(t1, tissue, ("T1", "label"))
-    inside = load_labels(labels_path, {"intracranial": tuple(intracranial_labels)})
+    inside = tissues_of(labels, {"intracranial": tuple(intracranial_labels)}, labels_path)
     mask = main_part(np.asarray(inside.voxels) != 0, "intracranial mask")
     return Anatomy(t1, tissue.with_voxels(tissue.voxels * mask), tissue.with_voxels(mask.astype(np.uint8)))
 
@@ -256,7 +259,7 @@ def require_forms_taken(
 ) -> None:
     """Raise InputError where two images share a grid by the form of a header that was not taken."""
     for one, source, taken in ((grid, grid_path, image), (image, path, grid)):
-        other = other_form(source)
+        other = read_grid(source).other
         if other is not None and is_same_grid(Image(one.voxels, other), taken):
             raise InputError(
                 f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "

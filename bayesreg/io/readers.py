@@ -17,7 +17,7 @@ from jaxtyping import Float
 from nibabel.arrayproxy import ArrayProxy
 from nibabel.spatialimages import SpatialImage
 
-from bayesreg.io.mrtrix import is_mrtrix, read_mrtrix
+from bayesreg.io.spaces import LPS, convert_affine
 from bayesreg.memory import memory_of_machine
 from bayesreg.types import InputError
 
@@ -25,8 +25,6 @@ from bayesreg.types import InputError
 ITK_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
 # Millimetres per unit of a NIfTI header; files that name none hold millimetres.
 MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "micron": 1e-3, "meter": 1e3}
-# World RAS and ITK's LPS differ in the signs of x and y.
-LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 # Two forms of a header say the same where they place no corner further apart than this share of a voxel, and slices of
 # a series are evenly spaced where none lies further than this share of their distance from its place.
 SAME_FORM, EVEN = 0.1, 0.02
@@ -64,26 +62,28 @@ class Volume(NamedTuple):
     header: Any = None
 
 
-class _Forms(NamedTuple):
-    """Where the voxels of a file lie.
+class Grid(NamedTuple):
+    """Where the voxels of a file lie, by its header alone.
 
     Attributes
     ----------
+    shape : tuple of int
     affine : (4, 4) array
         Voxel index to world RAS, mm.
     other : (4, 4) array or None
-        The q-form of the header, where it says something else than the s-form, which is taken.
-    remarks : list of str
+        The q-form of a NIfTI header, where it says something else than the s-form, which is taken.
+    remarks : tuple of str
         What a user should know.
     """
 
+    shape: tuple[int, ...]
     affine: Float[np.ndarray, "4 4"]
-    other: Float[np.ndarray, "4 4"] | None
-    remarks: list[str]
+    other: Float[np.ndarray, "4 4"] | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def read_volume(path: str | Path) -> Volume:
-    """Read a volume: NIfTI, MGZ and what else nibabel knows, NRRD, MetaImage and DICOM by SimpleITK, MRtrix's.
+    """Read a volume: NIfTI, MGZ and what else nibabel knows; NRRD, MetaImage and DICOM by SimpleITK.
 
     Parameters
     ----------
@@ -100,20 +100,22 @@ def read_volume(path: str | Path) -> Volume:
         return _read_dicom(path)
     if is_itk(path):
         return _read_by_itk(path)
-    if is_mrtrix(path):
-        return Volume(*read_mrtrix(path))
     source = _open(path)
-    forms = _forms(source)
-    for remark in forms.remarks:
+    grid = _grid_of(source)
+    for remark in grid.remarks:
         _log.warning("%s: %s", path, remark)
-    return Volume(_voxels(source, path), forms.affine, source.header)
+    return Volume(_voxels(source, path), grid.affine, source.header)
 
 
-def other_form(path: str | Path) -> Float[np.ndarray, "4 4"] | None:
-    """The q-form of a NIfTI header, where it says something else than the s-form, which is taken; without voxels."""
+def read_grid(path: str | Path) -> Grid:
+    """Read where the voxels of a volume lie, and no voxel; InputError as in `read_volume`."""
     path = Path(path)
-    without = _is_folder(path) or is_itk(path) or is_mrtrix(path)
-    return None if without else _forms(_open(path)).other
+    if _is_folder(path):
+        return _grid_of_series(_names_of_series(path), path)
+    if is_itk(path):
+        header = _itk_header(path)
+        return Grid(tuple(header.GetSize()), _affine_of_itk(header))
+    return _grid_of(_open(path))
 
 
 def is_itk(path: Path) -> bool:
@@ -178,16 +180,16 @@ def _shape(source: SpatialImage) -> tuple[int, ...]:
     return shape
 
 
-def _forms(source: SpatialImage) -> _Forms:
-    affine = np.asarray(source.affine, float)
+def _grid_of(source: SpatialImage) -> Grid:
+    shape, affine = _shape(source), np.asarray(source.affine, float)
     if not isinstance(source, nib.Nifti1Pair):
         analyze = f"an Analyze file does not tell left from right; {_x_runs(affine)}"
-        return _Forms(affine, None, [analyze] if isinstance(source, nib.AnalyzeImage) else [])
+        return Grid(shape, affine, None, (analyze,) if isinstance(source, nib.AnalyzeImage) else ())
     header, remarks, other = source.header, [], None
     if not (header["sform_code"] or header["qform_code"]):
         remarks.append(f"it says nothing of its orientation (sform and qform code 0); centred, and {_x_runs(affine)}")
     elif header["sform_code"] and header["qform_code"]:
-        affine, other, told = _choose_form(affine, _qform(header), _shape(source))
+        affine, other, told = _choose_form(affine, _qform(header), shape)
         remarks += told
     unit, known = _unit(header)
     if not known:
@@ -195,7 +197,7 @@ def _forms(source: SpatialImage) -> _Forms:
     if MILLIMETRES[unit] != 1:
         remarks.append(f"its header is in units of a {unit}, converted to mm")
     scale = np.diag([*[MILLIMETRES[unit]] * 3, 1.0])
-    return _Forms(scale @ affine, None if other is None else scale @ other, remarks)
+    return Grid(shape, scale @ affine, None if other is None else scale @ other, tuple(remarks))
 
 
 def _unit(header: Any) -> tuple[str, bool]:
@@ -273,17 +275,26 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error).strip() else type(error).__name__
 
 
-def _read_by_itk(path: Path) -> Volume:
+def _itk_header(path: Path) -> Any:
+    """A reader of SimpleITK that has read the header of a file."""
+    header = SimpleITK.ImageFileReader()
+    header.SetFileName(str(path))
     try:
-        header = SimpleITK.ImageFileReader()
-        header.SetFileName(str(path))
         header.ReadImageInformation()
-        _require_memory(header.GetSize(), path)
-        image = SimpleITK.ReadImage(str(path))
     except RuntimeError as error:
         raise InputError(
             f"image {path} cannot be read: SimpleITK finds it damaged, cut short or of another kind"
         ) from error
+    _require_memory(header.GetSize(), path)
+    return header
+
+
+def _read_by_itk(path: Path) -> Volume:
+    header = _itk_header(path)
+    try:
+        image = header.Execute()
+    except RuntimeError as error:
+        raise InputError(f"image {path} cannot be read: SimpleITK finds it damaged or cut short") from error
     if path.name.lower().endswith(".dcm") and image.GetSize()[-1] == 1:
         raise InputError(f"image {path} is one slice; give the folder that holds its series, and nothing else")
     if path.name.lower().endswith((".nrrd", ".nhdr")) and "NRRD_space" not in image.GetMetaDataKeys():
@@ -291,8 +302,8 @@ def _read_by_itk(path: Path) -> Volume:
     return from_itk(image)
 
 
-def _read_dicom(folder: Path) -> Volume:
-    """A series whose slices are evenly spaced; a gantry tilt becomes a shear of the affine."""
+def _names_of_series(folder: Path) -> tuple[str, ...]:
+    """The files of the one DICOM series in a folder, in their order."""
     series = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if len(series) != 1:
         listed = f": {', '.join(series)}" if series else ""
@@ -302,21 +313,32 @@ def _read_dicom(folder: Path) -> Volume:
         raise InputError(
             f"{left[0]} cannot be read as part of the DICOM series in its folder; mend it, or take it away"
         )
-    volume = _series(names, folder)
+    return tuple(names)
+
+
+def _grid_of_series(names: tuple[str, ...], folder: Path) -> Grid:
+    """The grid of slices that are evenly spaced; a gantry tilt becomes a shear of the affine."""
+    headers = [_itk_header(Path(name)) for name in names]
+    shape, affine = list(headers[0].GetSize()), _affine_of_itk(headers[0])
     if len(names) == 1:
-        return volume
-    places = np.array([_position(name) for name in names])
+        return Grid(tuple(shape), affine)
+    places = np.array([header.GetOrigin() for header in headers])
     step = (places[-1] - places[0]) / (len(places) - 1)
     away = np.linalg.norm(places - places[0] - np.arange(len(places))[:, None] * step, axis=1).max()
     length = np.linalg.norm(step)
-    if volume.voxels.shape[2] != len(places) or length == 0 or away > EVEN * length:
+    if any(header.GetSize()[2:] != (1,) for header in headers) or length == 0 or away > EVEN * length:
         raise InputError(
             f"the {len(places)} slices in {folder} are not evenly spaced: one lies {away:.3g} mm from its place, at "
             f"{length:.3g} mm a step. A slice is missing or there twice, or there are several images"
         )
-    affine = volume.affine.copy()
-    affine[:3, 2], affine[:3, 3] = LPS[:3, :3] @ step, LPS[:3, :3] @ places[0]
-    return volume._replace(affine=affine)
+    affine[:3, 2], affine[:3, 3] = step * LPS, places[0] * LPS
+    return Grid((*shape[:2], len(names)), affine)
+
+
+def _read_dicom(folder: Path) -> Volume:
+    names = _names_of_series(folder)
+    volume = _series(names, folder)
+    return volume._replace(affine=_grid_of_series(names, folder).affine)
 
 
 def _looks_like_dicom(path: Path) -> bool:
@@ -345,22 +367,19 @@ def _series(names: tuple[str, ...], folder: Path) -> Volume:
         SimpleITK.ProcessObject.SetGlobalWarningDisplay(warns)
 
 
-def _position(name: str) -> Float[np.ndarray, "3"]:
-    """Where the first voxel of a slice lies, LPS, mm."""
-    reader = SimpleITK.ImageFileReader()
-    reader.SetFileName(name)
-    reader.ReadImageInformation()
-    return np.array(reader.GetOrigin())
-
-
-def from_itk(image: Any) -> Volume:
-    """What an image of SimpleITK holds."""
+def _affine_of_itk(image: Any) -> Float[np.ndarray, "4 4"]:
+    """Voxel index to world RAS, mm, of an image of SimpleITK or of a header that it has read."""
     dimension = image.GetDimension()
     size = min(dimension, 3)
     affine = np.eye(4)
     direction = np.reshape(image.GetDirection(), (dimension, dimension))[:size, :size]
     affine[:size, :size] = direction * np.array(image.GetSpacing()[:size])
     affine[:size, 3] = image.GetOrigin()[:size]
-    array = SimpleITK.GetArrayFromImage(image)
+    return convert_affine(affine)
+
+
+def from_itk(image: Any) -> Volume:
+    """What an image of SimpleITK holds."""
+    array, dimension = SimpleITK.GetArrayFromImage(image), image.GetDimension()
     axes = (*range(dimension - 1, -1, -1), *range(dimension, array.ndim))
-    return Volume(np.ascontiguousarray(array.transpose(axes)), LPS @ affine)
+    return Volume(np.ascontiguousarray(array.transpose(axes)), _affine_of_itk(image))

@@ -16,6 +16,7 @@ from bayesreg.io.fields import save_displacement
 from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
+from bayesreg.io.spaces import LPS
 from bayesreg.io.volumes import load_image, save_image
 from bayesreg.types import InputError
 
@@ -142,8 +143,8 @@ def write_results(
         save_image(run.warped if scale is None else scale.undo(run.warped), place("warped_mean.nii.gz"))
     affine = run.background.affine
     save_displacement(place("displacement_mean.nii.gz"), displacement_mean, affine)
-    # The writer turns x and y round, from RAS to LPS; a standard deviation has no sign to turn.
-    unsigned = np.asarray(displacement_sd) * (-1.0, -1.0, 1.0)
+    # The writer converts vectors to LPS; a standard deviation is no vector, and stays positive.
+    unsigned = np.asarray(displacement_sd) * LPS
     save_displacement(place("displacement_sd.nii.gz"), unsigned, affine)
     if run.metrics is not None:
         write_json(place("metrics.json"), run.metrics)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
-from bayesreg.io.spaces import LPS
+from bayesreg.io.spaces import LPS, convert_affine, convert_motion
 from bayesreg.pose import Pose
 from bayesreg.types import AnyArray
 
@@ -62,13 +62,14 @@ def _write_text(file: h5py.File, name: str, text: str) -> None:
 
 def _affine(pose: Pose) -> tuple[str, np.ndarray, np.ndarray]:
     """Its matrix row by row, its translation; about the origin."""
-    matrix = np.diag([*LPS, 1.0]) @ np.asarray(pose.matrix, float) @ np.diag([*LPS, 1.0])
+    matrix = convert_motion(pose.matrix)
     return "AffineTransform", np.zeros(3), np.concatenate([matrix[:3, :3].ravel(), matrix[:3, 3]])
 
 
 def _displacement_field(field: Float[AnyArray, "X Y Z 3"], grid: Image) -> tuple[str, np.ndarray, np.ndarray]:
     """Size, origin, spacing and directions of its grid; vectors, the first voxel axis running fastest."""
-    origin, directions = grid.affine[:3, 3] * LPS, LPS[:, None] * grid.affine[:3, :3] / grid.voxel_sizes
-    known = np.concatenate([grid.shape, origin, grid.voxel_sizes, directions.ravel()])
+    affine = convert_affine(grid.affine)
+    directions = affine[:3, :3] / grid.voxel_sizes
+    known = np.concatenate([grid.shape, affine[:3, 3], grid.voxel_sizes, directions.ravel()])
     vectors = np.round(np.asarray(field) / QUANTUM) * QUANTUM * LPS
     return "DisplacementFieldTransform", known, vectors.transpose(2, 1, 0, 3).astype(np.float32).ravel()

@@ -126,14 +126,24 @@ def save_image(image: Image, path: str | Path) -> None:
 
 
 def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside", "refused"] = "outside") -> Image:
-    """Read a label file as tissue indices.
+    """Read a label file as tissue indices: `load_whole_numbers`, then `tissues_of`, whose errors it has."""
+    return tissues_of(load_whole_numbers(path), table, path, unlisted)
+
+
+def tissues_of(
+    image: Image, table: LabelTable, path: str | Path, unlisted: Literal["outside", "refused"] = "outside"
+) -> Image:
+    """Make tissue indices of labels.
 
     Parameters
     ----------
-    path : path
+    image : Image
+        Whole numbers.
     table : mapping
         Tissue name to the value, or values, that stand for it in the file; the order gives the indices. What stands for
         `BACKGROUND` is no tissue.
+    path : path
+        Of the labels, for a message.
     unlisted : {"outside", "refused"}
         Labels that are neither zero nor in the table are no tissue, or refused.
 
@@ -145,10 +155,9 @@ def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside"
     Raises
     ------
     InputError
-        As in `load_image`; also if the file holds values that are not integers, none of any tissue (or of one, where
-        what is not listed is outside), one that is not listed and is refused, or if a value belongs to two tissues.
+        If there are no labels of any tissue (or of one, where what is not listed is outside), or one that is not listed
+        and is refused, or if a value belongs to two tissues.
     """
-    image = load_whole_numbers(path)
     values = {name: np.atleast_1d(np.asarray(entry, int)).tolist() for name, entry in table.items()}
     present, counts = np.unique(image.voxels, return_counts=True)
     _check_table(values, present.tolist(), path, whole=unlisted == "outside")

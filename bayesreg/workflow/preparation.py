@@ -88,7 +88,7 @@ def prepare(config: Config) -> Prepared:
     size = _size(config, anatomy)
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, size * BRAIN_CLOSING, anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
-    fixed_ignore = _ignored(config, "fixed")
+    fixed_ignore = None if anatomy.image is None else _ignored(config, "fixed", anatomy.image)
     matched = _match(config, anatomy, domain, fixed_ignore)
     appraisal = _appraise(config, anatomy, domain, matched)
     clock.lap("images")
@@ -141,15 +141,15 @@ def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Ima
     return found
 
 
-def _ignored(config: Config, which: Literal["fixed", "moving"]) -> Image | None:
+def _ignored(config: Config, which: Literal["fixed", "moving"], image: Image) -> Image | None:
     """The mask of what an image says nothing of, as the file has it."""
     if not isinstance(config.data, FilesData):
         return None
-    path, image = getattr(config.data, f"{which}_ignore"), getattr(config.data, which)
-    if path is None:
+    mask_path, path = getattr(config.data, f"{which}_ignore"), getattr(config.data, which)
+    if mask_path is None:
         return None
-    mask = load_ignored(path)
-    require_forms_taken(load_image(image), image, mask, path, (which, f"{which}_ignore"))
+    mask = load_ignored(mask_path)
+    require_forms_taken(image, path, mask, mask_path, (which, f"{which}_ignore"))
     return _as_stored(mask)
 
 
@@ -158,10 +158,9 @@ def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image 
     data = config.data
     if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
         return None
-    images = anatomy.image, load_image(data.moving)
-    return match_images(
-        data, config.image_options.similarity, domain, *images, fixed_ignore, _ignored(config, "moving")
-    )
+    fixed, moving = anatomy.image, load_image(data.moving)
+    moving_ignore = _ignored(config, "moving", moving)
+    return match_images(data, config.image_options.similarity, domain, fixed, moving, fixed_ignore, moving_ignore)
 
 
 def _skull(intracranial: Path | None) -> Image | None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from bayesreg.config import Config, make_config, read_mapping
 from bayesreg.config.data import FilesData
-from bayesreg.image import Image
-from bayesreg.io.volumes import load_image, load_whole_numbers, shorten
+from bayesreg.io.readers import Grid, read_grid
+from bayesreg.io.volumes import load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_tables
 from bayesreg.tissues import ORGAN
 from bayesreg.types import InputError
@@ -90,8 +90,7 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     assert isinstance(data, FilesData)
     for name in ("fixed", "moving", "labels"):
         if (path := getattr(data, name)) is not None:
-            load = load_whole_numbers if name == "labels" else load_image
-            yield f"{name:<12}{path}: {_describe_grid(load(path))}"
+            yield f"{name:<12}{path}: {_describe_grid(read_grid(path))}"
     if data.labels is None:
         yield f"{'labels':<12}none: the organ is {_describe_organ(data)}, of one tissue"
     else:
@@ -146,7 +145,7 @@ def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], s
     return TABLES[fitting[0]], f"{fitting[0]}, which fits the values{also}"
 
 
-def _describe_grid(image: Image) -> str:
-    shape = " × ".join(map(str, image.shape))
-    sizes = " × ".join(f"{size:.3g}" for size in image.voxel_sizes)
+def _describe_grid(grid: Grid) -> str:
+    shape = " × ".join(map(str, grid.shape[:3]))
+    sizes = " × ".join(f"{size:.3g}" for size in np.linalg.norm(grid.affine[:3, :3], axis=0))
     return f"{shape} voxels of {sizes} mm"

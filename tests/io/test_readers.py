@@ -10,7 +10,7 @@ import pytest
 import SimpleITK
 
 from bayesreg.image import Image
-from bayesreg.io.readers import corners_apart, other_form, read_volume
+from bayesreg.io.readers import corners_apart, read_grid, read_volume
 from bayesreg.io.volumes import load_image
 from tests.test_image import AFFINES
 
@@ -155,13 +155,13 @@ def test_forms_at_odds_are_told_and_the_s_form_is_taken(tmp_path, caplog):
     nib.save(source, tmp_path / "a.nii")
     volume = read_volume(tmp_path / "a.nii")
     check(volume, sform)
-    np.testing.assert_allclose(other_form(tmp_path / "a.nii"), AFFINE, atol=1e-4)
+    np.testing.assert_allclose(read_grid(tmp_path / "a.nii").other, AFFINE, atol=1e-4)
     assert f"corners up to {corners_apart(sform, AFFINE, SHAPE):.3g} mm apart; the s-form is taken" in caplog.text
 
 
 def test_forms_that_agree_are_not_mentioned(tmp_path, caplog):
     read_volume(nifti(tmp_path / "a.nii"))
-    assert other_form(tmp_path / "a.nii") is None
+    assert read_grid(tmp_path / "a.nii").other is None
     assert not caplog.records
 
 
@@ -297,3 +297,17 @@ def test_what_no_reader_understands_is_one_message(tmp_path, name):
     with pytest.raises(ValueError, match=r"a\.\w+.* cannot be read: \S") as caught:
         read_volume(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii.gz", ".mgz", ""])
+def test_a_grid_is_that_of_the_volume(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".mgz":
+        nib.save(nib.MGHImage(VOXELS, AFFINE), path)
+    elif suffix:
+        SimpleITK.WriteImage(itk_image(), str(path))
+    else:
+        dicom(path, tilt=0.4)
+    grid, volume = read_grid(path), read_volume(path)
+    assert grid.shape == volume.voxels.shape
+    np.testing.assert_array_equal(grid.affine, volume.affine)
