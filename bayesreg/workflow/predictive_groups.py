@@ -105,8 +105,8 @@ def _log_likelihood(posterior: Posterior, draws: xr.Dataset, recorded: Mapping[s
     for name in names:
         dim = recorded[name].values.dims[0]
         values = np.concatenate([block[name] for block in blocks], axis=1)
-        labels = {**coords, dim: recorded[name].values[dim].to_numpy()}
-        found[name] = xr.DataArray(values, labels, ("chain", "draw", dim))
+        labels = recorded[name].values[dim].to_numpy()
+        found[name] = xr.DataArray(values, {**coords, str(dim): labels}, ("chain", "draw", dim))
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,6 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 
 from bayesreg.model.coordinates import complete
-from bayesreg.model.observations.landmarks import ComparedPoints
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
@@ -37,7 +36,7 @@ class LeftOut(NamedTuple):
     covariance: Float[np.ndarray, "k 3 3"]
 
 
-def leave_out(posterior: Posterior, term: ComparedPoints, estimands: dict[str, AnyArray]) -> LeftOut:
+def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -> LeftOut:
     """Leave each landmark out in turn, at given stiffness and scales.
 
     Given these, u_B is Gaussian as far as the other observations are linear in it. With H its precision (Gauss and
@@ -49,7 +48,7 @@ def leave_out(posterior: Posterior, term: ComparedPoints, estimands: dict[str, A
     ----------
     posterior : Posterior
     term : ComparedPoints
-        One of its terms.
+        Its term of the landmarks.
     estimands : dict
         Where the posterior is linearised: its mean.
     """
@@ -90,7 +89,7 @@ def _without(
 
 @jax.jit
 def _predicted_with_response(
-    problem: Problem, term: ComparedPoints, values: dict[str, AnyArray]
+    problem: Problem, term: Any, values: dict[str, AnyArray]
 ) -> tuple[AnyArray, AnyArray]:
     """u(p), and its derivative by u_B: (k, 3, sampled, 3)."""
 

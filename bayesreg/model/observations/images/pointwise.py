@@ -93,6 +93,10 @@ class Pointwise:
         """−log Z_s, a sum over the points."""
         raise NotImplementedError
 
+    def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
+        """Residuals that follow the model, in units of their scales."""
+        raise NotImplementedError
+
     def of_one_point(self: Same) -> Same:
         """The similarity itself."""
         return self
