@@ -8,12 +8,11 @@ import numpy as np
 
 from bayesreg.model.blocks import Values
 from bayesreg.model.observations.registry import kinds
+from bayesreg.model.observations.section import ObservationSection
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import State, state_of
 from bayesreg.model.term import Standardised
 from bayesreg.settings import Section
-
-OWN, OWN_TITLE = "own", "an observation of your own"
 
 
 def describe_observations(posterior: Posterior, values: Values) -> dict[str, dict[str, Any]]:
@@ -33,8 +32,8 @@ def describe_observations(posterior: Posterior, values: Values) -> dict[str, dic
 
 
 def _describe(observation: Any, term: Any, state: State) -> dict[str, Any]:
-    kind = getattr(observation, "kind", OWN)
-    title = kinds()[kind].title if kind in kinds() else OWN_TITLE
+    kind = getattr(observation, "kind", "own")
+    title = kinds().get(kind, ObservationSection).title
     found: dict[str, Any] = {"kind": kind, "title": title, "log": float(term.log(state))}
     if isinstance(options := getattr(observation, "options", None), Section):
         found["options"] = options.model_dump(mode="json")

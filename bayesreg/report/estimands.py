@@ -17,11 +17,12 @@ SYMBOLS = {
     "ratio": "λ/μ",
     "t_similarity": "T_s",
     "t_elastic": "T_r",
+    "body_load": "sd of the random loads inside",
+    "surface_load": "sd of the random loads at the surface",
     "field_sd": "sd of the log-stiffness",
     "field": "component of the log-stiffness",
 }
 DISPLACEMENT = "u_boundary"
-TEMPERATURES = ("t_similarity", "t_elastic")
 AXES = ("x", "y", "z")
 MOST_VALUES = 10_000_000
 
@@ -161,15 +162,18 @@ def draws_of(posterior: xr.Dataset, entry: Estimand, max_draws: int) -> np.ndarr
 
 
 def sampled_scales(posterior: xr.Dataset) -> list[str]:
-    """Names of the temperatures, and of the sds of observations, that vary over the draws."""
-    scales = [str(name) for name in posterior if str(name).endswith("_sd") and name != "field_sd"]
-    names = (name for name in (*TEMPERATURES, *scales) if name in posterior)
-    return [name for name in names if np.ptp(posterior[name].to_numpy()) > 0]
+    """Names of the temperatures, loads and sds of observations: single positive numbers that vary over the draws."""
+    scales = (str(name) for name, draws in posterior.data_vars.items() if set(draws.dims) == {"chain", "draw"})
+    return [name for name in scales if name != "field_sd" and np.ptp(posterior[name].to_numpy()) > 0]
 
 
 def symbol_of(name: str) -> str:
-    """The symbol of a variable in a report; the sd of an observation has its name."""
-    return SYMBOLS.get(name) or name.removesuffix("_sd") + " sd, mm"
+    """The symbol of a variable in a report; the scales of an observation have its name."""
+    if name in SYMBOLS:
+        return SYMBOLS[name]
+    if name.endswith("_t_similarity"):
+        return f"T_s of {name.removesuffix('_t_similarity')}"
+    return name.removesuffix("_sd") + " sd, mm" if name.endswith("_sd") else name.replace("_", " ")
 
 
 class Group(NamedTuple):

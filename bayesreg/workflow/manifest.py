@@ -24,7 +24,7 @@ from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.adequacy import describe_observations
-from bayesreg.model.blocks import Values
+from bayesreg.model.blocks import Scale, Values
 from bayesreg.model.posterior import Posterior
 
 # A sampled node counts as in contact where its mean position lies this near to the skull, mm.
@@ -90,6 +90,11 @@ def manifest(
         "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
         "model": config.model.model_dump(mode="json"),
         "observations": observations,
+        "scales": {
+            name: {"median": float(block.median), "log_sd": float(block.log_sd)}
+            for name, block in posterior.data.blocks.items()
+            if isinstance(block, Scale) and block.is_sampled
+        },
         "independent_points": posterior.independent_points,
         "exact": samples.exact,
         "stopped": {

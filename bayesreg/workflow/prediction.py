@@ -122,11 +122,12 @@ def predict(
 
 def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, np.ndarray]:
     """What the observations leave for the report, by "<observation>/<array>"."""
+    state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(mean))
     summarised = {name: one for name, one in posterior.observations.items() if isinstance(one, Summarised)}
     return {
         f"{name}/{key}": value
         for name, one in summarised.items()
-        for key, value in one.summarise(posterior, mean).items()
+        for key, value in one.summarise(posterior, state).items()
     }
 
 

@@ -130,16 +130,3 @@ def _nothing(block: Any) -> Moments:
     chains = jax.tree.leaves(block)[0].shape[0]
     moments = zero_moments(jax.tree.map(lambda leaf: leaf[:, 0], block))
     return jax.tree.map(np.asarray, moments._replace(count=np.zeros(chains)))
-
-
-def predictive_p(observed: AnyArray, replicated: AnyArray) -> float:
-    """Posterior predictive p-value: how often a replicated discrepancy is at least the realised one.
-
-    Near 0 the data show more of it than the model would, near 1 less.
-
-    Parameters
-    ----------
-    observed, replicated : arrays of one shape
-        The discrepancy of the data and of a replication, for every draw.
-    """
-    return float(np.mean(np.asarray(replicated) >= np.asarray(observed)))

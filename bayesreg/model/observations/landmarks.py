@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -17,10 +17,11 @@ from bayesreg.io.points import PointPairs, read_point_pairs
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values, scale_block
+from bayesreg.model.observations.landmarks_report import distance_figure, landmark_table
 from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.observations.observation import Placed, Recorded
-from bayesreg.model.observations.section import Name, ObservationSection
-from bayesreg.model.state import State, state_of
+from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
+from bayesreg.model.state import State
 from bayesreg.model.term import Label, PointCurvature
 from bayesreg.printable import require_printable
 from bayesreg.settings import FoundFile, KnownOrInferred, ScalePrior
@@ -94,10 +95,9 @@ class Landmarks:
         )
         return Placed(self, term, {} if self.prior is None else {scale: scale_block(self.prior)})
 
-    def summarise(self, posterior: Any, mean: Values) -> dict[str, np.ndarray]:
-        """Residuals at the mean of the draws, and where the landmarks are few, of each as all else predicts it."""
+    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
+        """Residuals at a state, and where the landmarks are few, of each as all else predicts it."""
         term = posterior.data.terms[self.name]
-        state = state_of(posterior.data.body, posterior.data.blocks, mean)
         found = {
             "names": np.array(self.labels),
             "points": self.fixed_points,
@@ -106,7 +106,7 @@ class Landmarks:
         }
         if len(self.labels) > MOST_LEFT_OUT or not len(posterior.sampled) or 3 * len(posterior.sampled) > MOST_UNKNOWNS:
             return found
-        left_out = leave_out(posterior, term, posterior.estimands(mean))
+        left_out = leave_out(posterior, term, posterior.estimands(state.values))
         return found | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
 
     def recorded(self, term: ComparedPoints) -> Recorded:
@@ -255,3 +255,15 @@ class LandmarksSection(ObservationSection):
         labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
         sd = pairs.sd if self.sd is None else self.sd
         return [Landmarks(pairs.fixed, inputs.matching.pose.inverse.place(pairs.moving), sd, self.name, labels)]
+
+    @classmethod
+    def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
+        """Every landmark."""
+        return [landmark_table(name, summary)] if "residual" in summary else []
+
+    @classmethod
+    def figures(
+        cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
+    ) -> list[ReportFigure]:
+        """How far the landmarks lie from where the posterior takes them."""
+        return [distance_figure(name, summary)] if "residual" in summary else []

@@ -88,9 +88,7 @@ def _without(
 
 
 @jax.jit
-def _predicted_with_response(
-    problem: Problem, term: Any, values: dict[str, AnyArray]
-) -> tuple[AnyArray, AnyArray]:
+def _predicted_with_response(problem: Problem, term: Any, values: dict[str, AnyArray]) -> tuple[AnyArray, AnyArray]:
     """u(p), and its derivative by u_B: (k, 3, sampled, 3)."""
 
     def predicted(u_boundary: AnyArray) -> AnyArray:

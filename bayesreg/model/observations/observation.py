@@ -83,8 +83,8 @@ class Checked(Protocol):
 class Summarised(Protocol):
     """An observation that leaves arrays for the report."""
 
-    def summarise(self, posterior: Any, mean: Values) -> dict[str, np.ndarray]:
-        """Arrays, by name, at the values of all blocks at the mean of the draws."""
+    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
+        """Arrays, by name, at the state that the mean of the draws is."""
 
 
 @runtime_checkable

@@ -75,7 +75,7 @@ class ObservationSection(Section):
     """
 
     # What the kind is called in the report.
-    title: ClassVar[str]
+    title: ClassVar[str] = "an observation of your own"
 
     kind: str
     name: Name
@@ -89,12 +89,27 @@ class ObservationSection(Section):
         """Make the observations: of what was read, `inputs.observed[self.name]`, and of all else that a run knows."""
         raise NotImplementedError
 
+    # What the report shows. `summary` holds the arrays that the observation's method `summarise` has left, and those of
+    # `check_draw` (chain, draw, …); `described` is what run.json says of it.
+
+    @classmethod
+    def log_density(cls, name: str) -> str:
+        """The term of the density in HTML, with its sign."""
+        return f" + log p({name} | <var>u</var>)"
+
+    @classmethod
+    def explain(cls, name: str, described: Mapping[str, Any]) -> str:
+        """A sentence in HTML on that term; empty where its name says all."""
+        return ""
+
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
-        """The tables of an observation of this name, of what its method `summarise` has left."""
+        """The tables of an observation of this name."""
         return []
 
     @classmethod
-    def figures(cls, name: str, summary: Arrays, labels: Sequence[str]) -> list[ReportFigure]:
-        """The figures; `labels` are the names of the mesh's tissues."""
+    def figures(
+        cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
+    ) -> list[ReportFigure]:
+        """The figures of an observation of this name; `tissues` are those of the mesh."""
         return []

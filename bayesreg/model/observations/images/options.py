@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from bayesreg.interpolation import Interpolation
 from bayesreg.model.observations.images.pointwise import SimilaritySettings, SquaredDifferences
-from bayesreg.model.observations.images.similarity import AnySimilarity
+from bayesreg.model.observations.images.similarity import SIMILARITIES, AnySimilarity
 from bayesreg.settings import NotNegative, Positive, Section, by_kind, wrong
 
 # The kinds of similarities that bring a map of intensities of their own.
-OF_ANY_CONTRAST = [one.model_fields["kind"].default for one in get_args(AnySimilarity) if one.serves_any_contrast]
+OF_ANY_CONTRAST = [kind for kind, one in SIMILARITIES.items() if one.serves_any_contrast]
 
 # What is not given, by the name of the model's preset. The options of "paper" are the defaults of `ImageOptions`.
 PRESETS: Mapping[str, Mapping[str, Any]] = {

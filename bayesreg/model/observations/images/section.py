@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import model_validator
@@ -10,7 +10,9 @@ from pydantic import model_validator
 from bayesreg.io.records import Inputs
 from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.model.observations.images.pair import ImagePair
-from bayesreg.model.observations.section import Name, ObservationSection
+from bayesreg.model.observations.images.report import check_table, residual_figure
+from bayesreg.model.observations.images.similarity import SIMILARITIES
+from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
 from bayesreg.settings import FoundImage
 from bayesreg.types import InputError
 
@@ -52,3 +54,31 @@ class ImagesSection(ObservationSection, ImageOptions):
         channel = inputs.channels[self.name]
         tissue = channel.fixed.with_voxels(inputs.tissue.nearest(channel.fixed.grid_points()))
         return [ImagePair(channel.fixed, channel.moving, *images[2:], channel.one_contrast, tissue, **self.options)]
+
+    @classmethod
+    def log_density(cls, name: str) -> str:
+        """−E_s / T_s, of the pair of this name where there are others."""
+        of_pair = "" if name == "images" else f"({name})"
+        return f" − <var>E</var><sub>s</sub>{of_pair} / <var>T</var><sub>s</sub>{of_pair}"
+
+    @classmethod
+    def explain(cls, name: str, described: Mapping[str, Any]) -> str:
+        """E_s of the similarity."""
+        similarity = SIMILARITIES[described["options"]["similarity"]["kind"]]
+        return f"<var>E</var><sub>s</sub>{'' if name == 'images' else f'({name})'} = {similarity.formula}"
+
+    @classmethod
+    def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
+        """Posterior predictive checks."""
+        return [check_table(name, summary)] if "observed" in summary else []
+
+    @classmethod
+    def figures(
+        cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
+    ) -> list[ReportFigure]:
+        """The residual beside what the model expects of it."""
+        if "residual" not in summary:
+            return []
+        similarity = described["options"]["similarity"]
+        residual = SIMILARITIES[similarity["kind"]].residual
+        return [residual_figure(name, summary, tissues, similarity, residual)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, get_args
 
 from jaxtyping import Float
 
@@ -53,3 +53,5 @@ class Similarity(Protocol):
 AnySimilarity = SquaredDifferences | StudentT | LocalCorrelation | MutualInformation | SelfSimilarity
 """The settings of a similarity. Its method `on(positions, rest)` makes the `Similarity` at some points (q, 3), mm, of
 images with the `Intensities` `rest` there where nothing has moved."""
+
+SIMILARITIES = {one.model_fields["kind"].default: one for one in get_args(AnySimilarity)}

@@ -1,0 +1,282 @@
+"""A pair of images as it is compared, its options complete."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+from scipy import stats
+
+from bayesreg.image import Image
+from bayesreg.interpolation import Interpolator
+from bayesreg.mesh import TetMesh
+from bayesreg.model.blocks import Blocks, Coefficients, Values, scale_block
+from bayesreg.model.observations.images.contrast import contrast_functions
+from bayesreg.model.observations.images.discrepancies import discrepancies
+from bayesreg.model.observations.images.independence import independent_scores
+from bayesreg.model.observations.images.intensity_map import SHARE, shading_basis
+from bayesreg.model.observations.images.likelihood import ComparedImages, Comparison, shading_name
+from bayesreg.model.observations.images.options import ImageOptions
+from bayesreg.model.observations.images.points import quadrature_of, require_overlap, seen_points, visibility
+from bayesreg.model.observations.images.pointwise import Intensities, StudentT
+from bayesreg.model.observations.images.self_similarity import InTurn, describe_self_similarity
+from bayesreg.model.observations.observation import Placed, Recorded
+from bayesreg.model.state import State
+from bayesreg.settings import is_inferred
+from bayesreg.types import AnyArray, InputError
+
+# Quadrature points at which observed and replicated intensities are kept for ArviZ.
+MOST_POINTS = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPair:
+    """A pair of images as it is compared.
+
+    Attributes
+    ----------
+    fixed, moving : Image
+    name : str
+    fixed_ignore, moving_ignore : Image or None
+    options : ImageOptions
+    """
+
+    fixed: Image
+    moving: Image
+    name: str
+    fixed_ignore: Image | None
+    moving_ignore: Image | None
+    options: ImageOptions
+
+    kind: ClassVar[str] = "images"
+
+    def fixed_at(self, positions: Float[np.ndarray, "points 3"]) -> Float[AnyArray, "points"]:
+        """What is compared of the fixed image at all quadrature points, mm."""
+        return self.fixed.interpolate(positions, self.options.interpolation)
+
+    def moving_function(self) -> Interpolator | InTurn:
+        """What is compared of the moving image, as a function of the places of all quadrature points."""
+        return self.moving.interpolator(self.options.interpolation)
+
+    def smoothed(self, sd: float) -> PreparedPair:
+        """The pair with what is compared smoothed, sd in mm."""
+        # SciPy's filters let other threads run.
+        with ThreadPoolExecutor() as pool:
+            fixed, moving = pool.map(lambda image: image.smoothed(sd), (self.fixed, self.moving))
+        return replace(self, fixed=fixed, moving=moving)
+
+    def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
+        """Functions, besides those of a shading, of which m may have some more than f, smoothed by sd, mm."""
+        return np.zeros((len(positions), 0))
+
+    def compared_points(self, mesh: TetMesh) -> Any:
+        """The quadrature points that are compared.
+
+        Raises
+        ------
+        InputError
+            If the mesh does not overlap an image, or nothing of it is left to compare.
+        """
+        of_pair = "" if self.name == "images" else f" of {self.name!r}"
+        require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
+        require_overlap(mesh, self.moving, f"moving image{of_pair}")
+        visible = None if self.fixed_ignore is None else visibility(self.fixed, self.fixed_ignore)
+        return seen_points(mesh, quadrature_of(mesh, self.fixed, self.options), self.moving, visible)
+
+    def on(self, mesh: TetMesh) -> Placed:
+        """See `ImagePair.on`."""
+        quadrature, options = self.compared_points(mesh), self.options
+        positions = quadrature.positions(mesh)
+        smooth = self._smoothed_by_options()
+        moving, fixed_values = smooth.moving_function(), smooth.fixed_at(positions)
+        rest = Intensities(fixed_values, moving(jnp.asarray(positions)), quadrature.weights)
+        term = ComparedImages(
+            comparison=Comparison(self.name, is_inferred(options.similarity.temperature), self.temperature_name),
+            similarity=options.similarity.on(positions, rest),
+            fixed_values=fixed_values,
+            moving=moving,
+            quadrature=quadrature,
+            nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
+            positions=jnp.asarray(positions),
+            independent_share=jnp.asarray(_independent_share(self.name, options, len(positions))),
+            shading=self._shading(np.asarray(fixed_values), positions),
+            visible=None if self.moving_ignore is None else visibility(self.moving, self.moving_ignore),
+        )
+        return Placed(self, term, self._blocks(term))
+
+    @property
+    def temperature_name(self) -> str:
+        """The name of the block of T_s."""
+        return "t_similarity" if self.name == "images" else f"{self.name}_t_similarity"
+
+    def _blocks(self, term: ComparedImages) -> Blocks:
+        """T_s, and the coefficients of the shading where there is one."""
+        blocks: Blocks = {self.temperature_name: scale_block(self.options.similarity.temperature)}
+        if term.shading is not None:
+            blocks[shading_name(self.name)] = Coefficients(jnp.full(term.shading.shape[1], SHARE))
+        return blocks
+
+    def _shading(
+        self, fixed_values: Float[np.ndarray, "points"], positions: Float[np.ndarray, "points 3"]
+    ) -> Float[AnyArray, "points coefficients"] | None:
+        degree, more = self.options.intensity_map, self.functions(positions, self._smoothing_sd)
+        if degree is None and not more.shape[1]:
+            return None
+        return jnp.asarray(shading_basis(fixed_values, positions, degree or 0, more))
+
+    @property
+    def _smoothing_sd(self) -> float:
+        """By how much the options smooth both images, mm."""
+        return self.options.smoothing * max(image.voxel_volume for image in (self.fixed, self.moving)) ** (1 / 3)
+
+    def _smoothed_by_options(self) -> PreparedPair:
+        return _kept_smoothed(self, self._smoothing_sd) if self.options.smoothing else self
+
+    # For the judgement of the fit
+
+    def describe(self, term: ComparedImages, state: State) -> dict[str, float]:
+        """The noise and the residual at a state.
+
+        "noise_sd", that of a point of average weight, by T_s; "residual_sd"; and "residual_to_noise", how many times as
+        great as T_s implies a residual is: by its sd, or with Student's t by its median, since a few outliers, which
+        Student's t forgives, have a great share in the former.
+        """
+        z = np.asarray(term.scaled_residual(state.u, state.values))
+        similarity = self.options.similarity
+        if isinstance(similarity, StudentT):
+            ratio = np.median(np.abs(z)) / stats.t(similarity.degrees_of_freedom).ppf(0.75)
+        else:
+            ratio = np.std(z) / np.sqrt(term.similarity.variance())
+        return {
+            "noise_sd": term.noise_sd(float(term.temperature(state.values))),
+            "residual_sd": float(np.std(term.residuals(state.u, state.values))),
+            "residual_to_noise": float(ratio),
+        }
+
+    def check_draw(self, term: ComparedImages, state: State, key: AnyArray) -> dict[str, AnyArray]:
+        """Discrepancies of the residuals at a draw, "observed", and of noise that follows the model, "replicated"."""
+        mesh, cells = state.mesh, term.quadrature.cells
+        z = term.scaled_residual(state.u, state.values)
+        noise = term.standardised_noise(key, state.u, state.values)
+        return {
+            name: discrepancies(x, cells, jnp.asarray(mesh.neighbours), len(mesh.cells))
+            for name, x in (("observed", z), ("replicated", noise))
+        }
+
+    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
+        """The residual at a state, in units of the noise, and the tissue of each of its points."""
+        term = posterior.data.terms[self.name]
+        residual = term.scaled_residual(state.u, state.values)
+        tissue = posterior.mesh.tissue[np.asarray(term.quadrature.cells)]
+        return {"residual": np.asarray(residual, np.float32), "residual_tissue": tissue.astype(np.int8)}
+
+    def recorded(self, term: ComparedImages) -> Recorded:
+        """Intensities of f, as they are compared, at up to 1,000 evenly spaced quadrature points."""
+        points = np.linspace(0, len(term.positions) - 1, min(len(term.positions), MOST_POINTS)).round().astype(int)
+        where = {"units": "mm", "long_name": "position of the point in the fixed image, world RAS"}
+        dim, places = f"{self.name}_point", zip("xyz", np.asarray(term.positions)[points].T, strict=True)
+        coords = {dim: points} | {f"{self.name}_{axis}": (dim, place, where) for axis, place in places}
+        attributes = {"units": "1", "long_name": "intensity of the fixed image, as it is compared"}
+        return Recorded(xr.DataArray(np.asarray(term.fixed_values)[points], coords, [dim], attrs=attributes), points)
+
+    # For the search for the mode
+
+    def eased(self, term: ComparedImages, sd: float) -> ComparedImages:
+        """The term with what is compared smoothed further, sd in mm."""
+        smooth = self._smoothed_by_options().smoothed(sd)
+        return term._replace(moving=smooth.moving_function(), fixed_values=smooth.fixed_at(np.asarray(term.positions)))
+
+    @property
+    def is_tempered_by_residuals(self) -> bool:
+        """Whether residuals tell how many quadrature points are independent."""
+        return self.options.independent_points == "residual"
+
+    def count_independent_points(self, term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
+        """How many quadrature points are independent, by the residuals at these values (see `independent_scores`)."""
+        voxels = np.rint(self.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
+        return independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedPair(PreparedPair):
+    """A pair whose fixed image was mapped into the contrast of the moving one.
+
+    Attributes
+    ----------
+    source : Image
+        The fixed image itself, of whose intensities the map is a function.
+    tissue : Image or None
+    """
+
+    source: Image
+    tissue: Image | None
+
+    def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
+        """The functions that make up the map: how much of each is there is inferred with all else."""
+        return contrast_functions(self.source, positions, sd, self.tissue)
+
+
+@dataclass(frozen=True, eq=False)
+class SelfSimilarPair(PreparedPair):
+    """A pair that is compared by descriptors of its images (`self_similarity`).
+
+    Attributes
+    ----------
+    descriptors : tuple of (Image, Image)
+        Those of f and of m, which quadrature points compare in turn.
+    """
+
+    descriptors: tuple[tuple[Image, Image], ...]
+
+    def fixed_at(self, positions: Float[np.ndarray, "points 3"]) -> Float[AnyArray, "points"]:
+        """The descriptors of f, one at each point."""
+        functions = [fixed.interpolator(self.options.interpolation) for fixed, _ in self.descriptors]
+        return InTurn.of(functions)(jnp.asarray(positions))
+
+    def moving_function(self) -> InTurn:
+        """The descriptors of m, one at each point."""
+        return InTurn.of([moving.interpolator(self.options.interpolation) for _, moving in self.descriptors])
+
+    def smoothed(self, sd: float) -> SelfSimilarPair:
+        """The pair with its descriptors smoothed, sd in mm."""
+        with ThreadPoolExecutor() as pool:
+            smooth = pool.map(lambda two: (two[0].smoothed(sd), two[1].smoothed(sd)), self.descriptors)
+            return replace(self, descriptors=tuple(smooth))
+
+
+@lru_cache(maxsize=4)
+def _kept_smoothed(pair: PreparedPair, sd: float) -> PreparedPair:
+    return pair.smoothed(sd)
+
+
+def describe_pair(pair: PreparedPair) -> SelfSimilarPair:
+    """The pair, compared by the self-similarity of its images."""
+    axes, distance = pair.fixed.axes, max(float(image.voxel_sizes.max()) for image in (pair.fixed, pair.moving))
+    fixed, moving = (describe_self_similarity(image, axes, distance) for image in (pair.fixed, pair.moving))
+    return SelfSimilarPair(**vars(pair), descriptors=tuple(zip(fixed, moving, strict=True)))
+
+
+def _independent_share(name: str, options: ImageOptions, points: int) -> float:
+    """Effective number of independent quadrature points over the number of all.
+
+    Raises
+    ------
+    InputError
+        If there are fewer points than are said to be independent.
+    """
+    count = options.independent_points
+    # What residuals tell is known later, see `Posterior.count_independent_points`.
+    if count is None or count == "residual":
+        return 1.0
+    if count > points:
+        raise InputError(
+            f"{name}: independent_points is {count:g}, but the quadrature has {points} points; give at most as many, "
+            "or null for all"
+        )
+    return count / points

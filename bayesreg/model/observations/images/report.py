@@ -1,0 +1,144 @@
+"""What the report shows of a pair of images: the residual, and posterior predictive checks of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from bayesreg.model.observations.images.discrepancies import DISCREPANCIES
+from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
+from bayesreg.tissues import colours_of, label_of
+
+NAMES = {
+    "sd": "sd of the residual",
+    "greatest": "greatest |residual|",
+    "neighbours": "correlation between neighbouring cells",
+}
+# Outside of these a posterior predictive p-value is called extreme.
+EXTREME = (0.025, 0.975)
+BINS = 60
+# A tissue with fewer quadrature points has no curve of its own.
+LEAST_POINTS = 50
+
+
+class ExpectedNoise(NamedTuple):
+    """The distribution of standardised residuals where the model holds: its name, density, and share beyond ±3."""
+
+    name: str
+    density: Callable[[np.ndarray], np.ndarray]
+    beyond_three: float
+
+
+def noise_of(similarity: Mapping[str, Any]) -> ExpectedNoise:
+    """The noise of a similarity, given by its settings, in units of the scale √(T_s / 2w)."""
+    if similarity["kind"] == "student_t":
+        nu = float(similarity["degrees_of_freedom"])
+        return ExpectedNoise(f"Student’s t with ν = {nu:g}", stats.t(nu).pdf, float(2 * stats.t.sf(3, nu)))
+    return ExpectedNoise("standard Normal", stats.norm.pdf, float(2 * stats.norm.sf(3)))
+
+
+def check_table(name: str, summary: Arrays) -> ReportTable:
+    """Realised against replicated discrepancies, with posterior predictive p-values."""
+    rows, size = [], int(np.prod(summary["observed"].shape[:2]))
+    for k, discrepancy in enumerate(DISCREPANCIES):
+        observed, replicated = summary["observed"][..., k], summary["replicated"][..., k]
+        p = predictive_p(observed, replicated)
+        rows.append([NAMES[discrepancy], _interval(observed), _interval(replicated), _p_text(p, size), _judge(p)])
+    caption = (
+        f"Residuals in units of the noise sd that T_s implies, over {size:,} draws: those of the images, and those of "
+        "noise that follows the model (median and 90 % interval). p is how often the noise of the model shows at least "
+        "as much as the images do: near 0 there is more in the residual than the model allows, near 1 less. "
+        "Neighbouring cells share a face."
+    )
+    header = ["", "Images", "Model", "How often more", "Residual"]
+    return ReportTable(f"Posterior predictive checks{of_pair(name)}", caption, header, rows)
+
+
+def residual_figure(
+    name: str, summary: Arrays, tissues: Sequence[str], similarity: Mapping[str, Any], residual: str
+) -> ReportFigure:
+    """The histogram of the residual at the posterior mean, and the discrepancies."""
+    z, expected = summary["residual"], noise_of(similarity)
+    beyond = f"{float((np.abs(z) > 3).mean()):.2%}".replace("%", " %")
+    caption = (
+        f"Left: the residual at the {len(z):,} quadrature points, each over the scale that T_s implies there, by "
+        f"tissue, and the density that it should follow, {expected.name}; {beyond} lie beyond ±3 "
+        f"({expected.beyond_three:.2%} if it does). Right: the discrepancies of the table below."
+    )
+    if residual:
+        caption += f" The residual is {residual}."
+    alt = f"Histograms of the residual; its sd is {float(z.std()):.3g}."
+    draw = partial(_draw_residual, summary, tissues, expected)
+    return ReportFigure(f"residual-{name}", f"The residual{of_pair(name)}", caption, alt, 2.6, draw)
+
+
+def of_pair(name: str) -> str:
+    """What distinguishes a title of a pair of this name."""
+    return "" if name == "images" else f" of {name}"
+
+
+def _draw_residual(summary: Arrays, tissues: Sequence[str], expected: ExpectedNoise, figure: Any, style: Any) -> None:
+    count = len(DISCREPANCIES)
+    first, *others = np.ravel(figure.subplots(1, 1 + count, width_ratios=[1.6] + [1.0] * count))
+    z = np.asarray(summary["residual"], float)
+    reach = float(np.clip(np.quantile(np.abs(z), 0.995) * 1.15, 4.5, None))
+    edges = np.linspace(-reach, reach, BINS + 1)
+    for index, (tissue, colour) in enumerate(zip(tissues, colours_of(tissues), strict=True)):
+        own = z[summary["residual_tissue"] == index]
+        if len(own) >= LEAST_POINTS:
+            density = np.histogram(own, edges)[0] / len(own) / np.diff(edges)
+            label = f"{style.literal(label_of(tissue))}, sd {own.std():.2g}"
+            first.stairs(density, edges, color=colour, lw=1.3, label=label)
+    x = np.linspace(-reach, reach, 300)
+    first.fill_between(x, expected.density(x), color=style.FAINT, lw=0, label=expected.name, zorder=0)
+    first.set(xlim=(-reach, reach), ylim=(0, None), yticks=[], xlabel="standardised residual at the mean")
+    first.spines["left"].set_visible(False)
+    first.legend(loc="upper left", handlelength=1.2)
+    for k, axes in enumerate(others):
+        _draw_discrepancy(
+            axes, NAMES[DISCREPANCIES[k]], summary["observed"][..., k], summary["replicated"][..., k], style
+        )
+    others[0].legend(loc="upper left", bbox_to_anchor=(0, 1.04), ncols=2, handlelength=1.0, columnspacing=1.0)
+
+
+def _draw_discrepancy(axes: Any, name: str, observed: np.ndarray, replicated: np.ndarray, style: Any) -> None:
+    for values, colour, label in ((replicated, style.MUTED, "model"), (observed, style.ACCENT, "images")):
+        low, high = values.min(), values.max()
+        margin = max(0.02 * (high - low), 1e-3 * abs(high))
+        density, edges = np.histogram(values, np.linspace(low - margin, high + margin, 25))
+        axes.stairs(density / density.max(), edges, fill=True, color=colour, alpha=0.65, lw=0, label=label)
+    axes.set(yticks=[], ylim=(0, 1.3), xlabel=name)
+    text = _p_text(predictive_p(observed, replicated), observed.size)
+    axes.set_title(text, fontsize=8, color=style.MUTED, loc="right")
+    axes.spines["left"].set_visible(False)
+
+
+def predictive_p(observed: np.ndarray, replicated: np.ndarray) -> float:
+    """Posterior predictive p-value: how often a replicated discrepancy is at least the realised one.
+
+    Near 0 the data show more of it than the model would, near 1 less.
+
+    Parameters
+    ----------
+    observed, replicated : arrays of one shape
+        The discrepancy of the data and of a replication, for every draw.
+    """
+    return float(np.mean(replicated >= observed))
+
+
+def _p_text(p: float, draws: int) -> str:
+    """A p-value; a bound where no draw, or every draw, exceeds."""
+    return f"p < {1 / draws:.2g}" if p == 0 else f"p > {1 - 1 / draws:.3g}" if p == 1 else f"p = {p:.3f}"
+
+
+def _interval(draws: np.ndarray) -> str:
+    low, median, high = np.quantile(draws, (0.05, 0.5, 0.95))
+    return f"{median:.3g} ({low:.3g} to {high:.3g})".replace("-", "−")
+
+
+def _judge(p: float) -> str:
+    return "too much" if p < EXTREME[0] else "too little" if p > EXTREME[1] else "as the model has it"

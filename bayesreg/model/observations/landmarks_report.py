@@ -1,0 +1,96 @@
+"""What the report shows of landmarks: residuals beside their sd, and how well all else predicts each."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
+from bayesreg.types import AnyArray
+
+LEVELS = (0.5, 0.95)
+
+
+def surprise(residual: Float[AnyArray, "k 3"], covariance: Float[AnyArray, "k 3 3"]) -> Float[np.ndarray, "k"]:
+    """Probability of a residual nearer to zero than this one, by its covariance; NaN where that is not finite."""
+    residual, covariance = np.asarray(residual), np.asarray(covariance)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    probability = np.full(len(residual), np.nan)
+    r = residual[known]
+    squared = np.einsum("ki,ki->k", r, np.linalg.solve(covariance[known], r[..., None])[..., 0])
+    probability[known] = stats.chi2(3).cdf(squared)
+    return probability
+
+
+def landmark_table(name: str, summary: Arrays) -> ReportTable:
+    """Residual of every landmark at the posterior mean, and where it was left out."""
+    distance = np.linalg.norm(summary["residual"], axis=1)
+    rows = [
+        [str(label), float(summary["sd"][k]), float(distance[k]), *_left_out_cells(summary, k)]
+        for k, label in enumerate(summary["names"])
+    ]
+    header = ["", "Sd, mm", "Residual, mm", "Left out, mm", "Its region"]
+    title = "Each landmark" if name == "landmarks" else f"Each landmark of {name}"
+    return ReportTable(title, _caption(summary), header, rows, summary["points"])
+
+
+def _left_out_cells(summary: Arrays, k: int) -> list[Any]:
+    if "left_out_residual" not in summary:
+        return [None, None]
+    residual = summary["left_out_residual"][k]
+    if not np.isfinite(residual).all():
+        return ["not determined", None]
+    inside = surprise(residual[None], summary["left_out_covariance"][k : k + 1])[0]
+    return [float(np.linalg.norm(residual)), f"{100 * inside:.1f} %"]
+
+
+def _caption(summary: Arrays) -> str:
+    text = (
+        "Residual: distance of the landmark in the moving image from where the posterior mean takes it; sd: of the "
+        "error of each coordinate that the model gives it."
+    )
+    if "left_out_residual" not in summary:
+        return f"{text} They were not left out in turn, as up to 60 are where nodes are sampled."
+    residual = summary["left_out_residual"]
+    known = np.isfinite(residual).all(axis=1)
+    if not known.any():
+        return f"{text} Left out, no landmark is determined by the other observations."
+    inside = surprise(residual, summary["left_out_covariance"])[known]
+    shares = [f"{(inside <= level).mean():.0%} of the landmarks lie in their {level:.0%} region" for level in LEVELS]
+    mean = np.linalg.norm(residual[known], axis=1).mean()
+    return (
+        f"{text} Left out: the same distance where all other observations predict the landmark, at the mean stiffness; "
+        f"its mean is {mean:.3g} mm. Its region: the share of the prediction that lies nearer. "
+        f"{', '.join(shares)}.".replace("%", " %")
+    )
+
+
+def distance_figure(name: str, summary: Arrays) -> ReportFigure:
+    """Distances with each landmark and without it, beside what the model expects of them."""
+    count = len(summary["names"])
+    caption = (
+        "How far each landmark lies from where the posterior takes it: with the landmark among the data (dots) and "
+        "predicted by all others (rings). Grey: what 95 % of landmarks with this error do not exceed."
+    )
+    alt = f"Distances of {count} landmarks, with and without each among the data."
+    height = max(1.6, 0.17 * count + 0.9)
+    draw = partial(_draw_distances, summary)
+    return ReportFigure(f"landmarks-{name}", "Distances of the landmarks", caption, alt, height, draw)
+
+
+def _draw_distances(summary: Arrays, figure: Any, style: Any) -> None:
+    names, axes = [style.literal(str(name)) for name in summary["names"]], figure.subplots()
+    rows, reach = np.arange(len(names)), stats.chi(3).ppf(0.95)
+    axes.barh(rows, reach * summary["sd"], height=0.8, color=style.FAINT, lw=0, label="95 % of errors of this sd")
+    fitted = np.linalg.norm(summary["residual"], axis=1)
+    axes.plot(fitted, rows, "o", color=style.UNIFORM, ms=4, label="at the posterior mean")
+    if "left_out_residual" in summary:
+        predicted = np.linalg.norm(summary["left_out_residual"], axis=1)
+        axes.plot(predicted, rows, "o", mfc="none", mec=style.ACCENT, ms=5, label="predicted by all others")
+    axes.set(yticks=rows, yticklabels=names, xlabel="distance from the landmark, mm", xlim=(0, None))
+    axes.invert_yaxis()
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.9 / figure.get_figheight()), ncols=3)

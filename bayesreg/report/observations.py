@@ -1,0 +1,117 @@
+"""What was observed: the terms of the density, how each observation fits, and what each kind shows of itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from bayesreg.io.records import Predicted
+from bayesreg.mesh import TetMesh
+from bayesreg.model.observations.registry import kinds
+from bayesreg.model.observations.section import ObservationSection, ReportFigure, ReportTable
+from bayesreg.report import style
+from bayesreg.report.estimands import symbol_of
+from bayesreg.report.places import regions
+from bayesreg.report.style import Drawing
+from bayesreg.report.tables import Table
+from bayesreg.report.verdict import NONE, number, part, place_text
+
+
+def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
+    """The logarithm of the density as a sum of its terms.
+
+    Parameters
+    ----------
+    manifest : mapping
+    elastography : bool
+        Whether the displacement of the boundary is given, and so has no prior.
+    """
+    elastic = part(manifest, "model", "elastic_prior") or {}
+    loads, normalised = elastic.get("kind") == "loads", elastic.get("normalised")
+    priors = {
+        " + log p(<var>u</var> | λ, μ, random loads)": loads,
+        " − <var>E</var><sub>r</sub> / <var>T</var><sub>r</sub>": not loads,
+        " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": normalised and not loads,
+        " + log p(rigid motion of <var>u</var>)": part(manifest, "model", "rigid_sd") is not None,
+    }
+    observed = [_kind(one).log_density(name) for name, one in observations_of(manifest).items()]
+    prior = "".join(text for text, holds in priors.items() if holds and not elastography)
+    scales = [Markup(" + log p({})").format(symbol_of(name)) for name in part(manifest, "scales") or {}]
+    total = "".join(observed) + prior + " + log p(λ) + log p(μ)" + "".join(scales)
+    return Markup(re.sub("^ − ", "−", total).removeprefix(" + "))
+
+
+def explanations(manifest: Mapping[str, Any]) -> list[Markup]:
+    """What the terms of the observations mean, a sentence for each that says so."""
+    found = [_kind(one).explain(name, one) for name, one in observations_of(manifest).items()]
+    return [Markup(text) for text in found if text]
+
+
+def observation_table(manifest: Mapping[str, Any]) -> Table | None:
+    """How each observation fits at the posterior mean; None where the run does not say."""
+    observed = observations_of(manifest)
+    rows = [
+        [
+            name.replace("_", " "),
+            one["title"],
+            f"{one['values']:,}" if "values" in one else NONE,
+            number(one.get("residual_rms")),
+            number(one["log"]),
+        ]
+        for name, one in observed.items()
+    ]
+    caption = (
+        "At the posterior mean. Residual over sd: the root mean square of the residuals in units of the sd that the "
+        "model gives them; about 1 where the model holds, less where there are many unknowns to so many values. Log: "
+        "of the term of the density, up to its constant."
+    )
+    header = ["", "Kind", "Values", "Residual over sd", "Log"]
+    return Table("What was observed", caption, header, [("", rows)]) if rows else None
+
+
+def shown_by_kinds(manifest: Mapping[str, Any], mesh: TetMesh, predicted: Predicted | None) -> list[Drawing | Table]:
+    """The figures and tables that each observation shows of itself."""
+    if predicted is None:
+        return []
+    shown: list[Drawing | Table] = []
+    for name, one in observations_of(manifest).items():
+        summary = {key: np.asarray(value) for key, value in predicted.of_observation(name).items()}
+        shown += [_drawing(figure) for figure in _kind(one).figures(name, summary, mesh.names, one)]
+        shown += [_table(table, mesh) for table in _kind(one).tables(name, summary)]
+    return shown
+
+
+def observations_of(manifest: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """What run.json says of each observation, by its name."""
+    return part(manifest, "observations") or {}
+
+
+def _kind(described: Mapping[str, Any]) -> type[ObservationSection]:
+    """The class of a kind of observation; the base where none is registered, as of an observation of one's own."""
+    return kinds().get(described["kind"], ObservationSection)
+
+
+def _drawing(figure: ReportFigure) -> Drawing:
+    with style.look():
+        drawn = style.new_figure(figure.height)
+        figure.draw(drawn, style)
+        uri = style.data_uri(drawn, "svg")
+    return Drawing(figure.name, figure.title, figure.caption, figure.alt, uri)
+
+
+def _table(table: ReportTable, mesh: TetMesh) -> Table:
+    header, rows = table.header, [[_cell(cell) for cell in row] for row in table.rows]
+    if table.places is not None:
+        words = regions(mesh, table.places)
+        texts = [place_text((float(x), float(y), float(z))) for x, y, z in table.places]
+        header = [header[0], "Place (x, y, z), mm", "Where", *header[1:]]
+        rows = [[row[0], text, where, *row[1:]] for row, text, where in zip(rows, texts, words, strict=True)]
+    return Table(table.title, table.caption, header, [("", rows)])
+
+
+def _cell(cell: Any) -> str:
+    return cell if isinstance(cell, str) else number(None if cell is None else float(cell))
