@@ -15,7 +15,7 @@ from rich.table import Table as TerminalTable
 from bayesreg.inference.chains.efficiency import Efficiency
 from bayesreg.io.atomic import write_json, write_text
 from bayesreg.report import style
-from bayesreg.report.html import render
+from bayesreg.report.page import render
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table, in_terminal
 from bayesreg.report.verdict import NONE, number, rhat_text
