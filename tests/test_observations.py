@@ -92,7 +92,7 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
     if not data:
         page = result.report.read_text(encoding="utf-8")
         assert 'id="landmarks"' in page
-        assert 'id="fit"' not in page
+        assert "Posterior predictive checks" not in page
         assert "Before and after" not in page
 
 
@@ -116,7 +116,7 @@ def test_landmarks_are_held_out(folder, tmp_path):
     assert (np.sqrt(np.einsum("kii->ki", found.evaluation_covariance))[:2] >= 0.2).all()
     assert np.isnan(found.evaluation_covariance[2]).all()
     page = result.report.read_text(encoding="utf-8")
-    assert 'id="evaluation"' in page
+    assert 'id="landmarks-held-out"' in page
     assert "Target registration error" in page
     assert plain.run.predicted.evaluation_residual is None
     # They may be found later.
@@ -186,7 +186,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
     assert result.run.manifest["model"]["vessel_sd"] == {"median": 0.5, "log_sd": 1.0}
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "vessel sd, mm" in page
-    assert 'id="fit"' in page
+    assert "Posterior predictive checks" in page
     np.testing.assert_array_equal(whole.idata.posterior["vessel_sd"], result.idata.posterior["vessel_sd"])
 
 

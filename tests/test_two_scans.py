@@ -136,7 +136,7 @@ def test_what_was_found_is_kept_with_the_run(result, folder):
 
 def test_the_report_shows_it(result):
     page = result.report.read_text(encoding="utf-8")
-    assert "Where the moving image lies" in page
+    assert "from where the header of" in page
     assert "The rigid part of the displacement" in page
     assert "borders of the tissues in the fixed image" in page
     assert "What is hatched is ignored" in page

@@ -7,19 +7,29 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 from matplotlib.ticker import MaxNLocator
 
 from bayesreg.io.atomic import replacing, write_text
 from bayesreg.report import style
-from bayesreg.report.html import render
+from bayesreg.report.page import Opening, Part, write_page
 from bayesreg.report.style import Drawing
-from bayesreg.report.verdict import fixed, number
+from bayesreg.report.tables import Table
+from bayesreg.report.verdict import Verdict, fixed, number
 
 TABLE, PARQUET, PAGE = "cohort.csv", "cohort.parquet", "cohort.html"
 # More runs than these are drawn without their names.
 MOST_NAMED = 60
 # Panels side by side.
 MOST_COLUMNS = 6
+COLUMNS = {
+    "R̂": "rhat_max",
+    "Least ESS": "ess_min",
+    "Mean, mm": "shift_mean_mm",
+    "Greatest, mm": "shift_max_mm",
+    "Radius, mm": "radius95_mean_mm",
+    "Minutes": "minutes",
+}
 # Where values are further apart than this their axis is logarithmic.
 DECADES = 30
 
@@ -42,23 +52,30 @@ def write_cohort(table: pd.DataFrame, out: Path) -> None:
     finished = table[table["state"] == "finished"]
     converged = int((finished["converged"] == True).sum()) if len(finished) else 0  # noqa: E712 - None is not False
     headline = f"{len(finished)} of {len(table)} runs have finished, {converged} converged; {len(failed)} failed."
-    header = ["", "R̂", "least ESS", "mean, mm", "greatest, mm", "radius, mm", "minutes"]
-    columns = ("rhat_max", "ess_min", "shift_mean_mm", "shift_max_mm", "radius95_mean_mm", "minutes")
+    sound = not len(failed) and converged == len(table)
+    failures = [f"{row['folder']}: {row.get('message', '')}" for row in failed.to_dict("records")]
+    opening = Opening(
+        "Bayesian elastic registration · cohort",
+        out.name,
+        verdicts=[("", Verdict(sound, headline, ""))],
+        warnings=failures,
+    )
+    parts = [Part("Runs", [_table(finished), _stiffness(finished)])] if len(finished) else []
+    write_page(out / PAGE, opening, parts)
+
+
+def _table(finished: pd.DataFrame) -> Table:
+    """A row for each run, whose name leads to its report."""
+    link = Markup('<a href="{0}/report.html">{0}</a>')
     rows = [
-        {"name": name, "link": f"{name}/report.html", "cells": [_text(row.get(column)) for column in columns]}
+        [link.format(name), *(_text(row.get(column)) for column in COLUMNS.values())]
         for name, row in zip(finished["folder"], finished.to_dict("records"), strict=True)
     ]
-    failures = [{"name": row["folder"], "message": row.get("message", "")} for row in failed.to_dict("records")]
-    content = {
-        "title": out.name,
-        "sound": not len(failed) and converged == len(table),
-        "headline": headline,
-        "failures": failures,
-        "header": header,
-        "rows": rows,
-        "drawing": _stiffness(finished) if rows else None,
-    }
-    write_text(out / PAGE, render("cohort.html", content))
+    caption = (
+        "Each name leads to the report of its run. Displacement: mean and greatest length over the organ, the pose "
+        "left out. Radius: mean over the organ of the radius within which a point lies with 95 %."
+    )
+    return Table("Results", caption, ["", *COLUMNS], [("", rows)])
 
 
 def _text(value: Any) -> str:

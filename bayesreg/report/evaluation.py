@@ -8,6 +8,7 @@ from scipy import stats
 from bayesreg.io.records import Predicted
 from bayesreg.report import style
 from bayesreg.report.landmarks import surprise
+from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import fixed
@@ -16,8 +17,9 @@ from bayesreg.results.transform import distances_of
 LEVELS = (0.5, 0.9, 0.95)
 
 
-def evaluation_table(predicted: Predicted) -> Table | None:
+def evaluation_table(study: Study) -> Table | None:
     """Distances by the headers, by the pose, and by the posterior mean; None where nothing was held out."""
+    predicted = study.predicted
     if predicted.evaluation_residual is None:
         return None
     inside, after = np.asarray(predicted.evaluation_inside), np.linalg.norm(predicted.evaluation_residual, axis=1)
@@ -44,30 +46,25 @@ def evaluation_table(predicted: Predicted) -> Table | None:
     return Table("Target registration error", caption, ["", "Mean", "Median", "95 %", "Greatest"], [("", rows)])
 
 
-def evaluation(predicted: Predicted) -> Drawing | None:
+def evaluation(study: Study) -> Drawing | None:
     """Errors before and after, beside what was expected, and a calibration curve; None where nothing was held out."""
+    predicted = study.predicted
     if predicted.evaluation_residual is None or predicted.evaluation_posed is None:
         return None
     inside = np.asarray(predicted.evaluation_inside)
     if not inside.any():
         return None
     after = np.linalg.norm(predicted.evaluation_residual, axis=1)[inside]
-    before = np.asarray(predicted.evaluation_posed)[inside]
     radius = distances_of(np.asarray(predicted.evaluation_covariance)[inside]).radius
     found = np.sort(_surprise(predicted))
     count = len(found)
     with style.look():
         figure = style.new_figure(3.4)
-        left, middle, right = figure.subplots(1, 3)
-        order = np.argsort(before)
-        left.plot(before[order], "o", ms=3, color=style.UNIFORM, label="by the pose alone")
-        left.plot(after[order], "o", ms=3, color=style.ACCENT, label="by the posterior mean")
-        left.set(xlabel="landmark", ylabel="error, mm", ylim=(0, None), title="before and after")
-        left.legend()
-        middle.plot(radius, after, "o", ms=4, color=style.ACCENT)
+        left, right = figure.subplots(1, 2)
+        left.plot(radius, after, "o", ms=4, color=style.ACCENT)
         reach = 1.05 * max(radius.max(initial=0.1), after.max(initial=0.1))
-        middle.plot([0, reach], [0, reach], color=style.MUTED, lw=0.8)
-        middle.set(
+        left.plot([0, reach], [0, reach], color=style.MUTED, lw=0.8)
+        left.set(
             xlabel="95 % radius, mm",
             ylabel="error, mm",
             xlim=(0, reach),
@@ -84,9 +81,9 @@ def evaluation(predicted: Predicted) -> Drawing | None:
         )
         uri = style.data_uri(figure)
     caption = (
-        "Left: each landmark’s distance from where it was found, before the deformation and after it. Middle: the same "
-        "beside the radius that should hold it with 95 %; below the line is inside. Right: how many landmarks lie in "
-        "the regions of each probability; grey is where 95 % of such curves run if the probabilities are right."
+        "Left: error of each landmark beside the radius that should hold it with 95 %; below the line is inside. "
+        "Right: share of landmarks in the regions of each probability; grey: where 95 % of such curves lie if the "
+        "probabilities are right."
     )
     alt = f"Errors of {len(after)} landmarks that were held out, and how often they lie in their regions."
     return Drawing("held-out", "Landmarks that were held out", caption, alt, uri)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm, Normalize, to_rgb
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from scipy import ndimage
 
 from bayesreg.image import Image
@@ -22,10 +22,12 @@ from bayesreg.io.records import Run
 from bayesreg.mesh import TetMesh
 from bayesreg.report import style
 from bayesreg.report.metrics import divergence
-from bayesreg.report.slices import DIRECTIONS, IN_PLANE, MeshSlice, Plane, cut, main_plane, planes_through, sample
+from bayesreg.report.slices import DIRECTIONS, IN_PLANE, MeshSlice, Plane, planes_through, sample
 from bayesreg.tissues import colours_of, label_of
+from bayesreg.types import AnyArray
 
 BAR_LENGTHS = (5, 10, 20, 50, 100)
+MAX_VOXELS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,24 +39,29 @@ class View:
     run : Run
     planes : tuple of Plane
         Sagittal, coronal, axial.
-    main : Plane
     """
 
     run: Run
     planes: tuple[Plane, Plane, Plane]
-    main: Plane
     _slices: dict[Plane, MeshSlice] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, run: Run) -> View:
-        """Planes through the node of greatest displacement (true where known)."""
+    def of(cls, run: Run, point: AnyArray | None = None) -> View:
+        """Planes through a point (mm), else through the node of greatest displacement (true where known)."""
         u = true_or_mean_displacement(run)
-        planes = planes_through(run.mesh, run.mesh.points[(u**2).sum(axis=1).argmax()])
-        return cls(run, planes, main_plane(run.mesh, planes, u))
+        return cls(
+            run, planes_through(run.mesh, run.mesh.points[(u**2).sum(axis=1).argmax()] if point is None else point)
+        )
 
     def on(self, run: Run) -> View:
         """A view of another run on these planes."""
-        return View(run, self.planes, self.main)
+        return View(run, self.planes)
+
+    @cached_property
+    def main(self) -> Plane:
+        """The plane that sees most of the displacement: of the greatest integral of |u|² over its section."""
+        u = true_or_mean_displacement(self.run)
+        return max(self.planes, key=lambda plane: np.nansum(self.slice(plane).nodal(u) ** 2) * plane.spacing**2)
 
     def slice(self, plane: Plane) -> MeshSlice:
         """The mesh on a plane."""
@@ -62,24 +69,63 @@ class View:
             self._slices[plane] = MeshSlice(self.run.mesh, plane)
         return self._slices[plane]
 
-    def error(self, plane: Plane) -> np.ndarray:
-        """|ū − u_true| on a plane, mm."""
-        if self.run.truth is None:
-            raise ValueError("the error of a run is known only where the truth is")
-        difference = np.asarray(self.run.u_mean) - np.asarray(self.run.truth.u)
-        return np.linalg.norm(self.slice(plane).nodal(difference), axis=-1)
+    def norm(self, plane: Plane, vectors: AnyArray) -> np.ndarray:
+        """The length of a nodal vector field on a plane."""
+        return np.linalg.norm(self.slice(plane).nodal(vectors), axis=-1)
 
-    def spread(self, plane: Plane) -> np.ndarray:
-        """Root of the summed variances of u on a plane, mm."""
-        return np.linalg.norm(self.slice(plane).nodal(self.run.u_sd), axis=-1)
+    def scalar(self, plane: Plane, values: AnyArray) -> np.ndarray:
+        """A nodal number on a plane."""
+        return self.slice(plane).nodal(np.asarray(values, float)[:, None])[..., 0]
 
-    def magnitude(self, plane: Plane) -> np.ndarray:
-        """|ū| on a plane, mm."""
-        return np.linalg.norm(self.slice(plane).nodal(self.run.u_mean), axis=-1)
-
-    def divergence(self, plane: Plane, u: np.ndarray) -> np.ndarray:
+    def divergence(self, plane: Plane, u: AnyArray) -> np.ndarray:
         """Div u on a plane."""
         return self.slice(plane).cellwise(divergence(self.run.mesh, u))
+
+
+def error_of(run: Run) -> np.ndarray:
+    """ū − u_true at every node, (n, 3), mm."""
+    if run.truth is None:
+        raise ValueError("the error of a run is known only where the truth is")
+    return np.asarray(run.u_mean) - np.asarray(run.truth.u)
+
+
+class Row(NamedTuple):
+    """A row of maps, one for each plane, on one colour scale.
+
+    Attributes
+    ----------
+    label : str
+        Of its colour bar.
+    picture : function
+        From a plane to its pixels.
+    cmap : str
+    norm : Normalize or None
+        None for 0 to the greatest value of the row.
+    """
+
+    label: str
+    picture: Callable[[Plane], np.ndarray]
+    cmap: str
+    norm: Normalize | None = None
+
+
+def map_rows(view: View, rows: Sequence[Row]) -> tuple[Figure, np.ndarray]:
+    """A figure of rows of maps on the axial, the coronal and the sagittal plane, and its axes."""
+    planes = view.planes[::-1]
+    widths = [float(np.ptp(plane.horizontal)) for plane in planes]
+    height = 0.93 * style.WIDTH * max(np.ptp(plane.vertical) for plane in planes) / sum(widths)
+    figure = style.new_figure(len(rows) * height + 0.3)
+    axes = figure.subplots(len(rows), 3, width_ratios=widths, squeeze=False)
+    for panels, row in zip(axes, rows, strict=True):
+        pictures = [row.picture(plane) for plane in planes]
+        norm = row.norm or from_zero(*pictures)
+        for panel, plane, picture in zip(panels, planes, pictures, strict=True):
+            drawn = field_panel(panel, picture, plane, norm, row.cmap)
+            outline(panel, view, plane)
+        colourbar(figure, drawn, list(panels), row.label)
+    for panel, plane in zip(axes[0], planes, strict=True):
+        panel.set_title(plane.title)
+    return figure, axes
 
 
 def true_or_mean_displacement(run: Run) -> np.ndarray:
@@ -162,11 +208,14 @@ def label_lines(axes: Axes, run: Run, plane: Plane) -> None:
 
 
 def mesh_panel(axes: Axes, mesh: TetMesh, plane: Plane) -> None:
-    """The exact cut through the mesh, coloured by tissue."""
-    section = cut(mesh, plane.axis, plane.position)
-    colours = np.array([to_rgb(colour) for colour in colours_of(mesh.names)])[mesh.tissue[section.cell]]
-    axes.add_collection(PolyCollection(list(section.polygons), facecolors=colours, edgecolors="white", linewidths=0.45))
-    _frame(axes, plane, dark=False)
+    """The cut through the mesh, coloured by tissue; white lines between its tetrahedra."""
+    fine = plane._replace(spacing=plane.spacing / 3)
+    cell = np.nan_to_num(MeshSlice(mesh, fine).cellwise(np.arange(len(mesh.cells))), nan=-1.0).astype(int)
+    palette = np.array([*map(to_rgb, colours_of(mesh.names)), to_rgb("white")])
+    picture = palette[np.where(cell < 0, -1, mesh.tissue[cell])]
+    picture[:-1][cell[1:] != cell[:-1]] = 1.0
+    picture[:, :-1][cell[:, 1:] != cell[:, :-1]] = 1.0
+    field_panel(axes, picture, plane, Normalize(0, 1), style.GREY)
 
 
 def arrows(axes: Axes, view: View, plane: Plane, u: np.ndarray) -> None:
@@ -210,8 +259,9 @@ def grey_limits(run: Run) -> tuple[float, float]:
 
 
 def range_of(image: Image) -> tuple[float, float]:
-    """The range of an image, without its extremes."""
-    low, high = np.quantile(np.asarray(image.voxels, float), (0.005, 0.998))
+    """The range of an image, without its extremes, by an even sample of its voxels."""
+    values = np.ravel(image.voxels)
+    low, high = np.quantile(values[:: max(1, values.size // MAX_VOXELS)].astype(float), (0.005, 0.998))
     return float(low), float(max(high, low + 1e-9))
 
 
@@ -225,7 +275,7 @@ def colourbar(figure: FigureBase, drawn: ScalarMappable, axes: Axes | Sequence[A
         bar.locator, bar.minorlocator = LogLocator(subs=(1, 2, 5)), NullLocator()
         bar.formatter = FuncFormatter(lambda value, _: f"{value:.3g}")
     else:
-        bar.locator = FixedLocator(place["ticks"]) if "ticks" in place else MaxNLocator(5)
+        bar.locator = MaxNLocator(5)
     bar.update_ticks()
     bar.set_label(label, fontsize=8)
 

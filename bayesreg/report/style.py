@@ -9,9 +9,6 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
-import numpy as np
-import PIL.Image
-from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -87,6 +84,7 @@ class Drawing(NamedTuple):
     caption: str
     alt: str
     uri: str
+    kind: str = "figure"
 
 
 @contextmanager
@@ -110,13 +108,6 @@ def data_uri(figure: Figure, kind: str = "webp") -> str:
         figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs={"quality": QUALITY})
     media = "image/svg+xml" if kind == "svg" else f"image/{kind}"
     return f"data:{media};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-
-
-def grey_uri(picture: Float[np.ndarray, "Y X"]) -> str:
-    """A picture of numbers from 0 to 1, the first row below, as a data URI of one byte a pixel."""
-    buffer = io.BytesIO()
-    PIL.Image.fromarray((255 * picture[::-1]).astype(np.uint8)).save(buffer, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
 def literal(text: str) -> str:

@@ -1,79 +1,111 @@
-"""What a clinician reads first: what moved, how far, how sure that is, and where not to trust it."""
+"""What a clinician reads first: did it work, what moved, how far, how sure is that, and where not to trust it."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from bayesreg.io.records import Predicted, Run
 from bayesreg.report.places import regions
-from bayesreg.report.verdict import Verdict, fixed, percent, place_text
+from bayesreg.report.study import Study
+from bayesreg.report.verdict import fixed, number, part, percent, place_text
 from bayesreg.types import AnyArray
 
 # Beyond this 95 % radius a place is of little use to a hand, mm.
 COARSE = 2.0
 
 
-class Point(NamedTuple):
-    """A question and its answer."""
-
-    question: str
-    answer: str
-
-
-def summarise_run(run: Run, predicted: Predicted, judged: Verdict) -> list[Point]:
-    """Four questions and their answers, in words."""
-    mesh = run.mesh
-    u, radius = np.linalg.norm(run.u_mean, axis=1), np.asarray(predicted.reach)
-    share = mesh.nodal_volumes / mesh.nodal_volumes.sum()
-    middle, most = _quantile(u, share, 0.5), int(u.argmax())
-    least = int(radius.argmax())
-    near, far = _quantile(radius, share, 0.5), _quantile(radius, share, 0.9)
-    coarse = float(share[radius > COARSE].sum())
-    where, doubtful = regions(mesh, mesh.points[[most, least]])
-    trust = f"Least at {_place(mesh.points[least])} ({doubtful}): {fixed(float(radius[least]), 1)} mm. "
-    trust += (
-        f"In {percent(coarse)} of the organ that radius is above {COARSE:g} mm. "
-        if coarse
-        else f"It is below {COARSE:g} mm everywhere. "
-    )
-    trust += "Nothing is said of what lies outside the mesh."
-    if not judged.converged:
-        trust = f"Trust nothing yet: the sampler has not converged, and what stands here may change. {trust}"
+def answers(study: Study) -> list[tuple[str, str]]:
+    """Five questions, each with its answer."""
     return [
-        Point("What moved?", _pose(run)),
-        Point(
-            "How far?",
-            f"Half of the organ by more than {fixed(middle, 1)} mm; the most, {fixed(float(u[most]), 1)} mm, at "
-            f"{_place(mesh.points[most])} ({where}).",
-        ),
-        Point(
-            "How sure?",
-            f"Half of it is known to within {fixed(near)} mm, nine tenths to within {fixed(far)} mm: a point lies so "
-            "far from its mean place at most, with a probability of 95 %.",
-        ),
-        Point("Where not to trust it?", trust),
+        ("Did it work?", _success(study)),
+        ("What moved?", _pose(study)),
+        ("How far?", _size(study)),
+        ("How sure?", _certainty(study)),
+        ("Where not to trust it?", _doubt(study)),
     ]
 
 
-def _pose(run: Run) -> str:
-    """How the organ lies, in words."""
-    if run.matching.pose.is_identity:
-        return "The organ, in the one world in which it was seen before and after."
-    motion = run.matching.pose.about(run.mesh.points.mean(axis=0))
+def _success(study: Study) -> str:
+    converged = study.verdict.converged
+    chains = "The chains agree." if converged else "Not yet: the chains do not agree, and all figures may change."
+    return " ".join([chains, *_images(study), *_held_out(study), *_fits(study)])
+
+
+def _images(study: Study) -> list[str]:
+    """By how much the images differ, before and after."""
+    if study.image_differences is None:
+        return []
+    before, after = (number(value, 2) for value in study.image_differences)
+    return [f"The images differ by {after} (root mean square, scaled intensity); before, {before}."]
+
+
+def _held_out(study: Study) -> list[str]:
+    """How far landmarks that the sampler never saw lie from where they were found, before and after."""
+    predicted = study.predicted
+    if predicted.evaluation_residual is None or not np.asarray(predicted.evaluation_inside).any():
+        return []
+    inside = np.asarray(predicted.evaluation_inside)
+    before = np.asarray(predicted.evaluation_before)[inside].mean()
+    after = np.linalg.norm(predicted.evaluation_residual, axis=1)[inside].mean()
+    return [
+        f"Landmarks that were held out lie {fixed(after, 1)} mm (mean) from their true place; before, "
+        f"{fixed(before, 1)} mm."
+    ]
+
+
+def _fits(study: Study) -> list[str]:
+    """How large the residuals of each observation are beside what the model expects."""
+    observed = part(study.manifest, "observations") or {}
+    return [
+        f"Residuals of {name.replace('_', ' ')}: {number(one['residual_rms'], 2)} times the sd that the model expects."
+        for name, one in observed.items()
+        if one.get("residual_rms") is not None
+    ]
+
+
+def _pose(study: Study) -> str:
+    pose = study.run.matching.pose
+    if pose.is_identity:
+        return "Both images share one coordinate system; the organ deformed in it."
+    motion = pose.about(study.mesh.points.mean(axis=0))
     return (
         f"The organ lies {fixed(motion.millimetres, 1)} mm and {fixed(motion.degrees, 1)}° from where the header of "
-        "the moving image has it; displacements come on top of that."
+        "the moving image has it; it deformed besides."
     )
 
 
-def _place(point: AnyArray) -> str:
-    x, y, z = (float(coordinate) for coordinate in np.asarray(point))
-    return place_text((x, y, z))
+def _size(study: Study) -> str:
+    length = np.linalg.norm(study.run.u_mean, axis=1)
+    middle, most = _quantile(study, length, 0.5), int(length.argmax())
+    return (
+        f"Half of the organ moved more than {fixed(middle, 1)} mm; the most, {fixed(length[most], 1)} mm, is at "
+        f"{_place(study, most)}."
+    )
 
 
-def _quantile(values: AnyArray, share: AnyArray, level: float) -> float:
+def _certainty(study: Study) -> str:
+    near, far = (_quantile(study, study.predicted.reach, level) for level in (0.5, 0.9))
+    return (
+        f"With a probability of 95 % a point lies within a radius of its mean place: at most {fixed(near)} mm in half "
+        f"of the organ, at most {fixed(far)} mm in nine tenths."
+    )
+
+
+def _doubt(study: Study) -> str:
+    radius = np.asarray(study.predicted.reach)
+    least, share = int(radius.argmax()), study.mesh.nodal_volumes / study.mesh.nodal_volumes.sum()
+    coarse = float(share[radius > COARSE].sum())
+    text = f"The radius is greatest at {_place(study, least)}: {fixed(radius[least], 1)} mm. "
+    text += f"In {percent(coarse)} of the organ it is above {COARSE:g} mm. " if coarse else ""
+    return text + "The result says nothing of what lies outside the mesh."
+
+
+def _place(study: Study, node: int) -> str:
+    point = study.mesh.points[node]
+    return f"{place_text(point)} ({regions(study.mesh, point[None])[0]})"
+
+
+def _quantile(study: Study, values: AnyArray, level: float) -> float:
     """The value that so much of the volume does not exceed."""
     order = np.argsort(values)
-    return float(np.asarray(values)[order][np.searchsorted(np.cumsum(np.asarray(share)[order]), level)])
+    share = np.cumsum(study.mesh.nodal_volumes[order]) / study.mesh.nodal_volumes.sum()
+    return float(np.asarray(values)[order][np.searchsorted(share, level)])

@@ -1,110 +1,169 @@
-"""The organ in three dimensions, drawn by the browser: three.js stands in the page, which loads nothing."""
+"""The organ in three dimensions, which the reader can turn: its surface, the fluid in it, and the places."""
 
 from __future__ import annotations
 
-import base64
-import json
-from importlib.resources import files
+from html import escape
 from typing import Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
+import plotly.graph_objects as go
 import scipy.sparse
 from jaxtyping import Float, Int
 from markupsafe import Markup
 from scipy.sparse.csgraph import connected_components
 
-from bayesreg.io.records import Predicted
 from bayesreg.mesh import FACES, TetMesh
 from bayesreg.report import style
-from bayesreg.report.panels import View
-from bayesreg.report.uncertainty import region
+from bayesreg.report.study import Study
+from bayesreg.report.uncertainty import Place, places_of
 from bayesreg.tissues import is_fluid
 
-# Of the triangles' points, mm, and of colours.
-DECIMALS = 2
-FLUID = "#3a6ea5"
+FLUID, PLACE = "#3a6ea5", "#e8891c"
+# A grey that can be read on white and on black.
+TEXT = "#808b96"
+# How many times as large as it is the displacement is shown.
+ENLARGED = (0, 1, 2, 5)
+SHOWN = {0: "before", 1: "after"}
+FIGURE = Markup(
+    '<figure id="figure-three-d"><h3>In three dimensions</h3>{}<figcaption>Drag to turn, scroll to come nearer. '
+    "Surface of the mesh, fluid deep in it, and each place within the ellipsoid that holds it with 95 % (true size); "
+    "the pose is left out. Right of “after” the displacement is enlarged.</figcaption></figure>"
+)
 
 
-class Scale(NamedTuple):
-    """What colours mean."""
+class Surface(NamedTuple):
+    """Triangles that move: points at rest and their displacement, (k, 3), mm, and indices into both, (t, 3)."""
 
-    name: str
-    label: str
-    greatest: str
-    gradient: str
+    points: Float[np.ndarray, "k 3"]
+    u: Float[np.ndarray, "k 3"]
+    faces: Int[np.ndarray, "t 3"]
 
+    def at(self, times: int) -> list[list[float]]:
+        """The coordinates x, y and z with the displacement so many times as large."""
+        return np.round(self.points + times * self.u, 2).T.tolist()
 
-class ThreeD(NamedTuple):
-    """What the page needs.
-
-    Attributes
-    ----------
-    data : Markup
-        JSON.
-    libraries : dict
-        Name in the import map to a data URI.
-    program : Markup
-        The module that draws.
-    scales : list of Scale
-    caption : str
-    """
-
-    data: Markup
-    libraries: dict[str, str]
-    program: Markup
-    scales: list[Scale]
-    caption: str
+    def drawn(self, **how: Any) -> go.Mesh3d:
+        """The surface after the displacement."""
+        corners = dict(zip("xyzijk", (*self.at(1), *self.faces.T.tolist()), strict=True))
+        return go.Mesh3d(**corners, flatshading=False, **how)
 
 
-def three_d(view: View, predicted: Predicted) -> ThreeD:
-    """The surface of the organ, the fluid in it, and the regions that hold places with 95 %."""
-    mesh, u = view.run.mesh, np.asarray(view.run.u_mean)
-    values = {"displacement": np.linalg.norm(u, axis=1), "uncertainty": np.asarray(predicted.reach)}
-    labels = {"displacement": "displacement, mm", "uncertainty": "95 % radius, mm"}
-    outer, scales, colours = mesh.boundary_faces, [], {}
-    for name, value in values.items():
-        greatest = float(np.quantile(value[mesh.boundary], 0.995)) or 1.0
-        cmap = mpl.colormaps[style.MAGNITUDE if name == "displacement" else style.ERROR]
-        # Linear light, as the renderer has it.
-        colours[name] = cmap(np.clip(value / greatest, 0, 1))[:, :3] ** 2.2
-        stops = ", ".join(mpl.colors.to_hex(cmap(x)) for x in np.linspace(0, 1, 9))
-        scales.append(Scale(name, labels[name], f"{greatest:.2g}", f"linear-gradient(to right, {stops})"))
-    shells = [_shell(mesh, u, outer, colours)]
-    inner = _fluid_surface(mesh)
-    if len(inner):
-        shells.append(_shell(mesh, u, inner, None))
-    content = {
-        "centre": _rounded(mesh.points.mean(axis=0)),
-        "size": float(np.ptp(mesh.points, axis=0).max()),
-        "shells": shells,
-        "places": _places(predicted),
+def three_d(study: Study) -> Markup:
+    """A figure to turn, with the program that draws it; it loads nothing."""
+    drawn = figure(study).to_html(full_html=False, include_plotlyjs=True, config={"displayModeBar": False})
+    return FIGURE.format(Markup(drawn))
+
+
+def figure(study: Study) -> go.Figure:
+    """The surface of the mesh, the places, and the fluid deep inside."""
+    mesh, u = study.mesh, np.asarray(study.run.u_mean)
+    places = places_of(study)
+    surfaces = [_surface(mesh, u, mesh.boundary_faces), *(_ellipsoid(place) for place in places)]
+    scales = _scales(study)
+    traces = [surfaces[0].drawn(**scales["displacement"], opacity=0.35)]
+    traces += [
+        surface.drawn(color=PLACE, hoverinfo="name", name=escape(p.name))
+        for surface, p in zip(surfaces[1:], places, strict=True)
+    ]
+    if len(fluid := _fluid_faces(mesh)):
+        surfaces.append(_surface(mesh, u, fluid))
+        traces.append(surfaces[-1].drawn(color=FLUID, hoverinfo="skip"))
+    return go.Figure([*traces, _labels(places)], _layout(surfaces, scales))
+
+
+def _scales(study: Study) -> dict[str, dict[str, Any]]:
+    """What the colours of the surface can mean, by name."""
+    nodes = study.mesh.boundary
+    length = np.linalg.norm(study.run.u_mean, axis=1)
+    values = {
+        "displacement": (length, style.MAGNITUDE, "|ū|, mm"),
+        "95 % radius": (np.asarray(study.predicted.reach), style.ERROR, "95 % radius, mm"),
     }
-    caption = (
-        "Drag to turn, scroll to come nearer. The surface of the mesh and the fluid deep in it, where they were before "
-        "and where the posterior mean takes them (the pose left out), and each place within the ellipsoid that holds "
-        "it with 95 %. “Enlarge” shows movement and ellipsoids so many times as large as they are."
-    )
-    own = {"three": "three.module.min.js", "orbit-controls": "OrbitControls.js"}
-    libraries = {name: _data_uri(_read(file)) for name, file in own.items()}
-    return ThreeD(_embedded(content), libraries, Markup(_read("view.js")), scales, caption)
-
-
-def _shell(
-    mesh: TetMesh, u: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "t 3"], colours: dict[str, Any] | None
-) -> dict[str, Any]:
-    """A surface with points of its own."""
-    nodes, index = np.unique(faces, return_inverse=True)
     return {
-        "points": _rounded(mesh.points[nodes]),
-        "moved": _rounded(u[nodes]),
-        "faces": index.reshape(-1, 3).tolist(),
-        "colours": colours and {name: _rounded(colour[nodes].ravel()) for name, colour in colours.items()},
-        "colour": FLUID,
+        name: {
+            "intensity": np.round(value[nodes], 3).tolist(),
+            "colorscale": cmap.capitalize(),
+            "cmin": 0.0,
+            "cmax": float(np.quantile(value[nodes], 0.995)) or 1.0,
+            "colorbar": {"title": {"text": title}, "thickness": 12, "len": 0.6},
+            "hovertemplate": "%{intensity:.2f} mm<extra></extra>",
+        }
+        for name, (value, cmap, title) in values.items()
     }
 
 
-def _fluid_surface(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
+def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The scene without a frame, a slider for the displacement, and buttons for the colours."""
+    which = list(range(len(surfaces)))
+    steps = [
+        {"label": SHOWN.get(times, f"× {times}"), "method": "restyle", "args": [_moved(surfaces, times), which]}
+        for times in ENLARGED
+    ]
+    buttons = [
+        {"label": name, "method": "restyle", "args": [{key: [value] for key, value in scale.items()}, [0]]}
+        for name, scale in scales.items()
+    ]
+    hidden = {"visible": False}
+    return {
+        "height": 600,
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "font": {"color": TEXT},
+        "showlegend": False,
+        # World RAS: up is superior; seen from the front, right and above.
+        "scene": {
+            "aspectmode": "data",
+            **{f"{axis}axis": hidden for axis in "xyz"},
+            "camera": {"eye": {"x": 0.7, "y": 1.5, "z": 0.6}},
+        },
+        "sliders": [{"steps": steps, "active": 1, "x": 0.3, "len": 0.4, "y": 0.16, "currentvalue": {"visible": False}}],
+        "updatemenus": [
+            {"type": "buttons", "direction": "right", "buttons": buttons, "x": 0.0, "y": 0.99, "xanchor": "left"}
+        ],
+    }
+
+
+def _moved(surfaces: list[Surface], times: int) -> dict[str, list]:
+    """The coordinates of all surfaces, as a change to the figure."""
+    columns = zip(*(surface.at(times) for surface in surfaces), strict=True)
+    return dict(zip("xyz", map(list, columns), strict=True))
+
+
+def _surface(mesh: TetMesh, u: np.ndarray, faces: Int[np.ndarray, "t 3"]) -> Surface:
+    nodes, index = np.unique(faces, return_inverse=True)
+    return Surface(mesh.points[nodes], u[nodes], index.reshape(-1, 3))
+
+
+def _ellipsoid(place: Place) -> Surface:
+    """The region of a place; it moves as the place does."""
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, 9), np.linspace(0, 2 * np.pi, 17)[:-1], indexing="ij")
+    ball = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
+    quads = np.arange(8 * 16).reshape(8, 16)
+    right = np.roll(quads, -1, axis=1)
+    faces = np.concatenate([np.stack([quads, right, quads + 16], -1), np.stack([right, right + 16, quads + 16], -1)])
+    found = place.region
+    variance, axes = np.linalg.eigh(found.shape)
+    points = place.point + (ball * np.sqrt(np.maximum(variance, 1e-4))) @ axes.T
+    return Surface(points, np.tile(found.mean, (len(points), 1)), faces.reshape(-1, 3))
+
+
+def _labels(places: list[Place]) -> go.Scatter3d:
+    """The names of the places, where they go."""
+    x, y, z = np.stack([place.point + place.region.mean for place in places]).T.tolist()
+    names = [escape(place.name) for place in places]
+    return go.Scatter3d(
+        x=x,
+        y=y,
+        z=z,
+        text=names,
+        mode="text",
+        textposition="middle right",
+        textfont={"color": PLACE, "size": 13},
+        hoverinfo="skip",
+    )
+
+
+def _fluid_faces(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
     """The surface of the largest connected piece of fluid deep inside, such as the ventricles; empty without any."""
     fluid = np.array([is_fluid(name) for name in mesh.names])[mesh.tissue]
     deep = np.flatnonzero(fluid & ~np.isin(mesh.cells, mesh.boundary).any(axis=1))
@@ -117,39 +176,3 @@ def _fluid_surface(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
     faces = mesh.cells[largest][:, FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[count == 1]]
-
-
-def _places(predicted: Predicted) -> list[dict[str, Any]]:
-    draws = np.asarray(predicted.place_draws)
-    found = []
-    for index, (name, point) in enumerate(zip(predicted.place_names, predicted.place_points, strict=True)):
-        here = draws[:, :, index].reshape(-1, 3)
-        variance, directions = np.linalg.eigh(region(here).shape)
-        axes = directions.T * np.sign(np.linalg.det(directions))
-        found.append(
-            {
-                "name": str(name),
-                "point": _rounded(point),
-                "moved": _rounded(here.mean(axis=0)),
-                "half": np.round(np.sqrt(np.maximum(variance, 1e-4)), 3).tolist(),
-                "axes": np.round(axes, 4).tolist(),
-            }
-        )
-    return found
-
-
-def _rounded(values: Any) -> Any:
-    return np.round(np.asarray(values, float), DECIMALS).tolist()
-
-
-def _embedded(content: Any) -> Markup:
-    """JSON that ends no script element, whatever a place is called."""
-    return Markup(json.dumps(content, separators=(",", ":")).replace("<", "\\u003c"))
-
-
-def _read(name: str) -> str:
-    return files("bayesreg.report").joinpath("viewer", name).read_text(encoding="utf-8")
-
-
-def _data_uri(program: str) -> str:
-    return f"data:text/javascript;base64,{base64.b64encode(program.encode()).decode('ascii')}"

@@ -6,7 +6,15 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from bayesreg.report.page import Sentences
+from bayesreg.report.study import Study
 from bayesreg.report.verdict import number, part
+
+
+def explain(study: Study) -> Sentences | None:
+    """Sentences on the intervals of a run; None where there is nothing to say."""
+    said = explain_intervals(study.manifest)
+    return Sentences("How far the intervals can be trusted", said) if said else None
 
 
 def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
@@ -15,27 +23,32 @@ def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _correlated(manifest: Mapping[str, Any]) -> list[str]:
-    found = []
+    said = []
     for name, count in (part(manifest, "independent_points") or {}).items():
         points = part(manifest, "observations", name, "values")
         if not points or count > 0.99 * points:
             continue
         wider = math.sqrt(points / count)
-        found.append(
+        said.append(
             f"Neighbouring residuals are alike. Their correlation leaves {number(count)} of the {points:,} points that "
             f"are compared independent, by which the intervals are {number(wider, 2)} times as wide as if all were. "
             "What the model does not explain in the images has its share in that."
         )
-    return found
+    return said
 
 
 def _outliers(manifest: Mapping[str, Any]) -> list[str]:
-    if part(manifest, "model", "similarity") != "student_t" or not part(manifest, "implied_noise_sd"):
+    similarities = [
+        similarity
+        for name in part(manifest, "observations") or {}
+        if (similarity := part(manifest, "observations", name, "options", "similarity"))
+    ]
+    forgiving = [one["degrees_of_freedom"] for one in similarities if one["kind"] == "student_t"]
+    if not forgiving:
         return []
-    nu = part(manifest, "model", "degrees_of_freedom")
     return [
-        f"A residual far beyond the others counts for little (Student’s t with ν = {number(nu)}): a part of the images "
-        "that has no counterpart widens the intervals there, and pulls little."
+        f"A residual far beyond the others counts for little (Student’s t with ν = {number(forgiving[0])}): a part of "
+        "the images that has no counterpart widens the intervals there, and pulls little."
     ]
 
 

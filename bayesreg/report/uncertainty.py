@@ -1,31 +1,29 @@
-"""How far to trust the displacement, in millimetres: maps, and regions at places."""
+"""How far to trust the displacement at places: regions that hold 95 % of the draws."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm
 from matplotlib.patches import Ellipse
 
-from bayesreg.io.records import Predicted
 from bayesreg.report import panels, style
-from bayesreg.report.panels import View
 from bayesreg.report.places import regions
 from bayesreg.report.slices import IN_PLANE, NAMES, Plane
+from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import fixed, number, percent, place_text
+from bayesreg.report.verdict import fixed, percent, place_text
 from bayesreg.types import AnyArray
 
 LEVEL = 0.95
-BANDS = BoundaryNorm([0, 0.01, 0.05, 0.25, 0.5, 0.75, 1], 256)
 COLUMNS = 6
+# Half of the width of a magnified panel, mm.
 ZOOM = 4.0
 CLOUD = 300
+HEADER = ["", "Place (x, y, z)", "Where", "Shift x, y, z, mm", "Length, mm", "95 % semi-axes, mm"]
 
 
 class Region(NamedTuple):
@@ -57,136 +55,100 @@ def region(draws: Float[AnyArray, "draws 3"]) -> Region:
     return Region(mean, covariance * np.quantile(squared, LEVEL))
 
 
-def place_table(view: View, predicted: Predicted) -> Table:
+class Place(NamedTuple):
+    """A place of the fixed image: its name, its position (mm), and draws of its displacement, (chains, draws, 3)."""
+
+    name: str
+    point: np.ndarray
+    draws: np.ndarray
+
+    @property
+    def region(self) -> Region:
+        """The region of all draws of the displacement."""
+        return region(self.draws.reshape(-1, 3))
+
+
+def places_of(study: Study) -> list[Place]:
+    """The places of a run."""
+    predicted = study.predicted
+    draws, points = np.moveaxis(np.asarray(predicted.place_draws), 2, 0), np.asarray(predicted.place_points, float)
+    return [Place(str(name), *rest) for name, *rest in zip(predicted.place_names, points, draws, strict=True)]
+
+
+def place_table(study: Study) -> Table:
     """Displacement and 95 % region of every place."""
-    words = regions(view.run.mesh, predicted.place_points)
-    rows = []
-    for k, (name, point) in enumerate(zip(predicted.place_names, predicted.place_points, strict=True)):
-        draws = np.asarray(predicted.place_draws)[:, :, k].reshape(-1, 3)
-        found = region(draws)
-        far = (np.linalg.norm(draws - found.mean, axis=1) > predicted.far_mm).mean()
-        rows.append(
-            [
-                str(name),
-                place_text((float(point[0]), float(point[1]), float(point[2]))),
-                words[k],
-                ", ".join(fixed(float(x), 1) for x in found.mean),
-                fixed(float(np.linalg.norm(found.mean)), 1),
-                " × ".join(fixed(float(x)) for x in found.semi_axes),
-                percent(float(far)),
-            ]
-        )
+    words, far = regions(study.mesh, study.predicted.place_points), float(study.predicted.far_mm)
+    rows = [_place_row(place, where, far) for place, where in zip(places_of(study), words, strict=True)]
     caption = (
-        "Mean displacement (to the right, to the front, upwards) and the semi-axes of the ellipsoid that holds 95 % of "
-        f"{draws.shape[0]:,} evenly spaced draws; last, the share of draws more than {predicted.far_mm:g} mm from the "
-        "mean. Where no places are given some are chosen; report.places in the configuration names others."
+        "Mean displacement (to the right, to the front, upwards), and the ellipsoid that holds 95 % of the draws; "
+        "last, the share of draws further from the mean. The setting report.places names places; else some are chosen."
     )
-    header = ["", "Place (x, y, z)", "Where", "Shift x, y, z, mm", "Norm, mm", "95 % semi-axes, mm", _beyond(predicted)]
-    return Table("Places", caption, header, [("", rows)])
+    return Table("Places", caption, [*HEADER, f"P(> {far:g} mm)"], [("", rows)])
 
 
-def _beyond(predicted: Predicted) -> str:
-    return f"P(> {predicted.far_mm:g} mm)"
+def _place_row(place: Place, where: str, far: float) -> list[str]:
+    found = place.region
+    beyond = (np.linalg.norm(place.draws.reshape(-1, 3) - found.mean, axis=1) > far).mean()
+    shift = ", ".join(fixed(x, 1) for x in found.mean)
+    axes = " × ".join(fixed(x) for x in found.semi_axes)
+    return [
+        place.name,
+        place_text(place.point),
+        where,
+        shift,
+        fixed(float(np.linalg.norm(found.mean)), 1),
+        axes,
+        percent(beyond),
+    ]
 
 
-def places(view: View, predicted: Predicted) -> Drawing:
-    """Where each place goes, on the moving image: the draws and their 95 % region."""
-    count = len(predicted.place_names)
-    bands, columns = -(-count // COLUMNS), min(max(count, 4), COLUMNS)
-    size = style.WIDTH / columns
+def places(study: Study) -> Drawing:
+    """Where each place goes, on the moving image: the draws and their 95 % region, one column for each place."""
+    shown = places_of(study)
+    bands, columns = -(-len(shown) // COLUMNS), min(max(len(shown), 4), COLUMNS)
     with style.look():
-        figure = style.new_figure(bands * (3 * size + 0.35))
+        figure = style.new_figure(bands * (3 * style.WIDTH / columns + 0.35))
         axes = figure.subplots(3 * bands, columns, squeeze=False)
-        limits = panels.grey_limits(view.run)
-        for k, name in enumerate(predicted.place_names):
+        limits = panels.grey_limits(study.run)
+        for k, place in enumerate(shown):
             band, column = divmod(k, COLUMNS)
             for row, axis in enumerate((2, 1, 0)):
-                _place(axes[3 * band + row, column], view, predicted, k, axis, limits)
-            axes[3 * band, column].set_title(style.literal(str(name)), fontsize=8)
-        for band in range(bands):
-            for row, axis in enumerate((2, 1, 0)):
+                _draw_place(axes[3 * band + row, column], study, place, axis, limits)
                 axes[3 * band + row, 0].set_ylabel(NAMES[axis], fontsize=8, color=style.MUTED)
+            axes[3 * band, column].set_title(style.literal(place.name), fontsize=8)
         for panel in axes.ravel():
             if not panel.has_data():
                 panel.remove()
         uri = style.data_uri(figure)
     caption = (
-        "Where each place of the fixed image is to be found, magnified. Dots: one per draw, "
-        "coloured by chain; cross and ellipse: mean and outline of the ellipsoid that holds 95 % of the draws; dashed: "
-        "the way from its place in the fixed image (ring, where it is near enough to be seen)."
+        "Dots: one for each draw, coloured by chain; cross and ellipse: mean and 95 % ellipsoid; dashed: the way from "
+        "the place in the fixed image (ring)."
     )
-    alt = "Places with their displaced positions: " + ", ".join(str(name) for name in predicted.place_names) + "."
-    return Drawing("places", "Where the places go", caption, alt, uri)
+    alt = "Places with their displaced positions: " + ", ".join(place.name for place in shown) + "."
+    return Drawing("places", "Where each place goes, on the moving image", caption, alt, uri)
 
 
-def _place(axes: Axes, view: View, predicted: Predicted, k: int, axis: int, limits: tuple[float, float]) -> None:
+def _draw_place(axes: Axes, study: Study, place: Place, axis: int, limits: tuple[float, float]) -> None:
     across, up = IN_PLANE[axis]
-    point, u = np.asarray(predicted.place_points)[k], np.asarray(predicted.place_draws)[:, :, k]
-    found = region(u.reshape(-1, 3))
+    found, point = place.region, place.point
     goes = point + found.mean
     half = max(ZOOM, 2 * float(found.semi_axes[0]))
     sides = [(float(goes[j] - half), float(goes[j] + half)) for j in (across, up)]
     plane = Plane(axis, float(goes[axis]), sides[0], sides[1], 2 * half / 160)
-    panels.image_panel(axes, view.run.moving or view.run.background, plane, limits)
-    stride = max(1, u.shape[0] * u.shape[1] // CLOUD)
-    for chain, colour in zip(point + u, style.chain_colours(len(u)), strict=True):
+    panels.image_panel(axes, study.run.moving or study.run.background, plane, limits)
+    stride = max(1, place.draws.shape[0] * place.draws.shape[1] // CLOUD)
+    for chain, colour in zip(point + place.draws, style.chain_colours(len(place.draws)), strict=True):
         axes.plot(chain[::stride, across], chain[::stride, up], ".", ms=2.2, color=colour, alpha=0.9, mew=0)
     axes.plot([point[across], goes[across]], [point[up], goes[up]], color="white", lw=0.8, ls=(0, (2, 2)))
     axes.plot(point[across], point[up], "o", mfc="none", mec="white", ms=7, mew=1.3)
     axes.plot(goes[across], goes[up], "+", color="white", ms=6, mew=1.1)
-    _ellipse(axes, goes[[across, up]], found.shape[np.ix_((across, up), (across, up))])
+    _draw_ellipse(axes, goes[[across, up]], found.shape[np.ix_((across, up), (across, up))])
     axes.set(xlim=plane.horizontal, ylim=plane.vertical)
 
 
-def _ellipse(axes: Axes, centre: np.ndarray, shape: np.ndarray) -> None:
+def _draw_ellipse(axes: Axes, centre: np.ndarray, shape: np.ndarray) -> None:
     """Outline of an ellipsoid seen along an axis: the same matrix without that axis."""
     values, vectors = np.linalg.eigh(shape)
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
     width, height = 2 * np.sqrt(np.clip(values[::-1], 0, None))
     axes.add_patch(Ellipse((centre[0], centre[1]), width, height, angle=angle, fill=False, ec="#f5d76e", lw=1.1))
-
-
-def maps(view: View, predicted: Predicted) -> Drawing:
-    """Sd, 95 % distance and probability of being far off, on three planes."""
-    planes = view.planes[::-1]
-    far = f"P(|u − ū| > {predicted.far_mm:g} mm)"
-    rows: list[tuple[str, Callable[[Plane], np.ndarray]]] = [
-        ("posterior sd, mm", view.spread),
-        ("95 % within, mm", lambda plane: _scalar(view, plane, predicted.reach)),
-        (far, lambda plane: _scalar(view, plane, predicted.far)),
-    ]
-    widths = [float(np.ptp(plane.horizontal)) for plane in planes]
-    height = 0.93 * style.WIDTH * max(np.ptp(plane.vertical) for plane in planes) / sum(widths)
-    with style.look():
-        figure = style.new_figure(3 * height + 0.3)
-        axes = figure.subplots(3, 3, width_ratios=widths)
-        for row, (label, values) in zip(axes, rows, strict=True):
-            pictures = [values(plane) for plane in planes]
-            norm, cmap = (BANDS, "OrRd") if label == far else (panels.from_zero(*pictures), style.ERROR)
-            place = {"ticks": BANDS.boundaries, "spacing": "uniform"} if label == far else {}
-            for panel, plane, picture in zip(row, planes, pictures, strict=True):
-                drawn = panels.field_panel(panel, picture, plane, norm, cmap)
-                panels.outline(panel, view, plane)
-            panels.colourbar(figure, drawn, list(row), label, **place)
-        for panel, plane in zip(axes[0], planes, strict=True):
-            panel.set_title(plane.title)
-        uri = style.data_uri(figure)
-    caption = (
-        "Top: posterior standard deviation (root of the summed variances of the three components). Middle: distance "
-        f"from its mean place within which a point lies with 95 %. Bottom: {far}, in bands. " + _numbers(predicted)
-    )
-    return Drawing("uncertainty", "How far to trust the displacement", caption, "Maps of the uncertainty, mm.", uri)
-
-
-def _numbers(predicted: Predicted) -> str:
-    """The content of the maps in a sentence."""
-    share = float((np.asarray(predicted.far) > 1 - LEVEL).mean())
-    median, worst = (number(float(x)) for x in (np.median(predicted.reach), np.max(predicted.reach)))
-    return (
-        f"The median node lies within {median} mm of its mean place with 95 %, the least certain one within {worst} "
-        f"mm; at {percent(share)} of the nodes P(|u − ū| > {predicted.far_mm:g} mm) is above 5 %."
-    )
-
-
-def _scalar(view: View, plane: Plane, values: AnyArray) -> np.ndarray:
-    return view.slice(plane).nodal(np.asarray(values, float)[:, None])[..., 0]

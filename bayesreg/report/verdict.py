@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,14 +40,6 @@ class Verdict(NamedTuple):
     converged: bool
     headline: str
     detail: str
-
-
-class Fact(NamedTuple):
-    """One key number: its label, its value as text, and a note."""
-
-    label: str
-    value: str
-    note: str = ""
 
 
 def number(value: float | int | None, digits: int = 3) -> str:
@@ -146,7 +139,7 @@ def _at(entry: Estimand) -> str:
     return f" at {place_text(entry.place)}" + (f", {entry.region}" if entry.region else "") if entry.place else ""
 
 
-def place_text(place: tuple[float, float, float]) -> str:
+def place_text(place: Iterable[float]) -> str:
     """A world position, mm."""
     # Adding zero turns −0 into 0.
     return ("(" + ", ".join(f"{round(coordinate) + 0:d}" for coordinate in place) + ") mm").replace("-", "−")
@@ -164,42 +157,31 @@ def _least(entries: Sequence[Estimand], figure: str) -> float:
     return float(np.nanmin(values)) if values and not np.isnan(values).all() else float("nan")
 
 
-def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterior: xr.Dataset) -> list[Fact]:
-    """The numbers of the first panel."""
-    sizes = posterior.sizes
-    failed, solved = part(manifest, "solver", "failed"), part(manifest, "solver", "iterations_mean")
-    greatest = worst(entries, 1)
-    implied, sampling = part(manifest, "implied_noise_sd"), part(manifest, "timings", "sampling")
-    return [
-        Fact("Greatest R̂", rhat_text(greatest[0].rhat) if greatest else NONE, _threshold_text(manifest)),
-        Fact(
-            "Least ESS",
-            f"{number(_least(entries, 'ess_bulk'), 2)} bulk",
-            f"{number(_least(entries, 'ess_tail'), 2)} tail, of {sizes['chain'] * sizes['draw']:,} draws",
-        ),
-        Fact(
-            "Acceptance",
-            percent(part(manifest, "acceptance", "inside_support")),
-            f"inside the support; {percent(part(manifest, 'acceptance', 'overall'))} overall",
-        ),
-        Fact("Chains × draws", f"{sizes['chain']} × {sizes['draw']:,}", "kept"),
-        Fact("Contact with the skull", _count(part(manifest, "contact_nodes")), "nodes"),
-        Fact("Failed solves", _count(failed), f"{number(solved)} iterations on average" if solved else ""),
-        Fact(
-            "Time",
-            duration(part(manifest, "timings", "total")),
-            f"{duration(sampling)} of it sampling" if sampling else "",
-        ),
-        Fact("Speed", number(part(manifest, "steps_per_second_per_chain")), "steps per second and chain"),
-        Fact("Residual sd", number(part(manifest, "residual_sd")), f"T_s implies {number(implied)}" if implied else ""),
-    ]
+def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterior: xr.Dataset) -> dict[str, str]:
+    """The key numbers of a run, as text under their labels."""
+    found, sizes = partial(part, manifest), posterior.sizes
+    implied = found("implied_noise_sd")
+    return {
+        "Greatest R̂": rhat_text(worst(entries, 1)[0].rhat) + _threshold_text(manifest) if entries else NONE,
+        "Least ESS, bulk": number(_least(entries, "ess_bulk"), 2),
+        "Least ESS, tail": number(_least(entries, "ess_tail"), 2),
+        "Chains × draws": f"{sizes['chain']} × {sizes['draw']:,}",
+        "Acceptance inside the support": percent(found("acceptance", "inside_support")),
+        "Acceptance in all": percent(found("acceptance", "overall")),
+        "Nodes in contact with the skull": _count(found("contact_nodes")),
+        "Failed elastic solves": _count(found("solver", "failed")),
+        "Iterations of a solve": number(found("solver", "iterations_mean")),
+        "Time in all": duration(found("timings", "total")),
+        "Time of sampling": duration(found("timings", "sampling")),
+        "Steps per second and chain": number(found("steps_per_second_per_chain")),
+        "Sd of the residual": number(found("residual_sd")) + (f" (T_s implies {number(implied)})" if implied else ""),
+    }
 
 
 def _threshold_text(manifest: Mapping[str, Any]) -> str:
-    threshold = part(manifest, "stopped", "rhat_threshold")
-    asked = f"asked for {threshold:g}" if threshold else "none asked for"
-    unsplit = _unsplit(manifest)
-    return asked if unsplit == NONE else f"{asked}; unsplit, as in the paper: {unsplit}"
+    threshold, unsplit = part(manifest, "stopped", "rhat_threshold"), _unsplit(manifest)
+    asked = f" (asked for {threshold:g}" if threshold else " (none asked for"
+    return asked + (")" if unsplit == NONE else f"; unsplit, as in the paper, {unsplit})")
 
 
 def _count(value: float | int | None) -> str:
@@ -220,19 +202,20 @@ def approximation(manifest: Mapping[str, Any]) -> str:
 
 
 def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
-    """Collect warnings beyond convergence.
+    """All warnings of a run beyond convergence: those of its data, and those of its result.
 
     Parameters
     ----------
     manifest : mapping
-        Its entries `solver`, `inverted_elements`, `residual_to_noise`, `implied_noise_sd`, `model` and `pair` are read.
+        Its entries `appraisal`, `solver`, `inverted_elements`, `residual_to_noise`, `implied_noise_sd`, `model` and
+        `pair` are read.
     mesh : TetMesh
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.
     """
-    return (
-        _equilibrium(manifest) + _solver(manifest) + _folding(manifest) + _noise(manifest) + _locking(mesh, posterior)
-    )
+    of_data = list(part(manifest, "appraisal", "beware") or [])
+    of_result = [*_solver(manifest), *_folding(manifest), *_noise(manifest), *_locking(mesh, posterior)]
+    return [*of_data, *_equilibrium(manifest), *of_result]
 
 
 def _equilibrium(manifest: Mapping[str, Any]) -> list[str]:
@@ -242,10 +225,10 @@ def _equilibrium(manifest: Mapping[str, Any]) -> list[str]:
 
 def doubt_of_equilibrium(model: Mapping[str, Any] | None, simulated: bool) -> str | None:
     """What is likely wrong where images that no model made are registered with a strict equilibrium inside."""
-    if simulated or part(model or {}, "sampled") != "boundary":
+    if simulated or part(model or {}, "elastic_prior", "nodes") != "boundary":
         return None
     return (
-        "The model has the inside in elastic equilibrium exactly (sampled: boundary), as no organ is: the intervals "
+        "The model has the inside in elastic equilibrium exactly (elastic_prior: {nodes: boundary}), as no organ is: the intervals "
         "are those of that model, and much narrower than the error of the displacement. On pairs that no model made, "
         "90 % intervals have held a fifth of the truth. model.preset: registration lets the inside depart from it."
     )
@@ -287,13 +270,13 @@ def _noise(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _locking(mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
-    found = []
+    warnings = []
     for group in parameter_groups(mesh, posterior, max_draws=1000):
         lam, mu = float(np.median(group.lam)), float(np.median(group.mu))
         nu = lam / (2 * (lam + mu)) if mu > 0 else 0.0
         if nu > NU_LOCKING:
-            found.append(
+            warnings.append(
                 f"Poisson’s ratio of {group.name} is {nu:.3f} at the medians (λ/μ = {number(lam / mu)}), above "
                 f"{NU_LOCKING}: linear tetrahedra lock near incompressibility, and the tissue moves too stiffly."
             )
-    return found
+    return warnings

@@ -14,11 +14,12 @@ from matplotlib.figure import Figure
 from bayesreg.mesh import TetMesh
 from bayesreg.report import style
 from bayesreg.report.estimands import parameter_groups
-from bayesreg.report.identifiability import RATIO_LEVELS
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import number
 from bayesreg.tissues import label_of
 from studies.mesh_error.recalibration import RANGE, Response, least_bodies, recalibrate, response
+
+RATIO_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 class Allowed(NamedTuple):

@@ -14,6 +14,7 @@ from bayesreg.image import Image
 from bayesreg.io.records import Predicted, Run, Truth
 from bayesreg.mesh import TetMesh
 from bayesreg.report.metrics import compute_metrics
+from bayesreg.report.study import Study as PageStudy
 from tests.phantoms import ball_mesh, rotated_affine
 
 CENTRE = np.array([2.0, -18.0, 12.0])
@@ -239,8 +240,10 @@ def manifest(uniform: bool, converged: bool) -> dict:
         "steps_per_second_per_chain": 63.4,
         "residual_sd": 0.0151,
         "implied_noise_sd": 0.0146,
+        "appraisal": {"beware": ["A fifth of the organ is ignored."], "notes": []},
         "observations": {"images": {"kind": "images", "log": -6021.4, "values": 12_000, "residual_rms": 1.03}},
         "model": {
+            "preset": "paper",
             "elasticity": "uniform" if uniform else "tissue",
             "similarity": "ssd",
             "t_similarity": 0.05,
@@ -266,3 +269,9 @@ def uniform_study() -> Study:
 def clinical_study(study: Study) -> Study:
     """The same without a truth and without a skull."""
     return study._replace(run=replace(study.run, truth=None, skull=None, metrics=None))
+
+
+@pytest.fixture(scope="session")
+def seen(study: Study) -> PageStudy:
+    """The study as pages see it."""
+    return PageStudy(*study)

@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import PIL.Image
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from bayesreg.report import adequacy, anatomy, convergence, marginals, style
-from bayesreg.report.estimands import Diagnosed, estimands, parameter_groups
-from bayesreg.report.panels import View, from_zero, symmetric
+from bayesreg.distance import signed_distance
+from bayesreg.report import adequacy, anatomy, convergence, marginals, panels, paper, stiffness, style
+from bayesreg.report.panels import View, error_of, from_zero, symmetric
+from bayesreg.report.slices import sample
+from bayesreg.report.study import Study, rms_difference
 from bayesreg.tissues import colours_of
 from tests.report.conftest import make_study
 
@@ -27,7 +30,13 @@ def by_element():
     lam = np.random.default_rng(0).gamma(3, size=(2, 2, len(study.run.mesh.cells)))
     for name, values in (("lam", lam), ("mu", 2 * np.ones_like(lam))):
         posterior[name] = (("chain", "draw", "tissue"), values)
-    return study.run, posterior, study.idata.sample_stats
+    nothing = posterior.isel(chain=0, draw=0, drop=True) * np.nan
+    return Study(study.run, study.idata._replace(posterior=posterior), nothing, nothing, nothing)
+
+
+def changed(seen: Study, **changes) -> Study:
+    """The study of another run."""
+    return Study(replace(seen.run, **changes), seen.idata, seen.rhat, seen.ess_bulk, seen.ess_tail)
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +51,7 @@ def pixels(drawing) -> np.ndarray:
 
 def test_the_error_on_a_plane_is_the_norm_of_the_interpolated_error(study, view):
     plane, run = view.main, study.run
-    picture = view.error(plane)
+    picture = view.norm(plane, error_of(run))
     inside = view.slice(plane).inside
     difference = view.slice(plane).nodal(run.u_mean) - view.slice(plane).nodal(run.truth.u)
     np.testing.assert_allclose(picture[inside], np.sqrt((difference[inside] ** 2).sum(axis=-1)), atol=1e-12)
@@ -50,26 +59,48 @@ def test_the_error_on_a_plane_is_the_norm_of_the_interpolated_error(study, view)
 
 
 def test_an_error_without_truth_is_refused(clinical_study):
-    view = View.of(clinical_study.run)
     with pytest.raises(ValueError, match="only where the truth is"):
-        view.error(view.main)
+        error_of(clinical_study.run)
 
 
-def test_the_residual_is_that_of_the_labelled_voxels(study):
-    run = study.run
+def test_the_difference_is_that_of_the_labelled_voxels(seen):
+    run = seen.run
     inside = np.asarray(run.tissue.voxels) > 0
     expected = np.sqrt(np.mean((np.asarray(run.moving.voxels) - np.asarray(run.fixed.voxels))[inside] ** 2))
-    assert anatomy.residual_sd(run, run.moving) == pytest.approx(expected, rel=1e-9)
-    assert f"{expected:.3f}" in anatomy.registration(View.of(run)).caption
+    assert rms_difference(run, run.moving) == pytest.approx(expected, rel=1e-9)
+    assert f"{expected:.3f}" in anatomy.before_and_after(seen).caption
 
 
-@pytest.mark.parametrize("draw", [anatomy.registration, adequacy.residual])
-def test_plain_differences_are_no_residual_of_unlike_contrasts(study, draw):
-    manifest = study.run.manifest
-    unlike = replace(study.run, manifest={**manifest, "model": {**manifest["model"], "similarity": "lncc"}})
+def test_plain_differences_are_no_residual_of_unlike_contrasts(seen):
+    manifest = seen.run.manifest
+    unlike = changed(seen, manifest={**manifest, "model": {**manifest["model"], "similarity": "lncc"}})
     said = "maps of f − m(x + ū) do not show its residual"
-    assert said in draw(View.of(unlike)).caption
-    assert said not in draw(View.of(study.run)).caption
+    assert said in anatomy.before_and_after(unlike).caption
+    assert said not in anatomy.before_and_after(seen).caption
+    assert said in adequacy.residual(unlike.view).caption
+
+
+def test_the_mesh_is_cut_into_the_tissues_of_its_cells(view):
+    """Pixels have the colour of their tetrahedron, and are white outside and between two of them."""
+    axes, plane = Figure().subplots(), view.main
+    panels.mesh_panel(axes, view.run.mesh, plane)
+    picture = np.asarray(axes.images[0].get_array())[1::3, 1::3]
+    tissue = view.slice(plane).cellwise(view.run.mesh.tissue)
+    rows, columns = (min(a, b) for a, b in zip(picture.shape, tissue.shape, strict=False))
+    picture, tissue = picture[:rows, :columns], tissue[:rows, :columns]
+    for index, colour in enumerate(colours_of(view.run.mesh.names)):
+        here = tissue == index
+        coloured = (np.abs(picture - to_rgb(colour)) < 1e-9).all(axis=-1)
+        assert coloured[here].mean() > 0.5
+        assert coloured[~here].mean() < 0.03
+    assert (picture[np.isnan(tissue)] == 1).mean() > 0.97
+
+
+def test_the_main_plane_sees_most_of_the_displacement(study):
+    points = study.run.mesh.points
+    for axis in range(3):
+        u = np.exp(-(((points[:, [axis]] - points[300, axis]) / 8) ** 2)) * np.ones(3)
+        assert View.of(replace(study.run, u_mean=u, truth=None), points[300]).main.axis == axis
 
 
 def test_one_colour_range_holds_all_pictures_and_signs_balance():
@@ -78,43 +109,44 @@ def test_one_colour_range_holds_all_pictures_and_signs_balance():
     assert (norm.vmin, norm.vmax) == (-3.0, 3.0)
 
 
-def test_pictures_differ_where_the_runs_do(study, view):
-    mirrored = study.run.u_mean * (-1.0)
-    other = View(type(study.run)(**{**vars(study.run), "u_mean": mirrored}), view.planes, view.main)
-    assert np.abs(pixels(anatomy.displacement(view)) - pixels(anatomy.displacement(other))).max() > 0.2
+def test_pictures_differ_where_the_runs_do(seen):
+    other = changed(seen, u_mean=seen.run.u_mean * (-1.0))
+    one, two = (pixels(anatomy.displacement(study)) for study in (seen, other))
+    assert np.abs(one - two).max() > 0.2
 
 
 def test_stiffness_by_element_is_mapped_by_its_median(by_element):
-    run, posterior, _ = by_element
-    found = anatomy.element_ratio(run, posterior)
-    np.testing.assert_allclose(found, np.median(posterior["lam"].to_numpy() / 2, axis=(0, 1)))
-    drawing = anatomy.element_stiffness(View.of(run), posterior)
+    expected = np.median(by_element.posterior["lam"].to_numpy() / 2, axis=(0, 1))
+    np.testing.assert_allclose(stiffness.element_ratio(by_element), expected)
+    drawing = stiffness.by_element(by_element)
     assert drawing.key == "elements"
     assert pixels(drawing).std() > 0.02
 
 
-def test_there_is_no_map_by_element_for_parameters_by_tissue(study, view):
-    assert anatomy.element_stiffness(view, study.idata.posterior) is None
+def test_there_is_no_map_by_element_for_parameters_by_tissue(seen):
+    assert stiffness.by_element(seen) is None
 
 
 def test_two_draws_without_any_convergence_figure_are_drawn_all_the_same(by_element):
-    run, posterior, statistics = by_element
-    nothing = posterior.isel(chain=0, draw=0, drop=True) * np.nan
-    entries = estimands(run.mesh, Diagnosed(nothing, nothing, nothing), posterior)
-    drawings = [
-        marginals.stiffness(run, posterior),
-        marginals.skull_node(run, posterior),
-        convergence.traces(posterior, statistics, entries),
-        convergence.distributions(run.mesh, entries, posterior["node"].to_numpy(), 1.01),
-    ]
+    draws = (marginals.marginals, paper.node, convergence.traces)
+    drawings = [*(draw(by_element) for draw in draws), convergence.distributions({"": by_element})]
     assert [drawing.key for drawing in drawings] == ["stiffness", "node", "traces", "distributions"]
     assert all(len(drawing.uri) > 5000 for drawing in drawings)
 
 
-def test_the_median_and_interval_stand_above_a_histogram(study):
+def test_the_node_nearest_to_the_skull_is_shown(seen, clinical_study):
+    """By the signed distance of the whole image."""
+    nodes = seen.posterior["node"].to_numpy()
+    distance = sample(signed_distance(seen.run.skull), (seen.mesh.points + seen.run.u_mean)[nodes])
+    away = distance[paper.node_at_skull(seen)]
+    assert away <= np.sort(np.abs(distance))[3]
+    assert paper.node(Study(*clinical_study)) is None
+
+
+def test_the_median_and_interval_stand_above_a_histogram(seen):
     axes = Figure().subplots()
-    group = parameter_groups(study.run.mesh, study.idata.posterior)[1]
-    marginals.ratio_panel(axes, study.run, group)
+    group = seen.parameters[1]
+    marginals.ratio_panel(axes, seen.run, group)
     low, median, high = np.quantile(group.ratio, (0.025, 0.5, 0.975))
     assert axes.get_title(loc="right") == f"{median:.2f} [{low:.2f}, {high:.1f}]"
     assert "truth" in [text.get_text().strip() for text in axes.texts]
@@ -161,17 +193,14 @@ def test_areas_on_a_logarithmic_axis_are_shares_of_the_draws():
     assert abs(np.log(peak) - 1.0) < 1.0
 
 
-def test_sampled_scales_are_drawn_with_their_prior(study):
-    posterior = study.idata.posterior
-    assert marginals.temperatures(study.run, posterior) is None
-    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+def test_sampled_scales_are_drawn_with_their_prior(seen):
+    chains, draws = seen.posterior.sizes["chain"], seen.posterior.sizes["draw"]
     hot = np.random.default_rng(0).lognormal(np.log(0.05), 0.1, size=(chains, draws))
-    fixed = posterior.assign(t_similarity=(("chain", "draw"), np.full((chains, draws), 0.05)))
-    assert marginals.temperatures(study.run, fixed) is None
-    sampled = posterior.assign(t_similarity=(("chain", "draw"), hot))
-    plain = marginals.temperatures(study.run, sampled)
-    model = study.run.manifest["model"] | {"t_similarity": {"median": 0.05, "log_sd": 0.3}}
-    run = replace(study.run, manifest=study.run.manifest | {"model": model})
-    assert np.abs(pixels(marginals.temperatures(run, sampled)) - pixels(plain)).max() > 0.2
-    assert "T_s" in plain.alt
-    assert "T_r" not in plain.alt
+    posterior = seen.posterior.assign(t_similarity=(("chain", "draw"), hot))
+    idata, figures = seen.idata._replace(posterior=posterior), (seen.rhat, seen.ess_bulk, seen.ess_tail)
+    model = seen.manifest["model"] | {"t_similarity": {"median": 0.05, "log_sd": 0.3}}
+    with_prior = replace(seen.run, manifest=seen.manifest | {"model": model})
+    plain, shown = (marginals.marginals(Study(run, idata, *figures)) for run in (seen.run, with_prior))
+    assert plain.title == "Stiffness ratios and scales"
+    assert marginals.marginals(seen).title == "Stiffness ratios"
+    assert len(base64.b64decode(shown.uri.split(",")[1])) > len(base64.b64decode(plain.uri.split(",")[1]))

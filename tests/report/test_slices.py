@@ -2,42 +2,8 @@ import numpy as np
 import pytest
 
 from bayesreg.image import Image
-from bayesreg.mesh import TetMesh
-from bayesreg.report.slices import MeshSlice, Plane, cut, main_plane, planes_through, sample
-from tests.phantoms import ball_mesh, box_mesh, linear_image, rotated_affine
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("position", [0.0, 3.7, 10.0, 19.99])
-def test_sections_of_a_cube_are_squares(axis, position):
-    mesh = box_mesh(cells_per_side=3, size=20.0)
-    section = cut(mesh, axis, position)
-    # A face in the plane belongs to the cells below it, of which there are none at the lower end.
-    assert section.areas.sum() == pytest.approx(0.0 if position == 0 else 400.0)
-    if position:
-        assert section.polygons.reshape(-1, 2).min() == pytest.approx(0.0, abs=1e-12)
-        assert section.polygons.reshape(-1, 2).max() == pytest.approx(20.0)
-
-
-@pytest.mark.parametrize("position", [0.25, 0.5, 0.75])
-def test_section_of_one_tetrahedron(position):
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    mesh = TetMesh.from_arrays(corners, np.array([[0, 1, 2, 3]]), np.array([0]), ("one",))
-    section = cut(mesh, 2, position)
-    assert section.areas == pytest.approx([(1 - position) ** 2 / 2])
-    found = np.unique(section.polygons[0].round(12), axis=0)
-    np.testing.assert_allclose(found, [[0, 0], [0, 1 - position], [1 - position, 0]], atol=1e-12)
-
-
-def test_every_cell_has_its_volume_as_the_integral_of_its_sections():
-    mesh = ball_mesh(40.0, 24.0)
-    low, high = mesh.points[:, 1].min(), mesh.points[:, 1].max()
-    steps = 1500
-    volume = np.zeros(len(mesh.cells))
-    for position in low + (np.arange(steps) + 0.5) * (high - low) / steps:
-        section = cut(mesh, 1, position)
-        np.add.at(volume, section.cell, section.areas * (high - low) / steps)
-    np.testing.assert_allclose(volume, mesh.volumes, rtol=0.02)
+from bayesreg.report.slices import MeshSlice, Plane, planes_through, sample
+from tests.phantoms import ball_mesh, linear_image, rotated_affine
 
 
 def test_fields_on_a_plane_are_exact_where_they_are_linear():
@@ -49,7 +15,7 @@ def test_fields_on_a_plane_are_exact_where_they_are_linear():
     assert picture.shape == points.shape == (100, 110, 3)
     np.testing.assert_allclose(picture[sliced.inside], points[sliced.inside] @ matrix.T, atol=1e-9)
     assert np.isnan(picture[~sliced.inside]).all()
-    assert sliced.inside.sum() == pytest.approx(cut(mesh, 0, 7.0).areas.sum(), rel=0.01)
+    assert sliced.inside.sum() == pytest.approx(np.pi * (40**2 - 7**2), rel=0.1)
 
 
 def test_cellwise_fields_name_the_cell_of_each_pixel():
@@ -100,16 +66,8 @@ def test_planes_pass_through_an_inner_point_and_leave_one_that_would_only_graze(
     sagittal, coronal, axial = planes_through(mesh, top)
     assert sagittal.position == pytest.approx(top[0])
     assert coronal.position == pytest.approx(top[1])
-    area = cut(mesh, 2, axial.position).areas.sum()
-    assert 0.6 * np.pi * 40**2 * 0.9 < area < 0.85 * np.pi * 40**2
-    assert axial.position > 8.0
-
-
-def test_the_main_plane_sees_most_of_the_displacement():
-    mesh = ball_mesh(40.0, 13.0)
-    planes = planes_through(mesh, np.array([5.0, 20.0, 8.0]))
-    u = np.where(np.abs(mesh.points[:, [1]] - 20) < 8, 5.0, 0.0) * np.ones(3)
-    assert main_plane(mesh, planes, u).axis == 1
+    # 60 % of the area of the largest section lies at √0.4 of the radius.
+    assert axial.position == pytest.approx(np.sqrt(0.4) * 40, abs=5)
 
 
 def test_titles_name_the_plane_with_a_proper_minus():

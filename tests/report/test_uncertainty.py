@@ -3,8 +3,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from bayesreg.report.panels import View
-from bayesreg.report.uncertainty import maps, region
+from bayesreg.report.uncertainty import region
 
 
 def test_the_region_of_normal_draws_is_the_ellipsoid_of_the_chi_square():
@@ -31,10 +30,3 @@ def test_draws_in_a_plane_or_at_a_point_have_flat_regions():
     flat = region(rng.normal(size=(2000, 3)) * (1, 1, 0))
     np.testing.assert_allclose(flat.semi_axes, np.sqrt(stats.chi2.ppf(0.95, 2)) * np.array([1, 1, 0]), atol=0.15)
     np.testing.assert_array_equal(region(np.ones((5, 3))).semi_axes, 0)
-
-
-def test_the_caption_says_how_much_is_how_uncertain(study):
-    caption = maps(View.of(study.run), study.run.predicted).caption
-    share = (study.run.predicted.far > 0.05).mean()
-    assert f"at {100 * share:.1f} % of the nodes" in caption
-    assert "within 1.25 mm of its mean place" in caption

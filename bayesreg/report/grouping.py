@@ -1,0 +1,98 @@
+"""Which chains of a run lie together, and which apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+
+from bayesreg.report.estimands import DISPLACEMENT, MOST_VALUES
+from bayesreg.types import AnyArray
+
+# Chains lie apart where this many estimands differ by so many of their standard deviations within a chain.
+APART = 3.0
+TOGETHER_IN_ALL_BUT = 3
+SEEN = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")
+
+
+class Grouping(NamedTuple):
+    """The groups of chains that lie together.
+
+    Attributes
+    ----------
+    label : (chains,) int array
+        Group of each chain, numbered from 0 in the order of their first chains.
+    drifting : (chains,) bool array
+        Whether the halves of a chain lie apart from one another: it is still on its way.
+    """
+
+    label: Int[np.ndarray, "chains"]
+    drifting: Bool[np.ndarray, "chains"]
+
+    @property
+    def groups(self) -> int:
+        """Number of groups."""
+        return int(self.label.max()) + 1
+
+    def chains(self, group: int) -> np.ndarray:
+        """The chains of a group."""
+        return np.flatnonzero(self.label == group)
+
+
+def grouping(posterior: xr.Dataset) -> Grouping:
+    """Group chains whose means lie close together, measured by the standard deviation within chains."""
+    values = _values(posterior)
+    means, variances = values.mean(axis=1), values.var(axis=1)
+    apart = np.array(
+        [[_distance(_separation(means, variances, i, j)) for j in range(len(means))] for i in range(len(means))]
+    )
+    _, label = connected_components(apart < APART, directed=False)
+    return Grouping(_renumber(label), np.array([_drifts(chain) for chain in values]))
+
+
+def _renumber(label: np.ndarray) -> np.ndarray:
+    _, first = np.unique(label, return_index=True)
+    return np.argsort(np.argsort(first))[label]
+
+
+def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"]:
+    """All estimands side by side."""
+    posterior = thin(posterior)
+    draws = [posterior[name].transpose("chain", "draw", ...) for name in SEEN if name in posterior]
+    flat = [values.to_numpy().reshape(*values.shape[:2], -1) for values in draws]
+    return np.concatenate(flat, axis=-1).astype(float)
+
+
+def thin(posterior: xr.Dataset) -> xr.Dataset:
+    """Thin the draws evenly, where they would take much memory."""
+    numbers = sum(posterior[name].size for name in SEEN if name in posterior)
+    return posterior.isel(draw=slice(None, None, max(1, numbers // MOST_VALUES)))
+
+
+def _separation(means: np.ndarray, variances: np.ndarray, i: int, j: int) -> Float[np.ndarray, "estimands"]:
+    """Distance of two means in standard deviations; none where both stand still at one place."""
+    gap, within = np.abs(means[i] - means[j]), np.sqrt((variances[i] + variances[j]) / 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(gap > 0, gap / within, 0.0)
+
+
+def _distance(separation: np.ndarray) -> float:
+    """The separation that a few estimands reach: one alone may do so by chance, or be a parameter's tail."""
+    rank = min(TOGETHER_IN_ALL_BUT, len(separation))
+    return float(np.partition(separation, -rank)[-rank])
+
+
+def _drifts(chain: Float[np.ndarray, "draws estimands"]) -> bool:
+    halves = np.array_split(chain, 2)
+    if len(halves[0]) < 2 or len(halves[1]) < 2:
+        return True
+    means, variances = (np.stack([getattr(half, figure)(axis=0) for half in halves]) for figure in ("mean", "var"))
+    return _distance(_separation(means, variances, 0, 1)) >= APART
+
+
+def group_means(chain_means: Float[AnyArray, "chains *shape"], groups: Grouping) -> Float[np.ndarray, "groups *shape"]:
+    """Mean over the chains of each group."""
+    return np.stack([np.asarray(chain_means)[groups.chains(k)].mean(axis=0) for k in range(groups.groups)])

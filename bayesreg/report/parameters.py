@@ -1,0 +1,167 @@
+"""The elastic parameters in one table: what each is, how sure that is, and what the data say of it beside the prior."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from bayesreg.report.estimands import SYMBOLS, Group, sampled_scales, symbol_of
+from bayesreg.report.study import Study
+from bayesreg.report.tables import Table
+from bayesreg.report.verdict import NONE, number, part, rhat_text, threshold_of
+from bayesreg.tissues import label_of
+
+# Identified: the central 90 % interval spans less than a factor of ten.
+IDENTIFIED = 10.0
+# A bound: the median is more than so many times the 1 % quantile, so that the density reaches zero, …
+REACHES_ZERO = 20.0
+# … and the bound is within this factor of the median.
+BOUND = 5.0
+# An interval of at least this share of the prior’s is called as wide as the prior.
+PRIOR_SHARE = 0.8
+LAME = ("lam", "mu")
+HEADER = ["", "Median", "95 % interval", "Prior, 95 %", "Data say", "R̂", "Least ESS"]
+CAPTION = (
+    "Only ratios shape the deformation where no force acts inside; the scale of λ and μ is set by the parameter that "
+    "is fixed and by the elastic temperature. λ/μ has no mean where μ may be 0. A flat prior on [0, ∞) is improper."
+)
+
+
+class Interval(NamedTuple):
+    """Central 95 % interval."""
+
+    low: float
+    high: float
+
+    @property
+    def text(self) -> str:
+        """The interval in words."""
+        return f"{number(self.low)} to {number(self.high)}"
+
+
+def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
+    """Put in words how a posterior bounds a positive number.
+
+    It says the same of a number and, with the bounds exchanged, of its reciprocal.
+
+    Parameters
+    ----------
+    draws : array
+        Draws of any shape; those that are not finite are left out.
+    prior : Interval, optional
+        Central 95 % interval of its prior; None where it is improper.
+
+    Returns
+    -------
+    str
+        "undefined", "fixed", "identified", "weakly identified", "only an upper bound", "only a lower bound" or "not
+        identified".
+    """
+    known = draws[np.isfinite(draws)]
+    if known.size == 0:
+        return "undefined"
+    if np.ptp(known) == 0:
+        return "fixed"
+    first, q01, low, median, high, q99, last = np.quantile(known, (0.025, 0.01, 0.05, 0.5, 0.95, 0.99, 0.975))
+    if prior is not None and last - first > PRIOR_SHARE * (prior.high - prior.low):
+        return "not identified"
+    if median > REACHES_ZERO * q01:
+        return "only an upper bound" if high < BOUND * median else "not identified"
+    if q99 > REACHES_ZERO * median:
+        return "only a lower bound" if median < BOUND * low else "not identified"
+    return "identified" if high < IDENTIFIED * low else "weakly identified"
+
+
+def prior_of_scale(prior: Mapping[str, float]) -> Interval:
+    """Central 95 % interval of the log-normal prior of a scale, given by its median and log_sd."""
+    factor = math.exp(stats.norm.ppf(0.975) * float(prior["log_sd"]))
+    return Interval(float(prior["median"]) / factor, float(prior["median"]) * factor)
+
+
+def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> Interval | None:
+    """Central 95 % interval of the prior of "lam" or "mu" of a tissue; None where it is improper.
+
+    Parameters
+    ----------
+    model : mapping
+        The section `model` of the manifest.
+    name : str
+    tissue : str, optional
+    """
+    given = (model.get("priors") or {}).get(name) or {}
+    if "alpha" not in given:
+        given = given.get(tissue) or (next(iter(given.values()), {}) if tissue == "uniform" else {})
+    high = given.get("high")
+    if high is None or math.isinf(high):
+        return None
+    low, alpha, beta = (float(given.get(key, default)) for key, default in (("low", 0), ("alpha", 1), ("beta", 1)))
+    return Interval(*(float(x) for x in stats.beta(alpha, beta, low, high - low).ppf((0.025, 0.975))))
+
+
+def parameter_table(study: Study) -> Table:
+    """A row for λ/μ, λ and μ of every tissue, and one for every sampled scale; the truth where it is known."""
+    groups = [(label_of(group.name), _group_rows(study, index, group)) for index, group in enumerate(study.parameters)]
+    rows = []
+    for name in sampled_scales(study.posterior):
+        known = part(study.manifest, "scales", name)
+        draws, prior = study.posterior[name].to_numpy(), prior_of_scale(known) if known else None
+        rows.append(_row(study, symbol_of(name), draws, (name, 0), prior, reading(draws, prior)))
+    groups += [("Scales", rows)] if rows else []
+    header, caption = list(HEADER), CAPTION
+    if study.run.truth is not None:
+        header.append("Truth")
+        groups = [(title, [[*row, _truth(study, title, row[0])] for row in rows]) for title, rows in groups]
+    if any(group.lam.shape[-1] > 1 for group in study.parameters):
+        caption += " Elements of a tissue are pooled: the interval holds how they differ, too."
+    return Table("Elastic parameters", caption, header, groups)
+
+
+def _group_rows(study: Study, index: int, group: Group) -> list[list[str]]:
+    model = part(study.manifest, "model") or {}
+    entry = None if group.lam.shape[-1] > 1 else index
+    rows = [_row(study, SYMBOLS["ratio"], group.ratio, ("ratio", entry), None, reading(group.ratio))]
+    for name in LAME:
+        draws, prior = getattr(group, name), prior_of(model, name, group.name)
+        rows.append(_row(study, SYMBOLS[name], draws, (name, entry), prior, reading(draws, prior)))
+    rows[0][3] = NONE
+    return rows
+
+
+def _row(
+    study: Study, symbol: str, draws: np.ndarray, entry: tuple[str, int | None], prior: Interval | None, said: str
+) -> list[str]:
+    known = draws[np.isfinite(draws)]
+    if said in ("fixed", "undefined"):
+        value = number(float(known[0])) if known.size else NONE
+        return [symbol, value, said, *[NONE] * 4]
+    low, median, high = (float(x) for x in np.quantile(known, (0.025, 0.5, 0.975)))
+    rhat, bulk, tail = _figures(study, *entry)
+    said = "the chains disagree" if rhat >= threshold_of(study.manifest) else said
+    prior_text = "improper" if prior is None else prior.text
+    least = number(float(np.fmin(bulk, tail)))
+    return [symbol, number(median), Interval(low, high).text, prior_text, said, _rhat(rhat), least]
+
+
+def _rhat(rhat: float) -> str:
+    return NONE if math.isnan(rhat) else rhat_text(rhat)
+
+
+def _figures(study: Study, name: str, entry: int | None) -> tuple[float, float, float]:
+    """R̂ and both ESS of one entry; NaN where it has none, or stands for several elements."""
+    if entry is None or name not in study.rhat:
+        return math.nan, math.nan, math.nan
+    rhat, bulk, tail = (float(np.ravel(figure[name].to_numpy())[entry]) for figure in study.diagnosed)
+    return rhat, bulk, tail
+
+
+def _truth(study: Study, title: str, symbol: str) -> str:
+    """The true value of a parameter of a tissue; a dash of what has none."""
+    truth, labels = study.run.truth, [label_of(name) for name in study.mesh.names]
+    if truth is None or title not in labels:
+        return NONE
+    lam, mu = (float(np.asarray(values)[labels.index(title)]) for values in (truth.lam, truth.mu))
+    return number({SYMBOLS["lam"]: lam, SYMBOLS["mu"]: mu, SYMBOLS["ratio"]: lam / mu}[symbol])
