@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyvista
 from scipy import ndimage
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
@@ -48,6 +50,14 @@ def box_mesh(
     inner = (grid > 1e-9) & (grid < 1 - 1e-9)
     grid = grid + inner * rng.uniform(-1, 1, grid.shape) * jitter / cells_per_side
     return _delaunay_mesh(grid * size + origin, flat=1e-9)
+
+
+def save_grid(path: Path, points: np.ndarray, cells: np.ndarray, tissue: np.ndarray | None = None) -> None:
+    """Write tetrahedra as they are, sound or not, by PyVista alone."""
+    grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: cells}, points)
+    if tissue is not None:
+        grid.cell_data["tissue"] = tissue
+    grid.save(path)
 
 
 def refined(mesh: TetMesh) -> TetMesh:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import meshio
 import numpy as np
 from jaxtyping import Float
 
 from bayesreg.io.atomic import load_arrays
 from bayesreg.io.fields import load_displacement
+from bayesreg.io.surface_files import read_dataset
 from bayesreg.mesh import TetMesh
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
@@ -135,7 +134,6 @@ def _is_volume(path: Path) -> bool:
 
 def _point_data(path: Path) -> dict[str, np.ndarray]:
     try:
-        # Not `meshio.read`, which ends the program where it fails.
-        return meshio.vtu.read(path).point_data
-    except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a .vtu mesh: {str(error) or type(error).__name__}") from error
+        return {name: np.asarray(values) for name, values in read_dataset(path).point_data.items()}
+    except ValueError as error:
+        raise InputError(f"{path} cannot be read as a .vtu mesh: {error}") from error

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import meshio
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -20,6 +18,7 @@ from bayesreg.io.domain import MeshError, domain_labels, labels_everywhere, mesh
 from bayesreg.io.fitting import pull_inside
 from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
+from bayesreg.io.surface_files import read_dataset, save_dataset
 from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, tissue_surfaces
 from bayesreg.io.tetwild import tetrahedralize
 from bayesreg.mesh import FACES, TetMesh
@@ -188,6 +187,8 @@ def save_mesh(
     InputError
         If the path ends otherwise, its folder does not exist, or an array has not one row per node or tetrahedron.
     """
+    import pyvista
+
     path = Path(path)
     if path.suffix != ".vtu":
         raise InputError(f"a mesh file must end in .vtu, got {path}")
@@ -195,11 +196,14 @@ def save_mesh(
         raise InputError(f"{path} cannot be written: there is no folder {path.parent}")
     nodal = _rows(point_data, len(mesh.points), "node")
     by_cell = {"tissue": mesh.tissue, **_rows(cell_data, len(mesh.cells), "tetrahedron")}
-    cells = {name: [values] for name, values in by_cell.items()}
-    content = meshio.Mesh(mesh.points, [("tetra", mesh.cells)], point_data=nodal, cell_data=cells)
+    grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: mesh.cells}, mesh.points)
+    for target, arrays in ((grid.point_data, nodal), (grid.cell_data, by_cell)):
+        for name, values in arrays.items():
+            target[name] = values
+    # UTF-8 bytes between zeros: texts in VTK's files are ASCII.
+    grid.field_data[NAMES_FIELD] = np.frombuffer("\0".join(mesh.names).encode(), np.uint8)
     with replacing(path) as temporary:
-        content.write(temporary)
-        _insert_names(temporary, mesh.names)
+        save_dataset(grid, temporary)
 
 
 def _rows(given: Mapping[str, AnyArray] | None, count: int, what: str) -> dict[str, np.ndarray]:
@@ -229,20 +233,19 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
     if not path.is_file():
         raise InputError(f"mesh {path}: there is no such file")
     try:
-        # Not `meshio.read`, which ends the program where it fails.
-        content = meshio.vtu.read(path)
-    except (meshio.ReadError, ET.ParseError, KeyError, ValueError) as error:
-        reason = str(error) or "it is cut short, or no .vtu file"
-        raise InputError(f"mesh {path} cannot be read: {reason}") from error
-    kinds = sorted({block.type for block in content.cells})
+        grid = read_dataset(path)
+    except ValueError as error:
+        raise InputError(f"mesh {path} cannot be read: {error}") from error
+    kinds = sorted(kind.name.lower() for kind in grid.distinct_cell_types)
     if kinds != ["tetra"]:
         raise InputError(f"mesh {path} must consist of tetrahedra, got {', '.join(kinds) or 'no cells'}")
-    if "tissue" not in content.cell_data:
-        raise InputError(f"mesh {path} has no cell data 'tissue'; it holds {sorted(content.cell_data) or 'none'}")
-    cells = np.concatenate([block.data for block in content.cells])
-    tissue = np.concatenate(content.cell_data["tissue"])
+    if "tissue" not in grid.cell_data:
+        raise InputError(f"mesh {path} has no cell data 'tissue'; it holds {sorted(grid.cell_data.keys()) or 'none'}")
     try:
-        mesh = TetMesh.from_arrays(content.points, cells, tissue, _stored_names(content) or names)
+        stored = grid.field_data.get(NAMES_FIELD)
+        names = names if stored is None else bytes(stored.astype(np.uint8)).decode().split("\0")
+        cells = grid.cells.reshape(-1, 5)[:, 1:]
+        mesh = TetMesh.from_arrays(grid.points, cells, grid.cell_data["tissue"], names)
     except ValueError as error:
         raise InputError(f"mesh {path}: {error}") from error
     _require_one_body(mesh, path)
@@ -296,23 +299,3 @@ def _nearest(labels: Image, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray,
     """Label of the voxel nearest to each point."""
     index = np.clip(np.rint(labels.world_to_voxel(points)).astype(int), 0, np.array(labels.shape) - 1)
     return np.asarray(labels.voxels)[tuple(index.T)].astype(int)
-
-
-def _insert_names(path: Path, names: tuple[str, ...]) -> None:
-    """Add the tissue names, as UTF-8 bytes between zeros: meshio reads field data from .vtu but writes none."""
-    tree = ET.parse(path)
-    grid = tree.getroot().find("UnstructuredGrid")
-    if grid is None:
-        raise InputError(f"{path} holds no UnstructuredGrid")
-    codes = "\0".join(names).encode()
-    field = ET.Element("FieldData")
-    attributes = {"type": "UInt8", "Name": NAMES_FIELD, "NumberOfTuples": str(len(codes)), "format": "ascii"}
-    ET.SubElement(field, "DataArray", attributes).text = " ".join(map(str, codes))
-    grid.insert(0, field)
-    tree.write(path)
-
-
-def _stored_names(content: meshio.Mesh) -> tuple[str, ...]:
-    if NAMES_FIELD not in content.field_data:
-        return ()
-    return tuple(bytes(content.field_data[NAMES_FIELD].astype(np.uint8)).decode().split("\0"))

@@ -5,9 +5,8 @@ PyVista takes seconds to import, which nothing else need wait for: hence inside 
 
 from __future__ import annotations
 
+import errno
 import re
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -19,9 +18,9 @@ from skimage import measure
 
 from bayesreg.io.atomic import replacing
 from bayesreg.io.spaces import TO_RAS, Space
+from bayesreg.io.surface_formats import join_cells, read_legacy, read_obj, read_ply, split_cells
 from bayesreg.types import AnyArray, InputError
 
-TRIAL = "import sys, pyvista; pyvista.read(sys.argv[1])"
 SUFFIXES = (".vtk", ".vtp", ".vtu", ".stl", ".ply", ".obj")
 
 
@@ -51,14 +50,19 @@ class SurfaceFile(NamedTuple):
 
         number = np.cumsum(chosen) - 1
         if isinstance(self.content, pyvista.UnstructuredGrid):
-            cells = _split(self.content.cells)
+            cells = split_cells(self.content.cells, len(chosen))
             kept = np.array([chosen[ids].all() for ids in cells], bool)
             rows = [(len(ids), *number[ids]) for ids, keep in zip(cells, kept, strict=True) if keep]
             connectivity = np.concatenate([[], *rows]).astype(int)
             content = pyvista.UnstructuredGrid(connectivity, self.content.celltypes[kept], self.content.points[chosen])
         else:
-            runs = [run for line in _split(self.content.lines) for run in _runs(chosen, line) if len(run) > 1]
-            faces = [ids for ids in _split(self.content.faces) if chosen[ids].all()]
+            runs = [
+                run
+                for line in split_cells(self.content.lines, len(chosen))
+                for run in _runs(chosen, line)
+                if len(run) > 1
+            ]
+            faces = [ids for ids in split_cells(self.content.faces, len(chosen)) if chosen[ids].all()]
             lines, triangles = (
                 np.concatenate([[], *((len(ids), *number[ids]) for ids in kind)]).astype(int) for kind in (runs, faces)
             )
@@ -66,16 +70,6 @@ class SurfaceFile(NamedTuple):
         for name, values in self.content.point_data.items():
             content.point_data[name] = np.asarray(values)[chosen]
         return self._replace(content=content, points=self.points[chosen])
-
-
-def _split(connectivity: np.ndarray) -> list[np.ndarray]:
-    """The points of each cell, where VTK has them in a row, each time after their number."""
-    found, start = [], 0
-    while start < len(connectivity):
-        end = start + 1 + connectivity[start]
-        found.append(np.asarray(connectivity[start + 1 : end]))
-        start = end
-    return found
 
 
 def _runs(chosen: Bool[np.ndarray, "k"], line: np.ndarray) -> list[np.ndarray]:
@@ -106,11 +100,9 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
         raise InputError(f"{path}: unknown kind of file with a surface; known are {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise InputError(f"{path}: no such file with a surface")
-    _require_harmless(path)
     try:
-        with pyvista.VtkErrorCatcher(raise_errors=True, send_to_logging=False):
-            surface = pyvista.read(path)
-    except (OSError, RuntimeError, ValueError) as error:
+        surface = read_dataset(path)
+    except ValueError as error:
         raise InputError(f"{path} cannot be read as a surface: it is damaged, or no {path.suffix} file") from error
     if not isinstance(surface, pyvista.PolyData | pyvista.UnstructuredGrid) or not surface.n_points:
         raise InputError(f"{path} cannot be read as a surface: it holds no points")
@@ -124,14 +116,74 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
     return SurfaceFile(surface, points * TO_RAS[chosen], chosen, (space or told) is not None)
 
 
-def _require_harmless(path: Path) -> None:
-    """Let another process read a file first, and raise InputError where that fails.
+READERS = {".vtk": read_legacy, ".ply": read_ply, ".obj": read_obj}
+# XML that compresses its arrays holds at most so many times as many numbers as it has bytes.
+MOST_COMPRESSED = 1100
 
-    VTK's readers believe what a file says of its own size, and the process dies where that is wrong.
-    """
-    trial = subprocess.run([sys.executable, "-c", TRIAL, str(path.absolute())], capture_output=True, check=False)
-    if trial.returncode:
-        raise InputError(f"{path} cannot be read as a surface: it is damaged, or no {path.suffix} file")
+
+def read_dataset(path: Path) -> Any:
+    """What a file of VTK's, .stl, .ply or .obj holds, as a dataset of PyVista; ValueError where it is damaged."""
+    content, suffix = path.read_bytes(), path.suffix.lower()
+    try:
+        return READERS[suffix](content) if suffix in READERS else _read_by_vtk(path, content)
+    except (LookupError, OverflowError) as error:
+        raise ValueError("it is damaged") from error
+
+
+def _read_by_vtk(path: Path, content: bytes) -> Any:
+    """Read XML or STL, by VTK; these readers survive a wrong size, but not all that they make of it is sound."""
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkLogger
+    from vtkmodules.vtkIOGeometry import vtkSTLReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
+
+    counts = map(int, re.findall(rb'NumberOf\w+\s*=\s*"\s*(\d+)', content))
+    if max(counts, default=0) > MOST_COMPRESSED * len(content):
+        raise ValueError("it is cut short")
+    kinds = {".vtp": vtkXMLPolyDataReader, ".vtu": vtkXMLUnstructuredGridReader, ".stl": vtkSTLReader}
+    reader, errors, verbosity = kinds[path.suffix.lower()](), [], vtkLogger.GetCurrentVerbosityCutoff()
+    reader.SetFileName(str(path))
+    reader.AddObserver("ErrorEvent", lambda *_: errors.append(path))
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    # What else it says of the file, to the terminal and to PyVista's log, is no help.
+    with pyvista.VtkErrorCatcher(send_to_logging=False):
+        reader.Update()
+    vtkLogger.SetStderrVerbosity(verbosity)
+    if errors:
+        raise ValueError(f"it is cut short, or no {path.suffix} file")
+    dataset = pyvista.wrap(reader.GetOutput())
+    grid = isinstance(dataset, pyvista.UnstructuredGrid)
+    for kind in ("Cells",) if grid else ("Verts", "Lines", "Polys", "Strips"):
+        cells = getattr(dataset, f"Get{kind}")()
+        offsets, points = (np.asarray(pyvista.convert_array(part)) for part in _arrays_of(cells))
+        split_cells(join_cells(offsets.astype(np.int64), points.astype(np.int64)), dataset.n_points)
+    return dataset
+
+
+def _arrays_of(cells: Any) -> tuple[Any, Any]:
+    return cells.GetOffsetsArray(), cells.GetConnectivityArray()
+
+
+def save_dataset(dataset: Any, path: Path) -> None:
+    """Write a dataset of PyVista; OSError where that fails."""
+    import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
+
+    xml = {".vtu": vtkXMLUnstructuredGridWriter, ".vtp": vtkXMLPolyDataWriter}.get(path.suffix.lower())
+    if xml is not None:
+        # Not into the file: where the disk is full, VTK ends the process.
+        writer = xml()
+        writer.SetInputData(dataset)
+        writer.SetDataModeToBinary()
+        writer.SetWriteToOutputString(True)
+        writer.Write()
+        path.write_text(writer.GetOutputString(), encoding="utf-8")
+        return
+    try:
+        with pyvista.VtkErrorCatcher(raise_errors=True, send_to_logging=False):
+            dataset.save(path)
+    except RuntimeError as error:
+        raise OSError(errno.EIO, "cannot be written: is the disk full?", str(path)) from error
 
 
 def write_surface(
@@ -159,7 +211,7 @@ def write_surface(
         moved.point_data[name] = np.asarray(value)
     moved.field_data["SPACE"] = [surface.space]
     with replacing(path) as temporary:
-        moved.save(temporary)
+        save_dataset(moved, temporary)
         _say_space(temporary, surface.space)
 
 
@@ -210,7 +262,7 @@ def save_surface(
     for name, value in values.items():
         surface.point_data[name] = np.asarray(value)
     with replacing(path) as temporary:
-        surface.save(temporary)
+        save_dataset(surface, temporary)
         _say_space(temporary, "RAS")
 
 

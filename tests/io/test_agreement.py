@@ -1,13 +1,12 @@
 """A mesh that does not lie where the labels are is told before anything long begins, with what would make it fit."""
 
-import meshio
 import numpy as np
 import pytest
 
 import bayesreg as br
 from bayesreg.io.agreement import require_agreement
 from bayesreg.mesh import TetMesh
-from tests.phantoms import ball_mesh
+from tests.phantoms import ball_mesh, save_grid
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +86,7 @@ def test_a_tetrahedron_that_is_there_twice_is_told(tmp_path):
     mesh = ball_mesh(spacing=30.0)
     cells = np.concatenate([mesh.cells, mesh.cells[[7]][:, [1, 2, 0, 3]]])
     tissue = np.append(mesh.tissue, 0)
-    meshio.Mesh(mesh.points, [("tetra", cells)], cell_data={"tissue": [tissue]}).write(tmp_path / "twice.vtu")
+    save_grid(tmp_path / "twice.vtu", mesh.points, cells, tissue)
     with pytest.raises(br.InputError, match="twice"):
         br.load_mesh(tmp_path / "twice.vtu")
     # A node more, far beyond an inner face: three tetrahedra share it.
@@ -97,6 +96,6 @@ def test_a_tetrahedron_that_is_there_twice_is_told(tmp_path):
     cells[-1] = (
         corners if np.linalg.det(points[corners[1:]] - points[corners[0]]) > 0 else [corners[k] for k in (1, 0, 2, 3)]
     )
-    meshio.Mesh(points, [("tetra", cells)], cell_data={"tissue": [tissue]}).write(tmp_path / "three.vtu")
+    save_grid(tmp_path / "three.vtu", points, cells, tissue)
     with pytest.raises(br.InputError, match="more than two tetrahedra share the face"):
         br.load_mesh(tmp_path / "three.vtu")

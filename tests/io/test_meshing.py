@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import meshio
 import numpy as np
 import pytest
+import pyvista
 
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
@@ -24,7 +24,7 @@ from bayesreg.io.meshing import (
 from bayesreg.mesh import TetMesh
 from tests.io.balls import CENTRE, balls, grid
 from tests.io.test_datasets import needs_brainweb
-from tests.phantoms import ball_mesh, box_mesh
+from tests.phantoms import ball_mesh, box_mesh, save_grid
 
 OPTIONS = MeshOptions(edge_length=16.0, envelope=4.0)
 
@@ -147,23 +147,23 @@ class TestFiles:
         mesh = ball_mesh()
         u = np.random.default_rng(0).normal(size=mesh.points.shape)
         save_mesh(mesh, tmp_path / "mesh.vtu", point_data={"u_mean": u, "count": np.arange(len(u))})
-        data = meshio.read(tmp_path / "mesh.vtu").point_data
+        data = pyvista.read(tmp_path / "mesh.vtu").point_data
         np.testing.assert_array_equal(data["u_mean"], u)
         np.testing.assert_array_equal(data["count"], np.arange(len(u)))
         assert load_mesh(tmp_path / "mesh.vtu").digest == mesh.digest
 
     def test_reads_files_without_names(self, tmp_path):
         mesh = ball_mesh()
-        meshio.Mesh(mesh.points, [("tetra", mesh.cells)], cell_data={"tissue": [mesh.tissue]}).write(tmp_path / "a.vtu")
+        save_grid(tmp_path / "a.vtu", mesh.points, mesh.cells, mesh.tissue)
         assert load_mesh(tmp_path / "a.vtu").digest == mesh.digest
 
     def test_a_failing_write_leaves_the_old_file(self, tmp_path, monkeypatch):
         save_mesh(ball_mesh(), tmp_path / "mesh.vtu")
 
-        def fail(path, names):
+        def fail(dataset, path):
             raise OSError("disk full")
 
-        monkeypatch.setattr(meshing, "_insert_names", fail)
+        monkeypatch.setattr(meshing, "save_dataset", fail)
         with pytest.raises(OSError, match="disk full"):
             save_mesh(box_mesh(), tmp_path / "mesh.vtu")
         assert load_mesh(tmp_path / "mesh.vtu").digest == ball_mesh().digest
@@ -192,20 +192,20 @@ class TestFiles:
             load_mesh(tmp_path / "mesh.vtu")
 
     def test_refuses_triangles(self, tmp_path):
-        meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]).write(tmp_path / "a.vtu")
+        pyvista.PolyData(np.eye(3), [3, 0, 1, 2]).cast_to_unstructured_grid().save(tmp_path / "a.vtu")
         with pytest.raises(ValueError, match="must consist of tetrahedra, got triangle"):
             load_mesh(tmp_path / "a.vtu")
 
     def test_refuses_cells_without_tissue(self, tmp_path):
         mesh = ball_mesh()
-        meshio.Mesh(mesh.points, [("tetra", mesh.cells)]).write(tmp_path / "a.vtu")
+        save_grid(tmp_path / "a.vtu", mesh.points, mesh.cells)
         with pytest.raises(ValueError, match="no cell data 'tissue'; it holds none"):
             load_mesh(tmp_path / "a.vtu")
 
     def test_refuses_an_inverted_mesh(self, tmp_path):
         mesh = ball_mesh()
         cells = mesh.cells[:, (1, 0, 2, 3)]
-        meshio.Mesh(mesh.points, [("tetra", cells)], cell_data={"tissue": [mesh.tissue]}).write(tmp_path / "a.vtu")
+        save_grid(tmp_path / "a.vtu", mesh.points, cells, mesh.tissue)
         with pytest.raises(ValueError, match=r"a\.vtu: \d+ tetrahedra have no positive volume"):
             load_mesh(tmp_path / "a.vtu")
 

@@ -1,0 +1,246 @@
+"""Readers of VTK's legacy format, PLY and OBJ in NumPy: VTK's own end the process where a file has a wrong size.
+
+What they make is a dataset of PyVista. PyVista takes seconds to import, which nothing else needs: hence inside the
+functions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from itertools import islice
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Int
+
+_HEAD = re.compile(
+    rb"# vtk DataFile Version (\d+)\.\d+[^\n]*\n[^\n]*\n\s*(ASCII|BINARY)\s+DATASET\s+(POLYDATA|UNSTRUCTURED_GRID)\b",
+    re.IGNORECASE,
+)
+_LEGACY_TYPES = {
+    "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4",
+    "unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtkidtype": "i4", "vtktypeint64": "i8",
+    "vtktypeuint64": "u8",
+}  # fmt: skip
+_PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+# Components of an attribute; the others say it themselves.
+_COMPONENTS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "SCALARS": 1}
+_CELLS = {"VERTICES": "verts", "LINES": "lines", "POLYGONS": "faces", "TRIANGLE_STRIPS": "strips", "CELLS": "cells"}
+
+
+class _Cursor:
+    """A place in the content of a file, which moves on with what is read; ValueError where the content ends."""
+
+    def __init__(self, content: bytes, at: int, is_text: bool, order: str) -> None:
+        self.content, self.at, self.is_text, self.order = content, at, is_text, order
+
+    def line(self) -> list[str]:
+        """The words of the next line that has any; none at the end."""
+        while self.at < len(self.content):
+            end = self.content.find(b"\n", self.at)
+            end = len(self.content) if end < 0 else end
+            words, self.at = self.content[self.at : end].decode("utf-8").split(), end + 1
+            if words:
+                return words
+        return []
+
+    def values(self, kind: str, count: int) -> np.ndarray:
+        if count < 0:
+            raise ValueError("a negative number of values")
+        if self.is_text:
+            words = list(islice(re.compile(rb"\S+").finditer(self.content, self.at), count))
+            if len(words) < count:
+                raise ValueError("it is cut short")
+            self.at = words[-1].end() if words else self.at
+            return np.array([word[0] for word in words], "S").astype(float if kind[0] == "f" else int).astype(kind)
+        stored = np.dtype(kind).newbyteorder(self.order)
+        start, self.at = self.at, self.at + count * stored.itemsize
+        if self.at > len(self.content):
+            raise ValueError("it is cut short")
+        return np.frombuffer(self.content, stored, count, start).astype(kind)
+
+    def texts(self, count: int) -> list[str]:
+        """Words: one a line, or each after its length, whose first two bits tell in how many bytes that stands."""
+        if self.is_text:
+            return [unquote(" ".join(self.line())) for _ in range(count)]
+        found = []
+        for _ in range(count):
+            size = 2 ** (3 - (int(self.values("u1", 1)[0]) >> 6))
+            self.at -= 1
+            length = int(self.values(f"u{size}", 1)[0]) & (2 ** (8 * size - 2) - 1)
+            found.append(self.values("u1", length).tobytes().decode("utf-8"))
+        return found
+
+    def cells(self, first: int, second: int, has_offsets: bool) -> Int[np.ndarray, "n"]:
+        """The points of every cell in a row, each time after their number."""
+        if not has_offsets:
+            return self.values("i4", second)
+        offsets = self.values(_legacy_type(self.line()[1]), first).astype(np.int64)
+        return join_cells(offsets, self.values(_legacy_type(self.line()[1]), second).astype(np.int64))
+
+    def skip(self, pattern: bytes) -> None:
+        if (found := re.compile(pattern, re.DOTALL).match(self.content, self.at)) is not None:
+            self.at = found.end()
+
+
+def join_cells(offsets: Int[np.ndarray, "c"], points: Int[np.ndarray, "k"]) -> Int[np.ndarray, "n"]:
+    """The points of every cell in a row, each time after their number; `offsets` say where each begins and ends."""
+    if not len(offsets):
+        return np.zeros(0, np.int64)
+    counts = np.diff(offsets)
+    if offsets[0] != 0 or offsets[-1] != len(points) or (counts < 0).any():
+        raise ValueError("the offsets of its cells do not fit")
+    return np.insert(points, offsets[:-1], counts)
+
+
+def split_cells(cells: Int[np.ndarray, "n"], count: int) -> list[np.ndarray]:
+    """The points of each cell; ValueError where a cell has points beyond the count, or ends too late."""
+    found, start = [], 0
+    while start < len(cells):
+        end = start + 1 + int(cells[start])
+        if not start < end <= len(cells):
+            raise ValueError("a cell does not end where it says")
+        found.append(cells[start + 1 : end])
+        start = end
+    points = np.concatenate([np.zeros(0, np.int64), *found])
+    if len(points) and not 0 <= points.min() <= points.max() < count:
+        raise ValueError(f"a cell has the point {points.max()} of {count} points")
+    return found
+
+
+def read_legacy(content: bytes) -> Any:
+    """Read a surface or grid in VTK's legacy format; ValueError, KeyError or IndexError where it is damaged."""
+    head = _HEAD.match(content)
+    if head is None:
+        raise ValueError("it does not begin as a surface or grid of VTK's legacy format")
+    cursor = _Cursor(content, head.end(), head[2].upper() == b"ASCII", ">")
+    parts: dict[str, np.ndarray] = {}
+    arrays: dict[str, dict[str, Any]] = {"": {}, "POINT_DATA": {}, "CELL_DATA": {}}
+    place, rows = "", 0
+    while words := cursor.line():
+        key = words[0].upper()
+        if key == "POINTS":
+            parts["points"] = cursor.values(_legacy_type(words[2]), 3 * int(words[1])).reshape(-1, 3)
+        elif key in _CELLS:
+            parts[_CELLS[key]] = cursor.cells(int(words[1]), int(words[2]), int(head[1]) >= 5)
+        elif key == "CELL_TYPES":
+            parts["types"] = cursor.values("i4", int(words[1]))
+        elif key in arrays:
+            place, rows = key, int(words[1])
+        elif key == "FIELD":
+            for _ in range(int(words[2])):
+                name, components, count, kind = cursor.line()
+                size = int(components) * int(count)
+                arrays[place][unquote(name)] = (
+                    cursor.texts(size)
+                    if kind == "string"
+                    else _rows(cursor.values(_legacy_type(kind), size), int(components))
+                )
+        elif key in _COMPONENTS:
+            components = int(words[3]) if key == "SCALARS" and len(words) > 3 else _COMPONENTS[key]
+            cursor.skip(rb"\s*LOOKUP_TABLE\s+\S+[ \r]*\n" if key == "SCALARS" else b"")
+            values = cursor.values(_legacy_type(words[2]), components * rows)
+            arrays[place][unquote(words[1])] = _rows(values, components)
+        elif key == "TEXTURE_COORDINATES":
+            values = cursor.values(_legacy_type(words[3]), int(words[2]) * rows)
+            arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
+        elif key == "COLOR_SCALARS":
+            values = cursor.values("f4" if cursor.is_text else "u1", int(words[2]) * rows)
+            arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
+        elif key == "LOOKUP_TABLE":
+            cursor.values("f4" if cursor.is_text else "u1", 4 * int(words[2]))
+        elif key == "METADATA":
+            cursor.skip(rb".*?(\n\s*\n|\Z)")
+        else:
+            raise ValueError(f"it has {key[:20]!r} where a word of VTK's is expected")
+    return _dataset(parts, arrays)
+
+
+def read_ply(content: bytes) -> Any:
+    """Read the points and faces of a PLY file; errors as of `read_legacy`."""
+    head = re.match(rb"ply\s(.*?)end_header[ \r]*\n", content, re.DOTALL)
+    if head is None:
+        raise ValueError("it does not begin as PLY")
+    lines = [line.split() for line in head[1].decode("utf-8").splitlines()]
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    form = "none"
+    for words in lines:
+        if words and words[0] == "format":
+            form = words[1]
+        elif words and words[0] == "element":
+            elements.append((words[1], int(words[2]), []))
+        elif words and words[0] == "property":
+            elements[-1][2].append(words[1:])
+    order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
+    cursor, parts = _Cursor(content, head.end(), form == "ascii", order), {}
+    for name, count, properties in elements:
+        if count > len(content):
+            raise ValueError("it is cut short")
+        rows = [[_ply_value(cursor, words) for words in properties] for _ in range(count)]
+        names = [words[-1] for words in properties]
+        if name == "vertex":
+            columns = [names.index(axis) for axis in "xyz"]
+            parts["points"] = np.array([[row[k] for k in columns] for row in rows], float).reshape(-1, 3)
+        elif name == "face":
+            column = names.index("vertex_index" if "vertex_index" in names else "vertex_indices")
+            parts["faces"] = _join([row[column] for row in rows])
+    return _dataset(parts)
+
+
+def _ply_value(cursor: _Cursor, words: Sequence[str]) -> Any:
+    if words[0] == "list":
+        return cursor.values(_PLY_TYPES[words[2]], int(cursor.values(_PLY_TYPES[words[1]], 1)[0]))
+    return cursor.values(_PLY_TYPES[words[0]], 1)[0]
+
+
+def read_obj(content: bytes) -> Any:
+    """Read the points, faces and lines of a Wavefront OBJ file; errors as of `read_legacy`."""
+    points: list[list[str]] = []
+    cells: dict[str, list[list[int]]] = {"f": [], "l": []}
+    for line in content.decode("utf-8", "replace").splitlines():
+        key, *words = line.split() or [""]
+        if key == "v":
+            points.append(words[:3])
+        elif key in cells:
+            # Numbers count from 1, or back from the last point.
+            numbers = [int(word.split("/")[0]) for word in words]
+            cells[key].append([number - 1 if number > 0 else len(points) + number for number in numbers])
+    return _dataset({
+        "points": np.array(points, float).reshape(-1, 3), "faces": _join(cells["f"]), "lines": _join(cells["l"]),
+    })  # fmt: skip
+
+
+def _legacy_type(name: str) -> str:
+    return _LEGACY_TYPES[name.lower()]
+
+
+def _rows(values: np.ndarray, components: int) -> np.ndarray:
+    return values if components == 1 else values.reshape(-1, components)
+
+
+def _join(cells: Iterable[Any]) -> Int[np.ndarray, "n"]:
+    return np.concatenate([np.zeros(0, np.int64), *(np.array([len(cell), *cell], np.int64) for cell in cells)])
+
+
+def _dataset(parts: dict[str, np.ndarray], arrays: dict[str, dict[str, Any]] | None = None) -> Any:
+    """A dataset of PyVista, whose cells have no other points than it has."""
+    import pyvista
+
+    points, types = parts.pop("points", np.zeros((0, 3))), parts.pop("types", None)
+    split = {name: split_cells(cells, len(points)) for name, cells in parts.items()}
+    if types is not None or "cells" in parts:
+        if set(parts) != {"cells"} or types is None or len(types) != len(split["cells"]):
+            raise ValueError("the types of its cells do not fit")
+        dataset = pyvista.UnstructuredGrid(parts["cells"], types.astype(np.uint8), points)
+    else:
+        dataset = pyvista.PolyData(points, **parts)
+    for name, target in (("POINT_DATA", "point_data"), ("CELL_DATA", "cell_data"), ("", "field_data")):
+        for key, values in (arrays or {}).get(name, {}).items():
+            getattr(dataset, target)[key] = values
+    return dataset
