@@ -1,6 +1,7 @@
 """The command line. Heavy imports stand inside the commands, so that help comes at once."""
 
 import errno
+import logging
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,6 +11,7 @@ from typer.core import TyperGroup
 from bayesreg import __version__
 from bayesreg.compilation import compile_quickly, keep_compiled_programs
 from bayesreg.label_tables import TABLES
+from bayesreg.messages import from_level, show_messages
 
 NOT_CONVERGED = 3
 STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
@@ -133,7 +135,17 @@ Space = Annotated[
     Literal["RAS", "LPS"] | None,
     typer.Option("--space", help="Of the coordinates of --points and --mesh, where a file does not say."),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+
+
+def _quieten(context: typer.Context, wanted: bool) -> bool:
+    if wanted:
+        context.with_resource(from_level(logging.WARNING))
+    return wanted
+
+
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Show no progress, and of messages warnings alone.", callback=_quieten)
+]
 Page = Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="HTML file to write.")]
 
 
@@ -146,11 +158,13 @@ def _show_version(wanted: bool) -> bool:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
     ] = False,
 ) -> None:
     """Registration of two images with posterior distributions of displacement and stiffness."""
+    context.with_resource(show_messages())
     compile_quickly()
     keep_compiled_programs()
 
@@ -206,7 +220,7 @@ def check(config: ConfigFile, overrides: Overrides = None) -> None:
     settings = load_config(config, overrides or ())
     from bayesreg.workflow.check import check
 
-    typer.echo(check(settings, say=typer.echo).cost)
+    typer.echo(check(settings).cost)
 
 
 @app.command()
@@ -255,7 +269,6 @@ def apply(
         draws=draws,
         space=space,
         margins=margin or (),
-        say=(lambda text: None) if quiet else typer.echo,
     )
     typer.echo("\n".join(f"Written: {path}" for path in written))
 
@@ -265,8 +278,7 @@ def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: MapsLike = No
     """Write maps of a run: how sure every point is, how volume changes, how stiff the tissue is."""
     from bayesreg.results.maps import maps
 
-    say = (lambda text: None) if quiet else typer.echo
-    written = maps(folder, out, far=far or (2.0,), like=like, say=say)
+    written = maps(folder, out, far=far or (2.0,), like=like)
     typer.echo("\n".join(f"Written: {path}" for path in written))
 
 
@@ -283,7 +295,7 @@ def reproduce(folder: RunFolder, out: OutFolder, quiet: Quiet = False) -> None:
     """Run again what a run's folder holds, and tell whether the draws are the same, bit for bit."""
     from bayesreg.workflow.reproduce import reproduce
 
-    found = reproduce(folder, out, progress=not quiet, say=(lambda text: None) if quiet else typer.echo)
+    found = reproduce(folder, out, progress=not quiet)
     typer.echo("\n".join(found.lines))
     if not found.same:
         raise typer.Exit(1)
@@ -297,7 +309,7 @@ def serve(
     """Offer log posterior, gradient and forward model to clients of UM-Bridge on this machine."""
     from bayesreg.workflow.serve import serve
 
-    serve(config, port, say=typer.echo)
+    serve(config, port)
 
 
 @app.command()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from xml.etree import ElementTree
 
 import nibabel as nib
@@ -19,6 +22,7 @@ from bayesreg.io import store
 from bayesreg.io.ledger import writing
 from bayesreg.io.quality import edge_lengths
 from bayesreg.mesh import signed_volumes
+from bayesreg.messages import from_level
 from bayesreg.report.panels import View, ignored
 from bayesreg.report.slices import planes_through
 from bayesreg.results.slicer import slicer
@@ -210,6 +214,18 @@ def test_the_composite_alone_makes_the_warped_image(result):
     assert away.max() < 0.02 * SCALE
 
 
+@contextmanager
+def keeping_messages() -> Iterator[list[str]]:
+    """For fixtures of a module, which have no `caplog`."""
+    said: list[str] = []
+    handler, log = logging.Handler(), logging.getLogger("bayesreg")
+    handler.emit = lambda record: said.append(record.getMessage())
+    log.addHandler(handler)
+    with from_level(logging.INFO):
+        yield said
+    log.removeHandler(handler)
+
+
 @pytest.fixture(scope="module")
 def applied(result, folder):
     rng = np.random.default_rng(0)
@@ -219,10 +235,10 @@ def applied(result, folder):
     ball = pyvista.Sphere(radius=12.0, center=result.mesh.points.mean(axis=0), theta_resolution=12, phi_resolution=12)
     ball.save(folder / "ball.vtk")
     ball.save(folder / "ball.stl")
-    said: list[str] = []
     given = {"points": folder / "p.csv", "mesh": folder / "ball.vtk", "image": folder / "fixed.nii.gz",
              "labels": folder / "organ.nii.gz"}  # fmt: skip
-    written = br.apply(result.folder, folder / "there", draws=40, far=(0.1, 2.0), say=said.append, **given)
+    with keeping_messages() as said:
+        written = br.apply(result.folder, folder / "there", draws=40, far=(0.1, 2.0), **given)
     return points, written, said
 
 
@@ -476,12 +492,12 @@ def test_a_run_that_has_moved_is_carried_on_alone(applied, result, folder, tmp_p
 
 
 @pytest.mark.parametrize(("asked", "used"), [(None, 200), (300, 300)])
-def test_labels_are_carried_by_as_many_draws_as_asked_for(result, folder, tmp_path, asked, used):
-    said: list[str] = []
+def test_labels_are_carried_by_as_many_draws_as_asked_for(result, folder, tmp_path, asked, used, caplog):
+    caplog.set_level(logging.INFO)
     small = br.Image(np.zeros((4, 4, 4)), POSE.matrix @ MASK.affine @ np.diag([12.0, 12.0, 12.0, 1.0]))
     br.save_image(small, tmp_path / "small.nii.gz")
     # Points ask for more draws than labels do.
     given = {"points": folder / "p.csv", "labels": folder / "organ.nii.gz", "like": tmp_path / "small.nii.gz"}
     (folder / "p.csv").exists() or (folder / "p.csv").write_text("x,y,z\n0,0,0")
-    br.apply(result.folder, tmp_path / "out", draws=asked, say=said.append, **given)
-    assert any(line.startswith("labels of") and line.endswith(f"by {used} draws") for line in said)
+    br.apply(result.folder, tmp_path / "out", draws=asked, **given)
+    assert any(line.startswith("labels of") and line.endswith(f"by {used} draws") for line in caplog.messages)

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
 
-Say = Callable[[str], None]
-
 
 class Info(NamedTuple):
     """One transition: what the proposal met, the probability with which it was accepted, and what it cost.
@@ -59,7 +57,7 @@ class Sampler(NamedTuple):
     Attributes
     ----------
     prepare : callable
-        (points, key, say) → (setup, points): start points (chains as the leading axis) to what the kernel needs
+        (points, key) → (setup, points): start points (chains as the leading axis) to what the kernel needs
         besides the data, a pytree that is found once, and the points from which chains then start.
     data : callable
         (setup) → the target's data as the functions below take them.
@@ -81,7 +79,7 @@ class Sampler(NamedTuple):
         Whether a step has many solves, of which it does not tell: that of the draw is counted in their place.
     """
 
-    prepare: Callable[[Any, AnyArray, Say], tuple[Any, Any]]
+    prepare: Callable[[Any, AnyArray], tuple[Any, Any]]
     data: Callable[[Any], Any]
     blank: Callable[[], Any]
     init: Callable[[Any, Any, Estimands], Any]

@@ -135,7 +135,7 @@ def build_mesh(
     for attempt in range(1, options.attempts + 1):
         try:
             mesh = _attempt(labels, names, surfaces, sizing, distance, options)
-            _log.info("mesh made: %s", check_mesh(mesh, labels))
+            _log.debug("mesh made: %s", check_mesh(mesh, labels))
             return mesh
         except ValueError as error:
             _log.warning("mesh %d of at most %d is not sound: %s", attempt, options.attempts, error)

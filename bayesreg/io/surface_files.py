@@ -140,8 +140,8 @@ def _read_by_vtk(path: Path, content: bytes) -> Any:
     counts = map(int, re.findall(rb'NumberOf\w+\s*=\s*"\s*(\d+)', content))
     if max(counts, default=0) > MOST_COMPRESSED * len(content):
         raise ValueError("it is cut short")
-    kinds = {".vtp": vtkXMLPolyDataReader, ".vtu": vtkXMLUnstructuredGridReader, ".stl": vtkSTLReader}
-    reader, errors, verbosity = kinds[path.suffix.lower()](), [], vtkLogger.GetCurrentVerbosityCutoff()
+    readers: dict[str, Any] = {".vtp": vtkXMLPolyDataReader, ".vtu": vtkXMLUnstructuredGridReader, ".stl": vtkSTLReader}
+    reader, errors, verbosity = readers[path.suffix.lower()](), [], vtkLogger.GetCurrentVerbosityCutoff()
     reader.SetFileName(str(path))
     reader.AddObserver("ErrorEvent", lambda *_: errors.append(path))
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
@@ -149,19 +149,20 @@ def _read_by_vtk(path: Path, content: bytes) -> Any:
     with pyvista.VtkErrorCatcher(send_to_logging=False):
         reader.Update()
     vtkLogger.SetStderrVerbosity(verbosity)
-    if errors:
-        raise ValueError(f"it is cut short, or no {path.suffix} file")
     dataset = pyvista.wrap(reader.GetOutput())
     grid = isinstance(dataset, pyvista.UnstructuredGrid)
-    for kind in ("Cells",) if grid else ("Verts", "Lines", "Polys", "Strips"):
-        cells = getattr(dataset, f"Get{kind}")()
-        offsets, points = (np.asarray(pyvista.convert_array(part)) for part in _arrays_of(cells))
-        split_cells(join_cells(offsets.astype(np.int64), points.astype(np.int64)), dataset.n_points)
+    kinds = [
+        getattr(dataset, f"Get{kind}")() for kind in (("Cells",) if grid else ("Verts", "Lines", "Polys", "Strips"))
+    ]
+    if errors or None in kinds:
+        raise ValueError(f"it is cut short, or no {path.suffix} file")
+    for cells in kinds:
+        offsets, points = (
+            np.asarray(pyvista.convert_array(part)).astype(np.int64)
+            for part in (cells.GetOffsetsArray(), cells.GetConnectivityArray())
+        )
+        split_cells(join_cells(offsets, points), dataset.n_points)
     return dataset
-
-
-def _arrays_of(cells: Any) -> tuple[Any, Any]:
-    return cells.GetOffsetsArray(), cells.GetConnectivityArray()
 
 
 def save_dataset(dataset: Any, path: Path) -> None:

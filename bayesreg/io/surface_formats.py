@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from itertools import islice
-from typing import Any
+from typing import Any, Literal, cast
 from urllib.parse import unquote
 
 import numpy as np
@@ -37,7 +37,7 @@ _CELLS = {"VERTICES": "verts", "LINES": "lines", "POLYGONS": "faces", "TRIANGLE_
 class _Cursor:
     """A place in the content of a file, which moves on with what is read; ValueError where the content ends."""
 
-    def __init__(self, content: bytes, at: int, is_text: bool, order: str) -> None:
+    def __init__(self, content: bytes, at: int, is_text: bool, order: Literal["<", ">"]) -> None:
         self.content, self.at, self.is_text, self.order = content, at, is_text, order
 
     def line(self) -> list[str]:
@@ -135,12 +135,12 @@ def read_legacy(content: bytes) -> Any:
             place, rows = key, int(words[1])
         elif key == "FIELD":
             for _ in range(int(words[2])):
-                name, components, count, kind = cursor.line()
-                size = int(components) * int(count)
+                name, width, length, kind = cursor.line()
+                size = int(width) * int(length)
                 arrays[place][unquote(name)] = (
                     cursor.texts(size)
                     if kind == "string"
-                    else _rows(cursor.values(_legacy_type(kind), size), int(components))
+                    else _rows(cursor.values(_legacy_type(kind), size), int(width))
                 )
         elif key in _COMPONENTS:
             components = int(words[3]) if key == "SCALARS" and len(words) > 3 else _COMPONENTS[key]
@@ -177,8 +177,9 @@ def read_ply(content: bytes) -> Any:
             elements.append((words[1], int(words[2]), []))
         elif words and words[0] == "property":
             elements[-1][2].append(words[1:])
-    order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
-    cursor, parts = _Cursor(content, head.end(), form == "ascii", order), {}
+    orders: dict[str, Literal["<", ">"]] = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+    parts: dict[str, np.ndarray] = {}
+    cursor = _Cursor(content, head.end(), form == "ascii", orders[form])
     for name, count, properties in elements:
         if count > len(content):
             raise ValueError("it is cut short")
@@ -239,7 +240,7 @@ def _dataset(parts: dict[str, np.ndarray], arrays: dict[str, dict[str, Any]] | N
             raise ValueError("the types of its cells do not fit")
         dataset = pyvista.UnstructuredGrid(parts["cells"], types.astype(np.uint8), points)
     else:
-        dataset = pyvista.PolyData(points, **parts)
+        dataset = pyvista.PolyData(points, **cast(Any, parts))
     for name, target in (("POINT_DATA", "point_data"), ("CELL_DATA", "cell_data"), ("", "field_data")):
         for key, values in (arrays or {}).get(name, {}).items():
             getattr(dataset, target)[key] = values

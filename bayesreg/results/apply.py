@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -23,6 +24,8 @@ from bayesreg.results.nodal_draws import POINT_DRAWS, transform_of
 from bayesreg.results.result import Result, load_result
 from bayesreg.results.transform import Spread, Transform, distances_of, spread
 from bayesreg.types import InputError
+
+_log = logging.getLogger(__name__)
 
 Around = Literal["harmonic", "missing"]
 
@@ -48,7 +51,6 @@ def apply(
     draws: int | None = None,
     space: Space | None = None,
     margins: Sequence[int] = (),
-    say: Callable[[str], None] = lambda text: None,
 ) -> list[Path]:
     """Carry what lies in the world of the fixed image to that of the moving one, over the posterior.
 
@@ -85,8 +87,6 @@ def apply(
         Of the coordinates in `points` and `mesh`, where a file does not say it.
     margins : sequence of int
         Labels; of each a surface is written (.vtk, RAS) beyond which every point has it with less than 5 %.
-    say : callable
-        Told what is done, and beware of.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def apply(
     given = {"points": points, "image": image, "labels": labels, "mesh": mesh}
     _require_sense(given, around, far, draws, margins)
     result, out = load_result(folder), require_folder(out)
-    how = _How(out, "fixed" if inverse else "moving", around, tuple(far), say)
+    how = _How(out, "fixed" if inverse else "moving", around, tuple(far))
     _require_own_names(how, given, like)
     # All input is read before anything long begins.
     tasks: list[Callable[[Transform], list[Path]]] = []
@@ -123,9 +123,9 @@ def apply(
     how.out.mkdir(parents=True, exist_ok=True)
     transform = transform_of(result, draws or (LABEL_DRAWS if points is None and mesh is None else POINT_DRAWS))
     transform = transform.inverse if inverse else transform
-    say(_describe(transform))
+    _log.info("%s", _describe(transform))
     if len(transform.draws) < FEW_DRAWS:
-        say(f"beware: {len(transform.draws)} draws tell little of how sure this is; {FEW_DRAWS} are few")
+        _log.warning("%d draws tell little of how sure this is; %d are few", len(transform.draws), FEW_DRAWS)
     return [path for task in tasks for path in task(transform)]
 
 
@@ -183,7 +183,6 @@ class _How(NamedTuple):
     where: str
     around: Around
     far: tuple[float, ...]
-    say: Callable[[str], None]
 
     def target(self, kind: str, source: Path) -> Path:
         """The file for what is carried of another."""
@@ -202,7 +201,9 @@ class _How(NamedTuple):
             return
         then = "the displacement goes on harmonically" if self.around == "harmonic" else "no place is given"
         count = f"{int((~inside).sum()):,} of {len(inside):,}"
-        self.say(f"{count} {what} lie around the mesh, where nothing is known: {then}, and how sure it is is not told")
+        _log.info(
+            "%s %s lie around the mesh, where nothing is known: %s, and how sure it is is not told", count, what, then
+        )
 
 
 def _describe(transform: Transform) -> str:
@@ -242,7 +243,7 @@ def _carry_points(points: Points, path: Path, how: _How, transform: Transform) -
 
 def _carry_surface(surface: SurfaceFile, path: Path, how: _How, transform: Transform) -> list[Path]:
     if not surface.is_said:
-        how.say(f"{path} does not say whether its coordinates are RAS or LPS (--space); they are taken as RAS")
+        _log.info("%s does not say whether its coordinates are RAS or LPS (--space); they are taken as RAS", path)
     found = spread(transform, surface.points, how.far)
     how.tell_of_outside(found.inside, f"points of {path}")
     if how.around == "missing":
@@ -294,7 +295,7 @@ def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Tr
 
 def _tell_of_nothing(inside: Bool[np.ndarray, "k"], path: Path, how: _How) -> None:
     if not inside.any():
-        how.say(f"beware: nothing of {path} comes from within the mesh; is it in the world of the other image?")
+        _log.warning("nothing of %s comes from within the mesh; is it in the world of the other image?", path)
 
 
 def _carry_labels(
@@ -302,7 +303,7 @@ def _carry_labels(
 ) -> list[Path]:
     count = min(len(transform.draws), most)
     some = replace(transform, draws=transform.draws[np.linspace(0, len(transform.draws) - 1, count).astype(int)])
-    how.say(f"labels of {path}, by {len(some.draws)} draws")
+    _log.info("labels of %s, by %d draws", path, len(some.draws))
     found = carry_labels(some, labels, grid, keep_around=how.around == "harmonic")
     _tell_of_nothing(np.asarray(found.most_probable.voxels).ravel() != 0, path, how)
     save_image(found.most_probable, target := how.target("labels", path))
@@ -316,7 +317,7 @@ def _carry_labels(
         write_nifti(probability, grid.affine, part := folder / f"label-{value}.nii.gz")
         written.append(part)
         if value in margins and not (np.nan_to_num(probability) > 1 - MARGIN).any():
-            how.say(f"beware: label {value} is improbable everywhere, and has no margin")
+            _log.warning("label %d is improbable everywhere, and has no margin", value)
         elif value in margins:
             target = how.name(path, f"_margin95_label-{value}.vtk")
             save_outline(target, np.nan_to_num(probability), grid.affine, 1 - MARGIN)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from bayesreg.results.result import load_result
 from bayesreg.results.transform import Transform, distances_of
 from bayesreg.types import InputError
 
+_log = logging.getLogger(__name__)
+
 CHUNK = 500_000
 
 
@@ -29,7 +32,6 @@ def maps(
     far: Sequence[float] = (2.0,),
     like: str | Path | None = None,
     draws: int = POINT_DRAWS,
-    say: Callable[[str], None] = lambda text: None,
 ) -> list[Path]:
     """Write maps of a run on the grid of its fixed image; NaN where the mesh does not reach, and nothing is known.
 
@@ -45,8 +47,6 @@ def maps(
         An image in the fixed image's world on whose grid the maps are written instead.
     draws : int
         How many at most.
-    say : callable
-        Told what was found.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def maps(
         by_cell |= {name: x for name, x in result.run.predicted.by_cell.items() if name != "stiffer_probability"}
     values |= {name: np.asarray(x)[covered.cell] for name, x in by_cell.items()}
     middle = float(np.median(values["radius95"]))
-    say(f"{len(covered.cell):,} voxels lie in the mesh; half of them have a 95 % radius above {middle:.2g} mm")
+    _log.info(f"{len(covered.cell):,} voxels lie in the mesh; half of them have a 95 % radius above {middle:.2g} mm")
     out.mkdir(parents=True, exist_ok=True)
     return [_write(out / f"{name}.nii.gz", grid, covered, x) for name, x in values.items()]
 

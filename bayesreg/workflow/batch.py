@@ -27,6 +27,7 @@ from bayesreg.inference.chains.progress import NoProgress
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.inference.draws.moments import greatest_rhat
 from bayesreg.io.ledger import STATUS, stage_of
+from bayesreg.messages import from_level
 from bayesreg.report.estimands import parameter_groups
 from bayesreg.results.result import Result
 from bayesreg.types import InputError
@@ -97,7 +98,9 @@ def run_task(config: str, task: Task, folder: str, cores: int | None) -> dict[st
         _take_share(cores)
     try:
         settings = load_config(config, task.overrides)
-        result = run(settings, folder, resume=True, progress=lambda *budget: _Reporter(task.name, *budget))
+        # Of many runs side by side nobody would know which one a message is about; warnings stand in its report, too.
+        with from_level(logging.ERROR):
+            result = run(settings, folder, resume=True, progress=lambda *budget: _Reporter(task.name, *budget))
         return {"state": "finished", **summarise(result)}
     except InputError as error:
         begun = (Path(folder) / STATUS).exists()

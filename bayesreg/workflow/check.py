@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,19 +19,19 @@ from bayesreg.workflow.appraisal import Likeness
 from bayesreg.workflow.assembly import posterior_of, start_of
 from bayesreg.workflow.preparation import prepared_inputs
 
+_log = logging.getLogger(__name__)
 
-def check(config: str | Path | Config, say: Callable[[str], None] = lambda text: None) -> Check:
+
+def check(config: str | Path | Config) -> Check:
     """Everything but sampling, with an estimate of time and memory.
 
     Parameters
     ----------
     config : path or Config
-    say : callable
-        Told what was found of labels and images, before the search for a start, which may take minutes.
     """
     config = config if isinstance(config, Config) else load_config(config)
     inputs, provenance = prepared_inputs(config)
-    say(describe_inputs(provenance["appraisal"]))
+    _log.info("%s", describe_inputs(provenance["appraisal"]))
     posterior = posterior_of(config, inputs)
     start = start_of(config, inputs, posterior)
     options, trial, reached = config.sampler, 10, []

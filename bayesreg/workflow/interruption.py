@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+_log = logging.getLogger(__name__)
 
 # Seconds after which a signal comes again.
 AGAIN = 0.5
@@ -34,13 +37,8 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextmanager
-def ending_between_blocks(say: Callable[[str], None]) -> Iterator[Callable[[], None]]:
-    """Put signals off while blocks of draws are made.
-
-    Parameters
-    ----------
-    say : callable
-        Is told that a signal has come. Another one ends the program at once.
+def ending_between_blocks() -> Iterator[Callable[[], None]]:
+    """Put signals off while blocks of draws are made; another one ends the program at once.
 
     Yields
     ------
@@ -53,7 +51,7 @@ def ending_between_blocks(say: Callable[[str], None]) -> Iterator[Callable[[], N
         if came:
             raise Interrupted(number)
         came.append(number)
-        say("the run ends after this block of draws; another signal ends it at once")
+        _log.info("the run ends after this block of draws; another signal ends it at once")
 
     def require_none() -> None:
         if came:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,8 @@ from bayesreg.results.result import Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.preparation import PROVENANCE, store_inputs
 from bayesreg.workflow.run import run
+
+_log = logging.getLogger(__name__)
 
 # What stands in run.json of where a run was made; the same of all of these makes the same bits.
 WHERE = ("versions", "devices", "xla_flags", "machine", "cores")
@@ -53,9 +55,7 @@ class Comparison(NamedTuple):
         return ["the draws are not the same", *told, *(found or ["nothing that run.json records tells why"])]
 
 
-def reproduce(
-    folder: str | Path, out: str | Path, progress: bool = True, say: Callable[[str], None] = lambda text: None
-) -> Comparison:
+def reproduce(folder: str | Path, out: str | Path, progress: bool = True) -> Comparison:
     """Run again what the folder of a run holds, with its seed and as many draws, and compare.
 
     Parameters
@@ -67,8 +67,6 @@ def reproduce(
         Folder of the repetition, new or empty.
     progress : bool
         As in `bayesreg.run`.
-    say : callable
-        Told what is done.
 
     Raises
     ------
@@ -89,7 +87,8 @@ def reproduce(
     with locked(out):
         # Those files may have changed, or be gone.
         store_inputs(out, inputs, provenance | {"sources": {}})
-    say(f"{first.run.manifest['steps_per_chain']:,} steps of {config.sampler.chains} chains, with seed {config.seed}")
+    steps, chains = first.run.manifest["steps_per_chain"], config.sampler.chains
+    _log.info(f"{steps:,} steps of {chains} chains, with seed {config.seed}")
     return _compare(first, run(config, out, resume=True, progress=progress))
 
 

@@ -5,13 +5,14 @@ Reports are imported where they are written: no run waits at its start for what 
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from bayesreg.config import Config, load_config, load_stored_config, resolved_yaml
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
@@ -31,6 +32,7 @@ from bayesreg.io.atomic import write_text
 from bayesreg.io.ledger import is_sound, locked, read_status, require_file, stage_of, writing
 from bayesreg.io.records import Inputs
 from bayesreg.memory import memory_of_machine
+from bayesreg.messages import show_messages
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.results.result import REPORT, Result, load_result
@@ -48,6 +50,8 @@ from bayesreg.workflow.preparation import (
 )
 from bayesreg.workflow.reports import report
 from bayesreg.workflow.sources import digests_of_sources, require_same_sources
+
+_log = logging.getLogger(__name__)
 
 # Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
 # whole state is written.
@@ -93,35 +97,35 @@ def run(
     """
     config = config if isinstance(config, Config) else load_config(config)
     given = require_observations(observations) if observations else []
-    return _run(config, Path(out), resume, progress, given)
+    with show_messages() if progress is True else nullcontext():
+        return _run(config, Path(out), resume, progress, given)
 
 
 def _run(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
     began = time.perf_counter()
-    say = _narrator(progress)
     if resume and stage_of(out) is not None:
         with locked(out):
-            return _resume(config, out, progress, observations, began, say)
+            return _resume(config, out, progress, observations, began)
     # What a run has left that was cut off before its inputs stood is worth nothing.
     if not (resume and read_status(out) is not None):
         store.require_fresh(out)
-    say("reading the files, meshing")
+    _log.info("reading the files, meshing")
     if config.has_images and not config.pairs_of_images:
-        say("the images are shown and not compared: observations does not name them ({kind: images})")
+        _log.info("the images are shown and not compared: observations does not name them ({kind: images})")
     # Before they are read: what changes meanwhile is told when the run goes on.
     sources = digests_of_sources(config, MAY_CHANGE)
     inputs, provenance = prepared_inputs(config, observations)
     for line in provenance["appraisal"].get("notes", ()):
-        say(line)
+        _log.info("%s", line)
     for sentence in provenance["appraisal"].get("beware", ()):
-        say(f"beware: {sentence}")
+        _log.warning("%s", sentence)
     # Nothing is written before all input has proved sound, and all of it before the first step is taken.
     posterior = posterior_of(config, inputs, observations)
     _require_memory(config, posterior)
     provenance["observations"] = _fingerprint(posterior, observations)
     provenance["sources"] = sources
     searching = time.perf_counter()
-    posterior = temper(config, inputs, posterior, say)
+    posterior = temper(config, inputs, posterior)
     provenance["independent_points"] = posterior.independent_points
     reached = _first(config, inputs, posterior, out, progress, time.perf_counter() - searching)
     inputs = with_initial(inputs, config)
@@ -130,7 +134,7 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
             raise InputError(f"another process has begun a run in {out} meanwhile; name another folder")
         provenance = with_unsampled(provenance, began + float(reached[0].seconds))
         store_inputs(out, inputs, provenance)
-        return _go_on(config, inputs, posterior, reached, provenance, out, began, progress, say)
+        return _go_on(config, inputs, posterior, reached, provenance, out, began, progress)
 
 
 def _resume(
@@ -139,14 +143,13 @@ def _resume(
     progress: Showing,
     observations: list[Any],
     began: float,
-    say: Callable[[str], None],
 ) -> Result:
     known = _resumed_config(out, config)
     provenance = store.read_json(require_file(out, PROVENANCE))
     require_same_sources(config, provenance.get("sources", {}), MAY_CHANGE, out)
     finished = stage_of(out) == "finished"
     if finished and all(getattr(known, name) == getattr(config, name) for name in MAY_CHANGE):
-        say(f"{out} holds a finished run already; another budget (stop) would continue it")
+        _log.info(f"{out} holds a finished run already; another budget (stop) would continue it")
         if not is_sound(out, REPORT):
             report(out)
             return load_result(out)
@@ -154,7 +157,7 @@ def _resume(
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(out, provenance, posterior, observations)
     # What `simulate` has made is not tempered yet.
-    posterior = temper(config, inputs, posterior, say)
+    posterior = temper(config, inputs, posterior)
     provenance["independent_points"] = posterior.independent_points
     if finished:
         checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
@@ -169,7 +172,7 @@ def _resume(
         write_text(place("config.yaml"), inputs.config)
         store.write_observed(place, inputs.observed)
         store.write_json(place(PROVENANCE), with_unsampled(provenance, began + sampled))
-    return _go_on(config, inputs, posterior, reached, provenance, out, began, progress, say)
+    return _go_on(config, inputs, posterior, reached, provenance, out, began, progress)
 
 
 def _go_on(
@@ -181,27 +184,26 @@ def _go_on(
     out: Path,
     began: float,
     progress: Showing,
-    say: Callable[[str], None],
 ) -> Result:
     """Sample from where the chains stand, and write the results."""
     _save_state(out, *reached)
-    say(_describe_mesh(inputs))
-    with ending_between_blocks(say) as require_no_signal:
+    _log.info("%s", _describe_mesh(inputs))
+    with ending_between_blocks() as require_no_signal:
         samples = _sample(config, posterior, reached, out, progress, require_no_signal)
-    say("writing the results")
+    _log.info("writing the results")
     result = finish(config, inputs, posterior, samples, provenance, out, began)
-    say(f"{samples.reason}")
-    _warn(config, result, say)
+    _log.info("%s", samples.reason)
+    _warn(config, result)
     return result
 
 
-def _warn(config: Config, result: Result, say: Callable[[str], None]) -> None:
+def _warn(config: Config, result: Result) -> None:
     """Say what the report says first of a model that real images seldom fit."""
     from bayesreg.report.verdict import doubt_of_equilibrium
 
     doubt = doubt_of_equilibrium(result.run.manifest["model"], simulated=config.simulate is not None)
     if doubt is not None and config.pairs_of_images:
-        say(f"beware: {doubt}")
+        _log.warning("%s", doubt)
 
 
 def _resumed_config(out: Path, config: Config) -> Config:
@@ -245,25 +247,20 @@ def _require_same_observations(out: Path, provenance: dict[str, Any], posterior:
             )
 
 
-def _narrator(progress: Showing) -> Callable[[str], None]:
-    console = Console(quiet=progress is not True, highlight=False)
-    return lambda text: console.print(text, markup=False)
-
-
 def _describe_mesh(inputs: Inputs) -> str:
     mesh = inputs.mesh
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
 
-def temper(config: Config, inputs: Inputs, posterior: Posterior, say: Callable[[str], None]) -> Posterior:
+def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
     """The posterior that the chains are to draw from."""
     if posterior.tempered:
         return posterior
-    say("how many points are independent: where the images first lead to")
-    found = temper_target(posterior, config.sampler.chains, config.seed, start_of(config, inputs, posterior), say)
+    _log.info("how many points are independent: where the images first lead to")
+    found = temper_target(posterior, config.sampler.chains, config.seed, start_of(config, inputs, posterior))
     assert isinstance(found, Posterior)
     for name, count in found.independent_points.items():
-        say(f"{name}: {count:,.0f} of {len(found.data.terms[name].positions):,} points are independent")
+        _log.info(f"{name}: {count:,.0f} of {len(found.data.terms[name].positions):,} points are independent")
     return found
 
 
@@ -275,9 +272,7 @@ def _first(
     What was spent on the way there before, `seconds`, counts as sampling.
     """
     options, start = config.sampler, start_of(config, inputs, posterior)
-    found = first_checkpoint(
-        posterior, options.name, options.chains, config.seed, start, _narrator(progress), **options.settings
-    )
+    found = first_checkpoint(posterior, options.name, options.chains, config.seed, start, **options.settings)
     found = found._replace(seconds=found.seconds + seconds)
     return found, checkpoints.StoredBlocks(out, 0)
 

@@ -6,12 +6,12 @@ Seelinger et al., "UM-Bridge: Uncertainty quantification and modeling bridge", J
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs
 from bayesreg.workflow.run import temper
+
+_log = logging.getLogger(__name__)
 
 LOG_POSTERIOR = "log_posterior"
 LOOPBACK, PORT = "127.0.0.1", 4242
@@ -155,7 +157,7 @@ def models_of(posterior: Posterior) -> list[Served]:
     return [Served(name, function, posterior.data, inputs) for name, (function, inputs) in functions.items()]
 
 
-def serve(config: str | Path | Config, port: int = PORT, say: Callable[[str], None] = lambda text: None) -> None:
+def serve(config: str | Path | Config, port: int = PORT) -> None:
     """Serve the posterior of a configuration, or of a run's folder, until the process is stopped.
 
     Parameters
@@ -164,8 +166,6 @@ def serve(config: str | Path | Config, port: int = PORT, say: Callable[[str], No
         A configuration, or the folder of a run, whose inputs are taken.
     port : int
         On loopback alone: other machines do not reach it.
-    say : callable
-        Told what is served, and where.
 
     Raises
     ------
@@ -176,20 +176,23 @@ def serve(config: str | Path | Config, port: int = PORT, say: Callable[[str], No
         from umbridge import um
     except ImportError as error:
         raise InputError("the package umbridge is missing: pip install 'bayesreg[serve]'") from error
-    posterior = posterior_of_run(config, say)
+    posterior = posterior_of_run(config)
     models = models_of(posterior)
     names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior).items())
-    say(f"inputs: {names}; serving {', '.join(one.name for one in models)} at http://{LOOPBACK}:{port}")
+    served = ", ".join(one.name for one in models)
+    _log.info("inputs: %s; serving %s at http://%s:%d", names, served, LOOPBACK, port)
     # umbridge would listen to every machine.
-    run_app = partial(um.web.run_app, host=LOOPBACK, print=None)
+    run_app = um.web.run_app
+    um.web.run_app = partial(run_app, host=LOOPBACK, print=None)
     try:
-        with mock.patch.object(um.web, "run_app", run_app):
-            um.serve_models(models, port)
+        um.serve_models(models, port)
     except OSError as error:
         raise InputError(f"nothing can be served at port {port}: {error.strerror}; name another one") from error
+    finally:
+        um.web.run_app = run_app
 
 
-def posterior_of_run(config: str | Path | Config, say: Callable[[str], None]) -> Posterior:
+def posterior_of_run(config: str | Path | Config) -> Posterior:
     """What a run of a configuration would sample, or that of a folder samples."""
     if not isinstance(config, Config) and Path(config).is_dir():
         if stage_of(config) is None:
@@ -201,7 +204,7 @@ def posterior_of_run(config: str | Path | Config, say: Callable[[str], None]) ->
         settings = config if isinstance(config, Config) else load_config(config)
         inputs, _ = prepared_inputs(settings)
         posterior = posterior_of(settings, inputs)
-    return temper(settings, inputs, posterior, say)
+    return temper(settings, inputs, posterior)
 
 
 def _finite(values: np.ndarray, name: str) -> np.ndarray:

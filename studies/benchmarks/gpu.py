@@ -27,6 +27,7 @@ from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.target import logdensity
 from bayesreg.io import store
+from bayesreg.messages import show_messages
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import PROVENANCE
 
@@ -113,7 +114,8 @@ def effective_draws(posterior: br.Posterior, sizes: list[int], minutes: float) -
         def told(text: Any, began: float = began) -> None:
             print(f"  {time.perf_counter() - began:.1f} s  {text}", file=sys.stderr, flush=True)
 
-        first = first_checkpoint(posterior, "hmc", chains, seed=0, say=told)
+        with show_messages():
+            first = first_checkpoint(posterior, "hmc", chains, seed=0)
         prepared = time.perf_counter() - began
         stop, block = StopRule(rhat=1.01, ess=400, max_seconds=60 * minutes), 100 if chains < 32 else 25
         found = sample(

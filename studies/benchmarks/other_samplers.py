@@ -29,6 +29,7 @@ import argparse
 import contextlib
 import importlib
 import io
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -146,10 +147,15 @@ def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.n
     about_mode = first_checkpoint(posterior, "laplace", chains, seed, start)
     heard = [now()]
 
-    def say(text: str) -> None:
-        heard.append(now() if text.startswith("mode") else heard[-1])
+    def hear(record: logging.LogRecord) -> bool:
+        heard.append(now() if record.getMessage().startswith("mode") else heard[-1])
+        return True
 
-    first = first_checkpoint(posterior, "hmc", chains, seed, start, say)
+    log = logging.getLogger("bayesreg.inference.gaussian.mode_search")
+    log.setLevel(logging.INFO)
+    log.addFilter(hear)
+    first = first_checkpoint(posterior, "hmc", chains, seed, start)
+    log.removeFilter(hear)
     return np.asarray(jax.vmap(about_mode.setup.gaussian.place)(about_mode.state.position)), first, heard[-1]
 
 

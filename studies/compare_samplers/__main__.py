@@ -71,7 +71,7 @@ def compare_samplers(
     inputs = prepared_inputs(config)[0]
     posterior, setting = posterior_of(config, inputs), _setting(config, minutes)
     start = start_of(config, inputs, posterior)
-    target = temper_target(posterior, config.sampler.chains, config.seed, start, console.print)
+    target = temper_target(posterior, config.sampler.chains, config.seed, start)
     rule = StopRule(config.stop.rhat, config.stop.ess, 60 * minutes)
     efficiencies: list[Efficiency] = []
     for name in samplers:
@@ -87,7 +87,6 @@ def compare_samplers(
                 thin=own.thin,
                 block=own.block or BLOCK,
                 start=start,
-                say=lambda text: console.print(f"  {text}", markup=False),
                 **own.settings,
             )
         )
@@ -131,7 +130,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="budget of each sampler")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override an entry")
     given = parser.parse_args()
-    compare_samplers(load_config(given.config, given.set), given.out, given.samplers.split(","), given.minutes)
+    with show_messages():
+        compare_samplers(load_config(given.config, given.set), given.out, given.samplers.split(","), given.minutes)
 
 
 if __name__ == "__main__":

@@ -94,7 +94,6 @@ def measure_efficiency(
     thin: int = 1,
     block: int = 20,
     start: Start | None = None,
-    say: Callable[[str], None] = lambda text: None,
     progress: bool = False,
     **settings: Any,
 ) -> Efficiency:
@@ -108,7 +107,7 @@ def measure_efficiency(
         ends.append((int(checkpoint.draws), float(checkpoint.seconds)))
 
     try:
-        first = first_checkpoint(posterior, sampler, budget.chains, seed, start, say, **settings)
+        first = first_checkpoint(posterior, sampler, budget.chains, seed, start, **settings)
         samples = sample(
             posterior, sampler, budget.chains, budget.draws, seed, thin=thin, block=block, stop=budget.stop,
             progress=progress, resume=(first, []), on_block=keep, **settings,

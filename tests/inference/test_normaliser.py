@@ -184,7 +184,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     post = posterior()
     points = starting_points(post, br.Start(), 2, jax.random.key(0))
-    setup, _ = hmc(post, Hmc(warm_up=2)).prepare(points, jax.random.key(1), lambda text: None)
+    setup, _ = hmc(post, Hmc(warm_up=2)).prepare(points, jax.random.key(1))
     sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post)
     places = np.asarray(setup.middle) + sd * np.random.default_rng(0).normal(size=(10, len(sd)))
     true, found = (

@@ -1,5 +1,6 @@
 """Every sampler of the registry on a small Gaussian before a wall; `test_closed_form` has some on a real posterior."""
 
+import logging
 from functools import cache
 
 import blackjax.mcmc.proposal
@@ -185,21 +186,21 @@ def starts_at(*y: float) -> dict[str, np.ndarray]:
     return {"u_boundary": points}
 
 
-def test_every_chain_finds_its_own_mode():
-    said = []
-    found = search_modes(two_modes(), starts_at(-3.0, 4.0, 2.0, -4.0), True, said.append)
+def test_every_chain_finds_its_own_mode(caplog):
+    caplog.set_level(logging.INFO)
+    found = search_modes(two_modes(), starts_at(-3.0, 4.0, 2.0, -4.0), True)
     assert len(found.gaussians) == 2
     assert found.chains[0] == found.chains[3] != found.chains[1] == found.chains[2]
     centres = np.array([np.asarray(gaussian.centre)[1] for gaussian in found.gaussians])
     assert sorted(centres) == pytest.approx([-4.5, 4.5], abs=0.1)
     sd = np.sqrt(two_modes().covariance[1, 1])
     assert distance(found.gaussians[0], np.asarray(found.gaussians[1].centre)) == pytest.approx(9 / sd, rel=0.02)
-    assert any("2, about which" in text for text in said)
-    assert any("chains 0, 3" in text for text in said)
+    assert any("2, about which" in text for text in caplog.messages)
+    assert any("chains 0, 3" in text for text in caplog.messages)
 
 
 def test_searches_that_end_in_one_place_are_one_mode():
-    found = search_modes(two_modes(), starts_at(3.0, 4.0), True, lambda text: None)
+    found = search_modes(two_modes(), starts_at(3.0, 4.0), True)
     assert (len(found.gaussians), found.chains) == (1, [0, 0])
 
 

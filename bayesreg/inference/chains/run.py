@@ -171,12 +171,11 @@ def temper_target(
     chains: int,
     seed: int,
     start: Start | None = None,
-    say: Callable[[str], None] = lambda text: None,
 ) -> Target:
     """The posterior that `sample` draws from: tempered by its residuals, where the options want that, or as it is."""
     points = starting_points(posterior, start or Start(), chains, _start_key(seed))
     require_numbers(points)
-    return temper(posterior, points, say)
+    return temper(posterior, points)
 
 
 def _start_key(seed: int) -> AnyArray:
@@ -189,12 +188,9 @@ def first_checkpoint(
     chains: int,
     seed: int,
     start: Start | None = None,
-    say: Callable[[str], None] = lambda text: None,
     **settings: Any,
 ) -> Checkpoint:
     """The checkpoint before any draw: where `sample` starts its chains, unless it resumes.
-
-    `say` is told of the search for the mode and of the warm-up, where the sampler has them.
 
     Raises
     ------
@@ -206,7 +202,7 @@ def first_checkpoint(
     points = starting_points(posterior, start or Start(), chains, key_start)
     require_numbers(points)
     chosen = choose_sampler(sampler, posterior, **settings)
-    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), say)
+    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1))
     data = chosen.sampler.data(setup)
     checkpoint = _first(chosen, data, setup, points)
     require_density(_observe(chosen, data, setup, checkpoint.state).evaluation)

@@ -17,10 +17,10 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from unittest import mock
 
 import netCDF4
 import numpy as np
+import platformdirs
 import xarray as xr
 
 from bayesreg.inference.draws.blocks import Block, Blocks
@@ -115,8 +115,11 @@ def arviz() -> Any:
         return sys.modules["arviz"]
     with warnings.catch_warnings(), TemporaryDirectory() as folder:
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-        with mock.patch("platformdirs.user_cache_dir", return_value=folder):
+        found, platformdirs.user_cache_dir = platformdirs.user_cache_dir, lambda *_, **__: folder
+        try:
             import arviz
+        finally:
+            platformdirs.user_cache_dir = found
 
     return arviz
 

@@ -31,7 +31,7 @@ from bayesreg.inference.gaussian.whitened import (
     whitened_density,
     whitened_position,
 )
-from bayesreg.inference.kernel import Draw, Info, Sampler, Say
+from bayesreg.inference.kernel import Draw, Info, Sampler
 from bayesreg.inference.layout import dimension, flat_position, unravel
 from bayesreg.inference.target import (
     Estimands,
@@ -142,14 +142,14 @@ def about_gaussian(
     # Made here and not while something is traced, where it would leave the target's own arrays in the program.
     unravel(target)
 
-    def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
-        modes = search_modes(target, points, mode_search == "per_chain", say)
+    def prepare(points: Any, key: AnyArray) -> tuple[Setup, Any]:
+        modes = search_modes(target, points, mode_search == "per_chain")
         key_start, key_tune = jax.random.split(key)
         starts = _scatter_all(target, modes, jax.random.split(key_start, len(modes.chains)))
         gaussian = modes.gaussians[0]
         if tuning is None:
             return setup_about(target, gaussian, gaussian.centre), starts
-        return _warm_up(walk, tuning, np.asarray(gaussian.centre), starts, key_tune, say)
+        return _warm_up(walk, tuning, np.asarray(gaussian.centre), starts, key_tune)
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
@@ -166,7 +166,7 @@ def _condition(target: Target, setup: Setup) -> Any:
     return target.condition(estimands_of(target, target.data, unravel(target)(setup.middle)))
 
 
-def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
+def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyArray) -> tuple[Setup, Any]:
     """The setup that the chains go on with, and where they then are.
 
     Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already the
@@ -180,7 +180,7 @@ def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyAr
     _, points = tune(_condition(target, first), walk, first, points, key_settle, stage, apart=True)
     # The stand-in reaches far about both middles.
     second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
-    return tune(_condition(target, second), walk, second, points, key_tune, stage, say=say)
+    return tune(_condition(target, second), walk, second, points, key_tune, stage)
 
 
 def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:

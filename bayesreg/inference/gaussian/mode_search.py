@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,8 @@ from bayesreg.inference.layout import flat_position, others
 from bayesreg.inference.target import Target, without_normaliser
 from bayesreg.types import InputError
 
+_log = logging.getLogger(__name__)
+
 # The last stage is repeated so often, at most, or until no coordinate moves by more, and no hyperparameter by more of
 # its standard deviations.
 REPEATS, SETTLED, SETTLED_SD = 20, 3e-3, 0.1
@@ -36,7 +38,6 @@ ROUGH, FINE = 1e-4, 1e-10
 def find_mode(
     target: Target,
     start: Float[np.ndarray, "dimension"],
-    say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
     """A mode of the log density of the position, by L-BFGS along the target's continuation.
@@ -46,8 +47,6 @@ def find_mode(
     target : Target
     start : (d,) array
         Flat position to start from.
-    say : callable
-        Told of each stage.
     iterations : int
         Most iterations of a stage; the last is repeated, whitened anew, until it moves nothing.
 
@@ -61,13 +60,12 @@ def find_mode(
     InputError
         If the density is not finite at the start.
     """
-    return settle(target, approach(target, start, say, iterations), say, iterations)
+    return settle(target, approach(target, start, iterations), iterations)
 
 
 def approach(
     target: Target,
     start: Float[np.ndarray, "dimension"],
-    say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
     """Where the target's continuation leads the displacements from a flat position, or where a search has been."""
@@ -76,14 +74,13 @@ def approach(
     if target.mode_search.approached is not None:
         flat = np.asarray(flat_position(target, target.data, target.mode_search.approached))
     for data in target.mode_search.continuation():
-        flat = _improve(target, data, flat, False, iterations, say, gain=ROUGH)
+        flat = _improve(target, data, flat, False, iterations, gain=ROUGH)
     return flat
 
 
 def settle(
     target: Target,
     flat: Float[np.ndarray, "dimension"],
-    say: Callable[[str], None] = lambda text: None,
     iterations: int = 40,
     repeats: int = REPEATS,
 ) -> Float[np.ndarray, "dimension"]:
@@ -94,7 +91,7 @@ def settle(
     resting, before = mark_hyperparameters(target), flat
     better = Found(flat, np.inf)
     for _ in range(repeats):
-        found = _improve(target, target.data, better.flat, True, iterations, say)
+        found = _improve(target, target.data, better.flat, True, iterations)
         balanced = balance_field(target, found, partial(_factor, target, found))
         moved = np.abs(balanced - before)[~resting].max()
         # Once they rest, what else moves is too little for them to follow.
@@ -107,7 +104,7 @@ def settle(
         if moved < SETTLED and better.moved < SETTLED_SD:
             return better.flat
     if repeats == REPEATS:
-        say("mode: not settled")
+        _log.warning("mode: not settled")
     return better.flat
 
 
@@ -139,7 +136,6 @@ def _improve(
     flat: Float[np.ndarray, "dimension"],
     moves: bool,
     iterations: int,
-    say: Callable[[str], None],
     gain: float = FINE,
 ) -> Float[np.ndarray, "dimension"]:
     """L-BFGS in the coordinates whitened where it starts."""
@@ -172,7 +168,7 @@ def _improve(
     options = {"maxiter": iterations, "maxcor": 20, "ftol": gain, "gtol": 1e-2}
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
     place, least, _ = best[-1]
-    say(f"mode: log density {log_normaliser - least:.1f}")
+    _log.info("mode: log density %.1f", log_normaliser - least)
     return np.asarray(_place(gaussian, moving * place))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +12,10 @@ from jaxtyping import Float
 
 from bayesreg.inference.gaussian.laplace import Gaussian, laplace
 from bayesreg.inference.gaussian.mode_search import approach, find_mode, settle
-from bayesreg.inference.kernel import Say
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.inference.target import Target, estimands_of, logdensity
+
+_log = logging.getLogger(__name__)
 
 # Residuals are near those of the mode where the search has been whitened anew so often.
 FEW = 2
@@ -36,26 +38,26 @@ class Modes(NamedTuple):
     chains: list[int]
 
 
-def search_modes(target: Target, points: Any, each: bool, say: Say) -> Modes:
+def search_modes(target: Target, points: Any, each: bool) -> Modes:
     """Modes from the start points (chains as the leading axis): one from their mean, or one from each.
 
     One search costs as much as all of a short run; that it leads elsewhere from other starts is the exception.
     """
     chains = len(next(iter(points.values())))
     if not each:
-        return Modes([laplace(target, find_mode(target, _middle(target, points), say))], [0] * chains)
+        return Modes([laplace(target, find_mode(target, _middle(target, points)))], [0] * chains)
     found = []
     for chain in range(chains):
-        say(f"chain {chain}:")
-        found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points)), say))
-    return report_modes(target, tell_apart(target, np.stack(found)), say)
+        _log.info("chain %d:", chain)
+        found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points))))
+    return report_modes(target, tell_apart(target, np.stack(found)))
 
 
-def temper(target: Target, points: Any, say: Say) -> Target:
+def temper(target: Target, points: Any) -> Target:
     """The target, tempered near the mode that the mean of the start points leads to, if it has yet to be."""
     if target.mode_search is None or target.mode_search.tempering is None:
         return target
-    there = settle(target, approach(target, _middle(target, points), say), say, repeats=FEW)
+    there = settle(target, approach(target, _middle(target, points)), repeats=FEW)
     return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(there))))
 
 
@@ -79,17 +81,17 @@ def distance(gaussian: Gaussian, flat: Float[np.ndarray, "dimension"]) -> float:
     return float(np.abs((flat - np.asarray(gaussian.centre)) / sd).max())
 
 
-def report_modes(target: Target, modes: Modes, say: Say) -> Modes:
+def report_modes(target: Target, modes: Modes) -> Modes:
     """Report the modes and return them."""
     if len(modes.gaussians) == 1:
-        say("modes: every chain's search ended at one and the same")
+        _log.info("modes: every chain's search ended at one and the same")
         return modes
-    say(f"modes: {len(modes.gaussians)}, about which the chains start; all are whitened at the first")
+    _log.info("modes: %d, about which the chains start; all are whitened at the first", len(modes.gaussians))
     for number, gaussian in enumerate(modes.gaussians):
         centre = np.asarray(gaussian.centre)
         chains = ", ".join(str(chain) for chain, mode in enumerate(modes.chains) if mode == number)
         apart = distance(modes.gaussians[0], centre)
-        say(f"  log density {_height(target, centre):.1f}, {apart:.1f} sd from the first: chains {chains}")
+        _log.info("  log density %.1f, %.1f sd from the first: chains %s", _height(target, centre), apart, chains)
     return modes
 
 

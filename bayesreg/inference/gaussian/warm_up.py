@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -9,9 +10,11 @@ import jax
 import jax.numpy as jnp
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 
-from bayesreg.inference.kernel import Info, Say
+from bayesreg.inference.kernel import Info
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
+
+_log = logging.getLogger(__name__)
 
 # The tuning of the step starts here, and is drawn to ten times as much.
 FIRST_STEP = 0.05
@@ -57,8 +60,7 @@ class Walking(Protocol):
 
 
 def tune(
-    data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False,
-    say: Say = lambda text: None,
+    data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False
 ) -> tuple[Any, Any]:  # fmt: skip
     """The setup with its step size, and where the chains then are.
 
@@ -75,15 +77,13 @@ def tune(
         Tune each chain's step by itself, and let no trajectory have more than `FEW_STEPS`. A chain that starts where
         the density is steep takes short steps until it is back; with one step for all it would stand still for as long
         as the others take longer ones, or shorten theirs.
-    say : callable
-        Told of what was found.
     """
     keys = jax.random.split(key, tuning.warm_up)
     first = jax.vmap(partial(walk.init, data, setup))(starts)
     points, sizes, rates = _run(walk, tuning, data, setup, first, keys, jnp.asarray(apart))
     setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
-    say(f"warm-up: step {float(setup.step_size):.2g}{trajectory}, acceptance {late:.0%}")
+    _log.info("warm-up: step %.2g%s, acceptance %.0f%%", float(setup.step_size), trajectory, 100 * late)
     return setup, points
 
 

@@ -74,7 +74,7 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
 
     return Sampler(
         # The setup is where the chains start, on average: the data are prepared for that neighbourhood.
-        prepare=lambda points, _key, _say: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
+        prepare=lambda points, _key: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
         data=lambda start: target.condition(start),
         blank=lambda: target.coordinates.reference(),
         init=init,

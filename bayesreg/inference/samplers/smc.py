@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from typing import Any
 
@@ -13,11 +14,13 @@ from blackjax.smc import adaptive_tempered, resampling
 
 from bayesreg.inference.gaussian.rotation import rotation
 from bayesreg.inference.gaussian.whitened import Setup, whitened_density, whitened_position
-from bayesreg.inference.kernel import Sampler, Say
+from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.hamiltonian import hmc
 from bayesreg.inference.samplers.settings import Hmc, Smc
 from bayesreg.inference.target import Target, estimands_of
 from bayesreg.types import AnyArray, InputError
+
+_log = logging.getLogger(__name__)
 
 # Trajectories of each particle at each temperature; the share of the particles that a rise of the inverse temperature
 # leaves effective; how many are moved at once; the most temperatures.
@@ -35,15 +38,15 @@ def smc(target: Target, settings: Smc) -> Sampler:
     particles, spread, target_acceptance = settings.particles, settings.spread, settings.target_acceptance
     chains_of = hmc(target, Hmc(**settings.model_dump(include=set(Hmc.model_fields))))
 
-    def prepare(points: Any, key: AnyArray, say: Say) -> tuple[Setup, Any]:
+    def prepare(points: Any, key: AnyArray) -> tuple[Setup, Any]:
         chains = len(next(iter(points.values())))
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
-        setup, _ = chains_of.prepare(points, key, say)
+        setup, _ = chains_of.prepare(points, key)
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         first = spread * jax.random.normal(key_first, (particles, len(setup.middle)))
-        found, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper, say)
+        found, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper)
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.gaussian, xi))(found[chosen])
         return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
@@ -59,7 +62,6 @@ def _temper(
     particles: AnyArray,
     acceptance: float,
     key: AnyArray,
-    say: Say,
 ) -> tuple[AnyArray, AnyArray]:
     """Particles and weights at β = 1; from one temperature to the next the step size follows the acceptance."""
     state, size = adaptive_tempered.init(particles), setup.step_size
@@ -70,7 +72,12 @@ def _temper(
             break
         if power >= 1:
             effective = 1 / float((state.weights**2).sum())
-            say(f"tempering: {number + 1} temperatures, acceptance {float(rate):.0%}, {effective:.0f} particles")
+            _log.info(
+                "tempering: %d temperatures, acceptance %.0f%%, %.0f particles",
+                number + 1,
+                100 * float(rate),
+                effective,
+            )
             return state.particles, state.weights
         size = jnp.clip(size * jnp.exp(rate - acceptance), 0.01, jnp.pi / 2)
     raise InputError("the tempering came to a halt before the posterior; give smc more particles or less spread")
