@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from bayesreg import __version__
 from bayesreg.compilation import compile_quickly, keep_compiled_programs
 from bayesreg.label_tables import TABLES
-from bayesreg.messages import from_level, show_messages
+from bayesreg.messages import show_messages
 
 NOT_CONVERGED = 3
 STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO)
@@ -27,7 +27,7 @@ class _Commands(TyperGroup):
         from bayesreg.workflow.interruption import Interrupted, ending_at_once
 
         try:
-            with ending_at_once():
+            with ending_at_once(), show_messages():
                 return super().invoke(ctx)
         except Interrupted as signal:
             typer.echo(f"bayesreg: {signal}; a run goes on from its last whole block of draws with --resume", err=True)
@@ -137,9 +137,10 @@ Space = Annotated[
 ]
 
 
-def _quieten(context: typer.Context, wanted: bool) -> bool:
+def _quieten(wanted: bool) -> bool:
     if wanted:
-        context.with_resource(from_level(logging.WARNING))
+        # Until the block of `show_messages` about the command ends.
+        logging.getLogger("bayesreg").setLevel(logging.WARNING)
     return wanted
 
 
@@ -158,13 +159,11 @@ def _show_version(wanted: bool) -> bool:
 
 @app.callback()
 def _options(
-    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
     ] = False,
 ) -> None:
     """Registration of two images with posterior distributions of displacement and stiffness."""
-    context.with_resource(show_messages())
     compile_quickly()
     keep_compiled_programs()
 
