@@ -81,9 +81,7 @@ class TetMesh:
     @cached_property
     def boundary_faces(self) -> Int[np.ndarray, "faces 3"]:
         """Triangles that belong to exactly one tetrahedron, normals outwards."""
-        faces = self.cells[:, FACES].reshape(-1, 3)
-        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return faces[first[count == 1]]
+        return boundary_faces_of(self.cells)
 
     @cached_property
     def boundary_edge(self) -> float:
@@ -122,6 +120,13 @@ def signed_volumes(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, 
     """Volume of every tetrahedron, mm³; negative where it is inverted."""
     corner = points[cells]
     return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
+
+
+def boundary_faces_of(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "faces 3"]:
+    """Triangles that belong to exactly one tetrahedron, normals outwards."""
+    faces = cells[:, FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[count == 1]]
 
 
 def faces_across(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "cells 4"]:

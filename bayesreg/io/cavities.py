@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from scipy import optimize, sparse
 from scipy.sparse.csgraph import connected_components
 
-from bayesreg.mesh import FACES, signed_volumes
+from bayesreg.mesh import boundary_faces_of, signed_volumes
 
 
 def without_cavities(
@@ -30,19 +30,13 @@ def without_cavities(
     points, cells
         The given ones first.
     """
-    faces = _boundary_faces(cells)
+    faces = boundary_faces_of(cells)
     part = _surface_parts(faces)
     a, b, c = np.moveaxis(points[faces], 1, 0)
     volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
     for cavity in np.flatnonzero(volume < 0):
         points, cells = _fill(points, cells, faces[part == cavity])
     return points, cells
-
-
-def _boundary_faces(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "faces 3"]:
-    faces = cells[:, FACES].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[first[count == 1]]
 
 
 def _surface_parts(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces"]:
