@@ -17,9 +17,11 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # Half of what a test takes is compiling: programs need not be fast, and two workers keep both cores busy as it is.
 compile_quickly(f"{QUICK.replace('level=1', 'level=0')} --xla_cpu_parallel_codegen_split_count=1")
 
-# Not for the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
+# Not for settings and the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
 _MODULES = [f"bayesreg.{path.stem}" for path in (_ROOT / "bayesreg").iterdir() if path.stem[0] not in "_."]
-install_import_hook([name for name in _MODULES if name != "bayesreg.config"], "beartype.beartype")
+install_import_hook(
+    [name for name in _MODULES if name not in ("bayesreg.config", "bayesreg.settings")], "beartype.beartype"
+)
 
 
 # Every compiled program maps memory; past the 65,530 maps that Linux allows a process the next one crashes it.

@@ -6,8 +6,8 @@ import numpy as np
 from scipy import stats
 
 from bayesreg.io.records import Predicted
+from bayesreg.model.observations.landmarks_report import surprise
 from bayesreg.report import style
-from bayesreg.report.landmarks import surprise
 from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table

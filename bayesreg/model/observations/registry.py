@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Annotated, Any, get_args
 
-from pydantic import AfterValidator, BeforeValidator, SerializeAsAny, ValidationInfo, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, SerializeAsAny, WithJsonSchema
 
 from bayesreg.model.observations.images.section import ImagesSection
 from bayesreg.model.observations.landmarks import LandmarksSection
@@ -48,7 +48,7 @@ def _load_entry_points() -> None:
         register(point.load())
 
 
-def _as_section(value: object, info: ValidationInfo) -> ObservationSection:
+def _as_section(value: object, info: Any) -> ObservationSection:
     """An entry of the list `observations` as the section of its kind."""
     if isinstance(value, ObservationSection):
         return value
