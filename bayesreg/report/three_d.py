@@ -24,6 +24,7 @@ TEXT = "#808b96"
 # How many times as large as it is the displacement is shown.
 ENLARGED = (0, 1, 2, 5)
 SHOWN = {0: "before", 1: "after"}
+LABEL = {"font": {"color": style.INK}, "bgcolor": "rgba(255,255,255,0.7)"}
 FIGURE = Markup(
     '<figure id="figure-three-d"><h3>In three dimensions</h3>{}<figcaption>Drag to turn, scroll to come nearer. '
     "Surface of the mesh, fluid deep in it, and each place within the ellipsoid that holds it with 95 % (true size); "
@@ -151,7 +152,7 @@ def _ellipsoid(place: Place) -> Surface:
 def _label(place: Place) -> dict[str, Any]:
     """The name of a place, where it goes; it is drawn over the scene."""
     at = dict(zip("xyz", (place.point + place.region.mean).tolist(), strict=True))
-    return {**at, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6}
+    return {**at, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6, **LABEL}
 
 
 def _fluid_faces(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
