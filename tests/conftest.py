@@ -17,7 +17,7 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # Half of what a test takes is compiling: programs need not be fast, and two workers keep both cores busy as it is.
 compile_quickly(f"{QUICK.replace('level=1', 'level=0')} --xla_cpu_parallel_codegen_split_count=1")
 
-# Not for settings and the configuration: pydantic checks it already, with types (protocols) that beartype cannot look at.
+# Not for settings and the configuration: pydantic checks them already, with protocols that beartype cannot look at.
 _MODULES = [f"bayesreg.{path.stem}" for path in (_ROOT / "bayesreg").iterdir() if path.stem[0] not in "_."]
 install_import_hook(
     [name for name in _MODULES if name not in ("bayesreg.config", "bayesreg.settings")], "beartype.beartype"

@@ -25,7 +25,9 @@ def evaluation_table(study: Study) -> Table | None:
     inside, after = np.asarray(predicted.evaluation_inside), np.linalg.norm(predicted.evaluation_residual, axis=1)
     outside = int((~inside).sum())
     if not inside.any():
-        caption = f"None of the {outside} landmarks that were held out lies in the mesh, and nothing is told of them."
+        caption = (
+            f"None of the {outside} landmarks that were held out lies in the mesh, where alone displacements are known."
+        )
         return Table("Target registration error", caption, [""], [])
     rows = [
         [name, *(fixed(float(value)) for value in (x.mean(), np.median(x), np.quantile(x, 0.95), x.max()))]
@@ -35,10 +37,10 @@ def evaluation_table(study: Study) -> Table | None:
             "By the posterior mean": after[inside],
         }.items()
     ]
-    found = _surprise(predicted)
-    shares = [f"{(found <= level).mean():.0%} lie in the regions of {level:.0%}" for level in LEVELS]
+    probability = _surprise(predicted)
+    shares = [f"{(probability <= level).mean():.0%} lie in the regions of {level:.0%}" for level in LEVELS]
     caption = (
-        f"Distance from where {len(found)} landmarks were found in the moving image, mm; the sampler never saw them. "
+        f"Distance from where {len(probability)} landmarks lie in the moving image, mm; the sampler never saw them. "
         f"Of these landmarks {', '.join(shares).replace('%', ' %')} that the posterior gives them."
     )
     if outside:
@@ -56,8 +58,8 @@ def evaluation(study: Study) -> Drawing | None:
         return None
     after = np.linalg.norm(predicted.evaluation_residual, axis=1)[inside]
     radius = distances_of(np.asarray(predicted.evaluation_covariance)[inside]).radius
-    found = np.sort(_surprise(predicted))
-    count = len(found)
+    probability = np.sort(_surprise(predicted))
+    count = len(probability)
     with style.look():
         figure = style.new_figure(3.4)
         left, right = figure.subplots(1, 2)
@@ -75,7 +77,9 @@ def evaluation(study: Study) -> Drawing | None:
         low, high = (stats.binom.ppf(edge, count, nominal) / max(count, 1) for edge in (0.025, 0.975))
         right.fill_between(nominal, low, high, color=style.FAINT, lw=0)
         right.plot(nominal, nominal, color=style.MUTED, lw=0.8)
-        right.step([0, *found, 1], [0, *(np.arange(1, count + 1) / max(count, 1)), 1], where="post", color=style.ACCENT)
+        right.step(
+            [0, *probability, 1], [0, *(np.arange(1, count + 1) / max(count, 1)), 1], where="post", color=style.ACCENT
+        )
         right.set(
             xlabel="probability of the region", ylabel="share of landmarks in it", title="calibration", aspect="equal"
         )

@@ -22,7 +22,7 @@ def regions(mesh: TetMesh, places: Float[AnyArray, "places 3"]) -> list[str]:
     offset = (places - (low + high) / 2) / ((high - low) / 2)
     _, nearest = cKDTree(mesh.points[mesh.cells].mean(axis=1)).query(places)
     labels = [label_of(mesh.names[k]) for k in mesh.tissue[nearest]]
-    return [f"{_sides(one)}, {label}" for one, label in zip(offset, labels, strict=True)]
+    return [f"{_sides(place)}, {label}" for place, label in zip(offset, labels, strict=True)]
 
 
 def _sides(offset: np.ndarray) -> str:

@@ -18,8 +18,8 @@ NAMES = [
 
 def notes(study: Study) -> Sentences | None:
     """What was found of pose and contrast before the search, a sentence each; None where nothing was."""
-    found = part(study.manifest, "appraisal", "notes")
-    return Sentences("What was found of the images", list(found)) if found else None
+    sentences = part(study.manifest, "appraisal", "notes")
+    return Sentences("What was found of the images", list(sentences)) if sentences else None
 
 
 def pose_table(study: Study) -> Table:

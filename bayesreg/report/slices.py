@@ -26,7 +26,7 @@ DIRECTIONS = (("L", "R"), ("P", "A"), ("I", "S"))
 MARGIN = 5.0
 PIXELS = 260
 LEAST_SECTION = 0.6
-SLABS = 12
+POSITIONS_TRIED = 41
 
 
 class Plane(NamedTuple):
@@ -130,12 +130,14 @@ def planes_through(mesh: TetMesh, point: Float[np.ndarray, "3"]) -> tuple[Plane,
 
 
 def _position(mesh: TetMesh, axis: int, wanted: float) -> float:
-    """The position nearest to the one wanted whose section is large, by the volume of the mesh in slabs."""
-    span = mesh.points[:, axis].min(), mesh.points[:, axis].max()
-    centres = mesh.points[mesh.cells, axis].mean(axis=1)
-    volume, edges = np.histogram(centres, SLABS, span, weights=mesh.volumes)
-    large = np.flatnonzero(volume >= LEAST_SECTION * volume.max())
-    return float(np.clip(wanted, edges[large[0]], edges[large[-1] + 1]))
+    """The position nearest to the one wanted whose section is large; areas by the mean section of each tetrahedron."""
+    heights = mesh.points[mesh.cells, axis]
+    low, high = heights.min(axis=1), heights.max(axis=1)
+    tried = np.linspace(low.min(), high.max(), POSITIONS_TRIED)
+    mean = mesh.volumes / (high - low)
+    area = np.array([mean[(low <= position) & (position <= high)].sum() for position in tried])
+    large = tried[area >= LEAST_SECTION * area.max()]
+    return float(np.clip(wanted, large[0], large[-1]))
 
 
 def _count(side: tuple[float, float], spacing: float) -> int:

@@ -56,9 +56,9 @@ def _fits(study: Study) -> list[str]:
     """How large the residuals of each observation are beside what the model expects."""
     observed = part(study.manifest, "observations") or {}
     return [
-        f"Residuals of {name.replace('_', ' ')}: {number(one['residual_rms'], 2)} times the sd that the model expects."
-        for name, one in observed.items()
-        if one.get("residual_rms") is not None
+        f"Residuals of {name.replace('_', ' ')}: {number(entry['residual_rms'], 2)} times what the model expects."
+        for name, entry in observed.items()
+        if entry.get("residual_rms") is not None
     ]
 
 

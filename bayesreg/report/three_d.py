@@ -24,6 +24,7 @@ TEXT = "#808b96"
 # How many times as large as it is the displacement is shown.
 ENLARGED = (0, 1, 2, 5)
 SHOWN = {0: "before", 1: "after"}
+LABEL = {"font": {"color": style.INK}, "bgcolor": "rgba(255,255,255,0.7)"}
 FIGURE = Markup(
     '<figure id="figure-three-d"><h3>In three dimensions</h3>{}<figcaption>Drag to turn, scroll to come nearer. '
     "Surface of the mesh, fluid deep in it, and each place within the ellipsoid that holds it with 95 % (true size); "
@@ -68,7 +69,7 @@ def figure(study: Study) -> go.Figure:
     if len(fluid := _fluid_faces(mesh)):
         surfaces.append(_surface(mesh, u, fluid))
         traces.append(surfaces[-1].drawn(color=FLUID, hoverinfo="skip"))
-    return go.Figure([*traces, _labels(places)], _layout(surfaces, scales))
+    return go.Figure(traces, _layout(surfaces, scales, [_label(place) for place in places]))
 
 
 def _scales(study: Study) -> dict[str, dict[str, Any]]:
@@ -92,7 +93,7 @@ def _scales(study: Study) -> dict[str, dict[str, Any]]:
     }
 
 
-def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]], labels: list[dict[str, Any]]) -> dict[str, Any]:
     """The scene without a frame, a slider for the displacement, and buttons for the colours."""
     which = list(range(len(surfaces)))
     steps = [
@@ -113,6 +114,7 @@ def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]]) -> dict[
         # World RAS: up is superior; seen from the front, right and above.
         "scene": {
             "aspectmode": "data",
+            "annotations": labels,
             **{f"{axis}axis": hidden for axis in "xyz"},
             "camera": {"eye": {"x": 0.7, "y": 1.5, "z": 0.6}},
         },
@@ -141,26 +143,16 @@ def _ellipsoid(place: Place) -> Surface:
     quads = np.arange(8 * 16).reshape(8, 16)
     right = np.roll(quads, -1, axis=1)
     faces = np.concatenate([np.stack([quads, right, quads + 16], -1), np.stack([right, right + 16, quads + 16], -1)])
-    found = place.region
-    variance, axes = np.linalg.eigh(found.shape)
+    region = place.region
+    variance, axes = np.linalg.eigh(region.shape)
     points = place.point + (ball * np.sqrt(np.maximum(variance, 1e-4))) @ axes.T
-    return Surface(points, np.tile(found.mean, (len(points), 1)), faces.reshape(-1, 3))
+    return Surface(points, np.tile(region.mean, (len(points), 1)), faces.reshape(-1, 3))
 
 
-def _labels(places: list[Place]) -> go.Scatter3d:
-    """The names of the places, where they go."""
-    x, y, z = np.stack([place.point + place.region.mean for place in places]).T.tolist()
-    names = [escape(place.name) for place in places]
-    return go.Scatter3d(
-        x=x,
-        y=y,
-        z=z,
-        text=names,
-        mode="text",
-        textposition="middle right",
-        textfont={"color": PLACE, "size": 13},
-        hoverinfo="skip",
-    )
+def _label(place: Place) -> dict[str, Any]:
+    """The name of a place, where it goes; it is drawn over the scene."""
+    at = dict(zip("xyz", (place.point + place.region.mean).tolist(), strict=True))
+    return {**at, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6, **LABEL}
 
 
 def _fluid_faces(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:

@@ -87,16 +87,16 @@ def place_table(study: Study) -> Table:
 
 
 def _place_row(place: Place, where: str, far: float) -> list[str]:
-    found = place.region
-    beyond = (np.linalg.norm(place.draws.reshape(-1, 3) - found.mean, axis=1) > far).mean()
-    shift = ", ".join(fixed(x, 1) for x in found.mean)
-    axes = " × ".join(fixed(x) for x in found.semi_axes)
+    ellipsoid = place.region
+    beyond = (np.linalg.norm(place.draws.reshape(-1, 3) - ellipsoid.mean, axis=1) > far).mean()
+    shift = ", ".join(fixed(x, 1) for x in ellipsoid.mean)
+    axes = " × ".join(fixed(x) for x in ellipsoid.semi_axes)
     return [
         place.name,
         place_text(place.point),
         where,
         shift,
-        fixed(float(np.linalg.norm(found.mean)), 1),
+        fixed(float(np.linalg.norm(ellipsoid.mean)), 1),
         axes,
         percent(beyond),
     ]
@@ -130,9 +130,9 @@ def places(study: Study) -> Drawing:
 
 def _draw_place(axes: Axes, study: Study, place: Place, axis: int, limits: tuple[float, float]) -> None:
     across, up = IN_PLANE[axis]
-    found, point = place.region, place.point
-    goes = point + found.mean
-    half = max(ZOOM, 2 * float(found.semi_axes[0]))
+    ellipsoid, point = place.region, place.point
+    goes = point + ellipsoid.mean
+    half = max(ZOOM, 2 * float(ellipsoid.semi_axes[0]))
     sides = [(float(goes[j] - half), float(goes[j] + half)) for j in (across, up)]
     plane = Plane(axis, float(goes[axis]), sides[0], sides[1], 2 * half / 160)
     panels.image_panel(axes, study.run.moving or study.run.background, plane, limits)
@@ -142,7 +142,7 @@ def _draw_place(axes: Axes, study: Study, place: Place, axis: int, limits: tuple
     axes.plot([point[across], goes[across]], [point[up], goes[up]], color="white", lw=0.8, ls=(0, (2, 2)))
     axes.plot(point[across], point[up], "o", mfc="none", mec="white", ms=7, mew=1.3)
     axes.plot(goes[across], goes[up], "+", color="white", ms=6, mew=1.1)
-    _draw_ellipse(axes, goes[[across, up]], found.shape[np.ix_((across, up), (across, up))])
+    _draw_ellipse(axes, goes[[across, up]], ellipsoid.shape[np.ix_((across, up), (across, up))])
     axes.set(xlim=plane.horizontal, ylim=plane.vertical)
 
 

@@ -118,7 +118,7 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
 
 
 def _missed_rules(manifest: Mapping[str, Any], threshold: float) -> str:
-    """The figures that the stop rule asked for besides the rank-normalised R-hat, and those found."""
+    """The figures that the stop rule asked for besides the rank-normalised R-hat, and those reached."""
     wanted = part(manifest, "stopped", "ess_threshold")
     if wanted is None:
         return f"its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, asked for {threshold:g}"
@@ -159,22 +159,22 @@ def _least(entries: Sequence[Estimand], figure: str) -> float:
 
 def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterior: xr.Dataset) -> dict[str, str]:
     """The key numbers of a run, as text under their labels."""
-    found, sizes = partial(part, manifest), posterior.sizes
-    implied = found("implied_noise_sd")
+    entry, sizes = partial(part, manifest), posterior.sizes
+    implied = entry("implied_noise_sd")
     return {
         "Greatest R̂": rhat_text(worst(entries, 1)[0].rhat) + _threshold_text(manifest) if entries else NONE,
         "Least ESS, bulk": number(_least(entries, "ess_bulk"), 2),
         "Least ESS, tail": number(_least(entries, "ess_tail"), 2),
         "Chains × draws": f"{sizes['chain']} × {sizes['draw']:,}",
-        "Acceptance inside the support": percent(found("acceptance", "inside_support")),
-        "Acceptance in all": percent(found("acceptance", "overall")),
-        "Nodes in contact with the skull": _count(found("contact_nodes")),
-        "Failed elastic solves": _count(found("solver", "failed")),
-        "Iterations of a solve": number(found("solver", "iterations_mean")),
-        "Time in all": duration(found("timings", "total")),
-        "Time of sampling": duration(found("timings", "sampling")),
-        "Steps per second and chain": number(found("steps_per_second_per_chain")),
-        "Sd of the residual": number(found("residual_sd")) + (f" (T_s implies {number(implied)})" if implied else ""),
+        "Acceptance inside the support": percent(entry("acceptance", "inside_support")),
+        "Acceptance in all": percent(entry("acceptance", "overall")),
+        "Nodes in contact with the skull": _count(entry("contact_nodes")),
+        "Failed elastic solves": _count(entry("solver", "failed")),
+        "Iterations of a solve": number(entry("solver", "iterations_mean")),
+        "Time in all": duration(entry("timings", "total")),
+        "Time of sampling": duration(entry("timings", "sampling")),
+        "Steps per second and chain": number(entry("steps_per_second_per_chain")),
+        "Sd of the residual": number(entry("residual_sd")) + (f" (T_s implies {number(implied)})" if implied else ""),
     }
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bayesreg.report.evaluation import evaluation, evaluation_table
+from bayesreg.report.study import Study
 
 
 @pytest.fixture
@@ -16,7 +19,7 @@ def held_out(study):
         rng, count = np.random.default_rng(0), len(inside)
         residual = rng.normal(size=(count, 3)) * 0.5
         covariance = np.where(np.reshape(inside, (-1, 1, 1)), 0.25 * np.eye(3), np.nan)
-        return study.run.predicted._replace(
+        predicted = study.run.predicted._replace(
             evaluation_names=np.arange(count).astype(str),
             evaluation_points=np.zeros((count, 3)),
             evaluation_before=np.full(count, 9.0),
@@ -25,6 +28,7 @@ def held_out(study):
             evaluation_covariance=covariance,
             evaluation_inside=np.asarray(inside),
         )
+        return Study(replace(study.run, predicted=predicted), *study[1:])
 
     return of
 
@@ -37,7 +41,7 @@ def test_landmarks_outside_the_mesh_are_left_out_and_told(held_out):
     # The length of a Normal vector of sd 0.5: mean 0.798, 95 % 1.40.
     assert after[0] == pytest.approx(0.798, abs=0.05)
     assert after[2] == pytest.approx(1.40, abs=0.15)
-    assert "400 landmarks were found" in table.caption
+    assert "400 landmarks lie in the moving image" in table.caption
     assert "3 more lie outside the mesh" in table.caption
     shares = [float(word) for word in table.caption.split() if word.isdecimal()]
     assert np.abs(np.array(shares[1:6:2]) - (50, 90, 95)).max() < 9
@@ -45,11 +49,11 @@ def test_landmarks_outside_the_mesh_are_left_out_and_told(held_out):
 
 
 def test_none_in_the_mesh_is_told_in_a_sentence(held_out):
-    predicted = held_out([False] * 2)
-    assert evaluation_table(predicted).caption.startswith("None of the 2 landmarks that were held out lies in the mesh")
-    assert evaluation(predicted) is None
+    hidden = held_out([False] * 2)
+    assert evaluation_table(hidden).caption.startswith("None of the 2 landmarks that were held out lies in the mesh")
+    assert evaluation(hidden) is None
 
 
-def test_without_landmarks_there_is_no_table(study):
-    assert evaluation_table(study.run.predicted) is None
-    assert evaluation(study.run.predicted) is None
+def test_without_landmarks_there_is_no_table(seen):
+    assert evaluation_table(seen) is None
+    assert evaluation(seen) is None

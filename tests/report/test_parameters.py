@@ -3,6 +3,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+from bayesreg.image import Image
 from bayesreg.io.records import Run
 from bayesreg.report.parameters import Interval, parameter_table, prior_of, reading
 from bayesreg.report.study import Study
@@ -24,7 +25,16 @@ def posterior_of(lam: np.ndarray, mu: np.ndarray, **temperatures: np.ndarray) ->
 def studied(posterior: xr.Dataset, model: dict, lam: list[float], mu: list[float], **scalars: float) -> Study:
     """A run with these R̂."""
     rhat = xr.Dataset({"lam": ("tissue", lam), "mu": ("tissue", mu)} | {k: ((), v) for k, v in scalars.items()})
-    run = Run("", {"model": model}, MESH, *np.zeros((2, *MESH.points.shape)), None, None, None, None)
+    run = Run(
+        "",
+        {"model": model},
+        MESH,
+        *np.zeros((2, *MESH.points.shape)),
+        None,
+        None,
+        Image(np.zeros((1, 1, 1)), np.eye(4)),
+        None,
+    )
     return Study(run, Draws(posterior, xr.Dataset()), rhat, 100 * rhat, 200 * rhat)
 
 

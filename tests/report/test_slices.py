@@ -66,8 +66,8 @@ def test_planes_pass_through_an_inner_point_and_leave_one_that_would_only_graze(
     sagittal, coronal, axial = planes_through(mesh, top)
     assert sagittal.position == pytest.approx(top[0])
     assert coronal.position == pytest.approx(top[1])
-    # 60 % of the area of the largest section lies at √0.4 of the radius.
-    assert axial.position == pytest.approx(np.sqrt(0.4) * 40, abs=5)
+    # 60 % of the area of the largest section lies at √0.4 of the radius; edges of 13 mm blur that by half of one.
+    assert axial.position == pytest.approx(np.sqrt(0.4) * 40, abs=6.6)
 
 
 def test_titles_name_the_plane_with_a_proper_minus():
