@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -124,6 +124,12 @@ class Image:
         if np.shape(voxels) != self.shape:
             raise InputError(f"expected voxels of shape {self.shape}, got {np.shape(voxels)}")
         return Image(voxels, self.affine)
+
+    def part(self, box: Sequence[slice]) -> Image:
+        """The part of the image in a box of voxels, its place in the world kept."""
+        affine = np.array(self.affine, float)
+        affine[:3, 3] = self.voxel_to_world(np.array([float(along.start) for along in box]))
+        return Image(np.asarray(self.voxels)[tuple(box)], affine)
 
     def world_to_voxel(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3"]:
         """Continuous voxel indices of world points (mm)."""

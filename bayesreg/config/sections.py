@@ -101,7 +101,7 @@ class BidsConfig(Section):
 class ResultsConfig(Section):
     """What a run leaves for other programs, besides what it always does."""
 
-    draws: Annotated[int, Field(strict=True, ge=0)] = 20
+    draws: Annotated[int, Field(strict=True, ge=0)] = 0
     """How many draws, evenly spaced, are written as transforms and displacement fields of their own."""
     bids: BidsConfig | None = None
     """Write the results under the names of BIDS derivatives, too."""

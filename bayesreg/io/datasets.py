@@ -41,6 +41,8 @@ BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
 CLOSING = 3.0
 # How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
 MNI152_SKULL = 3.0
+# Its grid ends so many voxels beyond the skull.
+MNI152_MARGIN = 12
 
 
 class Anatomy(NamedTuple):
@@ -82,7 +84,22 @@ def mni152() -> Anatomy:
     likelihood = np.stack([1 - gm.voxels - wm.voxels, gm.voxels, wm.voxels])
     tissue = np.where(brain, likelihood.argmax(axis=0) + 1, 0)
     inside = edt.edt(~brain, anisotropy=tuple(t1.voxel_sizes)) <= MNI152_SKULL
-    return Anatomy(t1, t1.with_voxels(tissue.astype(np.int8)), t1.with_voxels(inside.astype(np.uint8)))
+    # Beyond that the image is zero.
+    some = _box_about(inside, MNI152_MARGIN)
+    return Anatomy(
+        t1.part(some),
+        t1.with_voxels(tissue.astype(np.int8)).part(some),
+        t1.with_voxels(inside.astype(np.uint8)).part(some),
+    )
+
+
+def _box_about(mask: np.ndarray, margin: int) -> list[slice]:
+    """The voxels that hold a mask and a margin about it."""
+    box = []
+    for axis in range(3):
+        known = np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis})))
+        box.append(slice(max(known[0] - margin, 0), min(known[-1] + margin + 1, mask.shape[axis])))
+    return box
 
 
 def brainweb(

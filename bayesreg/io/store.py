@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Float
 from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, write_text
 from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
+from bayesreg.io.intensities import in_levels, save_in_levels
 from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
@@ -51,14 +52,19 @@ Place = Callable[[str], Path]
 
 def write_inputs(place: Place, inputs: Inputs) -> None:
     """Write config.yaml, mesh.vtu and what is in inputs/, where they have their places."""
-    every = ("fixed", "moving", "tissue", "skull", "fixed_ignore", "moving_ignore")
-    given = {name: image for name in every if (image := getattr(inputs, name)) is not None}
+    labels = {name: getattr(inputs, name) for name in ("tissue", "skull", "fixed_ignore", "moving_ignore")}
+    saved: list[Future] = []
+    images = {"fixed": inputs.fixed, "moving": inputs.moving}
     for name, channel in inputs.channels.items():
-        given |= {f"channel-{name}-fixed": channel.fixed, f"channel-{name}-moving": channel.moving}
-    places = [place(f"inputs/{name}.nii.gz") for name in given]
+        images |= {f"channel-{name}-fixed": channel.fixed, f"channel-{name}-moving": channel.moving}
     # The compression lets other threads run.
     with ThreadPoolExecutor() as pool:
-        list(pool.map(save_image, given.values(), places))
+        for save, given in ((save_image, labels), (save_in_levels, images)):
+            for name, image in given.items():
+                if image is not None:
+                    saved.append(pool.submit(save, image, place(f"inputs/{name}.nii.gz")))
+    for one in saved:
+        one.result()
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
         save_arrays(place("inputs/truth.npz"), known)
@@ -85,9 +91,13 @@ def read_inputs(folder: str | Path) -> Inputs:
     config = require_file(folder, "config.yaml").read_text(encoding="utf-8")
     mesh = load_mesh(require_file(folder, "inputs/mesh.vtu"))
     tissue = load_image(require_file(folder, "inputs/tissue.nii.gz"))
-    fixed, moving, skull, fixed_ignore, moving_ignore = (
+    skull, fixed_ignore, moving_ignore = (
         None if (path := _file(folder, f"inputs/{name}.nii.gz")) is None else load_image(path)
-        for name in ("fixed", "moving", "skull", "fixed_ignore", "moving_ignore")
+        for name in ("skull", "fixed_ignore", "moving_ignore")
+    )
+    fixed, moving = (
+        None if (path := _file(folder, f"inputs/{name}.nii.gz")) is None else in_levels(load_image(path))
+        for name in ("fixed", "moving")
     )
     known, given, arrays = (
         None if (path := _file(folder, f"inputs/{name}.npz")) is None else load_arrays(path, ANEW)
@@ -105,9 +115,8 @@ def read_inputs(folder: str | Path) -> Inputs:
 
 
 def _channel(folder: str | Path, name: str, one_contrast: bool) -> Channel:
-    fixed, moving = (
-        load_image(require_file(folder, f"inputs/channel-{name}-{which}.nii.gz")) for which in ("fixed", "moving")
-    )
+    paths = (require_file(folder, f"inputs/channel-{name}-{which}.nii.gz") for which in ("fixed", "moving"))
+    fixed, moving = (in_levels(load_image(path)) for path in paths)
     return Channel(fixed, moving, one_contrast)
 
 
@@ -139,8 +148,7 @@ def write_results(
     by_cell = {} if run.predicted is None else run.predicted.by_cell
     save_mesh(run.mesh, place("mesh.vtu"), {"u_mean": run.u_mean, "u_sd": run.u_sd}, by_cell)
     if run.warped is not None:
-        scale = run.matching.scale
-        save_image(run.warped if scale is None else scale.undo(run.warped), place("warped_mean.nii.gz"))
+        save_in_levels(run.warped, place("warped_mean.nii.gz"), run.matching.scale)
     affine = run.background.affine
     save_displacement(place("displacement_mean.nii.gz"), displacement_mean, affine)
     # The writer converts vectors to LPS; a standard deviation is no vector, and stays positive.

@@ -319,8 +319,17 @@ def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "sec
         )
 
 
-def write_nifti(voxels: np.ndarray, affine: AnyArray, path: Path, intent: int | None = None) -> None:
-    """Write voxels as NIfTI, mm, all of it or nothing; InputError as in `save_image`."""
+def write_nifti(
+    voxels: np.ndarray,
+    affine: AnyArray,
+    path: Path,
+    intent: int | None = None,
+    scaling: tuple[float, float] | None = None,
+) -> None:
+    """Write voxels as NIfTI, mm, all of it or nothing; InputError as in `save_image`.
+
+    With a scaling (a, b) a voxel v stands for a v + b.
+    """
     if not path.name.endswith((".nii", ".nii.gz")):
         raise InputError(f"{path} must end in .nii or .nii.gz")
     if not path.parent.is_dir():
@@ -329,6 +338,8 @@ def write_nifti(voxels: np.ndarray, affine: AnyArray, path: Path, intent: int | 
     image.header.set_xyzt_units("mm")
     if intent is not None:
         image.header.set_intent(intent)
+    if scaling is not None:
+        image.header.set_slope_inter(*scaling)
     with replacing(path) as temporary:
         nib.save(image, temporary)
 

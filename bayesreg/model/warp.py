@@ -13,7 +13,6 @@ from bayesreg.fem.location import locate
 from bayesreg.image import Image
 from bayesreg.interpolation import Interpolation
 from bayesreg.mesh import TetMesh
-from bayesreg.model.submesh import submesh_variance
 from bayesreg.types import AnyArray
 
 
@@ -32,40 +31,6 @@ def nodal_field_on_grid(
     nodal = np.asarray(values)[mesh.cells[cells]]
     field[tuple(index.T)] = np.einsum("qa,qac->qc", barycentric, nodal)
     return field
-
-
-class Moments(NamedTuple):
-    """The displacement at the voxel centres of an image, mm; zero outside the mesh.
-
-    Attributes
-    ----------
-    mean : (X, Y, Z, 3) array
-        That of the nodes, interpolated.
-    sd : (X, Y, Z, 3) array
-        Its variance is that of the nodes, interpolated as a standard deviation, and what the mesh cannot follow of a
-        smooth displacement (`bayesreg.model.submesh`).
-    rms_sd : dict
-        Root mean square over the voxels and axes of both parts of the standard deviation: "nodes", "mesh".
-    """
-
-    mean: Float[np.ndarray, "X Y Z 3"]
-    sd: Float[np.ndarray, "X Y Z 3"]
-    rms_sd: dict[str, float]
-
-
-def moments_on_grid(
-    mesh: TetMesh, mean: Float[np.ndarray, "nodes 3"], sd: Float[np.ndarray, "nodes 3"], grid: Image
-) -> Moments:
-    """The mean and the standard deviation of the displacement on the grid of an image, from those of the nodes, mm."""
-    index, cells, barycentric = covered_voxels(grid, mesh)
-    nodal = np.concatenate([mean, sd], axis=1)[mesh.cells[cells]]
-    there = np.einsum("qa,qac->qc", barycentric, nodal)
-    beyond = submesh_variance(mesh, mean)[cells]
-    fields = np.zeros((2, *grid.shape, 3))
-    fields[(0, *index.T)] = there[:, :3]
-    fields[(1, *index.T)] = np.sqrt(there[:, 3:] ** 2 + beyond)
-    parts = {"nodes": there[:, 3:] ** 2, "mesh": beyond}
-    return Moments(fields[0], fields[1], {name: float(np.sqrt(part.mean())) for name, part in parts.items()})
 
 
 class Covered(NamedTuple):

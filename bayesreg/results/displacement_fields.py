@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayesreg.fem.deformation import Displaced
 from bayesreg.fem.location import Location
@@ -13,6 +13,7 @@ from bayesreg.image import Image
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.store import Place
 from bayesreg.io.transforms import save_transform
+from bayesreg.model.submesh import submesh_variance
 from bayesreg.pose import Pose
 from bayesreg.results.transform import Transform
 
@@ -20,8 +21,69 @@ MEAN, MEAN_INVERSE, ENSEMBLE = "transform_mean.h5", "transform_mean_inverse.h5",
 # Between the voxels of an ensemble's fields, in mean edges of the mesh: linear interpolation then errs by 0.02 mm in
 # the median, and by 0.2 mm at most where a draw bends by some mm from node to node.
 ENSEMBLE_SPACING = 0.2
+# Between the voxels of the mean's transforms, in mean edges of the mesh, rounded down to whole voxels of the image.
+MEAN_SPACING = 0.15
+# Written fields are multiples of this, mm: in the mesh, and around it, where nothing is observed.
+FIELD_STEP, STEP_AROUND = 2.0**-9, 2.0**-5
 # What the grid of an inverse reaches beyond the displaced mesh, mm.
 MARGIN = 10.0
+
+
+class Moments(NamedTuple):
+    """The displacement from one world to the other at the voxel centres of an image, world RAS, single precision.
+
+    Attributes
+    ----------
+    mean : (X, Y, Z, 3) array
+        mm, the pose included, in the mesh and around it.
+    sd : (X, Y, Z, 3) array
+        mm. Its variance is that of the nodes, interpolated as a standard deviation, and what the mesh cannot follow of
+        a smooth displacement (`bayesreg.model.submesh`). Zero around the mesh.
+    rms_sd : dict
+        Root mean square over the voxels in the mesh and the axes of both parts of it: "nodes", "mesh".
+    """
+
+    mean: Float[np.ndarray, "X Y Z 3"]
+    sd: Float[np.ndarray, "X Y Z 3"]
+    rms_sd: dict[str, float]
+
+    @property
+    def rounded(self) -> tuple[Float[np.ndarray, "X Y Z 3"], Float[np.ndarray, "X Y Z 3"]]:
+        """Mean and standard deviation as they are written: rounded, so that files are small."""
+        inside = (self.sd > 0).any(axis=-1, keepdims=True)
+        step = np.where(inside, np.float32(FIELD_STEP), np.float32(STEP_AROUND))
+        sd = np.maximum(np.rint(self.sd / np.float32(FIELD_STEP)), inside) * np.float32(FIELD_STEP)
+        return np.rint(self.mean / step) * step, sd
+
+
+def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], grid: Image) -> Moments:
+    """The displacement by the posterior mean, and its standard deviation, at the voxel centres of an image.
+
+    Parameters
+    ----------
+    transform : Transform
+        From the fixed image's world.
+    nodal_sd : (n, 3) array
+        Posterior standard deviation at the nodes, mm, along the axes of the moving image's world.
+    grid : Image
+    """
+    mesh, deformer = transform.mesh, transform.deformer
+    submesh = submesh_variance(mesh, transform.pose.displacement(mesh.points, transform.u_mean))
+    mean, sd = np.zeros((2, int(np.prod(grid.shape)), 3), np.float32)
+    squares, count = np.zeros((2, 3)), 0
+    for some, points in grid.blocks():
+        location = deformer.locate(points)
+        u = transform.mean.displacement(points, location)
+        mean[some] = transform.pose.displacement(points, u)
+        inside = np.flatnonzero(deformer.is_inside(location))
+        cell = location.cell[inside]
+        nodal = np.einsum("ka,kai->ki", location.barycentric[inside], nodal_sd[mesh.cells[cell]]) ** 2
+        sd[some.start + inside] = np.sqrt(nodal + submesh[cell])
+        squares += nodal.sum(axis=0), submesh[cell].sum(axis=0)
+        count += len(inside)
+    parts = np.sqrt(squares.mean(axis=1) / max(count, 1))
+    shape = (*grid.shape, 3)
+    return Moments(mean.reshape(shape), sd.reshape(shape), dict(zip(("nodes", "mesh"), parts.tolist(), strict=True)))
 
 
 class OnGrid(NamedTuple):
@@ -59,9 +121,7 @@ def return_on(displaced: Displaced, grid: Image, near: list[Location] | None = N
     return OnGrid(field.reshape(*grid.shape, 3), found)
 
 
-def write_transforms(
-    place: Place, transform: Transform, grid: Image, mean: Float[np.ndarray, "X Y Z 3"] | None = None
-) -> None:
+def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
     """Write the transforms of the posterior mean, there and back, and those of the draws of a transform.
 
     Parameters
@@ -73,18 +133,23 @@ def write_transforms(
     transform : Transform
         From the fixed image's world.
     grid : Image
-        Of the fixed image.
-    mean : (X, Y, Z, 3) array, optional
-        The mean displacement on it, the pose not included, if it is known already.
+        Of the fixed image. The mean's field stands at every voxel centre, or where voxels are much smaller than
+        tetrahedra, in which the field is linear, at every second, third, …
     """
     pose, upright = transform.pose, grid.on_orthogonal_grid(order=0)
-    field = mean if mean is not None and upright is grid else displacement_on(transform.mean, upright).field
-    save_transform(place(MEAN), field, upright, pose)
-    back = around_displaced(upright, transform.mesh.points + transform.u_mean)
-    returns = return_on(transform.mean, back).field
-    save_transform(place(MEAN_INVERSE), returns, back, pose.inverse, pose_first=True)
+    there = _every(upright, np.floor(MEAN_SPACING * transform.mesh.boundary_edge / upright.voxel_sizes).astype(int))
+    save_transform(place(MEAN), displacement_on(transform.mean, there).field, there, pose)
+    back = around_displaced(there, transform.mesh.points + transform.u_mean)
+    save_transform(place(MEAN_INVERSE), return_on(transform.mean, back).field, back, pose.inverse, pose_first=True)
     if len(transform.draws):
         _write_ensemble(place, transform, upright)
+
+
+def _every(grid: Image, step: Int[np.ndarray, "3"]) -> Image:
+    """A grid of every n-th voxel centre along each axis, which reaches as far as the whole does."""
+    step = np.maximum(step, 1)
+    shape = -(-(np.array(grid.shape) - 1) // step) + 1
+    return Image(np.zeros(shape, np.int8), np.array(grid.affine) * np.append(step, 1))
 
 
 def _write_ensemble(place: Place, transform: Transform, grid: Image) -> None:

@@ -18,10 +18,10 @@ from bayesreg.io.ledger import drop, writing
 from bayesreg.io.points import PointPairs
 from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.warp import moments_on_grid, warp_image
+from bayesreg.model.warp import warp_image
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.results.bids import FOLDER, write_bids
-from bayesreg.results.displacement_fields import ENSEMBLE, displacement_on, total_displacement, write_transforms
+from bayesreg.results.displacement_fields import ENSEMBLE, moments_on, write_transforms
 from bayesreg.results.nodal_draws import POINT_DRAWS, nodal_draws
 from bayesreg.results.result import POSTERIOR, REPORT, Result
 from bayesreg.results.transform import Transform
@@ -62,27 +62,23 @@ def finish(
         held_out = evaluate_landmarks(PointPairs.of_arrays(inputs.observed[NAME]), many, config.evaluation.sd)
         predicted = predicted._replace(**held_out)
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
-    total = np.asarray(pose.displacement(inputs.mesh.points, samples.u_mean))
-    moments = moments_on_grid(inputs.mesh, total, total_sd, grid)
-    some = transform(config.results.draws)
-    field = displacement_on(some.mean, grid).field
-    mean_field = total_displacement(pose, grid.grid_points(), field)
+    moments = moments_on(many, total_sd, grid)
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, many.draws, mean, judged, provenance, began)
         | {"displacement_sd": moments.rms_sd},
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
-        warped=_warp(inputs, mean_field),
+        warped=_warp(inputs, moments.mean),
         metrics=metrics,
         predicted=predicted,
         **inputs._asdict(),
     )
-    # Those of a run that left more of them.
+    # An earlier end of this run may have left more files.
     for folder in (ENSEMBLE, FOLDER):
         drop(out, folder)
     with writing(out) as place:
-        write_transforms(place, some, grid, field)
-        store.write_results(place, finished, mean_field, moments.sd)
+        write_transforms(place, transform(config.results.draws), grid)
+        store.write_results(place, finished, *moments.rounded)
     with writing(out, "finished") as place:
         if config.results.bids is not None:
             write_bids(out, config.results.bids, place)

@@ -21,6 +21,7 @@ from bayesreg.io.agreement import require_agreement
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels
 from bayesreg.io.displacements import IDENTITY, read_boundary, require_displacement
 from bayesreg.io.domain import size_of_solid, without_ridges
+from bayesreg.io.intensities import in_levels
 from bayesreg.io.ledger import writing
 from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
 from bayesreg.io.points import PointPairs, read_point_pairs
@@ -321,8 +322,8 @@ def _load_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
 
 def _as_stored(image: Image) -> Image:
     """Round to the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
-    voxels = np.asarray(image.voxels)
-    return Image(voxels.astype(np.float32) if voxels.dtype.kind == "f" else voxels, image.affine.astype(np.float32))
+    stored = in_levels(image) if np.asarray(image.voxels).dtype.kind == "f" else image
+    return Image(stored.voxels, image.affine.astype(np.float32))
 
 
 def _pair(

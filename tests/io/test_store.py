@@ -7,6 +7,7 @@ import pyvista
 
 from bayesreg.image import Image
 from bayesreg.io import checkpoints, ledger, store
+from bayesreg.io.intensities import in_levels
 from bayesreg.io.records import Inputs, Predicted, Run, Truth
 from tests.phantoms import ball_mesh, rotated_affine
 
@@ -17,7 +18,7 @@ def run():
     mesh = ball_mesh(40.0, 30.0)
     shape, n = (7, 6, 5), len(mesh.points)
     affine = rotated_affine(mesh.points, shape)
-    images = {name: Image(rng.normal(size=shape).astype(np.float32), affine) for name in ("fixed", "moving", "warped")}
+    images = {name: in_levels(Image(rng.normal(size=shape), affine)) for name in ("fixed", "moving", "warped")}
     return Run(
         config="sampler:\n  step: 1e-3 # λ\n",
         manifest={"seed": 3, "stopped": {"converged": False, "reason": "budget"}},

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from bayesreg.fem.elements import gauss_quadrature
-from bayesreg.image import Image
 from bayesreg.model.submesh import submesh_variance
-from bayesreg.model.warp import covered_voxels, moments_on_grid
 from tests.phantoms import ball_mesh, refined
 
 MESH = refined(refined(ball_mesh(spacing=30.0)))
@@ -39,23 +36,3 @@ def test_it_is_the_error_of_interpolation_inside():
     found = submesh_variance(MESH, smooth(MESH.points))[inside].mean(axis=0)
     expected = squared_error(MESH)[inside].mean(axis=0)
     np.testing.assert_allclose(found, expected, rtol=0.25)
-
-
-def test_the_sd_of_a_voxel_holds_what_the_mesh_cannot_follow():
-    affine = np.diag([3.0, 3.0, 3.0, 1.0])
-    affine[:3, 3] = -43.5
-    grid = Image(np.zeros((30, 30, 30)), affine)
-    u, sd = smooth(MESH.points), np.full(MESH.points.shape, 0.2)
-    mean, found, parts = moments_on_grid(MESH, u, sd, grid)
-    covered = covered_voxels(grid, MESH)
-    at = tuple(covered.voxel.T)
-    expected = np.sqrt(0.04 + submesh_variance(MESH, u)[covered.cell])
-    np.testing.assert_allclose(found[at], expected)
-    assert np.abs(mean[at] - smooth(grid.voxel_to_world(covered.voxel.astype(float)))).max() < 0.1
-    assert parts["nodes"] == pytest.approx(0.2)
-    assert parts["nodes"] ** 2 + parts["mesh"] ** 2 == pytest.approx((found[at] ** 2).mean())
-    outside = np.ones(grid.shape, bool)
-    outside[at] = False
-    assert outside.any()
-    assert (found[outside] == 0).all()
-    assert (mean[outside] == 0).all()

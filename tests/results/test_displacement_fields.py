@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.io.fields import load_displacement
+from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Motion, Pose
-from bayesreg.results.displacement_fields import displacement_on, write_transforms
+from bayesreg.results.displacement_fields import FIELD_STEP, STEP_AROUND, moments_on, write_transforms
 from bayesreg.results.transform import Transform
 from tests.phantoms import ball_mesh
 
@@ -169,13 +171,51 @@ def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
 
 def test_without_a_pose_and_without_draws(tmp_path):
     transform, grid = _transform(Pose.identity(), draws=0), _grid(GRIDS["upright"])
-    write_transforms(tmp_path.joinpath, transform, grid, displacement_on(transform.mean, grid).field)
+    write_transforms(tmp_path.joinpath, transform, grid)
     assert {path.name for path in tmp_path.iterdir()} == {"transform_mean.h5", "transform_mean_inverse.h5"}
     x, y, z = load_displacement(tmp_path / "transform_mean.h5")
     expected = transform.mean.displacement(*[grid.grid_points().reshape(-1, 3)] * 1, transform.deformer.locate(
         grid.grid_points().reshape(-1, 3)))  # fmt: skip
     found = np.stack([one.voxels for one in (x, y, z)], axis=-1).reshape(-1, 3)
     np.testing.assert_allclose(found, expected, atol=2.0**-12)
+
+
+def test_small_voxels_are_passed_over(tmp_path):
+    """A field is linear in a tetrahedron: every third voxel of 0.75 mm says what it is in the others."""
+    transform, grid = _transform(), _grid(np.diag([0.75, 2.0, 2.0]))
+    write_transforms(_place(tmp_path), transform, grid)
+    x, _, _ = load_displacement(tmp_path / "transform_mean.h5")
+    np.testing.assert_allclose(x.voxel_sizes, [2.25, 2.0, 2.0])
+    assert x.contains(grid.voxel_to_world(np.array([[0.0, 0.0, 0.0], np.array(grid.shape) - 1.0]))).all()
+    there = SimpleITK.ReadTransform(str(tmp_path / "transform_mean.h5"))
+    points = CENTRE + np.random.default_rng(2).uniform(-20, 20, (200, 3))
+    away = np.linalg.norm(_of_itk(there, points) - transform.place(points)[0], axis=1)
+    assert np.median(away) < 0.01
+    assert away.max() < 0.06
+
+
+def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow():
+    transform, grid = _transform(), _grid(GRIDS["oblique"])
+    sd = np.full(transform.mesh.points.shape, 0.2)
+    mean, found, parts = moments = moments_on(transform, sd, grid)
+    points = grid.grid_points().reshape(-1, 3)
+    np.testing.assert_allclose(points + mean.reshape(-1, 3), transform.place(points)[0], atol=1e-5)
+    covered = covered_voxels(grid, transform.mesh)
+    at = tuple(covered.voxel.T)
+    total = transform.pose.displacement(transform.mesh.points, transform.u_mean)
+    expected = np.sqrt(0.04 + submesh_variance(transform.mesh, total)[covered.cell])
+    np.testing.assert_allclose(found[at], expected, rtol=1e-5)
+    assert parts["nodes"] == pytest.approx(0.2)
+    assert parts["nodes"] ** 2 + parts["mesh"] ** 2 == pytest.approx((found[at].astype(float) ** 2).mean())
+    outside = np.ones(grid.shape, bool)
+    outside[at] = False
+    assert outside.any()
+    assert (found[outside] == 0).all()
+    written_mean, written_sd = moments.rounded
+    assert np.abs(written_mean - mean)[at].max() <= FIELD_STEP / 2 + 1e-6
+    assert np.abs(written_mean - mean).max() <= STEP_AROUND / 2 + 1e-5
+    assert np.abs(written_sd - found).max() <= FIELD_STEP / 2
+    assert ((written_sd > 0).any(axis=-1) == ~outside).all()
 
 
 def test_a_sheared_grid_gets_one_at_right_angles(tmp_path):
