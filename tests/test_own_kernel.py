@@ -1,4 +1,4 @@
-"""A kernel of BlackJAX that is none of the package's, on the posterior's log density: the example of docs/samplers.md."""
+"""The example of docs/samplers.md: a kernel of BlackJAX on the log density of a posterior."""
 
 import re
 from pathlib import Path

@@ -230,7 +230,8 @@ def doubt_of_equilibrium(model: Mapping[str, Any] | None, simulated: bool) -> st
     return (
         "The model has the inside in elastic equilibrium exactly (elastic_prior: {nodes: boundary}), as no organ is: "
         "the intervals are those of that model, and much narrower than the error of the displacement. On pairs that no "
-        "model made, 90 % intervals have held a fifth of the truth. model.preset: registration lets the inside depart from it."
+        "model made, 90 % intervals have held a fifth of the truth. model.preset: registration lets the inside depart "
+        "from it."
     )
 
 
