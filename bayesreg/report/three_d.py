@@ -142,10 +142,10 @@ def _ellipsoid(place: Place) -> Surface:
     ball = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
     quads = np.arange(8 * 16).reshape(8, 16)
     right = np.roll(quads, -1, axis=1)
-    faces = np.concatenate([np.stack([quads, right, quads + 16], -1), np.stack([right, right + 16, quads + 16], -1)])
+    faces = np.concatenate([np.stack([quads, quads + 16, right], -1), np.stack([right, quads + 16, right + 16], -1)])
     region = place.region
     variance, axes = np.linalg.eigh(region.shape)
-    points = place.point + (ball * np.sqrt(np.maximum(variance, 1e-4))) @ axes.T
+    points = place.point + (ball * np.sqrt(np.maximum(variance, 1e-4))) @ (axes * np.linalg.det(axes)).T
     return Surface(points, np.tile(region.mean, (len(points), 1)), faces.reshape(-1, 3))
 
 
