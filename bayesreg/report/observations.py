@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from bayesreg.io.records import Predicted
 from bayesreg.mesh import TetMesh
@@ -38,11 +38,17 @@ def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
         " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": normalised and not loads,
         " + log p(rigid motion of <var>u</var>)": part(manifest, "model", "rigid_sd") is not None,
     }
-    observed = [_kind(one).log_density(name) for name, one in observations_of(manifest).items()]
+    observed = [_kind(one).log_density(str(escape(name))) for name, one in observations_of(manifest).items()]
     prior = "".join(text for text, holds in priors.items() if holds and not elastography)
-    scales = [Markup(" + log p({})").format(symbol_of(name)) for name in part(manifest, "scales") or {}]
+    scales = [f" + log p({_symbol(name)})" for name in part(manifest, "scales") or {}]
     total = "".join(observed) + prior + " + log p(λ) + log p(μ)" + "".join(scales)
     return Markup(re.sub("^ − ", "−", total).removeprefix(" + "))
+
+
+def _symbol(name: str) -> str:
+    """The symbol of a scale in HTML, without its unit."""
+    symbol = str(escape(symbol_of(name).removesuffix(", mm")))
+    return re.sub(r"^T_([rs])\b", r"<var>T</var><sub>\1</sub>", symbol)
 
 
 def explanations(manifest: Mapping[str, Any]) -> list[Markup]:

@@ -11,13 +11,13 @@ import numpy as np
 import xarray as xr
 
 from bayesreg.mesh import TetMesh
+from bayesreg.printable import NONE, number
 from bayesreg.report.estimands import Estimand, above, parameter_groups, worst
 
 DEFAULT_THRESHOLD = 1.01
 LEAST_ESS = 100.0
 NU_LOCKING = 0.48
 NOISE_FACTOR = 1.5
-NONE = "–"
 UNCONVERGED = (
     "What follows describes where the chains have been so far, not the posterior: "
     "means may still move, and intervals and effective sample sizes are unreliable."
@@ -40,20 +40,6 @@ class Verdict(NamedTuple):
     converged: bool
     headline: str
     detail: str
-
-
-def number(value: float | int | None, digits: int = 3) -> str:
-    """A number to so many significant digits; a dash where there is none."""
-    if value is None or not math.isfinite(value):
-        return NONE
-    if value == 0:
-        return "0"
-    if not 1e-3 <= abs(value) < 1e7:
-        return f"{value:.{digits - 1}g}".replace("e+", "e").replace("-", "−")
-    if abs(value) >= 10**digits:
-        return f"{value:,.0f}".replace("-", "−")
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:.{decimals}f}".replace("-", "−")
 
 
 def fixed(value: float | int | None, decimals: int = 2) -> str:

@@ -13,6 +13,8 @@ from scipy import ndimage
 from bayesreg.image import Image
 from bayesreg.io.records import Predicted, Run, Truth
 from bayesreg.mesh import TetMesh
+from bayesreg.model.elastic.boltzmann import Boltzmann
+from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.report.study import Study as PageStudy
 from tests.phantoms import ball_mesh, rotated_affine
@@ -183,11 +185,12 @@ def make_predicted(rng: np.random.Generator, mesh: TetMesh, u_mean: np.ndarray, 
         place_draws=u_mean[nodes] + spread,
         motion=rng.normal((1.0, -2.0, 0.5, 3.0, 0.0, -4.0), 0.1, (chains, 100, 6)),
         centre=np.array(CENTRE),
-        residual=1.3 * rng.normal(size=4 * len(mesh.cells)),
-        residual_tissue=np.repeat(mesh.tissue, 4),
-        discrepancies=np.array(["sd", "greatest", "neighbours"]),
-        observed=observed,
-        replicated=rng.normal((1.0, 4.0, 0.0), (0.01, 0.2, 0.05), (chains, 100, 3)),
+        observations={
+            "images/residual": 1.3 * rng.normal(size=4 * len(mesh.cells)),
+            "images/residual_tissue": np.repeat(mesh.tissue, 4),
+            "images/observed": observed,
+            "images/replicated": rng.normal((1.0, 4.0, 0.0), (0.01, 0.2, 0.05), (chains, 100, 3)),
+        },
     )
 
 
@@ -241,16 +244,20 @@ def manifest(uniform: bool, converged: bool) -> dict:
         "residual_sd": 0.0151,
         "implied_noise_sd": 0.0146,
         "appraisal": {"beware": ["A fifth of the organ is ignored."], "notes": []},
-        "observations": {"images": {"kind": "images", "log": -6021.4, "values": 12_000, "residual_rms": 1.03}},
+        "observations": {
+            "images": {
+                "kind": "images",
+                "title": "pair of images",
+                "options": ImageOptions().model_dump(mode="json"),
+                "log": -6021.4,
+                "values": 12_000,
+                "residual_rms": 1.03,
+            }
+        },
         "model": {
             "preset": "paper",
             "elasticity": "uniform" if uniform else "tissue",
-            "similarity": "ssd",
-            "t_similarity": 0.05,
-            "t_elastic": 1e4,
-            "quadrature": "gauss4",
-            "interpolation": "linear",
-            "normalised": False,
+            "elastic_prior": Boltzmann().model_dump(mode="json"),
         },
     }
 

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from bayesreg.distance import signed_distance
-from bayesreg.report import adequacy, anatomy, convergence, marginals, panels, paper, stiffness, style
+from bayesreg.report import anatomy, convergence, marginals, panels, paper, stiffness, style
 from bayesreg.report.panels import View, error_of, from_zero, symmetric
 from bayesreg.report.slices import sample
 from bayesreg.report.study import Study, rms_difference
@@ -69,15 +69,6 @@ def test_the_difference_is_that_of_the_labelled_voxels(seen):
     expected = np.sqrt(np.mean((np.asarray(run.moving.voxels) - np.asarray(run.fixed.voxels))[inside] ** 2))
     assert rms_difference(run, run.moving) == pytest.approx(expected, rel=1e-9)
     assert f"{expected:.3f}" in anatomy.before_and_after(seen).caption
-
-
-def test_plain_differences_are_no_residual_of_unlike_contrasts(seen):
-    manifest = seen.run.manifest
-    unlike = changed(seen, manifest={**manifest, "model": {**manifest["model"], "similarity": "lncc"}})
-    said = "maps of f − m(x + ū) do not show its residual"
-    assert said in anatomy.before_and_after(unlike).caption
-    assert said not in anatomy.before_and_after(seen).caption
-    assert said in adequacy.residual(unlike.view).caption
 
 
 def test_the_mesh_is_cut_into_the_tissues_of_its_cells(view):
@@ -198,8 +189,8 @@ def test_sampled_scales_are_drawn_with_their_prior(seen):
     hot = np.random.default_rng(0).lognormal(np.log(0.05), 0.1, size=(chains, draws))
     posterior = seen.posterior.assign(t_similarity=(("chain", "draw"), hot))
     idata, figures = seen.idata._replace(posterior=posterior), (seen.rhat, seen.ess_bulk, seen.ess_tail)
-    model = seen.manifest["model"] | {"t_similarity": {"median": 0.05, "log_sd": 0.3}}
-    with_prior = replace(seen.run, manifest=seen.manifest | {"model": model})
+    scales = {"t_similarity": {"median": 0.05, "log_sd": 0.3}}
+    with_prior = replace(seen.run, manifest=seen.manifest | {"scales": scales})
     plain, shown = (marginals.marginals(Study(run, idata, *figures)) for run in (seen.run, with_prior))
     assert plain.title == "Stiffness ratios and scales"
     assert marginals.marginals(seen).title == "Stiffness ratios"

@@ -14,7 +14,7 @@ from bayesreg.report.places import regions
 from bayesreg.report.three_d import figure
 from bayesreg.report.uncertainty import places_of
 
-FIGURES = {"registration", "displacement", "places", "stiffness", "residual", "traces", "distributions"}
+FIGURES = {"registration", "displacement", "places", "stiffness", "residual-images", "traces", "distributions"}
 PAPER = {"data", "result", "node"}
 
 
@@ -271,14 +271,19 @@ def test_names_from_anywhere_are_shown_as_they_are(study, tmp_path):
     mesh = replace(study.run.mesh, names=tissues)
     names = ["$x_{$", "</script><script>alert(2)</script>", *study.run.predicted.place_names[2:]]
     landmarks = {
-        "landmark_names": np.array(["$x_{$", "$\\frac$ <b>"]),
-        "landmark_points": mesh.points[:2],
-        "landmark_sd": np.ones(2),
-        "landmark_residual": np.ones((2, 3)),
+        "points/names": np.array(["$x_{$", "$\\frac$ <b>"]),
+        "points/points": mesh.points[:2],
+        "points/sd": np.ones(2),
+        "points/residual": np.ones((2, 3)),
     }
-    predicted = study.run.predicted._replace(place_names=np.array(names), **landmarks)
+    observations = {**study.run.predicted.observations, **landmarks}
+    predicted = study.run.predicted._replace(place_names=np.array(names), observations=observations)
     posterior = study.idata.posterior.assign_coords(tissue=list(tissues))
-    manifest = study.run.manifest | {"name": "<img src=x onerror=alert(3)> $x_{$"}
+    described = {"points": {"kind": "landmarks", "title": "pairs of points", "log": 0.0}}
+    manifest = study.run.manifest | {
+        "name": "<img src=x onerror=alert(3)> $x_{$",
+        "observations": study.run.manifest["observations"] | described,
+    }
     run = replace(study.run, mesh=mesh, predicted=predicted, manifest=manifest, metrics=None)
     figures = [one.assign_coords(tissue=list(tissues)) for one in (study.rhat, study.ess_bulk, study.ess_tail)]
     write_report(run, study.idata._replace(posterior=posterior), *figures, tmp_path / "report.html")
@@ -287,5 +292,5 @@ def test_names_from_anywhere_are_shown_as_they_are(study, tmp_path):
     assert "<img src=x" not in text
     page = Page(text)
     assert "b" not in page.tags
-    for name in (*tissues, *names[:2], *landmarks["landmark_names"]):
+    for name in (*tissues, *names[:2], *landmarks["points/names"]):
         assert name in page.text or any(name in cell for row in page.rows for cell in row), name

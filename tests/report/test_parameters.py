@@ -5,7 +5,7 @@ from scipy import stats
 
 from bayesreg.image import Image
 from bayesreg.io.records import Run
-from bayesreg.report.parameters import Interval, parameter_table, prior_of, reading
+from bayesreg.report.parameters import Interval, parameter_table, prior_of, prior_of_scale, reading
 from bayesreg.report.study import Study
 from tests.phantoms import box_mesh
 from tests.report.conftest import Draws
@@ -27,7 +27,7 @@ def studied(posterior: xr.Dataset, model: dict, lam: list[float], mu: list[float
     rhat = xr.Dataset({"lam": ("tissue", lam), "mu": ("tissue", mu)} | {k: ((), v) for k, v in scalars.items()})
     run = Run(
         "",
-        {"model": model},
+        {"model": model, "scales": {"t_similarity": {"median": 0.05, "log_sd": 1.0}}},
         MESH,
         *np.zeros((2, *MESH.points.shape)),
         None,
@@ -79,20 +79,18 @@ def test_a_posterior_like_its_prior_is_not_identified():
 def test_priors_are_read_from_the_manifest():
     beta = {"alpha": 2.0, "beta": 3.0, "low": 1.0, "high": 11.0}
     flat = {"alpha": 1.0, "beta": 1.0, "low": 0.0, "high": None}
-    model = {"priors": {"lam": {"gm": beta, "wm": flat}, "mu": flat | {"high": 40.0}}, "t_elastic": 1e4}
-    model["t_similarity"] = {"median": 0.05, "log_sd": 1.0}
+    model = {"priors": {"lam": {"gm": beta, "wm": flat}, "mu": flat | {"high": 40.0}}}
     draws = 1 + 10 * np.random.default_rng(0).beta(2, 3, 200_000)
     np.testing.assert_allclose(prior_of(model, "lam", "gm"), np.quantile(draws, (0.025, 0.975)), rtol=0.01)
     assert prior_of(model, "lam", "wm") is prior_of(model, "lam", "csf") is prior_of({}, "mu", "gm") is None
     assert prior_of(model, "mu", "csf") == pytest.approx((1.0, 39.0))
-    assert prior_of(model, "t_similarity") == pytest.approx((0.05 * np.exp(-1.96), 0.05 * np.exp(1.96)), rel=1e-3)
-    assert prior_of(model, "t_elastic") is None
+    scale = prior_of_scale({"median": 0.05, "log_sd": 1.0})
+    assert scale == pytest.approx((0.05 * np.exp(-1.96), 0.05 * np.exp(1.96)), rel=1e-3)
 
 
 def test_a_row_for_all_that_is_known(posterior):
     model = {
         "priors": {"lam": {"gm": {"alpha": 1.0, "beta": 1.0, "low": 0.0, "high": 20.0}}},
-        "t_similarity": {"median": 0.05, "log_sd": 1.0},
     }
     table = parameter_table(studied(posterior, model, [1.0] * 3, [1.0, np.nan, 1.5], t_similarity=1.0))
     found = {(group, row[0]): row[1:] for group, rows in table.groups for row in rows}

@@ -11,8 +11,14 @@ from tests.report.test_verdict import elastic
 
 MANIFEST = {
     "independent_points": {"images": 25_000.0},
-    "observations": {"images": {"kind": "images", "values": 100_000}},
-    "model": {"similarity": "student_t", "degrees_of_freedom": 4.0, "sampled": "all"},
+    "observations": {
+        "images": {
+            "kind": "images",
+            "values": 100_000,
+            "options": {"similarity": {"kind": "student_t", "degrees_of_freedom": 4.0}},
+        }
+    },
+    "model": {"elastic_prior": {"nodes": "all"}},
     "implied_noise_sd": 0.04,
     "residual_sd": 0.04,
     "displacement_sd": {"nodes": 0.08, "mesh": 0.05},
@@ -35,7 +41,8 @@ def test_inverted_tetrahedra_of_the_draws_are_told():
 
 def test_nothing_is_told_of_what_a_run_does_not_have():
     assert explain_intervals({}) == []
-    independent = MANIFEST | {"independent_points": {"images": 100_000.0}, "model": {"similarity": "ssd"}}
+    observed = {"images": {"kind": "images", "values": 100_000, "options": {"similarity": {"kind": "ssd"}}}}
+    independent = MANIFEST | {"independent_points": {"images": 100_000.0}, "observations": observed}
     assert len(explain_intervals(independent)) == 1
 
 
@@ -44,7 +51,7 @@ def test_nothing_is_told_of_what_a_run_does_not_have():
     [("boundary", None, True), ("boundary", {"kind": "paper"}, False), ("all", None, False)],
 )
 def test_a_strict_equilibrium_of_real_images_is_warned_of(sampled, pair, told):
-    manifest = MANIFEST | {"model": {"sampled": sampled}, "pair": pair}
+    manifest = MANIFEST | {"model": {"elastic_prior": {"nodes": sampled}}, "pair": pair}
     warnings = warnings_of(manifest, box_mesh(), elastic([1.0] * 3, [1.0] * 3))
     assert any("preset: registration" in text for text in warnings) == told
-    assert (doubt_of_equilibrium({"sampled": sampled}, simulated=pair is not None) is not None) == told
+    assert (doubt_of_equilibrium({"elastic_prior": {"nodes": sampled}}, simulated=pair is not None) is not None) == told

@@ -11,6 +11,7 @@ from scipy import stats
 
 from bayesreg.model.observations.images.discrepancies import DISCREPANCIES
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
+from bayesreg.printable import number
 from bayesreg.tissues import colours_of, label_of
 
 NAMES = {
@@ -136,8 +137,8 @@ def _p_text(p: float, draws: int) -> str:
 
 
 def _interval(draws: np.ndarray) -> str:
-    low, median, high = np.quantile(draws, (0.05, 0.5, 0.95))
-    return f"{median:.3g} ({low:.3g} to {high:.3g})".replace("-", "−")
+    low, median, high = (float(x) for x in np.quantile(draws, (0.05, 0.5, 0.95)))
+    return f"{number(median)} ({number(low)} to {number(high)})"
 
 
 def _judge(p: float) -> str:

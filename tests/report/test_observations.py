@@ -3,11 +3,20 @@
 import re
 
 import bayesreg as br
-from bayesreg.report.density import formula, observation_table, similarity_energy
+from bayesreg.model.observations.images.options import ImageOptions
+from bayesreg.report.observations import explanations, formula, observation_table
 
-IMAGES = {"kind": "images", "log": -12.0, "values": 400, "residual_rms": 0.9}
-POINTS = {"kind": "landmarks", "log": -3.0, "values": 24, "residual_rms": 1.1}
-OWN = {"kind": "own", "log": -0.5}
+OPTIONS = ImageOptions(similarity="lncc").model_dump(mode="json")
+IMAGES = {
+    "kind": "images",
+    "title": "pair of images",
+    "options": OPTIONS,
+    "log": -12.0,
+    "values": 400,
+    "residual_rms": 0.9,
+}
+POINTS = {"kind": "landmarks", "title": "pairs of points", "log": -3.0, "values": 24, "residual_rms": 1.1}
+OWN = {"kind": "own", "title": "an observation of your own", "log": -0.5}
 
 
 def plain(markup):
@@ -15,28 +24,35 @@ def plain(markup):
 
 
 def test_the_papers_density():
-    manifest = {"observations": {"images": IMAGES}, "model": {"normalised": False, "rigid_sd": None}}
+    manifest = {
+        "observations": {"images": IMAGES},
+        "model": {"elastic_prior": {"kind": "boltzmann", "normalised": False}, "rigid_sd": None},
+    }
     assert plain(formula(manifest, elastography=False)) == "−Es / Ts − Er / Tr + log p(λ) + log p(μ)"
     assert plain(formula(manifest, elastography=True)) == "−Es / Ts + log p(λ) + log p(μ)"
 
 
 def test_every_term_is_named():
     scales = {"t_similarity": {"median": 1.0, "log_sd": 1.0}, "points_sd": {"median": 1.0, "log_sd": 1.0}}
-    model = {"normalised": True, "rigid_sd": 3.0, "similarity": "lncc", **scales}
+    model = {"elastic_prior": {"kind": "boltzmann", "normalised": True}, "rigid_sd": 3.0}
     observed = {"images": IMAGES, "t2": IMAGES, "points": POINTS, "<own>": OWN}
-    found = formula({"observations": observed, "model": model}, elastography=False)
+    found = formula({"observations": observed, "model": model, "scales": scales}, elastography=False)
     assert "&lt;own&gt;" in found
     assert plain(found) == (
-        "−Es(images) / Ts − Es(t2) / Ts + log p(points | u) + log p(&lt;own&gt; | u) − Er / Tr − log Z(λ, μ, Tr) "
+        "−Es / Ts − Es(t2) / Ts(t2) + log p(points | u) + log p(&lt;own&gt; | u) − Er / Tr − log Z(λ, μ, Tr) "
         "+ log p(rigid motion of u) + log p(λ) + log p(μ) + log p(Ts) + log p(points sd)"
     )
 
 
 def test_random_loads_take_the_place_of_the_elastic_energy():
     load = {"median": 0.1, "log_sd": 3.0}
-    model = {"normalised": True, "elastic_prior": "loads", "body_load": load, "surface_load": load}
-    found = plain(formula({"observations": {"images": IMAGES}, "model": model}, elastography=False))
-    sizes = "log p(body load) + log p(surface load)"
+    manifest = {
+        "observations": {"images": IMAGES},
+        "model": {"elastic_prior": {"kind": "loads", "body": load, "surface": load}},
+        "scales": {"body_load": load, "surface_load": load},
+    }
+    found = plain(formula(manifest, elastography=False))
+    sizes = "log p(sd of the random loads inside) + log p(sd of the random loads at the surface)"
     assert found == f"−Es / Ts + log p(u | λ, μ, random loads) + log p(λ) + log p(μ) + {sizes}"
 
 
@@ -49,8 +65,14 @@ def test_the_default_model_has_the_papers_density():
 
 def test_landmarks_alone_have_no_similarity():
     manifest = {"observations": {"points": POINTS}, "model": {}}
-    assert similarity_energy(manifest) is None
+    assert explanations(manifest) == []
     assert plain(formula(manifest, elastography=False)) == "log p(points | u) − Er / Tr + log p(λ) + log p(μ)"
+
+
+def test_each_pair_of_images_says_what_it_compares():
+    found = [plain(text) for text in explanations({"observations": {"images": IMAGES, "t2": IMAGES, "points": POINTS}})]
+    assert [text.split(" = ")[0] for text in found] == ["Es", "Es(t2)"]
+    assert all("affine map" in text for text in found)
 
 
 def test_observations_without_residuals_leave_their_cells_empty():
