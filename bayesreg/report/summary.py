@@ -65,7 +65,7 @@ def _fits(study: Study) -> list[str]:
 def _pose(study: Study) -> str:
     pose = study.run.matching.pose
     if pose.is_identity:
-        return "Both images share one coordinate system; the organ deformed in it."
+        return "The organ deformed; before and after share one coordinate system."
     motion = pose.about(study.mesh.points.mean(axis=0))
     return (
         f"The organ lies {fixed(motion.millimetres, 1)} mm and {fixed(motion.degrees, 1)}° from where the header of "

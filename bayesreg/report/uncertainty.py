@@ -102,8 +102,10 @@ def _place_row(place: Place, where: str, far: float) -> list[str]:
     ]
 
 
-def places(study: Study) -> Drawing:
-    """Where each place goes, on the moving image: the draws and their 95 % region, one column for each place."""
+def places(study: Study) -> Drawing | None:
+    """The draws and the 95 % region of each place, on the moving image, one column for each; None without images."""
+    if study.run.moving is None:
+        return None
     shown = places_of(study)
     bands, columns = -(-len(shown) // COLUMNS), min(max(len(shown), 4), COLUMNS)
     with style.look():
@@ -135,7 +137,8 @@ def _draw_place(axes: Axes, study: Study, place: Place, axis: int, limits: tuple
     half = max(ZOOM, 2 * float(ellipsoid.semi_axes[0]))
     sides = [(float(goes[j] - half), float(goes[j] + half)) for j in (across, up)]
     plane = Plane(axis, float(goes[axis]), sides[0], sides[1], 2 * half / 160)
-    panels.image_panel(axes, study.run.moving or study.run.background, plane, limits)
+    assert study.run.moving is not None
+    panels.image_panel(axes, study.run.moving, plane, limits)
     stride = max(1, place.draws.shape[0] * place.draws.shape[1] // CLOUD)
     for chain, colour in zip(point + place.draws, style.chain_colours(len(place.draws)), strict=True):
         axes.plot(chain[::stride, across], chain[::stride, up], ".", ms=2.2, color=colour, alpha=0.9, mew=0)
