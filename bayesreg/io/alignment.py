@@ -14,8 +14,8 @@ from scipy import ndimage
 from bayesreg.ignored import fill_ignored, ignored_voxels
 from bayesreg.image import Image
 from bayesreg.io.domain import relative_size
-from bayesreg.io.readers import from_itk
-from bayesreg.io.spaces import LPS, convert_affine, convert_motion
+from bayesreg.io.itk import from_itk, to_itk
+from bayesreg.io.spaces import LPS, convert_motion
 from bayesreg.pose import Motion, Pose
 from bayesreg.types import InputError
 
@@ -114,7 +114,7 @@ def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
     tuple of Image
         Its x, y and z components, mm, world RAS.
     """
-    one, other = (_to_itk(image, "float32") for image in (fixed.on_orthogonal_grid(), moving.on_orthogonal_grid()))
+    one, other = (to_itk(image, "float32") for image in (fixed.on_orthogonal_grid(), moving.on_orthogonal_grid()))
     other = SimpleITK.Resample(other, one, SimpleITK.Transform(), SimpleITK.sitkLinear, 0.0)
     other = SimpleITK.HistogramMatching(other, one, 256, 15, True)
     field = None
@@ -161,8 +161,8 @@ class _Level(NamedTuple):
 
     @classmethod
     def of(cls, fixed: Image, moving: Image, around: Image, kept: Image | None, edge: float, share: float) -> _Level:
-        masks = [None if one is None else _to_itk(_coarser(one, edge, 0), "uint8") for one in (around, kept)]
-        one, other = (_to_itk(_coarser(image, edge, 1), "float32") for image in (fixed, moving))
+        masks = [None if one is None else to_itk(_coarser(one, edge, 0), "uint8") for one in (around, kept)]
+        one, other = (to_itk(_coarser(image, edge, 1), "float32") for image in (fixed, moving))
         assert masks[0] is not None
         return cls(one, other, edge, share, masks[0], masks[1])
 
@@ -216,16 +216,6 @@ def _coarser(image: Image, edge: float, order: int) -> Image:
         blur = np.where(wanted > sizes, wanted / sizes / 2, 0.0)
         image = image.with_voxels(ndimage.gaussian_filter(np.asarray(image.voxels, float), blur, mode="nearest"))
     return image.on_orthogonal_grid(wanted, order)
-
-
-def _to_itk(image: Image, dtype: str) -> SimpleITK.Image:
-    """An image whose axes are orthogonal."""
-    found = SimpleITK.GetImageFromArray(np.asarray(image.voxels).astype(dtype).transpose(2, 1, 0))
-    affine = convert_affine(image.affine)
-    found.SetSpacing(image.voxel_sizes.tolist())
-    found.SetDirection((affine[:3, :3] / image.voxel_sizes).ravel().tolist())
-    found.SetOrigin(affine[:3, 3].tolist())
-    return found
 
 
 def _centre_of(mask: Image) -> Float[np.ndarray, "3"]:

@@ -15,19 +15,9 @@ import SimpleITK
 
 from bayesreg.image import Image
 from bayesreg.io.domain import main_part
+from bayesreg.io.grids import check_same_grid, check_same_space, is_same_grid, on_grid_of
 from bayesreg.io.readers import read_grid
-from bayesreg.io.volumes import (
-    LabelTable,
-    check_same_grid,
-    check_same_space,
-    is_same_grid,
-    load_image,
-    load_labels,
-    load_mask,
-    load_whole_numbers,
-    on_grid_of,
-    tissues_of,
-)
+from bayesreg.io.volumes import LabelTable, load_image, load_labels, load_mask, load_whole_numbers, tissues_of
 from bayesreg.label_tables import REST, TABLES
 from bayesreg.tissues import BRAIN, ORGAN, is_fluid, tissue_names
 from bayesreg.types import DATA_FOLDER, InputError

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.io.volumes import check_same_grid
+from bayesreg.io.grids import check_same_grid
 from bayesreg.tissues import BRAIN, BRAIN_CLOSING, BRAIN_VOLUME, is_fluid, label_of
 from bayesreg.types import InputError
 

@@ -10,7 +10,9 @@ import SimpleITK
 from jaxtyping import Float
 
 from bayesreg.image import Image
-from bayesreg.io.readers import Volume, from_itk, read_volume
+from bayesreg.io.grids import Volume
+from bayesreg.io.itk import from_itk
+from bayesreg.io.readers import read_volume
 from bayesreg.io.spaces import LPS
 from bayesreg.io.volumes import write_nifti
 from bayesreg.types import AnyArray, InputError

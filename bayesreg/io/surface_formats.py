@@ -152,6 +152,8 @@ def read_legacy(content: bytes) -> Any:
             arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
         elif key == "COLOR_SCALARS":
             values = cursor.values("f4" if cursor.is_text else "u1", int(words[2]) * rows)
+            # As text they are shares of the brightest.
+            values = np.rint(255 * values).astype(np.uint8) if cursor.is_text else values
             arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
         elif key == "LOOKUP_TABLE":
             cursor.values("f4" if cursor.is_text else "u1", 4 * int(words[2]))

@@ -9,18 +9,16 @@ from typing import Literal
 
 import nibabel as nib
 import numpy as np
-from scipy import ndimage
 
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
-from bayesreg.io.readers import Volume, corners_apart, read_volume
+from bayesreg.io.grids import Volume
+from bayesreg.io.readers import read_volume
 from bayesreg.tissues import BACKGROUND, tissue_names
 from bayesreg.types import AnyArray, InputError
 
 LabelTable = Mapping[str, int | Sequence[int]]
 
-# Grids are one where no corner lies further apart than this share of a voxel.
-SAME_GRID = 0.1
 # Labels that are stored as floating-point numbers lie this near to integers.
 ROUNDING = 0.05
 # Probabilities that were interpolated by splines overshoot by no more.
@@ -237,88 +235,6 @@ def shorten(values: Iterable[object], most: int = 30) -> str:
     return ", ".join(listed[:most]) + (", …" if len(listed) > most else "")
 
 
-def is_same_grid(a: Image, b: Image) -> bool:
-    """Tell whether two images share their grid (corners within a tenth of a voxel)."""
-    apart = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
-    return a.shape == b.shape and bool(apart <= SAME_GRID * a.voxel_sizes.min())
-
-
-def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
-    """Raise InputError unless two images share their grid (corners within a tenth of a voxel)."""
-    if a.shape != b.shape:
-        raise InputError(
-            f"the {names[0]} and the {names[1]} image must share one grid, but have shapes {a.shape} and {b.shape}; "
-            "resample one onto the other"
-        )
-    apart = corners_apart(a.affine, b.affine, a.shape)
-    if not is_same_grid(a, b):
-        raise InputError(
-            f"the {names[0]} and the {names[1]} image must share one grid, but their affines place corners up to "
-            f"{apart:.3g} mm apart; resample one onto the other"
-        )
-
-
-def on_grid_of(
-    grid: Image, image: Image, names: tuple[str, str] = ("first", "second"), anywhere: bool = False
-) -> Image:
-    """Labels or a mask on the grid of another image: as they are, or by the nearest voxel, and the log says so.
-
-    Parameters
-    ----------
-    grid : Image
-    image : Image
-        Beyond its own grid it counts as zero.
-    names : pair of str
-        What to call them in a message.
-    anywhere : bool
-        Whether the image may be a small part of the grid.
-
-    Raises
-    ------
-    InputError
-        If the two hardly overlap in world space.
-    """
-    if is_same_grid(grid, image):
-        return grid.with_voxels(image.voxels)
-    if not anywhere:
-        check_same_space(grid, image, names)
-    between = image.to_voxel @ grid.affine
-    found = grid.with_voxels(
-        ndimage.affine_transform(
-            np.asarray(image.voxels), between[:3, :3], between[:3, 3], grid.shape, order=0, mode="grid-constant"
-        )
-    )
-    before, after = (np.count_nonzero(one.voxels) * one.voxel_volume / 1e3 for one in (image, found))
-    reordered = np.allclose(between, np.rint(between), atol=SAME_GRID / max(grid.shape)) and np.isclose(before, after)
-    if not (reordered and round(abs(np.linalg.det(between))) == 1):
-        _log.warning(
-            "the %s image lies on another grid than the %s one; the nearest voxel is taken, and of %.4g ml that are "
-            "not zero %.4g remain", names[1], names[0], before, after,
-        )  # fmt: skip
-    return found
-
-
-def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "second"), least: float = 0.1) -> None:
-    """Raise InputError unless two images overlap in world space.
-
-    Parameters
-    ----------
-    a, b : Image
-        On grids of their own.
-    names : pair of str
-        What to call them in the message.
-    least : float
-        Least fraction of the first image's extent that the second must cover.
-    """
-    samples = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 16) for n in a.shape), indexing="ij"), axis=-1)
-    covered = float(np.mean(b.contains(a.voxel_to_world(samples))))
-    if covered < least:
-        raise InputError(
-            f"the {names[1]} image covers {covered:.0%} of the {names[0]} one, expected at least {least:.0%}: "
-            f"their centres lie at {_centre(a)} and {_centre(b)} mm; check the affines, or align the images"
-        )
-
-
 def write_nifti(
     voxels: np.ndarray,
     affine: AnyArray,
@@ -386,7 +302,3 @@ def _check_table(values: dict[str, list[int]], present: list[int], path: str | P
         _log.info(
             "label file %s lacks %s of the table, which its tissues do without", path, ", ".join(map(str, absent))
         )
-
-
-def _centre(image: Image) -> list[float]:
-    return image.voxel_to_world((np.array(image.shape) - 1) / 2).round(1).tolist()

@@ -11,8 +11,8 @@ from bayesreg.config.data import FilesData
 from bayesreg.ignored import ignored_voxels
 from bayesreg.image import Image, IntensityScale, robust_scale
 from bayesreg.io.alignment import find_pose
+from bayesreg.io.grids import check_same_space
 from bayesreg.io.records import Channel, Matching
-from bayesreg.io.volumes import check_same_space
 from bayesreg.model.observations.images.similarity import AnySimilarity
 from bayesreg.pose import Pose
 from bayesreg.types import InputError

@@ -10,7 +10,8 @@ import numpy as np
 
 from bayesreg.config import Config, make_config, read_mapping
 from bayesreg.config.data import FilesData
-from bayesreg.io.readers import Grid, read_grid
+from bayesreg.io.grids import Grid
+from bayesreg.io.readers import read_grid
 from bayesreg.io.volumes import load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_tables
 from bayesreg.tissues import ORGAN

@@ -10,7 +10,8 @@ import pytest
 import SimpleITK
 
 from bayesreg.image import Image
-from bayesreg.io.readers import corners_apart, read_grid, read_volume
+from bayesreg.io.grids import corners_apart
+from bayesreg.io.readers import read_grid, read_volume
 from bayesreg.io.volumes import load_image
 from tests.test_image import AFFINES
 

@@ -9,16 +9,8 @@ import SimpleITK
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.io.volumes import (
-    check_same_grid,
-    check_same_space,
-    load_image,
-    load_labels,
-    load_mask,
-    load_whole_numbers,
-    on_grid_of,
-    save_image,
-)
+from bayesreg.io.grids import check_same_grid, check_same_space, on_grid_of
+from bayesreg.io.volumes import load_image, load_labels, load_mask, load_whole_numbers, save_image
 from bayesreg.types import InputError
 from tests.test_image import AFFINES, affine_of
 

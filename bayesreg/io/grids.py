@@ -1,0 +1,164 @@
+"""Grids of voxels: what a file says of its own, and whether two images share one; world RAS, mm."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from bayesreg.image import Image
+from bayesreg.memory import memory_of_machine
+from bayesreg.types import InputError
+
+# Grids are one where no corner lies further apart than this share of a voxel.
+SAME_GRID = 0.1
+
+_log = logging.getLogger(__name__)
+
+
+class Volume(NamedTuple):
+    """What a file holds.
+
+    Attributes
+    ----------
+    voxels : (X, Y, Z, ...) array
+        The file's scale of intensities applied. Components of vectors are the last axis.
+    affine : (4, 4) array
+        Voxel index to world RAS, mm.
+    header : object
+        That of nibabel; None where SimpleITK has read the file.
+    """
+
+    voxels: np.ndarray
+    affine: Float[np.ndarray, "4 4"]
+    header: Any = None
+
+
+class Grid(NamedTuple):
+    """Where the voxels of a file lie, by its header alone.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    affine : (4, 4) array
+        Voxel index to world RAS, mm.
+    other : (4, 4) array or None
+        The q-form of a NIfTI header, where it says something else than the s-form, which is taken.
+    remarks : tuple of str
+        What a user should know.
+    """
+
+    shape: tuple[int, ...]
+    affine: Float[np.ndarray, "4 4"]
+    other: Float[np.ndarray, "4 4"] | None = None
+    remarks: tuple[str, ...] = ()
+
+
+def require_memory(shape: Sequence[int], path: Path) -> None:
+    """Raise InputError where a header speaks of more voxels than the machine could hold."""
+    needed = 8 * prod(map(int, shape))
+    held = memory_of_machine()
+    if needed > held:
+        grid = " × ".join(map(str, shape))
+        raise InputError(
+            f"image {path} has a grid of {grid} voxels by its header, which need {needed / 1e9:,.0f} GB; this machine "
+            f"has {held / 1e9:,.0f} GB"
+        )
+
+
+def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], shape: tuple[int, ...]) -> float:
+    """How far apart two affines place a corner of a grid, at most, mm."""
+    corners = np.stack(np.meshgrid(*((0.0, n - 1.0) for n in shape[:3]), indexing="ij"), axis=-1).reshape(-1, 3)
+    return float(np.linalg.norm(corners @ (one - other)[:3, :3].T + (one - other)[:3, 3], axis=1).max())
+
+
+def is_same_grid(a: Image, b: Image) -> bool:
+    """Tell whether two images share their grid (corners within a tenth of a voxel)."""
+    apart = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
+    return a.shape == b.shape and bool(apart <= SAME_GRID * a.voxel_sizes.min())
+
+
+def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
+    """Raise InputError unless two images share their grid (corners within a tenth of a voxel)."""
+    if a.shape != b.shape:
+        raise InputError(
+            f"the {names[0]} and the {names[1]} image must share one grid, but have shapes {a.shape} and {b.shape}; "
+            "resample one onto the other"
+        )
+    apart = corners_apart(a.affine, b.affine, a.shape)
+    if not is_same_grid(a, b):
+        raise InputError(
+            f"the {names[0]} and the {names[1]} image must share one grid, but their affines place corners up to "
+            f"{apart:.3g} mm apart; resample one onto the other"
+        )
+
+
+def on_grid_of(
+    grid: Image, image: Image, names: tuple[str, str] = ("first", "second"), anywhere: bool = False
+) -> Image:
+    """Labels or a mask on the grid of another image: as they are, or by the nearest voxel, and the log says so.
+
+    Parameters
+    ----------
+    grid : Image
+    image : Image
+        Beyond its own grid it counts as zero.
+    names : pair of str
+        What to call them in a message.
+    anywhere : bool
+        Whether the image may be a small part of the grid.
+
+    Raises
+    ------
+    InputError
+        If the two hardly overlap in world space.
+    """
+    if is_same_grid(grid, image):
+        return grid.with_voxels(image.voxels)
+    if not anywhere:
+        check_same_space(grid, image, names)
+    between = image.to_voxel @ grid.affine
+    found = grid.with_voxels(
+        ndimage.affine_transform(
+            np.asarray(image.voxels), between[:3, :3], between[:3, 3], grid.shape, order=0, mode="grid-constant"
+        )
+    )
+    before, after = (np.count_nonzero(one.voxels) * one.voxel_volume / 1e3 for one in (image, found))
+    reordered = np.allclose(between, np.rint(between), atol=SAME_GRID / max(grid.shape)) and np.isclose(before, after)
+    if not (reordered and round(abs(np.linalg.det(between))) == 1):
+        _log.warning(
+            "the %s image lies on another grid than the %s one; the nearest voxel is taken, and of %.4g ml that are "
+            "not zero %.4g remain", names[1], names[0], before, after,
+        )  # fmt: skip
+    return found
+
+
+def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "second"), least: float = 0.1) -> None:
+    """Raise InputError unless two images overlap in world space.
+
+    Parameters
+    ----------
+    a, b : Image
+        On grids of their own.
+    names : pair of str
+        What to call them in the message.
+    least : float
+        Least fraction of the first image's extent that the second must cover.
+    """
+    samples = np.stack(np.meshgrid(*(np.linspace(0, n - 1, 16) for n in a.shape), indexing="ij"), axis=-1)
+    covered = float(np.mean(b.contains(a.voxel_to_world(samples))))
+    if covered < least:
+        raise InputError(
+            f"the {names[1]} image covers {covered:.0%} of the {names[0]} one, expected at least {least:.0%}: "
+            f"their centres lie at {_centre(a)} and {_centre(b)} mm; check the affines, or align the images"
+        )
+
+
+def _centre(image: Image) -> list[float]:
+    return image.voxel_to_world((np.array(image.shape) - 1) / 2).round(1).tolist()
