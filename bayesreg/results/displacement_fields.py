@@ -23,8 +23,8 @@ MEAN, MEAN_INVERSE, ENSEMBLE = "transform_mean.h5", "transform_mean_inverse.h5",
 ENSEMBLE_SPACING = 0.2
 # Between the voxels of the mean's transforms, in mean edges of the mesh, rounded down to whole voxels of the image.
 MEAN_SPACING = 0.15
-# Written fields are multiples of this, mm: in the mesh, and around it, where nothing is observed.
-FIELD_STEP, STEP_AROUND = 2.0**-9, 2.0**-5
+# What is written is a multiple of this, mm: the mean in the mesh, around it, where nothing is observed, and the sd.
+MEAN_STEP, STEP_AROUND, SD_STEP = 2.0**-8, 2.0**-4, 2.0**-9
 # What the grid of an inverse reaches beyond the displaced mesh, mm.
 MARGIN = 10.0
 
@@ -51,8 +51,8 @@ class Moments(NamedTuple):
     def rounded(self) -> tuple[Float[np.ndarray, "X Y Z 3"], Float[np.ndarray, "X Y Z 3"]]:
         """Mean and standard deviation as they are written: rounded, so that files are small."""
         inside = (self.sd > 0).any(axis=-1, keepdims=True)
-        step = np.where(inside, np.float32(FIELD_STEP), np.float32(STEP_AROUND))
-        sd = np.maximum(np.rint(self.sd / np.float32(FIELD_STEP)), inside) * np.float32(FIELD_STEP)
+        step = np.where(inside, np.float32(MEAN_STEP), np.float32(STEP_AROUND))
+        sd = np.maximum(np.rint(self.sd / np.float32(SD_STEP)), inside) * np.float32(SD_STEP)
         return np.rint(self.mean / step) * step, sd
 
 
