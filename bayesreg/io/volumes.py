@@ -335,8 +335,8 @@ def write_nifti(
         image.header.set_intent(intent)
     if scaling is not None:
         image.header.set_slope_inter(*scaling)
-    with replacing(path) as temporary, Opener(temporary, "wb", compresslevel=COMPRESSION) as file:
-        image.to_stream(file)
+    with replacing(path) as temporary, Opener(str(temporary), "wb", compresslevel=COMPRESSION) as file:
+        image.to_stream(file)  # type: ignore[arg-type]
 
 
 def _one_real(voxels: np.ndarray) -> np.ndarray:
