@@ -195,7 +195,7 @@ def test_small_voxels_are_passed_over(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("linear", "around"), [(GRIDS["oblique"], 1e-5), (TURN @ np.diag([0.75, 2.0, 3.0]), 0.1)], ids=["coarse", "fine"]
+    ("linear", "around"), [(GRIDS["oblique"], 1e-5), (TURN @ np.diag([0.75, 2.0, 3.0]), 0.05)], ids=["coarse", "fine"]
 )
 def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow(linear, around):
     """On small voxels, too, where what lies around the mesh is interpolated."""
@@ -207,7 +207,8 @@ def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow(linea
     at = tuple(covered.voxel.T)
     away = np.abs(points + mean.reshape(-1, 3) - transform.place(points)[0]).reshape(mean.shape)
     assert away[at].max() < 1e-5
-    assert away.max() < around
+    assert np.percentile(away, 99) < around
+    assert away.max() < 5 * around
     total = transform.pose.displacement(transform.mesh.points, transform.u_mean)
     expected = np.sqrt(0.04 + submesh_variance(transform.mesh, total)[covered.cell])
     np.testing.assert_allclose(found[at], expected, rtol=1e-5)
