@@ -32,7 +32,7 @@ CLOSING = 3.0
 # How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
 MNI152_SKULL = 3.0
 # Its grid ends so many voxels beyond the skull.
-MNI152_MARGIN = 12
+MNI152_MARGIN = 8
 
 
 class Anatomy(NamedTuple):

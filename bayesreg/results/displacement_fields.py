@@ -13,7 +13,9 @@ from bayesreg.image import Image
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.store import Place
 from bayesreg.io.transforms import save_transform
+from bayesreg.mesh import TetMesh
 from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Pose
 from bayesreg.results.transform import Transform
 
@@ -23,8 +25,8 @@ MEAN, MEAN_INVERSE, ENSEMBLE = "transform_mean.h5", "transform_mean_inverse.h5",
 ENSEMBLE_SPACING = 0.2
 # Between the voxels of the mean's transforms, in mean edges of the mesh, rounded down to whole voxels of the image.
 MEAN_SPACING = 0.15
-# Written fields are multiples of this, mm: in the mesh, and around it, where nothing is observed.
-FIELD_STEP, STEP_AROUND = 2.0**-9, 2.0**-5
+# What is written is a multiple of this, mm: the mean in the mesh, around it, where nothing is observed, and the sd.
+MEAN_STEP, STEP_AROUND, SD_STEP = 2.0**-8, 2.0**-4, 2.0**-9
 # What the grid of an inverse reaches beyond the displaced mesh, mm.
 MARGIN = 10.0
 
@@ -51,8 +53,8 @@ class Moments(NamedTuple):
     def rounded(self) -> tuple[Float[np.ndarray, "X Y Z 3"], Float[np.ndarray, "X Y Z 3"]]:
         """Mean and standard deviation as they are written: rounded, so that files are small."""
         inside = (self.sd > 0).any(axis=-1, keepdims=True)
-        step = np.where(inside, np.float32(FIELD_STEP), np.float32(STEP_AROUND))
-        sd = np.maximum(np.rint(self.sd / np.float32(FIELD_STEP)), inside) * np.float32(FIELD_STEP)
+        step = np.where(inside, np.float32(MEAN_STEP), np.float32(STEP_AROUND))
+        sd = np.maximum(np.rint(self.sd / np.float32(SD_STEP)), inside) * np.float32(SD_STEP)
         return np.rint(self.mean / step) * step, sd
 
 
@@ -67,23 +69,36 @@ def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], gri
         Posterior standard deviation at the nodes, mm, along the axes of the moving image's world.
     grid : Image
     """
-    mesh, deformer = transform.mesh, transform.deformer
-    submesh = submesh_variance(mesh, transform.pose.displacement(mesh.points, transform.u_mean))
-    mean, sd = np.zeros((2, int(np.prod(grid.shape)), 3), np.float32)
-    squares, count = np.zeros((2, 3)), 0
+    mesh, pose = transform.mesh, transform.pose
+    step = _step(mesh, grid)
+    # Around the mesh, where the displacement is smooth and nothing is observed, that of every n-th voxel will do.
+    mean = _between(displacement_on(transform.mean, _every(grid, step)).field, step, grid.shape)
+    covered = covered_voxels(grid, mesh)
+    at = np.ravel_multi_index(tuple(covered.voxel.T), grid.shape)
+    corners = mesh.cells[covered.cell]
+    mean[at] = np.einsum("ka,kai->ki", covered.barycentric, transform.u_mean[corners])
     for some, points in grid.blocks():
-        location = deformer.locate(points)
-        u = transform.mean.displacement(points, location)
-        mean[some] = transform.pose.displacement(points, u)
-        inside = np.flatnonzero(deformer.is_inside(location))
-        cell = location.cell[inside]
-        nodal = np.einsum("ka,kai->ki", location.barycentric[inside], nodal_sd[mesh.cells[cell]]) ** 2
-        sd[some.start + inside] = np.sqrt(nodal + submesh[cell])
-        squares += nodal.sum(axis=0), submesh[cell].sum(axis=0)
-        count += len(inside)
-    parts = np.sqrt(squares.mean(axis=1) / max(count, 1))
-    shape = (*grid.shape, 3)
-    return Moments(mean.reshape(shape), sd.reshape(shape), dict(zip(("nodes", "mesh"), parts.tolist(), strict=True)))
+        mean[some] = pose.displacement(points, mean[some])
+    nodal = np.einsum("ka,kai->ki", covered.barycentric, nodal_sd[corners]) ** 2
+    beyond = submesh_variance(mesh, pose.displacement(mesh.points, transform.u_mean))[covered.cell]
+    sd = np.zeros_like(mean)
+    sd[at] = np.sqrt(nodal + beyond)
+    shape, parts = (*grid.shape, 3), {"nodes": nodal, "mesh": beyond}
+    rms = {name: float(np.sqrt(part.mean())) for name, part in parts.items()}
+    return Moments(mean.reshape(shape), sd.reshape(shape), rms)
+
+
+def _between(
+    field: Float[np.ndarray, "x y z 3"], step: Int[np.ndarray, "3"], shape: tuple[int, ...]
+) -> Float[np.ndarray, "voxels 3"]:
+    """A field of every n-th voxel, linearly interpolated at all of them, in the order of memory."""
+    for axis, (every, length) in enumerate(zip(step, shape, strict=True)):
+        before, share = np.divmod(np.arange(length), every)
+        after = np.minimum(before + 1, field.shape[axis] - 1)
+        weight = np.expand_dims((share / every).astype(np.float32), tuple({0, 1, 2, 3} - {axis}))
+        first = field.take(before, axis)
+        field = first + weight * (field.take(after, axis) - first) if every > 1 else first
+    return field.reshape(-1, 3)
 
 
 class OnGrid(NamedTuple):
@@ -137,7 +152,7 @@ def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
         tetrahedra, in which the field is linear, at every second, third, …
     """
     pose, upright = transform.pose, grid.on_orthogonal_grid(order=0)
-    there = _every(upright, np.floor(MEAN_SPACING * transform.mesh.boundary_edge / upright.voxel_sizes).astype(int))
+    there = _every(upright, _step(transform.mesh, upright))
     save_transform(place(MEAN), displacement_on(transform.mean, there).field, there, pose)
     back = around_displaced(there, transform.mesh.points + transform.u_mean)
     save_transform(place(MEAN_INVERSE), return_on(transform.mean, back).field, back, pose.inverse, pose_first=True)
@@ -145,9 +160,13 @@ def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
         _write_ensemble(place, transform, upright)
 
 
+def _step(mesh: TetMesh, grid: Image) -> Int[np.ndarray, "3"]:
+    """How many voxels lie between those at which the mean is written, by axis."""
+    return np.maximum(np.floor(MEAN_SPACING * mesh.boundary_edge / grid.voxel_sizes), 1).astype(int)
+
+
 def _every(grid: Image, step: Int[np.ndarray, "3"]) -> Image:
     """A grid of every n-th voxel centre along each axis, which reaches as far as the whole does."""
-    step = np.maximum(step, 1)
     shape = -(-(np.array(grid.shape) - 1) // step) + 1
     return Image(np.zeros(shape, np.int8), np.array(grid.affine) * np.append(step, 1))
 
