@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, box_mesh, flat_skull, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -15,7 +16,7 @@ FIXED, MOVING = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
 
 
 def build(f=FIXED, m=MOVING, mesh=MESH, skull=None, **options):
-    return br.build_posterior(f, m, mesh, model=br.ModelConfig(**options), skull=skull)
+    return posterior_of(f, m, mesh, skull, **options)
 
 
 def shifted(image, by):

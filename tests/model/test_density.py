@@ -10,6 +10,7 @@ import pytest
 
 import bayesreg as br
 from tests.oracles.paper import Paper, Prior
+from tests.options import posterior_of
 from tests.phantoms import PAPER_LAM, PAPER_MU, ball_mesh, flat_skull, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -53,7 +54,7 @@ def oracle(sampled, **options):
 
 def posterior(skull=None, **options):
     defaults = {"t_similarity": T_SIMILARITY, "t_elastic": T_ELASTIC, "fixed": {}}
-    return br.build_posterior(FIXED, MOVING, MESH, model=br.ModelConfig(**(defaults | options)), skull=skull)
+    return posterior_of(FIXED, MOVING, MESH, skull, **(defaults | options))
 
 
 def assert_same_density(found, expected, tolerance=1e-9):

@@ -15,6 +15,7 @@ from bayesreg.image import Image
 from bayesreg.model.observations.images.likelihood import ImageLikelihood
 from bayesreg.types import InputError
 from tests.model.test_gradients import assert_gradient
+from tests.options import image_options_of, model_of
 from tests.phantoms import box_mesh
 
 MESH = box_mesh(3, size=30.0)
@@ -24,14 +25,12 @@ FIXED, MOVING = (Image(RNG.normal(size=(21, 21, 21)), AFFINE) for _ in range(2))
 # mm: what is ignored lies below it, on a grid of its own.
 END = 12.0
 IGNORE = Image(np.arange(60)[:, None, None] * np.ones((60, 60, 60)) < 20, np.diag([0.6, 0.6, 0.6, 1.0]))
+MODEL = model_of(sampled="all", fixed={"lam": 1.0, "mu": 1.0})
 
 
 def build(similarity="ssd", t_similarity=4.0, interpolation="linear", **ignored):
-    model = br.ModelConfig(
-        sampled="all", fixed={"lam": 1.0, "mu": 1.0}, quadrature="gauss4", similarity=similarity,
-        t_similarity=t_similarity, interpolation=interpolation,
-    )  # fmt: skip
-    return br.build_posterior(mesh=MESH, observations=[br.ImagePair(FIXED, MOVING, **ignored)], model=model)
+    options = image_options_of(similarity=similarity, t_similarity=t_similarity, interpolation=interpolation)
+    return br.build_posterior(MESH, [br.ImagePair(FIXED, MOVING, **ignored, **options)], MODEL)
 
 
 def test_no_point_is_compared_where_the_fixed_image_is_ignored():
@@ -74,16 +73,12 @@ def test_the_gradient_is_that_of_differences(similarity):
 @pytest.mark.parametrize("smoothing", [0.0, 0.8])
 def test_intensities_that_are_ignored_change_nothing(similarity, smoothing):
     """Nor beside the mask, where smoothing, interpolation and descriptors would reach into it."""
-    model = br.ModelConfig(
-        sampled="all", fixed={"lam": 1.0, "mu": 1.0}, similarity=similarity, smoothing=smoothing, interpolation="cubic"
-    )
+    options = {"similarity": similarity, "smoothing": smoothing, "interpolation": "cubic"}
     voxels, fixed = np.array(MOVING.voxels), np.array(FIXED.voxels)
     voxels[:8], fixed[:8] = 1000.0, -500.0
     pairs = (FIXED, MOVING), (FIXED.with_voxels(fixed), MOVING.with_voxels(voxels))
     one, other = (
-        br.build_posterior(
-            mesh=MESH, observations=[br.ImagePair(*pair, fixed_ignore=IGNORE, moving_ignore=IGNORE)], model=model
-        )
+        br.build_posterior(MESH, [br.ImagePair(*pair, fixed_ignore=IGNORE, moving_ignore=IGNORE, **options)], MODEL)
         for pair in pairs
     )
     values = {**one.reference(), "u_boundary": RNG.normal(scale=0.1, size=MESH.points.shape)}

@@ -20,6 +20,7 @@ from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.pose import Pose
 from bayesreg.workflow.prediction import mean_values, predict
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -34,7 +35,7 @@ def images():
 
 def posterior(moving=None, **options):
     fixed, other = images()
-    return br.build_posterior(fixed, moving or other, MESH, model=br.ModelConfig(**(OPTIONS | options)))
+    return posterior_of(fixed, moving or other, MESH, **(OPTIONS | options))
 
 
 def values(seed=0, **temperatures):
@@ -89,7 +90,7 @@ def test_energy_is_what_the_correlations_leave_of_the_variance():
         (of_f, of_both), (_, of_m) = np.cov(f[inside], m[inside], aweights=w[inside], ddof=0)
         expected += w[inside].sum() * of_f * (1 - of_both**2 / (of_f * of_m))
     assert float(post.energies(state)["similarity_energy"]) == pytest.approx(expected, rel=20 * RIDGE)
-    squares = br.build_posterior(*images(), MESH, model=br.ModelConfig(**(OPTIONS | {"similarity": "ssd"})))
+    squares = posterior_of(*images(), MESH, **(OPTIONS | {"similarity": "ssd"}))
     assert expected < float(squares.energies(state)["similarity_energy"])
 
 
@@ -135,7 +136,7 @@ def test_a_smooth_bias_field_changes_little():
     for similarity in ("ssd", "lncc"):
         options = {"similarity": similarity, "quadrature": "gauss32", "window_mm": 8.0}
         # Where the images agree and nothing is left to explain.
-        found = br.build_posterior(moving, biased, MESH, model=br.ModelConfig(**(OPTIONS | options)))
+        found = posterior_of(moving, biased, MESH, **(OPTIONS | options))
         changes[similarity] = float(found.energies(found.reference())["similarity_energy"])
     assert 0 < changes["lncc"] < 0.01 * changes["ssd"]
 
