@@ -46,7 +46,6 @@ from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
 from bayesreg.model.coordinates import complete
-from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem as Data
 from bayesreg.workflow.preparation import prepare
@@ -144,8 +143,7 @@ def places(request: pytest.FixtureRequest, problem: Problem) -> Places:
 @lru_cache(maxsize=1)
 def _problem(mesh: str, interpolation: str) -> Problem:
     _forget()
-    model = ModelConfig(interpolation=interpolation)
-    posterior = _brain(mesh, model) if mesh in EDGES_OF_BRAINS else _ball(BALLS[mesh], model)
+    posterior = _brain(mesh, interpolation) if mesh in EDGES_OF_BRAINS else _ball(BALLS[mesh], interpolation)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
     return Problem(mesh, interpolation, posterior, posterior.condition(posterior.estimands(values)))
 
@@ -163,9 +161,10 @@ def _pair() -> Inputs:
     return prepare(br.load_config(DEMONSTRATION, [f"mesh.edge_length={EDGES_OF_BRAINS['0.8k']}"])).inputs
 
 
-def _brain(mesh: str, model: ModelConfig) -> Posterior:
+def _brain(mesh: str, interpolation: str) -> Posterior:
     pair = _pair()
-    return build_posterior(pair.fixed, pair.moving, pair.mesh if mesh == "0.8k" else _finer(mesh), model)
+    images = br.ImagePair(pair.fixed, pair.moving, interpolation=interpolation)
+    return build_posterior(pair.mesh if mesh == "0.8k" else _finer(mesh), [images])
 
 
 def _finer(mesh: str) -> TetMesh:
@@ -174,10 +173,10 @@ def _finer(mesh: str) -> TetMesh:
     return build_mesh(head.tissue, without_ridges(head.intracranial), MeshOptions(EDGES_OF_BRAINS[mesh]))
 
 
-def _ball(nodes: int, model: ModelConfig) -> Posterior:
+def _ball(nodes: int, interpolation: str) -> Posterior:
     mesh = mesh_of(nodes)
     fixed, moving = (smooth_image(mesh.points, (120,) * 3, seed=seed, blur=6.0) for seed in (0, 1))
-    return build_posterior(fixed, moving, mesh, model)
+    return build_posterior(mesh, [br.ImagePair(fixed, moving, interpolation=interpolation)])
 
 
 @lru_cache(maxsize=1)

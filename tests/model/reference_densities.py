@@ -79,7 +79,9 @@ def densities(posterior: br.Posterior, case: str) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Write the reference numbers of all cases."""
-    numbers = {f"{case}/{name}": value for case in CASES for name, value in densities(posterior_of_case(case), case).items()}
+    numbers = {
+        f"{case}/{name}": value for case in CASES for name, value in densities(posterior_of_case(case), case).items()
+    }
     np.savez_compressed(FILE, **numbers)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-import bayesreg as br
 from bayesreg.inference.gaussian.laplace import laplace
 from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.samplers.registry import choose_sampler

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 from scipy.special import betaln
 
-import bayesreg as br
 from bayesreg.model.priors import RangeTransform, ScaledBeta
 from tests.options import posterior_of
 from tests.phantoms import box_mesh, smooth_image

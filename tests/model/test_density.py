@@ -8,9 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-import bayesreg as br
-from tests.oracles.paper import Paper, Prior
 from tests.options import posterior_of
+from tests.oracles.paper import Paper, Prior
 from tests.phantoms import PAPER_LAM, PAPER_MU, ball_mesh, flat_skull, smooth_image
 
 MESH = ball_mesh(spacing=24.0)

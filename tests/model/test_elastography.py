@@ -11,8 +11,8 @@ import pytest
 
 import bayesreg as br
 from bayesreg.inference.draws.diagnostics import convergence
-from tests.oracles import paper
 from tests.options import posterior_of
+from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, pair_from_model
 
 MESH = ball_mesh(spacing=18.0)

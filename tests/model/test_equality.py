@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-import bayesreg as br
 from bayesreg.inference.gaussian.density import _height_and_slope
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
@@ -17,7 +16,9 @@ SKULL = flat_skull(MESH.points, axis=0, wall=21.0)
 
 def posterior(seed=1, mesh=MESH, skull=SKULL, shape=(14, 11, 16), **options):
     images = (smooth_image(mesh.points, shape, seed=seed + k) for k in range(2))
-    return posterior_of(*images, mesh, skull, **{"interpolation": "cubic", "rigid_sd": 1.0, "t_similarity": 0.5, **options})
+    return posterior_of(
+        *images, mesh, skull, **{"interpolation": "cubic", "rigid_sd": 1.0, "t_similarity": 0.5, **options}
+    )
 
 
 def mode(of):

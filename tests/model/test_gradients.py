@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import bayesreg as br
 from bayesreg.model.blocks import Scale
 from tests.options import posterior_of
 from tests.phantoms import LAM, MU, PAPER_LAM, PAPER_MU, ball_mesh, smooth_image

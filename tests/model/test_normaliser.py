@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import bayesreg as br
 from bayesreg.inference.target import logdensity, without_normaliser
 from tests.model.test_gradients import assert_gradient
-from tests.oracles import paper
 from tests.options import posterior_of
+from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, linear_image, smooth_image
 
 MESH = ball_mesh(spacing=24.0)

@@ -15,8 +15,8 @@ from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.model.options import PriorConfig
 from tests.model.test_gradients import assert_gradient
-from tests.oracles import paper
 from tests.options import model_of, posterior_of
+from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, box_mesh, refined, smooth_image
 
 MESH = ball_mesh(spacing=30.0)

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-import bayesreg as br
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
 from bayesreg.model.elastic.skull import is_allowed
 from bayesreg.model.state import state_of
-from tests.oracles.paper import in_skull
 from tests.options import posterior_of
+from tests.oracles.paper import in_skull
 from tests.phantoms import ball_mesh, flat_skull, rotated_affine, smooth_image
 
 CORNERS = np.array(list(product((-40.0, 40.0), repeat=3)))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import bayesreg as br
 from tests.model.test_gradients import assert_gradient
 from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
