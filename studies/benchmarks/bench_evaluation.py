@@ -256,15 +256,16 @@ def machine() -> floor.Machine:
 def at_one_place(problem: Problem, places: Places, peer: str) -> tuple[Callable[..., Any], list[np.ndarray]]:
     """A peer, and what it is handed for the first chain; there it finds what we do."""
     posterior, order = problem.posterior, {"linear": 1, "cubic": 3}[problem.interpolation]
+    pair = posterior.observations["images"]
     values = posterior.constrain(jax.tree.map(lambda x: x[0], places.positions))
     if peer in SOLVERS:
         arguments = [np.asarray(values[name]) for name in ("u_boundary", "lam", "mu")]
-        density = log_density(posterior.mesh, posterior.fixed, posterior.moving, order, SOLVERS[peer])
+        density = log_density(posterior.mesh, pair.fixed, pair.moving, order, SOLVERS[peer])
         assert np.isclose(density(*arguments), float(posterior.logdensity_constrained(values)), rtol=1e-9)
         return density, arguments
     images = posterior.images
     points = images.places(posterior.evaluate(values).u)
-    image, arguments = _image(posterior.moving, order), [np.asarray(points)]
+    image, arguments = _image(pair.moving, order), [np.asarray(points)]
     assert np.allclose(image(*arguments), images.moving(points), rtol=1e-9)
     return image, arguments
 

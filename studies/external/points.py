@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from bayesreg.report.landmarks import surprise
+from bayesreg.model.observations.landmarks_report import surprise
 
 from bayesreg.io.points import read_point_pairs
 from bayesreg.model.submesh import submesh_variance
