@@ -5,8 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 import bayesreg as br
+from bayesreg.pose import Pose
+from bayesreg.workflow.prediction import mean_values, predict
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -50,6 +53,30 @@ def test_known_ones_may_differ():
     before, after = (post.energies(post.reference()) for post in (same, other))
     assert float(before["images"]) == float(after["images"])
     assert float(after["flair"]) == pytest.approx(2 / 3 * float(before["flair"]), rel=1e-12)
+
+
+def test_both_are_checked_for_fit():
+    """Each as it is alone."""
+    given, chains, draws = pairs(KNOWN, KNOWN), 2, 3
+    both, *alone = (br.build_posterior(MESH, some) for some in (given, given[:1], given[1:]))
+    u = np.random.default_rng(0).normal(size=(chains, draws, len(MESH.boundary), 3))
+    lame = {name: np.broadcast_to(both.reference()[name], (chains, draws, 3)) for name in ("lam", "mu")}
+    dims = {"u_boundary": ("node", "axis"), "lam": ("tissue",), "mu": ("tissue",)}
+    posterior = xr.Dataset({n: (("chain", "draw", *dims[n]), x) for n, x in {"u_boundary": u, **lame}.items()})
+
+    def predicted(post):
+        still, places = np.zeros_like(MESH.points), {"here": tuple(MESH.points.mean(axis=0))}
+        mean = mean_values(post, posterior, still)
+        return predict(post, posterior, mean, still, still, places, 0, Pose.identity()).observations
+
+    found = predicted(both)
+    for name, post in zip(("images", "flair"), alone, strict=True):
+        expected = predicted(post)
+        assert {f"{name}/observed", f"{name}/replicated", f"{name}/residual"} <= set(expected)
+        assert found[f"{name}/observed"].shape[:2] == (chains, draws)
+        for key, value in expected.items():
+            np.testing.assert_allclose(found[key], value, rtol=1e-6, atol=1e-6)
+    assert abs(found["images/observed"] - found["flair/observed"]).max() > 0.01
 
 
 def test_a_name_that_another_pair_has_is_refused():

@@ -13,6 +13,7 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.image import Image
 from bayesreg.model.observations.images.likelihood import ImageLikelihood
+from bayesreg.model.state import state_of
 from bayesreg.types import InputError
 from tests.model.test_gradients import assert_gradient
 from tests.options import image_options_of, model_of
@@ -57,6 +58,31 @@ def test_the_density_is_that_of_noise_where_one_looks_and_of_any_intensity_elsew
     hidden = kind(loc=f.mean(), scale=np.sqrt(scale**2 + f.var()))
     expected = share * kind(scale=scale).logpdf(f - m) + (1 - share) * hidden.logpdf(f)
     assert float(post.energies(values)["images"]) == pytest.approx(expected.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("similarity", ["ssd", "student_t"])
+def test_replicates_are_drawn_from_the_density(similarity):
+    """By SciPy's distributions: m and noise where one looks, any intensity of f and noise where one does not."""
+    post, count = build(similarity, moving_ignore=IGNORE), 400
+    displacement = np.random.default_rng(3).normal(size=MESH.points.shape)
+    values = post.fill({**post.reference(), "u_boundary": displacement})
+    state, term = state_of(post.data.body, post.data.blocks, values), post.data.terms["images"]
+    replicates = np.asarray(term.likelihood(state).sample(jax.random.key(0), (count,)))
+    places = term.places(displacement)
+    f, m, w = (np.asarray(x) for x in (term.fixed_values, term.moving(places), term.quadrature.weights))
+    noise, variance = stats.norm() if similarity == "ssd" else stats.t(4.0), 4.0 / (2 * w)
+    x = np.asarray(places)[:, 0]
+    hidden, seen = x < END, x > END + 1.5
+    assert min(hidden.sum(), seen.sum()) > 50
+    for points, mean, scale in (
+        (seen, m, np.sqrt(variance)),
+        (hidden, np.full_like(f, f.mean()), np.sqrt(variance + f.var())),
+    ):
+        z = ((replicates - mean) / scale)[:, points]
+        assert stats.kstest(z.ravel(), noise.cdf).pvalue > 1e-3
+        of_points = z.mean(axis=0) * np.sqrt(count) / noise.std()
+        assert abs(of_points).max() < 5
+        assert (of_points**2).mean() == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.parametrize("similarity", ["ssd", "student_t", "lncc"])

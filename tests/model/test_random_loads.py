@@ -128,19 +128,20 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("prior", "says"),
     [
-        ({"sampled": "boundary"}, "sampled"),
-        ({"normalised": False}, "proper density"),
-        ({"t_elastic": 5.0}, "t_elastic"),
-        ({"body_load": None}, "random loads need its size"),
-        ({"elastic_prior": "boltzmann"}, "belong to elastic_prior: loads"),
-        ({"held": {0: (0.0, 0.0, 0.0)}}, "held"),
+        ({"kind": "loads", "nodes": "boundary"}, "loads.nodes"),
+        ({"kind": "loads", "normalised": False}, "loads.normalised"),
+        ({"kind": "loads", "temperature": 5.0}, "loads.temperature"),
+        ({"kind": "loads", "held": {0: (0.0, 0.0, 0.0)}}, "loads.held"),
+        ({"kind": "loads", "body": None}, "loads.body"),
+        ({"kind": "boltzmann", "body": 0.3}, "boltzmann.body"),
+        ("load", "'load' found using 'kind'"),
     ],
 )
-def test_options_that_do_not_go_together(change, says):
+def test_a_prior_has_no_option_of_the_other(prior, says):
     with pytest.raises(ValueError, match=says):
-        br.ModelConfig(**(OPTIONS | change))
+        br.ModelConfig(elastic_prior=prior)
 
 
 def test_its_parts_are_those_of_the_mesh():
@@ -150,7 +151,13 @@ def test_its_parts_are_those_of_the_mesh():
 
 
 def test_the_preset_is_a_model_that_what_is_given_replaces():
-    preset = br.ModelConfig(preset="registration", most_points=10)
-    assert (preset.elastic_prior, preset.sampled, preset.most_points) == ("loads", "all", 10)
+    preset = br.ModelConfig(preset="registration")
+    assert preset.elastic_prior == br.RandomLoads()
+    assert preset.elastic_prior.nodes == "all"
     assert br.ModelConfig(**preset.model_dump()) == preset
+    assert br.ModelConfig(preset="registration", elastic_prior={"body": 0.2}).elastic_prior == br.RandomLoads(body=0.2)
+    boltzmann = br.Boltzmann(temperature=5.0)
+    for given in (boltzmann, {"kind": "boltzmann", "temperature": 5.0}):
+        assert br.ModelConfig(preset="registration", elastic_prior=given).elastic_prior == boltzmann
     assert br.ModelConfig() == br.ModelConfig(preset="paper")
+    assert br.ModelConfig(elastic_prior={"temperature": 5.0}).elastic_prior == boltzmann
