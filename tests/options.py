@@ -38,7 +38,7 @@ def image_options_of(**options: Any) -> dict[str, Any]:
 
 
 def posterior_of(
-    fixed: br.Image, moving: br.Image, mesh: br.TetMesh, skull: br.Image | None = None, reference: Any = None,
+    fixed: br.Image, moving: br.Image, mesh: br.TetMesh, /, skull: br.Image | None = None, reference: Any = None,
     **options: Any,
 ) -> br.Posterior:  # fmt: skip
     """The posterior of one pair of images."""

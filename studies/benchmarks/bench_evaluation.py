@@ -46,7 +46,6 @@ from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.build import build_posterior
 from bayesreg.model.coordinates import complete
-from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.program import Problem as Data
 from bayesreg.workflow.preparation import prepare
@@ -144,8 +143,7 @@ def places(request: pytest.FixtureRequest, problem: Problem) -> Places:
 @lru_cache(maxsize=1)
 def _problem(mesh: str, interpolation: str) -> Problem:
     _forget()
-    model = ModelConfig(interpolation=interpolation)
-    posterior = _brain(mesh, model) if mesh in EDGES_OF_BRAINS else _ball(BALLS[mesh], model)
+    posterior = _brain(mesh, interpolation) if mesh in EDGES_OF_BRAINS else _ball(BALLS[mesh], interpolation)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
     return Problem(mesh, interpolation, posterior, posterior.condition(posterior.estimands(values)))
 
@@ -163,9 +161,10 @@ def _pair() -> Inputs:
     return prepare(br.load_config(DEMONSTRATION, [f"mesh.edge_length={EDGES_OF_BRAINS['0.8k']}"])).inputs
 
 
-def _brain(mesh: str, model: ModelConfig) -> Posterior:
+def _brain(mesh: str, interpolation: str) -> Posterior:
     pair = _pair()
-    return build_posterior(pair.fixed, pair.moving, pair.mesh if mesh == "0.8k" else _finer(mesh), model)
+    images = br.ImagePair(pair.fixed, pair.moving, interpolation=interpolation)
+    return build_posterior(pair.mesh if mesh == "0.8k" else _finer(mesh), [images])
 
 
 def _finer(mesh: str) -> TetMesh:
@@ -174,10 +173,10 @@ def _finer(mesh: str) -> TetMesh:
     return build_mesh(head.tissue, without_ridges(head.intracranial), MeshOptions(EDGES_OF_BRAINS[mesh]))
 
 
-def _ball(nodes: int, model: ModelConfig) -> Posterior:
+def _ball(nodes: int, interpolation: str) -> Posterior:
     mesh = mesh_of(nodes)
     fixed, moving = (smooth_image(mesh.points, (120,) * 3, seed=seed, blur=6.0) for seed in (0, 1))
-    return build_posterior(fixed, moving, mesh, model)
+    return build_posterior(mesh, [br.ImagePair(fixed, moving, interpolation=interpolation)])
 
 
 @lru_cache(maxsize=1)
@@ -257,15 +256,16 @@ def machine() -> floor.Machine:
 def at_one_place(problem: Problem, places: Places, peer: str) -> tuple[Callable[..., Any], list[np.ndarray]]:
     """A peer, and what it is handed for the first chain; there it finds what we do."""
     posterior, order = problem.posterior, {"linear": 1, "cubic": 3}[problem.interpolation]
+    pair = posterior.observations["images"]
     values = posterior.constrain(jax.tree.map(lambda x: x[0], places.positions))
     if peer in SOLVERS:
         arguments = [np.asarray(values[name]) for name in ("u_boundary", "lam", "mu")]
-        density = log_density(posterior.mesh, posterior.fixed, posterior.moving, order, SOLVERS[peer])
+        density = log_density(posterior.mesh, pair.fixed, pair.moving, order, SOLVERS[peer])
         assert np.isclose(density(*arguments), float(posterior.logdensity_constrained(values)), rtol=1e-9)
         return density, arguments
     images = posterior.images
     points = images.places(posterior.evaluate(values).u)
-    image, arguments = _image(posterior.moving, order), [np.asarray(points)]
+    image, arguments = _image(pair.moving, order), [np.asarray(points)]
     assert np.allclose(image(*arguments), images.moving(points), rtol=1e-9)
     return image, arguments
 

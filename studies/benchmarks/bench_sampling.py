@@ -8,17 +8,17 @@ import pytest
 
 from bayesreg.inference.chains.run import sample
 from bayesreg.model.build import build_posterior
-from bayesreg.model.options import ModelConfig
+from bayesreg.model.observations.images.pair import ImagePair
 from tests.phantoms import ball_mesh, smooth_image
 
 REPETITIONS = 9
 STEPS_PER_SECOND = 50  # What each of three chains should make on two cores; the paper's made 5.
 
 
-def _posterior(model: ModelConfig):
+def _posterior():
     mesh = ball_mesh(radius=70, spacing=16)
     fixed = smooth_image(mesh.points, (60, 60, 60))
-    return build_posterior(fixed, smooth_image(mesh.points, (60, 60, 60), seed=1), mesh, model)
+    return build_posterior(mesh, [ImagePair(fixed, smooth_image(mesh.points, (60, 60, 60), seed=1))])
 
 
 def _median(function, *arguments):
@@ -33,7 +33,7 @@ def _median(function, *arguments):
 
 @pytest.mark.parametrize("chains", [pytest.param(chains, id=f"0.8k-{chains}") for chains in (3, 16)])
 def bench_steps_of_the_papers_sampler(chains):
-    posterior = _posterior(ModelConfig())
+    posterior = _posterior()
     blocks: list[float] = []
     sample(
         posterior,

@@ -25,7 +25,7 @@ import numpy as np
 
 from bayesreg.inference.target import estimands_of, logdensity
 from bayesreg.model.build import build_posterior
-from bayesreg.model.options import ModelConfig
+from bayesreg.model.observations.images.pair import ImagePair
 from bayesreg.model.posterior import Posterior
 from studies.benchmarks.bench_sampling import _median
 from studies.benchmarks.places import scattered
@@ -111,8 +111,8 @@ def phantom(nodes: int, voxels: bool) -> Posterior:
     mesh = mesh_of(nodes)
     shape = (184,) * 3 if voxels else (120,) * 3
     fixed, moving = (smooth_image(mesh.points, shape, seed=seed, blur=6.0) for seed in (0, 1))
-    model = ModelConfig(interpolation="cubic", quadrature="voxels" if voxels else "gauss4")
-    return build_posterior(fixed, moving, mesh, model)
+    images = ImagePair(fixed, moving, interpolation="cubic", quadrature="voxels" if voxels else "gauss4")
+    return build_posterior(mesh, [images])
 
 
 if __name__ == "__main__":

@@ -61,19 +61,16 @@ def phantom(
 def posterior(found: Phantom, mode: str, modes: int = 300, correlation: float = 20.0) -> br.Posterior:
     """λ/μ of the tissue known (ν = 0.45), the field unknown."""
     held = {int(node): tuple(found.u[node].tolist()) for node in found.mesh.boundary}
-    temperature = br.TemperaturePrior(median=100.0, log_sd=2.0)
-    joint = {"normalised": True, "t_elastic": temperature}
-    known = {"sampled": [], "held": held} if mode == "elastography" else joint
+    joint = br.Boltzmann(temperature=br.ScalePrior(median=100.0, log_sd=2.0), normalised=True)
     model = br.ModelConfig(
         elasticity="field",
         field=FieldConfig(modes=modes, correlation=correlation),
         fixed={"lam": LAM, "mu": MU},
-        t_similarity=found.t_similarity,
-        quadrature="voxels",
-        interpolation="cubic",
-        **known,
+        elastic_prior=br.Boltzmann(nodes=[], held=held) if mode == "elastography" else joint,
     )
-    return br.build_posterior(found.fixed, found.moving, found.mesh, model=model)
+    similarity = br.SquaredDifferences(temperature=found.t_similarity)
+    images = br.ImagePair(found.fixed, found.moving, similarity=similarity, quadrature="voxels", interpolation="cubic")
+    return br.build_posterior(found.mesh, [images], model)
 
 
 def judged(found: Phantom, post: br.Posterior, idata) -> dict[str, float]:

@@ -88,7 +88,7 @@ def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
         path, out = write_pair(folder), folder / "run"
         br.save_mesh(ball_mesh(38, spacing_of(nodes)), folder / "mesh.vtu")
         settings = YAML(typ="safe").load(path)
-        settings["model"]["sampled"] = "all"
+        settings["model"]["elastic_prior"] = {"nodes": "all"}
         YAML(typ="safe").dump(settings, path)
         config = load_config(path)
         inputs, provenance = prepared_inputs(config)

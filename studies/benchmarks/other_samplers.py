@@ -4,7 +4,7 @@
 
 RUN is a run's folder; without it a phantom is registered, a ball pressed in from the side, with a wall above it. All
 chains start at the same places, overdispersed about the mode. The search for it is on nobody's account, its last
-seconds on that of `hmc`. The others sample `Posterior.logdensity_of`, its elastic solves as for chains of `hmc`, in
+seconds on that of `hmc`. The others sample `bayesreg.inference.target.logdensity`, its elastic solves as for chains of `hmc`, in
 unconstrained coordinates and in those that `hmc` has whitened by the end of its warm-up: these they are given.
 
 - Warm-up counts, and takes the others a third of the budget. Compilation does not, tracing included; it is told.
@@ -17,7 +17,7 @@ unconstrained coordinates and in those that `hmc` has whitened by the end of its
 - tinyDA's adaptive Metropolis learns a covariance once it has d draws, and draws by Cholesky's factor here: its own way
   is a singular value decomposition for each draw. Its MALA is handed the gradient with the density: its own way are
   finite differences.
-- The skull is a hard wall, where the density is zero: `hmc` is reflected there, the others can only refuse.
+- The skull is a soft wall.
 
 Evaluations are those after the warm-up. Rates in parentheses are worth nothing: chains whose R̂ is above 1.1 have yet
 to meet, and the effective sample size of a short one is about that of so many chains.
@@ -44,6 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import bayesreg as br
+from bayesreg.inference import target as targets
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.initialise import Start
 from bayesreg.inference.chains.run import first_checkpoint, sample
@@ -138,8 +139,8 @@ def phantom() -> tuple[br.Posterior, Start]:
     noise = 0.003 * np.random.default_rng(0).normal(size=moving.shape)
     fixed = moving.with_voxels(moving.interpolate(points + pressed, "cubic") + noise)
     skull = flat_skull(mesh.points, axis=2, wall=mesh.points[:, 2].max() + 0.5, voxel=2.0)
-    model = br.ModelConfig(interpolation="cubic", t_similarity=0.01, fixed={"mu": {"gm": 1.0}})
-    return br.build_posterior(fixed, moving, mesh, model, skull), Start()
+    images = br.ImagePair(fixed, moving, similarity=br.SquaredDifferences(temperature=0.01), interpolation="cubic")
+    return br.build_posterior(mesh, [images], br.ModelConfig(fixed={"mu": {"gm": 1.0}}), skull), Start()
 
 
 def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.ndarray, Checkpoint, Moment]:
@@ -188,7 +189,7 @@ def position(posterior: Any, gaussian: Gaussian | None, x: jax.Array) -> dict[st
 
 def logdensity(posterior: Any, data: Any, gaussian: Gaussian | None, x: jax.Array) -> jax.Array:
     """Of flat coordinates; whitening is linear, and leaves out a constant."""
-    return logdensity(posterior, data, position(posterior, gaussian, x))
+    return targets.logdensity(posterior, data, position(posterior, gaussian, x))
 
 
 value = jax.jit(logdensity, static_argnums=0)

@@ -30,6 +30,7 @@ from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import checkpoints, store
 from bayesreg.model.coordinates import complete
+from bayesreg.model.observations.images.pointwise import SumOfSquaredDifferences
 from bayesreg.workflow.assembly import posterior_of
 from studies.benchmarks.bench_sampling import _median
 
@@ -47,7 +48,7 @@ def main() -> None:
     arrays = checkpoints.load_state(given.run)
     if (
         options.name != "hmc"
-        or posterior.options.similarity != "ssd"
+        or not isinstance(posterior.images.similarity, SumOfSquaredDifferences)
         or posterior.data.body.field is not None
         or not arrays
     ):

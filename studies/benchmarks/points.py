@@ -110,9 +110,10 @@ def prior_covariances(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
     unit = box_mesh(CELLS_PER_SIDE, 1.0)
     mesh = br.TetMesh.from_arrays(unit.points * (high - low) + low, unit.cells, 0 * unit.tissue, ("tissue",))
-    model = br.ModelConfig(elasticity="uniform", fixed={"lam": LAM, "mu": MU}, t_elastic=1.0, rigid_sd=RIGID_SD)
+    elastic, known = br.Boltzmann(temperature=1.0), {"lam": LAM, "mu": MU}
+    model = br.ModelConfig(elasticity="uniform", fixed=known, elastic_prior=elastic, rigid_sd=RIGID_SD)
     marks = br.Landmarks(points, points, sd=1.0)
-    posterior = br.build_posterior(mesh=mesh, observations=[marks], model=model)
+    posterior = br.build_posterior(mesh, [marks], model)
     data = posterior.data.without_term("landmarks")
     precision = posterior.mode_search.curvature(data, posterior.estimands(posterior.reference())).gauss_newton
     modes, term = np.asarray(data.terms["rigid"].modes), posterior.data.terms["landmarks"]

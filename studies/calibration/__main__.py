@@ -18,7 +18,7 @@ import numpy as np
 
 import bayesreg as br
 from studies.calibration import carried, external, figures, geweke, mesh_share, pairs, sbc
-from studies.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, posterior_of
+from studies.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, calibrated
 
 # Wrong on purpose, and to be found out: T_s held at 1.5 times its true value, the elastic prior without its normaliser.
 PLANTED: dict[str, dict[str, Any]] = {
@@ -50,7 +50,7 @@ def calibrate_by_simulation(out: Path) -> dict[str, Any]:
     for name, options in PLANTED.items():
         say(f"calibration, planted error: {name}")
         variant = VARIANTS["no skull"]
-        posterior, settings = posterior_of(variant, **options), sbc.Settings(replications=100)
+        posterior, settings = calibrated(variant, **options), sbc.Settings(replications=100)
         runs[name] = sbc.calibrate(Simulator(variant), posterior, settings, say=say)
     found = {}
     for name, ranks in runs.items():
@@ -85,7 +85,7 @@ def compare_simulators(out: Path) -> dict[str, Any]:
     """Geweke's test of each kernel, with the skull, and of a planted error."""
     simulator, found = Simulator(VARIANTS["skull"]), {}
     trials: dict[str, tuple[str, br.Posterior | None]] = {name: (name, None) for name in GEWEKE_STEPS}
-    wrong = posterior_of(VARIANTS["skull"], **PLANTED["T_s 1.5 times too high"])
+    wrong = calibrated(VARIANTS["skull"], **PLANTED["T_s 1.5 times too high"])
     trials["hmc, T_s 1.5 times too high"] = ("hmc", wrong)
     for name, (sampler, posterior) in trials.items():
         say(f"Geweke's test: {name}")

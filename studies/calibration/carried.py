@@ -15,9 +15,9 @@ import numpy as np
 
 from bayesreg.fem.deformation import Deformer, Displaced
 from bayesreg.image import Image
+from bayesreg.model.observations.landmarks_report import surprise
 from bayesreg.model.submesh import submesh_variance
 from bayesreg.pose import Pose
-from bayesreg.report.landmarks import surprise
 from bayesreg.results.carried_labels import carry_labels
 from bayesreg.results.transform import Transform, spread
 from studies.calibration import sbc

@@ -48,7 +48,8 @@ BODIES = 30
 DISPLACEMENT, NOISE_SD = 10.0, 0.01
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 SECONDS = 90.0
-MODEL = br.ModelConfig(t_similarity={"median": 0.1, "log_sd": 1.0}, interpolation="cubic")
+MODEL = br.ModelConfig()
+IMAGE_OPTIONS = {"similarity": br.SquaredDifferences(temperature=br.ScalePrior(median=0.1)), "interpolation": "cubic"}
 
 Say = Callable[[str], None]
 Made = TypeVar("Made")
@@ -129,7 +130,7 @@ def register_bodies(folder: Path, say: Say = print) -> Response:
     shared = anatomy(folder, same_mesh=False)
     (making,) = meshes(folder, [BODIES_EDGE])
     lam, mu = (dict(zip(making.names, values.tolist(), strict=True)) for values in (TRUE_LAM, TRUE_MU))
-    subject = Subject(*shared[:3], making, shared.registering, MODEL, lam, mu, DISPLACEMENT, NOISE_SD)
+    subject = Subject(*shared[:3], making, shared.registering, MODEL, IMAGE_OPTIONS, lam, mu, DISPLACEMENT, NOISE_SD)
     found = []
     for seed in range(1, BODIES + 1):
         path = folder / f"body_{seed:02d}.json"
@@ -154,7 +155,8 @@ def allowing_for(known: Response, pair: dict[str, Any], seed: int) -> dict[str, 
 def register(shared: Anatomy, pair: SyntheticPair, seed: int) -> dict[str, Any]:
     """Intervals of λ/μ on the mesh, and how well the sampling and the model do."""
     skull = shared.skull if shared.making.digest == shared.registering.digest else None
-    posterior = br.build_posterior(pair.fixed, pair.moving, shared.registering, MODEL, skull)
+    images = br.ImagePair(pair.fixed, pair.moving, **IMAGE_OPTIONS)
+    posterior = br.build_posterior(shared.registering, [images], MODEL, skull)
     rule = StopRule(rhat=1.01, ess=400, max_seconds=SECONDS)
     samples = br.sample(posterior, "hmc", chains=4, draws=1500, seed=seed, stop=rule, progress=False)
     draws, judged = dataset(samples.idata, "posterior"), convergence(samples.idata)

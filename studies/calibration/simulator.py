@@ -21,6 +21,7 @@ from scipy.linalg import solve_triangular
 import bayesreg as br
 from bayesreg.inference.target import without_normaliser
 from bayesreg.mesh import TetMesh
+from tests.options import posterior_of
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
@@ -64,16 +65,14 @@ class Variant(NamedTuple):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of `ModelConfig`."""
-        elastic = {"t_elastic": T_ELASTIC}
+        """Of the model and of the pair of images (`tests.options`)."""
+        elastic: dict[str, Any] = {"t_elastic": T_ELASTIC, "normalised": True}
         if self.loads:
-            elastic = {"elastic_prior": "loads", "sampled": "all", "similarity": "student_t",
-                       "degrees_of_freedom": DEGREES_OF_FREEDOM}  # fmt: skip
+            elastic = {"similarity": "student_t", "degrees_of_freedom": DEGREES_OF_FREEDOM}
         return {
             "fixed": {"mu": {"gm": 2.0}} if self.inferred else {},
             "priors": dict.fromkeys(LAME, PRIOR),
             "t_similarity": T_SIMILARITY,
-            "normalised": True,
             "interpolation": "cubic",
             "rigid_sd": RIGID_SD,
             **elastic,
@@ -89,12 +88,12 @@ VARIANTS = {
 }
 
 
-def posterior_of(variant: Variant, **planted: Any) -> br.Posterior:
+def calibrated(variant: Variant, **planted: Any) -> br.Posterior:
     """The density under test; `planted` are options that are wrong on purpose."""
     moving = smooth_image(MESH.points, seed=1, blur=2.0)
     skull = flat_skull(MESH.points, axis=0, wall=WALL, voxel=1.0) if variant.skull else None
     # The fixed image is replaced at the quadrature points, one replication after another.
-    return br.build_posterior(moving, moving, MESH, br.ModelConfig(**variant.options | planted), skull)
+    return posterior_of(moving, moving, MESH, skull, **variant.options | planted)
 
 
 class Simulator:
@@ -109,7 +108,7 @@ class Simulator:
 
     def __init__(self, variant: Variant, mesh: TetMesh = MESH) -> None:
         self.variant, self.mesh = variant, mesh
-        self.posterior = posterior_of(variant)
+        self.posterior = calibrated(variant)
 
     @cached_property
     def unit_stiffness(self) -> dict[str, np.ndarray]:
@@ -186,7 +185,7 @@ def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> A
     u, images = posterior.evaluate_estimands(without_normaliser(posterior, data), estimands).u, data.terms["images"]
     t_similarity = estimands.get("t_similarity", data.blocks["t_similarity"].reference())
     scale = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
-    if posterior.options.similarity == "student_t":
+    if isinstance(posterior.observations["images"].options.similarity, br.StudentT):
         return images.predicted(u) + scale * jax.random.t(key, DEGREES_OF_FREEDOM, scale.shape)
     return images.predicted(u) + scale * jax.random.normal(key, scale.shape)
 

@@ -26,7 +26,7 @@ from studies.external.make_pair import GLIA, GM, WHITE, data_folder, read_anatom
 
 NOISE = 0.03
 LEVELS = (0.5, 0.9, 0.95)
-SETTINGS = ("mesh.edge_length=30.0", "model.most_points=30000", "stop.max_minutes=3.0")
+SETTINGS = ("mesh.edge_length=30.0", "observations=[{kind: images, most_points: 30000}]", "stop.max_minutes=3.0")
 
 
 def rigid_motion(seed: int, millimetres: float, degrees: float, centre: np.ndarray) -> np.ndarray:

@@ -88,7 +88,9 @@ def _require_ratios(result: Result) -> None:
             "free"
         )
     if run.boundary is not None or model.elastic_prior.held or model.elastic_prior.samples_no_node:
-        raise InputError("bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.held)")
+        raise InputError(
+            "bodies move elsewhere than the run: its nodes must not be held (known_boundary, model.elastic_prior.held)"
+        )
     if list(run.manifest["observations"]) != ["images"]:
         raise InputError(
             "bodies are registered by one pair of images: the run must have observed nothing else; this one observed "

@@ -41,9 +41,9 @@ class Subject(NamedTuple):
     making, registering : TetMesh
         A finer mesh, and the one in question.
     model : ModelConfig
+        Of the registration.
     image_options : mapping
         How the pair of images is compared (`bayesreg.ImagePair`).
-        Options of the registration.
     lam, mu : mapping
         Tissue name to the value of a fluid, or to one about which those of a solid tissue lie.
     displacement, noise_sd, smoothing_mm : float
@@ -108,9 +108,8 @@ def register_body(subject: Subject, seed: int) -> Body:
     true = {name: lam[name] / mu[name] for name in tissues}
     try:
         pair = _push(subject, rng, *(np.array([values[name] for name in names]) for values in (lam, mu)))
-        values, inverted = _mode(
-            build_posterior(subject.registering, [ImagePair(pair.fixed, pair.moving, **subject.image_options)], model)
-        )
+        images = ImagePair(pair.fixed, pair.moving, **subject.image_options)
+        values, inverted = _mode(build_posterior(subject.registering, [images], model))
     except InputError as error:
         return Body(seed, true, {}, str(error))
     ratios = np.asarray(values["lam"]) / np.asarray(values["mu"])

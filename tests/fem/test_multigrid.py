@@ -15,6 +15,7 @@ from bayesreg.fem import equilibrium, preconditioners
 from bayesreg.fem.elasticity import rigid_modes, stiffness, unknowns_of
 from bayesreg.fem.multigrid import Multigrid, multigrid
 from bayesreg.inference.target import logdensity
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, PAPER_LAM, PAPER_MU, ball_mesh, smooth_image
 
 RNG = np.random.default_rng(0)
@@ -137,8 +138,7 @@ def test_a_posterior_of_a_large_mesh_is_compiled_once(monkeypatch):
     monkeypatch.setattr(preconditioners, "DENSE_LIMIT", 100)
     mesh = ball_mesh(spacing=13.0)
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
-    post = br.build_posterior(*images, mesh, model=br.ModelConfig(interpolation="cubic"))
-    assert post.single_nodes is None
+    post = posterior_of(*images, mesh, interpolation="cubic")
     values = post.reference()
     here = post.condition(post.estimands(values))
     there = post.condition(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))

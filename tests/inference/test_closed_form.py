@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from tests.options import posterior_of
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, linear_image, rotated_affine, smooth_image
 
@@ -21,6 +22,8 @@ MESH = box_mesh(2)
 LAM, MU = np.array([0.5, 1.0, 1.5]), np.array([0.7, 1.0, 1.4])
 OFFSET, GRADIENT = 0.4, np.array([0.03, -0.02, 0.04])
 TEMPERATURES = {"t_similarity": 1.0, "t_elastic": 20.0, "rigid_sd": 0.3}
+KNOWN = {name: dict(zip(MESH.names, values, strict=True)) for name, values in (("lam", LAM), ("mu", MU))}
+OPTIONS = {"fixed": KNOWN, **TEMPERATURES}
 WALL, FAR, VOXEL = 21.0, 45.0, 2.0
 WIDTH = 0.15
 
@@ -43,12 +46,10 @@ def problem() -> Problem:
     # What the moving image shows after a shift by (0.8, -0.5, 0.3) mm, and a texture that it cannot explain.
     ramp = OFFSET + (texture.grid_points() + np.array([0.8, -0.5, 0.3])) @ GRADIENT
     fixed = br.Image(ramp + 0.1 * (texture.voxels - 0.5), affine)
-    known = {name: dict(zip(MESH.names, values, strict=True)) for name, values in (("lam", LAM), ("mu", MU))}
-    model = br.ModelConfig(fixed=known, **TEMPERATURES)
     arrays = ((image.voxels, image.affine) for image in (fixed, moving))
     oracle = paper.Paper(MESH.points, MESH.cells, MESH.tissue, *arrays, MESH.boundary, **TEMPERATURES)
     exact = paper.gaussian_posterior(oracle, LAM, MU, OFFSET, GRADIENT)
-    return Problem(br.build_posterior(fixed, moving, MESH, model=model), oracle, exact)
+    return Problem(posterior_of(fixed, moving, MESH, **OPTIONS), oracle, exact)
 
 
 @cache
@@ -57,8 +58,7 @@ def walled(wall: float = WALL, width: float = WIDTH) -> br.Posterior:
     found = problem()
     images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
     skull = flat_skull(MESH.points, axis=0, wall=wall, voxel=VOXEL)
-    model = br.ModelConfig(**{**dict(found.posterior.options), "skull_width": width})
-    return br.build_posterior(*images, MESH, model=model, skull=skull)
+    return posterior_of(*images, MESH, skull, **OPTIONS, skull_width=width)
 
 
 def run(posterior, sampler, seed, **settings):

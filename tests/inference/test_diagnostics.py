@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-import bayesreg as br
 from bayesreg.inference.draws import diagnostics
 from bayesreg.inference.draws.diagnostics import convergence, figures, labelled, worst
 from bayesreg.inference.draws.inference_data import (
@@ -19,6 +18,7 @@ from bayesreg.inference.draws.inference_data import (
     to_inference_data,
 )
 from bayesreg.io.checkpoints import StoredBlocks
+from tests.options import posterior_of
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -27,7 +27,7 @@ CHAINS, DRAWS = 3, 60
 
 def posterior(**options):
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    return br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(**options))
+    return posterior_of(fixed, moving, MESH, **options)
 
 
 def blocks(target, count=2, seed=0):

@@ -14,7 +14,8 @@ from bayesreg.inference.gaussian.laplace import _add_convexly, laplace, precisio
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import logdensity
-from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, TEMPERATURES, problem
+from tests.inference.test_closed_form import GRADIENT, LAM, MESH, MU, OFFSET, OPTIONS, TEMPERATURES, problem
+from tests.options import posterior_of
 from tests.oracles import paper
 from tests.phantoms import flat_skull, smooth_image
 
@@ -33,9 +34,9 @@ def test_a_gaussian_posterior_is_its_own_approximation():
 def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
     """Known in closed form at each T_r; the joint mode of T_r and the displacements lies next to T_r = 0."""
     found = problem()
-    options = {**dict(found.posterior.options), "t_elastic": {"median": 20.0, "log_sd": 1.0}, "normalised": True}
+    options = {**OPTIONS, "t_elastic": {"median": 20.0, "log_sd": 1.0}, "normalised": True}
     arrays = found.oracle.fixed, found.oracle.moving
-    posterior = br.build_posterior(*(br.Image(*each) for each in arrays), MESH, model=br.ModelConfig(**options))
+    posterior = posterior_of(*(br.Image(*each) for each in arrays), MESH, **options)
 
     def minus_evidence(log_t):
         oracle = paper.Paper(
@@ -60,8 +61,7 @@ def test_the_mode_at_a_wall_is_that_of_the_quadratic_program():
     found, wall = problem(), float(MESH.points[:, 0].max()) + 0.1
     exact, skull = found.exact, flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
     images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
-    model = br.ModelConfig(**{**dict(found.posterior.options), "skull_width": 1e-3})
-    posterior = br.build_posterior(*images, MESH, model=model, skull=skull)
+    posterior = posterior_of(*images, MESH, skull, **OPTIONS, skull_width=1e-3)
     mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
     root = np.linalg.cholesky(exact.precision).T
     highest = np.full(len(mode), np.inf)
@@ -83,8 +83,8 @@ def test_a_gaussian_is_found_from_beside_it():
 def test_curvature_of_parameters_is_the_hessian():
     images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
     prior = br.PriorConfig(alpha=2.0, beta=2.0, low=0.1, high=5.0)
-    model = br.ModelConfig(priors={"lam": prior, "mu": prior}, interpolation="cubic", t_elastic=30.0, rigid_sd=1.0)
-    posterior = br.build_posterior(*images, MESH, model=model)
+    options = {"interpolation": "cubic", "t_elastic": 30.0, "rigid_sd": 1.0}
+    posterior = posterior_of(*images, MESH, priors={"lam": prior, "mu": prior}, **options)
     flat = np.asarray(ravel_pytree(posterior.initial(jax.random.key(0)))[0])
     reference = laplace(posterior, flat)
     precision = np.linalg.inv(np.asarray(reference.factor @ reference.factor.T))
@@ -112,8 +112,7 @@ def test_parameters_that_nothing_is_known_of_have_the_prior_s_width():
     """No contrast and no deformation: uniform up to `high` is N(0, 1) in their scores."""
     flat = smooth_image(MESH.points, seed=1)
     flat = flat.with_voxels(np.zeros(flat.shape))
-    model = br.ModelConfig(priors={"lam": {"high": 20.0}, "mu": {"high": 5.0}}, rigid_sd=1.0)
-    posterior = br.build_posterior(flat, flat, MESH, model=model)
+    posterior = posterior_of(flat, flat, MESH, priors={"lam": {"high": 20.0}, "mu": {"high": 5.0}}, rigid_sd=1.0)
     position = {**posterior.unconstrain(posterior.reference()), "lam": jnp.array([-1.0, 0.0, 2.0])}
     flat = np.asarray(ravel_pytree(position)[0])
     precision = precision_at(posterior, flat)
@@ -126,7 +125,7 @@ def test_parameters_that_nothing_is_known_of_have_the_prior_s_width():
 
 def smooth_posterior():
     images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    return br.build_posterior(*images, MESH, model=br.ModelConfig(interpolation="cubic", rigid_sd=1.0))
+    return posterior_of(*images, MESH, interpolation="cubic", rigid_sd=1.0)
 
 
 @pytest.mark.parametrize("above", [0.1, 1.0, 20.0, 300.0])
@@ -152,7 +151,7 @@ def test_a_search_without_an_end_is_told():
     """Without contrast, and flat priors without bound, λ and μ grow for ever."""
     flat = smooth_image(MESH.points, seed=1)
     flat = flat.with_voxels(np.zeros(flat.shape))
-    posterior = br.build_posterior(flat, flat, MESH, model=br.ModelConfig(rigid_sd=1.0))
+    posterior = posterior_of(flat, flat, MESH, rigid_sd=1.0)
     start = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
     with pytest.raises(br.InputError, match="runs away"):
         find_mode(posterior, start)

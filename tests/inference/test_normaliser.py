@@ -30,6 +30,7 @@ from bayesreg.inference.kernel import Info, together
 from bayesreg.inference.layout import slices
 from bayesreg.inference.samplers.hamiltonian import hmc
 from bayesreg.inference.samplers.settings import Hmc
+from tests.options import posterior_of
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(2)
@@ -44,7 +45,9 @@ def costly(monkeypatch):
 @cache
 def posterior():
     images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    model = br.ModelConfig(
+    return posterior_of(
+        *images,
+        MESH,
         normalised=True,
         interpolation="cubic",
         priors={name: {"high": 20.0} for name in ("lam", "mu")},
@@ -52,7 +55,6 @@ def posterior():
         t_similarity=5.0,
         rigid_sd=1.0,
     )
-    return br.build_posterior(*images, MESH, model=model)
 
 
 def flat_of(post):

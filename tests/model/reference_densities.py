@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 import bayesreg as br
 from bayesreg.model.options import FieldConfig
+from tests.options import posterior_of
 from tests.phantoms import ball_mesh, flat_skull, smooth_image
 
 FILE = Path(__file__).with_suffix(".npz")
@@ -34,10 +35,10 @@ CASES: dict[str, dict[str, Any]] = {
     "element": TEMPERED | {"elasticity": "element", "interpolation": "cubic"},
     "field": TEMPERED | {"elasticity": "field", "field": FieldConfig(correlation=25.0, modes=12), "priors": PROPER},
     "normalised": TEMPERED | {
-        "normalised": True, "t_elastic": br.TemperaturePrior(median=100.0, log_sd=0.7), "priors": PROPER,
+        "normalised": True, "t_elastic": br.ScalePrior(median=100.0, log_sd=0.7), "priors": PROPER,
     },
     "student_t": TEMPERED | {
-        "similarity": "student_t", "t_similarity": br.TemperaturePrior(median=5.0, log_sd=0.5),
+        "similarity": "student_t", "t_similarity": br.ScalePrior(median=5.0, log_sd=0.5),
         "quadrature": "gauss32", "independent_points": 900.0,
     },
     "held": TEMPERED | {"held": HELD, "quadrature": "voxels"},
@@ -45,10 +46,10 @@ CASES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def posterior_of(case: str) -> br.Posterior:
+def posterior_of_case(case: str) -> br.Posterior:
     """The posterior of a case, its solves to 1e-12."""
     skull = flat_skull(MESH.points, 2, float(MESH.points[:, 2].max()) + 9.0) if case in ("tissue", "held") else None
-    posterior = br.build_posterior(FIXED, MOVING, MESH, model=br.ModelConfig(**CASES[case]), skull=skull)
+    posterior = posterior_of(FIXED, MOVING, MESH, skull, **CASES[case])
     body, tight = posterior.data.body, jnp.asarray(TOLERANCE)
     body = body._replace(system=body.system._replace(tolerance=tight, adjoint_tolerance=tight))
     return replace(posterior, data=posterior.data._replace(body=body))
@@ -78,7 +79,9 @@ def densities(posterior: br.Posterior, case: str) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Write the reference numbers of all cases."""
-    numbers = {f"{case}/{name}": value for case in CASES for name, value in densities(posterior_of(case), case).items()}
+    numbers = {
+        f"{case}/{name}": value for case in CASES for name, value in densities(posterior_of_case(case), case).items()
+    }
     np.savez_compressed(FILE, **numbers)
 
 

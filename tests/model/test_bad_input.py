@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, box_mesh, flat_skull, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -15,7 +16,7 @@ FIXED, MOVING = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
 
 
 def build(f=FIXED, m=MOVING, mesh=MESH, skull=None, **options):
-    return br.build_posterior(f, m, mesh, model=br.ModelConfig(**options), skull=skull)
+    return posterior_of(f, m, mesh, skull, **options)
 
 
 def shifted(image, by):
@@ -65,9 +66,11 @@ def test_something_must_be_sampled():
         build(sampled=[0, 5], held=dict.fromkeys((0, 5, 9), (0.0, 0.0, 0.0)), priors=priors)
 
 
-@pytest.mark.parametrize("options", [{"sampled": [0, 1, 2, 31]}, {"held": {31: (0.0, 0.0, 0.0)}}])
-def test_nodes_must_exist(options):
-    with pytest.raises(ValueError, match=rf"{next(iter(options))} names node 31, but the mesh has 31 nodes"):
+@pytest.mark.parametrize(
+    ("options", "name"), [({"sampled": [0, 1, 2, 31]}, "nodes"), ({"held": {31: (0.0, 0.0, 0.0)}}, "held")]
+)
+def test_nodes_must_exist(options, name):
+    with pytest.raises(ValueError, match=rf"elastic_prior.{name} names node 31, but the mesh has 31 nodes"):
         build(**options)
     with pytest.raises(ValueError, match="greater than or equal to 0"):
         build(sampled=[-1, 0, 1, 2])
@@ -113,14 +116,14 @@ def test_one_entry_cannot_be_fixed_at_two_values():
     [
         ({"fixed": {"mu": {"gm": -1.0}}}, "fixed"),
         ({"fixed": {"nu": 0.3}}, "fixed"),
-        ({"t_similarity": 0.0}, "t_similarity"),
-        ({"t_elastic": -5.0}, "t_elastic"),
+        ({"t_similarity": 0.0}, "similarity.ssd.temperature"),
+        ({"t_elastic": -5.0}, "elastic_prior.boltzmann.temperature"),
         ({"rigid_sd": 0.0}, "rigid_sd"),
         ({"elasticity": "voxel"}, "elasticity"),
         ({"interpolation": "nearest"}, "interpolation"),
         ({"quadrature": "gauss5"}, "quadrature"),
-        ({"sampled": "interior"}, "sampled"),
-        ({"held": {0: (1.0, 2.0)}}, "held"),
+        ({"sampled": "interior"}, "elastic_prior.boltzmann.nodes"),
+        ({"held": {0: (1.0, 2.0)}}, "elastic_prior.boltzmann.held"),
         ({"held": {0: (np.nan, 0.0, 0.0)}}, "held"),
         ({"t_similarty": 0.05}, "t_similarty"),
     ],

@@ -18,6 +18,7 @@ from bayesreg.mesh import signed_volumes
 from bayesreg.model.curvature import _assemble
 from bayesreg.model.elastic.barrier import QUADRATIC_BELOW, WIDTH, Barrier, cost, volume_shares
 from bayesreg.model.observations.landmarks import Landmarks
+from tests.options import model_of
 from tests.phantoms import box_mesh
 
 
@@ -28,8 +29,8 @@ def squeezed(share):
 
 def build(mesh, fixed, moving, least_volume):
     marks = Landmarks(fixed, moving, sd=0.1)
-    model = br.ModelConfig(sampled="all", least_volume=least_volume, fixed={"lam": 1.0, "mu": 1.0})
-    return br.build_posterior(mesh=mesh, observations=[marks], model=model)
+    model = model_of(sampled="all", least_volume=least_volume, fixed={"lam": 1.0, "mu": 1.0})
+    return br.build_posterior(mesh, [marks], model)
 
 
 def test_shares_are_those_of_the_volumes():
@@ -99,10 +100,10 @@ def test_displacements_that_the_evidence_takes_too_far_rest(wild, monkeypatch):
     mesh = box_mesh()
     marks = mesh.points[::2]
     landmarks = Landmarks(marks, marks + np.random.default_rng(0).normal(size=marks.shape), sd=0.5)
-    model = br.ModelConfig(
+    model = model_of(
         sampled="all", least_volume=0.1, normalised=True, t_elastic={"median": 10.0}, fixed={"lam": 1.0, "mu": 1.0}
     )
-    posterior = br.build_posterior(mesh=mesh, observations=[landmarks], model=model)
+    posterior = br.build_posterior(mesh, [landmarks], model)
     start = np.asarray(flat_position(posterior, posterior.data, posterior.estimands(posterior.reference())))
     expected, searches = find_mode(posterior, start), []
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-import bayesreg as br
 from bayesreg.inference.gaussian.laplace import laplace
 from bayesreg.inference.gaussian.whitened import setup_about
 from bayesreg.inference.samplers.registry import choose_sampler
+from tests.options import posterior_of
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -23,8 +23,7 @@ MESH = ball_mesh(spacing=24.0)
 def posterior():
     """One image twice, so that the mode is at rest."""
     image = smooth_image(MESH.points, seed=1)
-    model = br.ModelConfig(t_similarity=5.0, t_elastic=100.0, interpolation="cubic", rigid_sd=2.0)
-    return br.build_posterior(image, image, MESH, model=model)
+    return posterior_of(image, image, MESH, t_similarity=5.0, t_elastic=100.0, interpolation="cubic", rigid_sd=2.0)
 
 
 def test_the_density_of_chains_is_the_density_to_a_hundredth():

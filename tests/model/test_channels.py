@@ -2,43 +2,83 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 import bayesreg as br
+from bayesreg.pose import Pose
+from bayesreg.workflow.prediction import mean_values, predict
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
 T1, FLAIR = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
 OTHER_T1, OTHER_FLAIR = (smooth_image(MESH.points, seed=seed) for seed in (3, 4))
-PAIRS = [br.ImagePair(T1, OTHER_T1, name="t1"), br.ImagePair(FLAIR, OTHER_FLAIR, name="flair")]
+KNOWN, INFERRED = 2.0, br.ScalePrior(median=2.0)
 
 
-def build(observations, t_similarity):
-    model = br.ModelConfig(t_similarity=t_similarity)
-    return br.build_posterior(mesh=MESH, observations=observations, model=model)
+def pairs(temperature, of_flair):
+    of_t1, of_flair = ({"similarity": {"kind": "ssd", "temperature": of_pair}} for of_pair in (temperature, of_flair))
+    return [br.ImagePair(T1, OTHER_T1, **of_t1), br.ImagePair(FLAIR, OTHER_FLAIR, name="flair", **of_flair)]
 
 
-def test_the_logs_of_both_add_up():
-    both, *alone = (build(pairs, 2.0) for pairs in (PAIRS, PAIRS[:1], PAIRS[1:]))
+@pytest.mark.parametrize("temperature", [KNOWN, INFERRED])
+def test_the_logs_of_both_add_up(temperature):
+    given = pairs(temperature, temperature)
+    both, *alone = (br.build_posterior(MESH, some) for some in (given, given[:1], given[1:]))
     u = np.random.default_rng(0).normal(size=(len(MESH.boundary), 3))
     values = {**both.reference(), "u_boundary": u}
     found = both.energies(values)
-    for name, one in zip(("t1", "flair"), alone, strict=True):
-        assert float(found[name]) == pytest.approx(float(one.energies(values)[name]), rel=1e-12)
+    for name, one in zip(("images", "flair"), alone, strict=True):
+        its_own = {key: values[key] for key in one.reference()}
+        assert float(found[name]) == pytest.approx(float(one.energies(its_own)[name]), rel=1e-12)
 
 
 def test_each_has_its_own_temperature_where_it_is_inferred():
-    post = build(PAIRS, {"median": 2.0, "log_sd": 1.0})
+    post = br.build_posterior(MESH, pairs(INFERRED, INFERRED))
     values = post.reference()
-    assert {"t_similarity", "flair_t_similarity"} <= set(values)
-    before = post.energies(values)
-    after = post.energies({**values, "flair_t_similarity": 3.0})
-    assert float(before["t1"]) == float(after["t1"])
-    alone = build(PAIRS[1:], {"median": 2.0, "log_sd": 1.0})
-    expected = alone.energies({**alone.reference(), "t_similarity": 3.0})
+    assert {"t_similarity", "flair_t_similarity"} <= set(post.estimands(values))
+    before, after = post.energies(values), post.energies({**values, "flair_t_similarity": jnp.asarray(3.0)})
+    assert float(before["images"]) == float(after["images"])
+    alone = br.build_posterior(MESH, pairs(INFERRED, INFERRED)[1:])
+    expected = alone.energies({**alone.reference(), "flair_t_similarity": jnp.asarray(3.0)})
     assert float(after["flair"]) == pytest.approx(float(expected["flair"]), rel=1e-12)
+    assert float(after["flair"]) != pytest.approx(float(before["flair"]), rel=1e-3)
 
 
-def test_known_they_share_one():
-    assert "flair_t_similarity" not in build(PAIRS, 2.0).reference()
+def test_known_ones_may_differ():
+    same, other = (br.build_posterior(MESH, pairs(KNOWN, of_flair)) for of_flair in (KNOWN, 3.0))
+    assert [float(other.reference()[name]) for name in ("t_similarity", "flair_t_similarity")] == [2.0, 3.0]
+    before, after = (post.energies(post.reference()) for post in (same, other))
+    assert float(before["images"]) == float(after["images"])
+    assert float(after["flair"]) == pytest.approx(2 / 3 * float(before["flair"]), rel=1e-12)
+
+
+def test_both_are_checked_for_fit():
+    """Each as it is alone."""
+    given, chains, draws = pairs(KNOWN, KNOWN), 2, 3
+    both, *alone = (br.build_posterior(MESH, some) for some in (given, given[:1], given[1:]))
+    u = np.random.default_rng(0).normal(size=(chains, draws, len(MESH.boundary), 3))
+    lame = {name: np.broadcast_to(both.reference()[name], (chains, draws, 3)) for name in ("lam", "mu")}
+    dims = {"u_boundary": ("node", "axis"), "lam": ("tissue",), "mu": ("tissue",)}
+    posterior = xr.Dataset({n: (("chain", "draw", *dims[n]), x) for n, x in {"u_boundary": u, **lame}.items()})
+
+    def predicted(post):
+        still, places = np.zeros_like(MESH.points), {"here": tuple(MESH.points.mean(axis=0))}
+        mean = mean_values(post, posterior, still)
+        return predict(post, posterior, mean, still, still, places, 0, Pose.identity()).observations
+
+    found = predicted(both)
+    for name, post in zip(("images", "flair"), alone, strict=True):
+        expected = predicted(post)
+        assert {f"{name}/observed", f"{name}/replicated", f"{name}/residual"} <= set(expected)
+        assert found[f"{name}/observed"].shape[:2] == (chains, draws)
+        for key, value in expected.items():
+            np.testing.assert_allclose(found[key], value, rtol=1e-6, atol=1e-6)
+    assert abs(found["images/observed"] - found["flair/observed"]).max() > 0.01
+
+
+def test_a_name_that_another_pair_has_is_refused():
+    with pytest.raises(br.InputError, match="'images' of an observation is taken"):
+        br.build_posterior(MESH, 2 * pairs(KNOWN, KNOWN)[:1])

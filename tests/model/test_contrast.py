@@ -11,6 +11,7 @@ from bayesreg.image import Image
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.model.observations.images.contrast import contrast_functions, explained_shares, map_contrast
+from tests.options import model_of
 from tests.phantoms import ball_mesh
 
 MESH = ball_mesh(spacing=30.0)
@@ -74,12 +75,9 @@ def moved(contrast=lambda voxels: voxels):
 
 
 def error_of(moving, one_contrast, **options):
-    model = br.ModelConfig(
-        preset="registration", fixed={"lam": 10.0, "mu": 1.0}, quadrature="voxels", independent_points=None,
-        surface_load=1.0, body_load=0.1, **options,
-    )  # fmt: skip
-    pair = br.ImagePair(FIXED, moving, one_contrast=one_contrast)
-    posterior = br.build_posterior(mesh=MESH, observations=[pair], model=model)
+    model = model_of(preset="registration", fixed={"lam": 10.0, "mu": 1.0}, surface_load=1.0, body_load=0.1)
+    pair = br.ImagePair(FIXED, moving, one_contrast=one_contrast, independent_points=None, **options)
+    posterior = br.build_posterior(MESH, [pair], model)
     start = flat_position(posterior, posterior.data, posterior.estimands(posterior.reference()))
     mode = unravel(posterior)(find_mode(posterior, np.asarray(start)))
     found = posterior.constrain(mode)["u_boundary"]
@@ -88,8 +86,8 @@ def error_of(moving, one_contrast, **options):
 
 def test_the_functions_of_the_map_are_among_the_unknowns():
     moving = FIXED.with_voxels(other_contrast(np.asarray(FIXED.voxels)))
-    pair = br.ImagePair(FIXED, moving, one_contrast=False)
-    posterior = br.build_posterior(mesh=MESH, observations=[pair], model=br.ModelConfig(quadrature="voxels"))
+    pair = br.ImagePair(FIXED, moving, one_contrast=False, quadrature="voxels")
+    posterior = br.build_posterior(MESH, [pair])
     basis = np.asarray(posterior.images.shading)
     functions = contrast_functions(FIXED, np.asarray(posterior.images.positions))
     left = functions - basis @ np.linalg.lstsq(basis, functions, rcond=None)[0]
@@ -99,9 +97,8 @@ def test_the_functions_of_the_map_are_among_the_unknowns():
 
 @pytest.mark.parametrize("similarity", ["lncc"])
 def test_a_similarity_with_maps_of_its_own_takes_the_images_as_they_are(similarity):
-    pair = br.ImagePair(FIXED, FIXED, one_contrast=False)
-    model = br.ModelConfig(similarity=similarity, quadrature="voxels")
-    assert br.build_posterior(mesh=MESH, observations=[pair], model=model).images.shading is None
+    pair = br.ImagePair(FIXED, FIXED, one_contrast=False, similarity=similarity, quadrature="voxels")
+    assert br.build_posterior(MESH, [pair]).images.shading is None
 
 
 def test_tissues_of_one_brightness_may_differ_in_the_other_image():

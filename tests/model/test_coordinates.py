@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 from scipy.special import betaln
 
-import bayesreg as br
 from bayesreg.model.priors import RangeTransform, ScaledBeta
+from tests.options import posterior_of
 from tests.phantoms import box_mesh, smooth_image
 
 Z = np.array([-9.0, -7.9, -6.5, -3.0, -0.5, 0.0, 0.7, 2.0, 7.0])
@@ -98,9 +98,9 @@ def test_a_prior_is_the_same_after_a_round_trip_as_a_pytree():
 def test_the_scale_is_the_reference():
     mesh = box_mesh(2)
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
-    model = br.ModelConfig(priors={"lam": {"low": 1.0}, "mu": {"high": 8.0}})
+    priors = {"lam": {"low": 1.0}, "mu": {"high": 8.0}}
     given = {"lam": np.array([3.0, 0.5, 30.0]), "mu": np.ones(3)}
-    posterior = br.build_posterior(*images, mesh, model=model, reference=given)
+    posterior = posterior_of(*images, mesh, reference=given, priors=priors)
     median = {**posterior.unconstrain(posterior.reference()), "lam": jnp.zeros(3), "mu": jnp.zeros(2)}
     found = posterior.constrain(median)
     np.testing.assert_allclose(found["lam"], 1 + np.log(2) * given["lam"])

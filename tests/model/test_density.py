@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-import bayesreg as br
+from tests.options import posterior_of
 from tests.oracles.paper import Paper, Prior
 from tests.phantoms import PAPER_LAM, PAPER_MU, ball_mesh, flat_skull, smooth_image
 
@@ -53,7 +53,7 @@ def oracle(sampled, **options):
 
 def posterior(skull=None, **options):
     defaults = {"t_similarity": T_SIMILARITY, "t_elastic": T_ELASTIC, "fixed": {}}
-    return br.build_posterior(FIXED, MOVING, MESH, model=br.ModelConfig(**(defaults | options)), skull=skull)
+    return posterior_of(FIXED, MOVING, MESH, skull, **(defaults | options))
 
 
 def assert_same_density(found, expected, tolerance=1e-9):

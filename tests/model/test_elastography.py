@@ -11,6 +11,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.inference.draws.diagnostics import convergence
+from tests.options import posterior_of
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, pair_from_model
 
@@ -37,7 +38,10 @@ def posterior(free=("lam gm", "mu wm"), **options):
         name: {t: float(v) for t, v in zip(NAMES, values, strict=True) if f"{name} {t}" not in free}
         for name, values in (("lam", LAM), ("mu", MU))
     }
-    model = br.ModelConfig(
+    return posterior_of(
+        fixed,
+        moving,
+        MESH,
         fixed=known,
         sampled=[],
         held={int(node): tuple(u[node].tolist()) for node in MESH.boundary},
@@ -46,7 +50,6 @@ def posterior(free=("lam gm", "mu wm"), **options):
         interpolation="cubic",
         **{"priors": {name: br.PriorConfig(low=low, high=high) for name, (low, high) in RANGE.items()}} | options,
     )
-    return br.build_posterior(fixed, moving, MESH, model=model)
 
 
 def values(lam_gm, mu_wm):
@@ -138,7 +141,7 @@ def test_a_part_of_the_boundary_is_not_enough():
     held = {int(node): tuple(u[node].tolist()) for node in MESH.boundary[1:]}
     priors = {name: br.PriorConfig(high=9.0) for name in RANGE}
     with pytest.raises(ValueError, match=rf"needs every boundary node held .* 1 of {len(MESH.boundary)} are not"):
-        br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(sampled=[], held=held, priors=priors))
+        posterior_of(fixed, moving, MESH, sampled=[], held=held, priors=priors)
 
 
 def test_a_flat_prior_would_be_improper():

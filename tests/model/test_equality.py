@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-import bayesreg as br
 from bayesreg.inference.gaussian.density import _height_and_slope
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import unravel
+from tests.options import posterior_of
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)
@@ -15,9 +15,10 @@ SKULL = flat_skull(MESH.points, axis=0, wall=21.0)
 
 
 def posterior(seed=1, mesh=MESH, skull=SKULL, shape=(14, 11, 16), **options):
-    model = br.ModelConfig(**{"interpolation": "cubic", "rigid_sd": 1.0, "t_similarity": 0.5, **options})
     images = (smooth_image(mesh.points, shape, seed=seed + k) for k in range(2))
-    return br.build_posterior(*images, mesh, model=model, skull=skull)
+    return posterior_of(
+        *images, mesh, skull, **{"interpolation": "cubic", "rigid_sd": 1.0, "t_similarity": 0.5, **options}
+    )
 
 
 def mode(of):

@@ -13,6 +13,7 @@ from scipy import linalg, stats
 import bayesreg as br
 from bayesreg.model import field
 from bayesreg.model.options import FieldConfig
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, box_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -27,8 +28,7 @@ def posterior(elasticity="field", **options):
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
     given = {"field": FieldConfig(modes=MODES, correlation=30.0)} if elasticity == "field" else {}
     settings = {"t_similarity": 5.0, "t_elastic": 100.0, "interpolation": "cubic", "fixed": {"mu": by_tissue(MU)}}
-    model = br.ModelConfig(elasticity=elasticity, **(given | settings | options))
-    return br.build_posterior(fixed, moving, MESH, model=model)
+    return posterior_of(fixed, moving, MESH, elasticity=elasticity, **(given | settings | options))
 
 
 @cache

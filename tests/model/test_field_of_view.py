@@ -7,6 +7,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.image import Image
+from tests.options import model_of
 from tests.phantoms import box_mesh
 
 MESH = box_mesh(3, size=30.0)
@@ -45,10 +46,10 @@ def test_images_do_not_pull_where_nothing_is_seen():
 
 def build(moving, quadrature):
     rule = {} if quadrature is None else {"quadrature": quadrature}
-    model = br.ModelConfig(sampled="all", fixed={"lam": 1.0, "mu": 1.0}, **rule)
-    pair = [] if moving is None else [br.ImagePair(FIXED, moving)]
+    model = model_of(sampled="all", fixed={"lam": 1.0, "mu": 1.0})
+    pair = [] if moving is None else [br.ImagePair(FIXED, moving, **rule)]
     marks = br.Landmarks(MESH.points[:9], MESH.points[:9], sd=1.0)
-    return br.build_posterior(mesh=MESH, observations=[*pair, marks], model=model)
+    return br.build_posterior(MESH, [*pair, marks], model)
 
 
 def test_the_state_of_a_slab_is_finite():

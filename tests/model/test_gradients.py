@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import bayesreg as br
 from bayesreg.model.blocks import Scale
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, PAPER_LAM, PAPER_MU, ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -21,7 +21,7 @@ def by_tissue(values):
 
 def posterior(**options):
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    return br.build_posterior(fixed, moving, MESH, model=br.ModelConfig(**(SETTINGS | options)))
+    return posterior_of(fixed, moving, MESH, **(SETTINGS | options))
 
 
 def state(lam, mu, seed=0):

@@ -13,8 +13,10 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.image import Image
 from bayesreg.model.observations.images.likelihood import ImageLikelihood
+from bayesreg.model.state import state_of
 from bayesreg.types import InputError
 from tests.model.test_gradients import assert_gradient
+from tests.options import image_options_of, model_of
 from tests.phantoms import box_mesh
 
 MESH = box_mesh(3, size=30.0)
@@ -24,14 +26,12 @@ FIXED, MOVING = (Image(RNG.normal(size=(21, 21, 21)), AFFINE) for _ in range(2))
 # mm: what is ignored lies below it, on a grid of its own.
 END = 12.0
 IGNORE = Image(np.arange(60)[:, None, None] * np.ones((60, 60, 60)) < 20, np.diag([0.6, 0.6, 0.6, 1.0]))
+MODEL = model_of(sampled="all", fixed={"lam": 1.0, "mu": 1.0})
 
 
 def build(similarity="ssd", t_similarity=4.0, interpolation="linear", **ignored):
-    model = br.ModelConfig(
-        sampled="all", fixed={"lam": 1.0, "mu": 1.0}, quadrature="gauss4", similarity=similarity,
-        t_similarity=t_similarity, interpolation=interpolation,
-    )  # fmt: skip
-    return br.build_posterior(mesh=MESH, observations=[br.ImagePair(FIXED, MOVING, **ignored)], model=model)
+    options = image_options_of(similarity=similarity, t_similarity=t_similarity, interpolation=interpolation)
+    return br.build_posterior(MESH, [br.ImagePair(FIXED, MOVING, **ignored, **options)], MODEL)
 
 
 def test_no_point_is_compared_where_the_fixed_image_is_ignored():
@@ -60,6 +60,31 @@ def test_the_density_is_that_of_noise_where_one_looks_and_of_any_intensity_elsew
     assert float(post.energies(values)["images"]) == pytest.approx(expected.sum(), rel=1e-9)
 
 
+@pytest.mark.parametrize("similarity", ["ssd", "student_t"])
+def test_replicates_are_drawn_from_the_density(similarity):
+    """By SciPy's distributions: m and noise where one looks, any intensity of f and noise where one does not."""
+    post, count = build(similarity, moving_ignore=IGNORE), 400
+    displacement = np.random.default_rng(3).normal(size=MESH.points.shape)
+    values = post.fill({**post.reference(), "u_boundary": displacement})
+    state, term = state_of(post.data.body, post.data.blocks, values), post.data.terms["images"]
+    replicates = np.asarray(term.likelihood(state).sample(jax.random.key(0), (count,)))
+    places = term.places(displacement)
+    f, m, w = (np.asarray(x) for x in (term.fixed_values, term.moving(places), term.quadrature.weights))
+    noise, variance = stats.norm() if similarity == "ssd" else stats.t(4.0), 4.0 / (2 * w)
+    x = np.asarray(places)[:, 0]
+    hidden, seen = x < END, x > END + 1.5
+    assert min(hidden.sum(), seen.sum()) > 50
+    for points, mean, scale in (
+        (seen, m, np.sqrt(variance)),
+        (hidden, np.full_like(f, f.mean()), np.sqrt(variance + f.var())),
+    ):
+        z = ((replicates - mean) / scale)[:, points]
+        assert stats.kstest(z.ravel(), noise.cdf).pvalue > 1e-3
+        of_points = z.mean(axis=0) * np.sqrt(count) / noise.std()
+        assert abs(of_points).max() < 5
+        assert (of_points**2).mean() == pytest.approx(1.0, abs=0.3)
+
+
 @pytest.mark.parametrize("similarity", ["ssd", "student_t", "lncc"])
 def test_the_gradient_is_that_of_differences(similarity):
     post = build(similarity, interpolation="cubic", moving_ignore=IGNORE)
@@ -74,16 +99,12 @@ def test_the_gradient_is_that_of_differences(similarity):
 @pytest.mark.parametrize("smoothing", [0.0, 0.8])
 def test_intensities_that_are_ignored_change_nothing(similarity, smoothing):
     """Nor beside the mask, where smoothing, interpolation and descriptors would reach into it."""
-    model = br.ModelConfig(
-        sampled="all", fixed={"lam": 1.0, "mu": 1.0}, similarity=similarity, smoothing=smoothing, interpolation="cubic"
-    )
+    options = {"similarity": similarity, "smoothing": smoothing, "interpolation": "cubic"}
     voxels, fixed = np.array(MOVING.voxels), np.array(FIXED.voxels)
     voxels[:8], fixed[:8] = 1000.0, -500.0
     pairs = (FIXED, MOVING), (FIXED.with_voxels(fixed), MOVING.with_voxels(voxels))
     one, other = (
-        br.build_posterior(
-            mesh=MESH, observations=[br.ImagePair(*pair, fixed_ignore=IGNORE, moving_ignore=IGNORE)], model=model
-        )
+        br.build_posterior(MESH, [br.ImagePair(*pair, fixed_ignore=IGNORE, moving_ignore=IGNORE, **options)], MODEL)
         for pair in pairs
     )
     values = {**one.reference(), "u_boundary": RNG.normal(scale=0.1, size=MESH.points.shape)}

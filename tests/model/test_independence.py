@@ -16,6 +16,7 @@ from bayesreg.inference.layout import flat_position
 from bayesreg.model.coordinates import complete
 from bayesreg.model.observations.images.independence import independent_points, independent_scores
 from bayesreg.types import InputError
+from tests.options import posterior_of
 from tests.phantoms import ball_mesh, rotated_affine, smooth_image
 
 SIZES = np.array([1.0, 1.5, 2.0])
@@ -110,11 +111,8 @@ def test_a_residual_of_nothing_is_told():
 
 MESH = ball_mesh(spacing=30.0)
 OPTIONS = {
-    "elastic_prior": "loads",
     "body_load": 0.3,
     "surface_load": 0.3,
-    "normalised": True,
-    "sampled": "all",
     "priors": {"lam": {"high": 60.0}, "mu": {"high": 60.0}},
     "quadrature": "voxels",
     "interpolation": "cubic",
@@ -124,7 +122,7 @@ OPTIONS = {
 
 def posterior(**options):
     images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    return br.build_posterior(*images, MESH, model=br.ModelConfig(**(OPTIONS | options)))
+    return posterior_of(*images, MESH, **(OPTIONS | options))
 
 
 def test_scores_are_what_the_images_pull_with():
@@ -168,7 +166,7 @@ def test_a_search_goes_on_where_the_tempering_has_led_to():
 
 def test_residuals_tell_of_voxels_alone():
     with pytest.raises(ValueError, match="residual needs quadrature: voxels"):
-        br.ModelConfig(independent_points="residual")
+        br.ImagePair(*(smooth_image(MESH.points, seed=seed) for seed in (1, 2)), independent_points="residual")
 
 
 @pytest.mark.long

@@ -9,6 +9,7 @@ import pytest
 import bayesreg as br
 from bayesreg.model.observations.images.intensity_map import shading_basis
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 from tests.phantoms import ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
@@ -22,7 +23,7 @@ def shaded(image):
 
 
 def posterior(moving, **options):
-    return br.build_posterior(FIXED, moving, MESH, model=br.ModelConfig(quadrature="voxels", **options))
+    return posterior_of(FIXED, moving, MESH, quadrature="voxels", **options)
 
 
 def test_a_shading_is_all_that_tells_images_at_rest_apart():
@@ -55,7 +56,7 @@ def test_the_gradient_is_that_of_differences():
 
 def test_it_is_refused_with_a_map_in_every_window():
     with pytest.raises(ValueError, match="intensity_map"):
-        br.ModelConfig(similarity="lncc", intensity_map=1)
+        br.ImagePair(FIXED, FIXED, similarity="lncc", intensity_map=1)
 
 
 def test_fewer_points_weigh_as_much_as_all():
@@ -71,9 +72,7 @@ def test_both_images_are_smoothed():
     moving = smooth_image(MESH.points, seed=2)
     sd = 0.8 * FIXED.voxel_volume ** (1 / 3)
     found = posterior(moving, smoothing=0.8)
-    by_hand = br.build_posterior(
-        FIXED.smoothed(sd), moving.smoothed(sd), MESH, model=br.ModelConfig(quadrature="voxels")
-    )
+    by_hand = posterior_of(FIXED.smoothed(sd), moving.smoothed(sd), MESH, quadrature="voxels")
     state = {"u_boundary": np.ones((len(MESH.boundary), 3)), "lam": np.ones(3), "mu": np.ones(3)}
     assert float(found.evaluate(state).similarity_energy) == pytest.approx(
         float(by_hand.evaluate(state).similarity_energy)

@@ -13,17 +13,18 @@ import xarray as xr
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.draws.predictive import predictive_p
 from bayesreg.model.observations.images.likelihood import ImageLikelihood
 from bayesreg.model.observations.images.local_correlation import LEAST, RIDGE, windows_of
 from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.pose import Pose
 from bayesreg.workflow.prediction import mean_values, predict
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=24.0)
 OPTIONS = {"similarity": "lncc", "t_similarity": 5.0, "t_elastic": 100.0, "interpolation": "cubic", "window_mm": 20.0}
+SQUARES = {name: value for name, value in OPTIONS.items() if name != "window_mm"} | {"similarity": "ssd"}
 KNOWN = {name: dict(zip(MESH.names, x.tolist(), strict=True)) for name, x in (("lam", LAM), ("mu", MU))}
 
 
@@ -34,7 +35,7 @@ def images():
 
 def posterior(moving=None, **options):
     fixed, other = images()
-    return br.build_posterior(fixed, moving or other, MESH, model=br.ModelConfig(**(OPTIONS | options)))
+    return posterior_of(fixed, moving or other, MESH, **(OPTIONS | options))
 
 
 def values(seed=0, **temperatures):
@@ -89,7 +90,7 @@ def test_energy_is_what_the_correlations_leave_of_the_variance():
         (of_f, of_both), (_, of_m) = np.cov(f[inside], m[inside], aweights=w[inside], ddof=0)
         expected += w[inside].sum() * of_f * (1 - of_both**2 / (of_f * of_m))
     assert float(post.energies(state)["similarity_energy"]) == pytest.approx(expected, rel=20 * RIDGE)
-    squares = br.build_posterior(*images(), MESH, model=br.ModelConfig(**(OPTIONS | {"similarity": "ssd"})))
+    squares = posterior_of(*images(), MESH, **SQUARES)
     assert expected < float(squares.energies(state)["similarity_energy"])
 
 
@@ -107,10 +108,6 @@ def test_windows_are_small_hold_enough_points_and_part_them(width):
     assert (windows.number == 1) == (width > 40)
     x = rng.normal(size=(3000, 2))
     np.testing.assert_allclose(windows.sums(x), np.stack([x[label == k].sum(axis=0) for k in label]), atol=1e-12)
-    points = rng.choice(3000, 500, replace=False)
-    some = np.asarray(windows.among(jnp.asarray(points)).sums(jnp.asarray(x[points])))
-    expected = [x[points][label[points] == k].sum(axis=0) for k in label[points]]
-    np.testing.assert_allclose(some, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(2.0, 0.3), (-1.0, 0.0), (-300.0, 1e4)])
@@ -132,11 +129,10 @@ def test_a_smooth_bias_field_changes_little():
     along = (moving.grid_points()[..., 0] - MESH.points[:, 0].min()) / np.ptp(MESH.points[:, 0])
     biased = moving.with_voxels(np.asarray(moving.voxels) * (1 + 0.5 * along))
     changes = {}
-    for similarity in ("ssd", "lncc"):
-        options = {"similarity": similarity, "quadrature": "gauss32", "window_mm": 8.0}
+    for options in (SQUARES, OPTIONS | {"window_mm": 8.0}):
         # Where the images agree and nothing is left to explain.
-        found = br.build_posterior(moving, biased, MESH, model=br.ModelConfig(**(OPTIONS | options)))
-        changes[similarity] = float(found.energies(found.reference())["similarity_energy"])
+        found = posterior_of(moving, biased, MESH, **(options | {"quadrature": "gauss32"}))
+        changes[options["similarity"]] = float(found.energies(found.reference())["similarity_energy"])
     assert 0 < changes["lncc"] < 0.01 * changes["ssd"]
 
 
@@ -264,17 +260,14 @@ def test_predictive_checks_hold_where_the_model_does():
     )
     places = {"here": tuple(MESH.points.mean(axis=0))}
     found = predict(post, draws, mean_values(post, draws, zero), zero, zero, places, 0, Pose.identity())
+    observed, replicated = (found.observations[f"images/{which}"] for which in ("observed", "replicated"))
     for k, name in enumerate(("sd", "greatest", "neighbours")):
-        assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, name
+        assert 0.01 < (observed[..., k] <= replicated[..., k]).mean() < 0.99, name
 
 
-def test_the_same_windows_serve_other_points_and_smoothed_images():
+def test_the_same_windows_serve_smoothed_images():
     post = posterior(quadrature="voxels", fixed=KNOWN)
     estimands = {"u_boundary": values()["u_boundary"]}
-    quick = post.condition(estimands, quick=True).terms["images"]
-    assert len(quick.similarity.windows.label) == 4 * len(MESH.cells) != len(post.images.similarity.windows.label)
-    assert quick.similarity.windows.number == posterior().images.similarity.windows.number
-    assert np.isfinite(float(post.evaluate_estimands(post.condition(estimands, quick=True), estimands).logdensity))
     for stage in post.mode_search.continuation():
         found = post.evaluate_estimands(stage, estimands)
         assert 0 < float(found.similarity_energy) < np.inf

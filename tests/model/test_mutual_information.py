@@ -9,17 +9,18 @@ import pytest
 from scipy.interpolate import BSpline
 
 import bayesreg as br
-from bayesreg.model.observations.images.mutual_information import BINS, MutualInformation
+from bayesreg.model.observations.images.mutual_information import BINS, JointInformation
 from bayesreg.model.observations.images.pointwise import Intensities
 from tests.model.test_contrast import FIXED, MESH, error_of, moved, other_contrast
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 
 RNG = np.random.default_rng(0)
 F = RNG.uniform(size=400)
 M = np.cos(3 * F) + 0.1 * RNG.normal(size=400)
 WEIGHTS = RNG.uniform(0.5, 2.0, size=400)
 PAIR = Intensities(jnp.asarray(F), jnp.asarray(M), jnp.asarray(WEIGHTS))
-SIMILARITY = MutualInformation(jnp.asarray(0.05), jnp.array([0.0, 1.0]), jnp.array([-1.2, 1.2]))
+SIMILARITY = JointInformation(jnp.asarray(0.05), jnp.array([0.0, 1.0]), jnp.array([-1.2, 1.2]))
 
 
 def shares_of(values, low, high):
@@ -71,9 +72,8 @@ def test_the_likelihood_is_a_density_of_f():
 
 
 def test_the_gradient_is_that_of_differences():
-    model = br.ModelConfig(similarity="mi", quadrature="gauss32", interpolation="cubic")
     moving = FIXED.with_voxels(other_contrast(np.asarray(FIXED.voxels)))
-    post = br.build_posterior(FIXED, moving, MESH, model=model)
+    post = posterior_of(FIXED, moving, MESH, similarity="mi", quadrature="gauss32", interpolation="cubic")
     assert_gradient(post.logdensity, post.initial(jax.random.key(0)))
 
 
@@ -83,12 +83,10 @@ def test_the_mode_of_a_pair_of_unlike_contrast_is_as_near_as_that_of_one_contras
 
 
 def test_there_is_no_noise_to_infer():
-    with pytest.raises(ValueError, match="no noise to infer"):
-        br.ModelConfig(similarity="mi", t_similarity={"median": 0.1})
-    assert br.ModelConfig(preset="registration", similarity="mi").t_similarity == 0.05
+    with pytest.raises(br.InputError, match=r"similarity\.mi\.temperature: .* number"):
+        br.ImagePair(FIXED, FIXED, similarity={"kind": "mi", "temperature": {"median": 0.1}})
 
 
 def test_a_constant_image_is_refused():
-    model = br.ModelConfig(similarity="mi")
     with pytest.raises(ValueError, match="constant"):
-        br.build_posterior(FIXED, FIXED.with_voxels(np.ones(FIXED.shape)), MESH, model=model)
+        posterior_of(FIXED, FIXED.with_voxels(np.ones(FIXED.shape)), MESH, similarity="mi")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import bayesreg as br
 from bayesreg.inference.target import logdensity, without_normaliser
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, linear_image, smooth_image
 
@@ -30,7 +30,7 @@ def images():
 
 
 def posterior(**options):
-    return br.build_posterior(*images(), MESH, model=br.ModelConfig(**(PROPER | options)))
+    return posterior_of(*images(), MESH, **(PROPER | options))
 
 
 def states(count=4, nodes=BOUNDARY, seed=0):
@@ -115,7 +115,7 @@ def replicated():
     """
     blank = linear_image(SMALL.points, np.zeros(3), 0.5)
     fixed = {"mu": {"csf": MU[0], "wm": MU[2]}, "lam": dict(zip(SMALL.names, LAM, strict=True))}
-    post = br.build_posterior(blank, blank, SMALL, model=br.ModelConfig(**PROPER, fixed=fixed))
+    post = posterior_of(blank, blank, SMALL, **PROPER, fixed=fixed)
     grid = jnp.exp(LEVELS)[:, None]
     draws = np.stack([drawn(theta, seed=i).reshape(-1, 3) for i, theta in enumerate(TRUTHS)])
 

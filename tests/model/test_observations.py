@@ -20,6 +20,7 @@ from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.state import State
 from bayesreg.model.term import Outside, PointCurvature, SharedCurvature
 from bayesreg.types import Equilibrium
+from tests.options import model_of
 from tests.oracles import paper
 from tests.phantoms import box_mesh, smooth_image
 
@@ -27,7 +28,7 @@ MESH = box_mesh(2)
 LAM, MU = np.array([0.5, 1.0, 1.5]), np.array([0.7, 1.0, 1.4])
 T_ELASTIC, RIGID_SD = 20.0, 0.8
 CHAINS = 32
-MODEL = br.ModelConfig(
+MODEL = model_of(
     fixed={name: dict(zip(MESH.names, values.tolist(), strict=True)) for name, values in (("lam", LAM), ("mu", MU))},
     t_elastic=T_ELASTIC,
     rigid_sd=RIGID_SD,
@@ -77,7 +78,7 @@ def landmarks():
 @cache
 def posterior(with_region=False):
     observed = [landmarks(), *([MeanDisplacement(*REGION)] if with_region else [])]
-    return br.build_posterior(mesh=MESH, observations=observed, model=MODEL)
+    return br.build_posterior(MESH, observed, MODEL)
 
 
 def barycentric(points):
@@ -184,7 +185,7 @@ def test_a_landmark_that_nothing_else_determines_is_told():
     model = MODEL.model_copy(update={"rigid_sd": None})
     rest = {"u_boundary": jnp.zeros((len(MESH.boundary), 3))}
     points, moved, sd = (part[:3] for part in places())
-    post = br.build_posterior(mesh=MESH, observations=[br.Landmarks(points, moved, sd)], model=model)
+    post = br.build_posterior(MESH, [br.Landmarks(points, moved, sd)], model)
     found = leave_out(post, post.data.terms["landmarks"], rest)
     assert np.isnan(found.residual).all()
     assert np.isinf(found.covariance).all()
@@ -196,7 +197,7 @@ def test_an_inferred_sd_has_the_posterior_of_its_evidence(median, log_sd):
     """The displacements are integrated out in closed form: the shifts are N(0, A Σ Aᵀ + sd² I) given sd."""
     points, moved, _ = places()
     observed = [br.Landmarks(points, moved, br.ScalePrior(median=median, log_sd=log_sd))]
-    post = br.build_posterior(mesh=MESH, observations=observed, model=MODEL)
+    post = br.build_posterior(MESH, observed, MODEL)
     precision, whole = prior()
     A = np.kron(barycentric(points), np.eye(3)) @ whole
     spread, shift = A @ np.linalg.solve(precision, A.T), (moved - points).ravel()
@@ -244,8 +245,8 @@ def test_terms_have_their_names_and_add_up():
 
 def test_images_and_landmarks_are_one_density():
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    both = br.build_posterior(mesh=MESH, observations=[br.ImagePair(fixed, moving), landmarks()], model=MODEL)
-    short = br.build_posterior(fixed, moving, MESH, model=MODEL)
+    both = br.build_posterior(MESH, [br.ImagePair(fixed, moving), landmarks()], MODEL)
+    short = br.build_posterior(MESH, [br.ImagePair(fixed, moving)], MODEL)
     values = {"u_boundary": 0.3 * np.sin(MESH.points[MESH.boundary]), "lam": LAM, "mu": MU}
     parts = both.energies(values)
     expected = float(short.logdensity_constrained(values)) + float(parts["landmarks"])
@@ -259,7 +260,7 @@ def test_curvature_of_a_term_from_outside_is_the_dense_hessian():
     """Its convex part, and in the unknowns that the term looks at alone: each costs a product."""
     term = Distance(np.array([4.0, 5.0, 6.0]), np.array([13.0, 12.0, 15.0]), measured=15.0, sd=0.5)
     mesh = box_mesh(4)
-    post = br.build_posterior(mesh=mesh, observations=[term], model=br.ModelConfig(sampled="all"))
+    post = br.build_posterior(mesh, [term], model_of(sampled="all"))
     u = 0.5 * np.random.default_rng(0).normal(size=mesh.points.shape)
 
     def energy(flat):
@@ -286,7 +287,7 @@ def test_a_term_from_outside_costs_the_directions_it_looks_at(count, monkeypatch
             return -0.5 * (state.u[self.nodes] ** 2).sum() + 0.0 * state.u.sum()
 
     mesh, asked = box_mesh(4), []
-    post = br.build_posterior(mesh=mesh, observations=[OfNodes()], model=br.ModelConfig(sampled="all"))
+    post = br.build_posterior(mesh, [OfNodes()], model_of(sampled="all"))
     products = curvature._products
 
     def counted(term, seen, flat, directions):
@@ -356,7 +357,7 @@ LOOSE = MODEL.model_copy(update={"rigid_sd": None})
 )
 def test_wrong_observations_are_told(observations, message):
     with pytest.raises(br.InputError, match=message):
-        br.build_posterior(mesh=MESH, observations=observations, model=MODEL)
+        br.build_posterior(MESH, observations, MODEL)
 
 
 @pytest.mark.parametrize(
@@ -386,16 +387,14 @@ def test_landmarks_must_bound_the_rigid_motions():
     """Two points, or three on a line, leave them free unless a prior or nodes that are held do not."""
     for few in (TWO, br.Landmarks([[x, 1.0, 1.0] for x in (0.5, 1.0, 1.5)], np.zeros((3, 3)), 1.0)):
         with pytest.raises(br.InputError, match="the posterior would be improper; give at least three"):
-            br.build_posterior(mesh=MESH, observations=[few], model=LOOSE)
-    held = LOOSE.model_copy(update={"held": {int(MESH.boundary[0]): (0.0, 0.0, 0.0)}})
+            br.build_posterior(MESH, [few], LOOSE)
+    held = LOOSE.model_copy(update={"elastic_prior": br.Boltzmann(held={int(MESH.boundary[0]): (0.0, 0.0, 0.0)})})
     for model, observations in ((MODEL, [TWO]), (held, [TWO]), (LOOSE, [landmarks()])):
-        br.build_posterior(mesh=MESH, observations=observations, model=model)
+        br.build_posterior(MESH, observations, model)
 
 
-def test_options_of_images_without_images_are_told():
-    model = MODEL.model_copy(update={"t_similarity": br.TemperaturePrior(median=0.1)})
-    with pytest.raises(br.InputError, match=r"model.t_similarity says how images are compared, and none are"):
-        br.build_posterior(mesh=MESH, observations=[landmarks()], model=model)
+def test_without_images_there_is_no_temperature_of_theirs():
+    assert set(posterior().reference()) == {"u_boundary", "lam", "mu", "t_elastic"}
 
 
 def test_unknown_names_of_values_are_told():
@@ -404,30 +403,27 @@ def test_unknown_names_of_values_are_told():
         post.logdensity_constrained({**post.reference(), "t_simlarity": 1.0})
 
 
+OF_YOUR_OWN = {"kind": "own", "title": "an observation of your own"}
+
+
 def test_observations_say_how_they_fit():
     """By the root of the mean square of their residuals over the sd, if they know these."""
     points, moved, sd = places()
     own = Own(lambda state: -0.5 * (state.u[3] ** 2).sum(), standardised_residual=lambda state: state.u[3])
-    post = br.build_posterior(
-        mesh=MESH, observations=[landmarks(), own, Own(lambda state: state.u[0, 0], name="shift")], model=MODEL
-    )
+    post = br.build_posterior(MESH, [landmarks(), own, Own(lambda state: state.u[0, 0], name="shift")], MODEL)
     told = describe_observations(post, post.reference())
     z = (moved - points) / sd[:, None]
     assert told["landmarks"] == {
         "kind": "landmarks",
+        "title": "pairs of points",
         "log": pytest.approx(-0.5 * (z**2).sum()),
         "values": z.size,
         "residual_rms": pytest.approx(np.sqrt((z**2).mean())),
     }
-    assert told["own"] == {"kind": "own", "log": 0.0, "values": 3, "residual_rms": 0.0}
-    assert told["shift"] == {"kind": "own", "log": 0.0}
+    assert told["own"] == {**OF_YOUR_OWN, "log": 0.0, "values": 3, "residual_rms": 0.0}
+    assert told["shift"] == {**OF_YOUR_OWN, "log": 0.0}
 
 
-def test_two_forms_at_once_and_half_a_pair_are_told():
-    image = smooth_image(MESH.points)
-    with pytest.raises(br.InputError, match="either fixed and moving, or observations"):
-        br.build_posterior(image, image, MESH, observations=[landmarks()])
-    with pytest.raises(br.InputError, match="needs both"):
-        br.build_posterior(fixed=image, mesh=MESH)
+def test_a_posterior_without_a_mesh_is_told():
     with pytest.raises(br.InputError, match="needs a mesh"):
-        br.build_posterior(observations=[landmarks()])
+        br.build_posterior(None, [landmarks()])

@@ -11,6 +11,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.model.program import registration
+from tests.options import image_options_of, model_of
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -25,8 +26,9 @@ NU = 6.0
 def posterior(**options):
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
     points = MESH.points[MESH.cells[:5]].mean(axis=1)
-    observed = [br.ImagePair(fixed, moving), br.Landmarks(points, points + 0.4, sd=0.7)]
-    return br.build_posterior(mesh=MESH, observations=observed, model=br.ModelConfig(**(OPTIONS | options)))
+    options = OPTIONS | options
+    observed = [br.ImagePair(fixed, moving, **image_options_of(**options)), br.Landmarks(points, points + 0.4, sd=0.7)]
+    return br.build_posterior(MESH, observed, model_of(**options))
 
 
 def values():

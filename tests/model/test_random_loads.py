@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 import scipy.linalg
-from bayesreg.model.elastic.priors import LoadPrior
 from scipy import stats
 from scipy.optimize import minimize
 
@@ -16,18 +15,19 @@ from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.model.options import PriorConfig
 from tests.model.test_gradients import assert_gradient
+from tests.options import model_of, posterior_of
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, ball_mesh, box_mesh, refined, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
 LOADS = {"body_load": 0.3, "surface_load": 0.7}
 PRIORS = {name: PriorConfig(high=60.0) for name in ("lam", "mu")}
-OPTIONS = {"elastic_prior": "loads", "normalised": True, "sampled": "all", "priors": PRIORS, **LOADS}
+OPTIONS = {"priors": PRIORS, **LOADS}
 
 
 def posterior(mesh=MESH, **options):
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
-    return br.build_posterior(*images, mesh, model=br.ModelConfig(**(OPTIONS | options)))
+    return posterior_of(*images, mesh, **(OPTIONS | options))
 
 
 def values(mesh=MESH, seed=0):
@@ -106,9 +106,9 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
     moved = (u + sd * rng.normal(size=count)).reshape(-1, 3)
     inferred = {name: {"median": 0.3, "log_sd": 2.0} for name in LOADS}
     fixed = {"lam": dict(zip(MESH.names, LAM.tolist(), strict=True)), "mu": {"csf": 0.5, "gm": 1.0}}
-    model = br.ModelConfig(**OPTIONS | inferred, fixed=fixed)
+    model = model_of(**OPTIONS | inferred, fixed=fixed)
     points = br.Landmarks(MESH.points, MESH.points + moved, sd=sd)
-    post = br.build_posterior(mesh=MESH, observations=[points], model=model)
+    post = br.build_posterior(MESH, [points], model)
     apart = scipy.linalg.null_space(rigid.T)
 
     def minus_evidence(theta):
@@ -128,29 +128,36 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("prior", "says"),
     [
-        ({"sampled": "boundary"}, "sampled"),
-        ({"normalised": False}, "proper density"),
-        ({"t_elastic": 5.0}, "t_elastic"),
-        ({"body_load": None}, "random loads need its size"),
-        ({"elastic_prior": "boltzmann"}, "belong to elastic_prior: loads"),
-        ({"held": {0: (0.0, 0.0, 0.0)}}, "held"),
+        ({"kind": "loads", "nodes": "boundary"}, "loads.nodes"),
+        ({"kind": "loads", "normalised": False}, "loads.normalised"),
+        ({"kind": "loads", "temperature": 5.0}, "loads.temperature"),
+        ({"kind": "loads", "held": {0: (0.0, 0.0, 0.0)}}, "loads.held"),
+        ({"kind": "loads", "body": None}, "loads.body"),
+        ({"kind": "boltzmann", "body": 0.3}, "boltzmann.body"),
+        ("load", "'load' found using 'kind'"),
     ],
 )
-def test_options_that_do_not_go_together(change, says):
+def test_a_prior_has_no_option_of_the_other(prior, says):
     with pytest.raises(ValueError, match=says):
-        br.ModelConfig(**(OPTIONS | change))
+        br.ModelConfig(elastic_prior=prior)
 
 
 def test_its_parts_are_those_of_the_mesh():
-    prior = LoadPrior.on(MESH, None)
+    prior = br.RandomLoads().on(MESH, None)
     assert float(prior.volumes.sum()) == pytest.approx(MESH.volumes.sum())
     assert prior.name == "elastic"
 
 
 def test_the_preset_is_a_model_that_what_is_given_replaces():
-    preset = br.ModelConfig(preset="registration", most_points=10)
-    assert (preset.elastic_prior, preset.sampled, preset.most_points) == ("loads", "all", 10)
+    preset = br.ModelConfig(preset="registration")
+    assert preset.elastic_prior == br.RandomLoads()
+    assert preset.elastic_prior.nodes == "all"
     assert br.ModelConfig(**preset.model_dump()) == preset
+    assert br.ModelConfig(preset="registration", elastic_prior={"body": 0.2}).elastic_prior == br.RandomLoads(body=0.2)
+    boltzmann = br.Boltzmann(temperature=5.0)
+    for given in (boltzmann, {"kind": "boltzmann", "temperature": 5.0}):
+        assert br.ModelConfig(preset="registration", elastic_prior=given).elastic_prior == boltzmann
     assert br.ModelConfig() == br.ModelConfig(preset="paper")
+    assert br.ModelConfig(elastic_prior={"temperature": 5.0}).elastic_prior == boltzmann

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.model.reference_densities import CASES, FILE, densities, posterior_of
+from tests.model.reference_densities import CASES, FILE, densities, posterior_of_case
 
 # Factors as they are now, and those of the former code that they are the products of.
 FORMER = {
@@ -28,7 +28,7 @@ def former(name):
 def test_densities_gradients_and_energies_are_those_of_the_former_code(case):
     with np.load(FILE) as file:
         expected = {name.removeprefix(f"{case}/"): file[name] for name in file.files if name.startswith(f"{case}/")}
-    found = densities(posterior_of(case), case)
+    found = densities(posterior_of_case(case), case)
     difference = np.linalg.norm(found["gradient"] - expected["gradient"], axis=1)
     assert (difference < 1e-6 * np.linalg.norm(expected["gradient"], axis=1)).all()
     for name in set(found) - {"gradient"}:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +12,7 @@ from bayesreg.image import Image
 from bayesreg.model.observations.images.self_similarity import PATCH, InTurn, describe_self_similarity
 from tests.model.test_contrast import FIXED, MESH, error_of, moved, other_contrast
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 
 RNG = np.random.default_rng(0)
 DISTANCE = 1.5
@@ -85,8 +84,7 @@ def test_images_take_turns(count):
 
 def posterior(**options):
     moving = FIXED.with_voxels(other_contrast(np.asarray(FIXED.voxels)))
-    model = br.ModelConfig(similarity="mind", interpolation="cubic", **options)
-    return br.build_posterior(FIXED, moving, MESH, model=model)
+    return posterior_of(FIXED, moving, MESH, similarity="mind", interpolation="cubic", **options)
 
 
 def test_the_gradient_is_that_of_differences():
@@ -130,15 +128,14 @@ def test_the_mode_of_a_pair_of_unlike_contrast_is_near():
 
 
 def test_what_is_ignored_stays_so():
-    pair = br.ImagePair(FIXED, FIXED, fixed_ignore=FIXED.with_voxels(np.asarray(FIXED.voxels) > 0.9))
-    model = br.ModelConfig(similarity="mind", quadrature="voxels")
+    bright = FIXED.with_voxels(np.asarray(FIXED.voxels) > 0.9)
     seen, all_of_it = (
-        br.build_posterior(mesh=MESH, observations=[one], model=model)
-        for one in (pair, replace(pair, fixed_ignore=None))
+        br.ImagePair(FIXED, FIXED, fixed_ignore=mask, similarity="mind", quadrature="voxels").on(MESH).term
+        for mask in (bright, None)
     )
-    assert len(seen.data.terms["images"].positions) < len(all_of_it.data.terms["images"].positions)
+    assert len(seen.positions) < len(all_of_it.positions)
 
 
 def test_a_map_of_intensities_is_refused_beside_it():
     with pytest.raises(ValueError, match="maps of its own"):
-        br.ModelConfig(similarity="mind", intensity_map=2)
+        br.ImagePair(FIXED, FIXED, similarity="mind", intensity_map=2)

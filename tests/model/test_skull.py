@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-import bayesreg as br
 from bayesreg.distance import signed_distance
 from bayesreg.image import Image
 from bayesreg.model.elastic.skull import is_allowed
 from bayesreg.model.state import state_of
+from tests.options import posterior_of
 from tests.oracles.paper import in_skull
 from tests.phantoms import ball_mesh, flat_skull, rotated_affine, smooth_image
 
@@ -130,8 +130,7 @@ def soft(width=0.5):
     mesh = ball_mesh(spacing=24.0)
     image = smooth_image(mesh.points, seed=1)
     wall = mesh.points[:, 2].max() + 1.0
-    model = br.ModelConfig(skull_width=width)
-    posterior = br.build_posterior(image, image, mesh, model=model, skull=flat_skull(mesh.points, 2, wall))
+    posterior = posterior_of(image, image, mesh, flat_skull(mesh.points, 2, wall), skull_width=width)
     u = np.zeros((len(posterior.sampled), 3))
     u[:, 2] = 3.0
     return posterior, {"u_boundary": u, "lam": np.ones(3), "mu": np.ones(3)}, wall

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import bayesreg as br
 from tests.model.test_gradients import assert_gradient
+from tests.options import posterior_of
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
 
 MESH = ball_mesh(spacing=30.0)
@@ -26,7 +26,7 @@ def images():
 
 
 def posterior(**options):
-    return br.build_posterior(*images(), MESH, model=br.ModelConfig(**options))
+    return posterior_of(*images(), MESH, **options)
 
 
 def values(seed=0, **temperatures):
@@ -84,8 +84,8 @@ def test_an_outlier_counts_little_under_students_t():
     wrong[7, 5, 8] += 30
     found = {}
     for name in ("ssd", "student_t"):
-        model = br.ModelConfig(similarity=name, t_similarity=5.0)
-        clean, spoilt = (br.build_posterior(f, moving, MESH, model=model) for f in (fixed, fixed.with_voxels(wrong)))
+        options = {"similarity": name, "t_similarity": 5.0}
+        clean, spoilt = (posterior_of(f, moving, MESH, **options) for f in (fixed, fixed.with_voxels(wrong)))
         found[name] = [float(post.energies(values())["similarity_energy"]) for post in (clean, spoilt)]
     assert found["ssd"][1] > 5 * found["ssd"][0]
     assert found["student_t"][1] < 1.5 * found["student_t"][0]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from tests.options import posterior_of
 from tests.phantoms import ball_mesh, pair_from_model
 
 MESH = ball_mesh(spacing=24.0)
@@ -34,7 +35,10 @@ def phantom():
 def registered(similarity, which, sampler, t_similarity=None, **settings):
     """Median error of the mean of u_B, mm, rms of the error over the posterior's sd, and the result."""
     pair = phantom()
-    model = br.ModelConfig(
+    post = posterior_of(
+        pair[0],
+        pair[which],
+        MESH,
         similarity=similarity,
         elasticity="uniform",
         fixed={"lam": 10.0, "mu": 1.0},
@@ -43,7 +47,6 @@ def registered(similarity, which, sampler, t_similarity=None, **settings):
         t_elastic=300.0,
         t_similarity=t_similarity or {"median": 2 * pair[4]},
     )
-    post = br.build_posterior(pair[0], pair[which], MESH, model=model)
     found = br.sample(post, sampler, seed=0, progress=False, **settings)
     draws = found.idata.posterior["u_boundary"].values
     error = draws.mean(axis=(0, 1)) - pair[3]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from studies.calibration import geweke
-from studies.calibration.simulator import VARIANTS, Simulator, posterior_of
+from studies.calibration.simulator import VARIANTS, Simulator, calibrated
 
 SIZE = {"chains": 120, "steps": 40}
 
@@ -30,6 +30,6 @@ def test_the_papers_kernel_leaves_the_joint_distribution_alone():
 @pytest.mark.slow
 def test_a_density_without_its_normaliser_is_found_out():
     """The paper's: λ and μ drift towards zero."""
-    wrong = posterior_of(VARIANTS["no skull"], normalised=False)
+    wrong = calibrated(VARIANTS["no skull"], normalised=False)
     found = geweke.compare(simulator(), "rwmh", wrong, **SIZE)
     assert not found.passes

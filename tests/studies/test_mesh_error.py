@@ -8,6 +8,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.io.atomic import read_json
+from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.results.result import Result
 from studies.mesh_error import __main__ as module
 from studies.mesh_error import bodies as bodies_module
@@ -19,6 +20,7 @@ from tests.report.conftest import make_study
 from tests.synthetic.test_pair import head
 
 NAMES = ("csf", "gm", "wm")
+OPTIONS = ImageOptions(similarity=br.StudentT(temperature=0.3), interpolation="cubic")
 
 
 def fake(_subject: Subject, seed: int) -> Body:
@@ -31,7 +33,10 @@ def fake(_subject: Subject, seed: int) -> Body:
 
 @pytest.fixture(scope="module")
 def study():
-    return make_study(draws=100, spacing=18.0)
+    found = make_study(draws=100, spacing=18.0)
+    images = {"kind": "images", "noise_sd": 0.0146, "options": OPTIONS.model_dump(mode="json")}
+    manifest = {**found.run.manifest, "observations": {"images": images}}
+    return found._replace(run=replace(found.run, manifest=manifest))
 
 
 def result_of(folder, run, study):
@@ -53,8 +58,9 @@ def folder(study, tmp_path, monkeypatch):
 def subject_of(**options) -> Subject:
     given = head(2.5)
     values = (dict(zip(NAMES, known.tolist(), strict=True)) for known in (PAPER_LAM, PAPER_MU))
-    model = br.ModelConfig(t_similarity=1e-3, interpolation="cubic", **options)
-    return Subject(given.fixed, given.tissue, given.skull, given.mesh, given.mesh, model, *values, 7.0, 1e-4)
+    images = {"similarity": br.SquaredDifferences(temperature=1e-3), "interpolation": "cubic"}
+    model = br.ModelConfig(**options)
+    return Subject(given.fixed, given.tissue, given.skull, given.mesh, given.mesh, model, images, *values, 7.0, 1e-4)
 
 
 def test_on_the_mesh_that_made_a_body_its_registration_finds_its_ratio():
@@ -99,6 +105,7 @@ def test_bodies_are_kept_and_more_are_added(folder, monkeypatch):
 
     def asking(subject: Subject, seed: int) -> Body:
         asked.append(seed)
+        assert ImageOptions(**subject.image_options) == OPTIONS
         return fake(subject, seed)
 
     monkeypatch.setattr(module, "register_body", asking)
@@ -125,7 +132,7 @@ def test_nothing_is_told_where_too_few_are_registered(folder, monkeypatch):
     [
         ({"skull": None}, "inside the skull"),
         ({"boundary": np.zeros((3, 3))}, "must not be held"),
-        ({"config": "model: {held: {0: [0.0, 0.0, 0.0]}}"}, "must not be held"),
+        ({"config": "model: {elastic_prior: {held: {0: [0.0, 0.0, 0.0]}}}"}, "must not be held"),
         ({"config": "model: {elasticity: uniform}"}, "elasticity: tissue"),
         ({"config": "model: {fixed: {lam: 9.0, mu: 1.0}}"}, "elasticity: tissue"),
         ({"manifest": {"observations": {"images": {}}, "inverted_elements": 2}}, "inside out"),

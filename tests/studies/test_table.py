@@ -76,5 +76,5 @@ def test_bayesreg_takes_the_configuration(tmp_path):
         (tmp_path / "pair").mkdir(exist_ok=True)
         (tmp_path / "pair" / f"{name}.nii.gz").touch()
     config = load_config(table.configure(tmp_path / "pair"))
-    assert config.model.elastic_prior == "loads"
+    assert config.model.elastic_prior.kind == "loads"
     assert config.data.tissues == ("csf", "gm", "wm")
