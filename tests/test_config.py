@@ -7,12 +7,15 @@ import pytest
 from pydantic import ValidationError
 
 from bayesreg.config import Config, ConfigError, load_config, model_of, resolved_yaml, schema
+from bayesreg.model.observations.images.options import ImageOptions, with_preset
 from bayesreg.model.options import ModelConfig
 from bayesreg.types import InputError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SMALL = "data: {source: mni152}\nsimulate: {kind: paper}\n"
-PROPER = "model: {normalised: true, priors: {lam: {csf: {high: 9}, gm: {high: 9}, wm: {high: 9}}, mu: {high: 9}}"
+POINTS = "observations: [{kind: landmarks, file: points.csv}]"
+PRIORS = "priors: {lam: {csf: {high: 9}, gm: {high: 9}, wm: {high: 9}}, mu: {high: 9}}"
+PROPER = f"model: {{{PRIORS}, elastic_prior: {{kind: boltzmann, normalised: true"
 FILES = """
 data:
   source: files
@@ -69,8 +72,10 @@ def test_paper_tissues_is_section_4_2_to_the_letter(paper_data):
     assert (config.simulate.displacement, config.simulate.patch_nodes) == (15, 20)
     assert config.simulate.lam == {"csf": 1e-6, "gm": 10, "wm": 30}
     assert config.simulate.mu == {"csf": 1e-6, "gm": 1, "wm": 1}
-    assert (config.model.elasticity, config.model.t_similarity, config.model.t_elastic) == ("tissue", 0.05, 10_000)
-    assert (config.model.quadrature, config.model.sampled, config.model.normalised) == ("gauss4", "boundary", False)
+    elastic, (images,) = config.model.elastic_prior, config.observations
+    assert (config.model.elasticity, elastic.kind, elastic.temperature) == ("tissue", "boltzmann", 10_000)
+    assert (elastic.nodes, elastic.normalised, config.model.skull_width) == ("boundary", False, 0)
+    assert (images.similarity.kind, images.similarity.temperature, images.quadrature) == ("ssd", 0.05, "gauss4")
     assert (config.model.fixed, config.model.priors) == ({"mu": {"gm": 1.0}}, {})
     assert (config.sampler.name, config.sampler.sigma_u) == ("rwmh", 0.008)
     assert (config.sampler.chains, config.sampler.thin) == (3, 10)
@@ -97,8 +102,7 @@ seed: 7
 data: {source: mni152}
 simulate: {kind: calibrated, direction: [1, 2, 3], lam: {csf: 1e-6, gm: 10, wm: 3e1}}
 model:
-  held: {12: [0, 0, -1.5]}
-  sampled: [1, 2, 3]
+  elastic_prior: {held: {12: [0, 0, -1.5]}, nodes: [1, 2, 3]}
   priors: {lam: {gm: {alpha: 2, beta: 3, low: 0, high: 60}}, mu: {high: .inf}}
 start: {field: truth, fraction: 0.5, lam: {csf: 1, gm: 10, wm: 20}}
 stop: {rhat: null, max_minutes: 1}
@@ -114,12 +118,14 @@ report: {places: {left ventricle: [-12, 3.5, 20]}}
     assert "rhat: null" in resolved_yaml(config)
 
 
-@pytest.mark.parametrize(
-    "more", ["", ", t_elastic: {median: 200}", ", fixed: {}", ", held: {3: [0, 0, 0]}", ", similarity: student_t"]
-)
-def test_the_proper_density(write, more):
-    config = load_config(write(SMALL + PROPER + ", t_similarity: {median: 0.05, log_sd: 0.5}" + more + "}"))
-    assert (config.model.t_similarity.median, config.model.t_similarity.log_sd) == (0.05, 0.5)
+@pytest.mark.parametrize("more", ["", ", temperature: {median: 200}", "}, fixed: {", ", held: {3: [0, 0, 0]}"])
+@pytest.mark.parametrize("kind", ["ssd", "student_t"])
+def test_the_proper_density(write, more, kind):
+    similarity = f"{{kind: {kind}, temperature: {{median: 0.05, log_sd: 0.5}}}}"
+    observed = f"\nobservations: [{{kind: images, similarity: {similarity}}}]"
+    config = load_config(write(SMALL + PROPER + more + "}}" + observed))
+    (images,) = config.observations
+    assert (images.similarity.temperature.median, images.similarity.temperature.log_sd) == (0.05, 0.5)
     assert load_config(write(resolved_yaml(config), "resolved.yaml")) == config
 
 
@@ -156,7 +162,7 @@ sampler:
 stop: {rhat: "low", max_steps: 0}
 start: {field: truth}
 """
-    message = complaint(write(text), "model.t_similarity=-3")
+    message = complaint(write(text), "model.rigid_sd=-3")
     for part in (
         "run.yaml:2: seed = -1: expected greater than or equal to 0",
         'run.yaml:6: data.moving = "gone.nii": no such file',
@@ -167,11 +173,15 @@ start: {field: truth}
         "run.yaml:11: sampler.thin = 2.5: expected a whole number",
         'run.yaml:12: stop.rhat = "low": expected a number',
         "run.yaml:12: stop.max_steps = 0: expected greater than or equal to 1",
-        "--set model.t_similarity=-3: model.t_similarity = -3: expected greater than 0",
+        "--set model.rigid_sd=-3: model.rigid_sd = -3: expected greater than 0",
         'run.yaml:13: start.field = "truth": the truth of this pair is not known',
     ):
         assert part in message
     assert len(message.splitlines()) == 11
+
+
+def similar(settings):
+    return f"observations: [{{kind: images, similarity: {{{settings}}}}}]"
 
 
 @pytest.mark.parametrize(
@@ -201,7 +211,10 @@ start: {field: truth}
             "stop.max_steps = 15: expected at least two kept draws, 20",
         ),
         (SMALL + "model: {elasticity: uniform}\nstart: {mu: {csf: 1, gm: 1, wm: 1}}", "start.mu"),
-        (SMALL + "model: {sampled: [4, 4, 7]}", "model.sampled = [4, 4, 7]: expected at least three nodes"),
+        (
+            SMALL + "model: {elastic_prior: {nodes: [4, 4, 7]}}",
+            "model.elastic_prior.nodes = [4, 4, 7]: expected at least three nodes",
+        ),
         (SMALL + "model: {fixed: {mu: {grey: 1}}}", "model.fixed.mu.grey = 1: unknown tissue; expected csf, gm, wm"),
         (SMALL + "model: {field: {modes: 9}}", "it belongs to elasticity: field, which is tissue here"),
         (SMALL + "model: {elasticity: field, field: {modes: 0}}", "model.field.modes = 0: expected greater than or eq"),
@@ -209,35 +222,51 @@ start: {field: truth}
         (SMALL + "known_boundary: brain.nii", 'known_boundary = "brain.nii": no such file'),
         (FILES + "known_boundary: truth", "the truth of this pair is not known; expected a file or null"),
         (SMALL + "known_boundary: truth", "model.priors.lam: a given boundary needs a prior with a finite high"),
-        (SMALL + "known_boundary: truth\nmodel: {sampled: all}", 'model.sampled = "all": expected the default'),
         (
-            SMALL + "known_boundary: truth\n" + PROPER + "}",
-            "model.normalised = true: expected false with known_boundary",
+            SMALL + "known_boundary: truth\nmodel: {elastic_prior: {nodes: all}}",
+            'model.elastic_prior.nodes = "all": expected the default',
+        ),
+        (
+            SMALL + "known_boundary: truth\n" + PROPER + "}}",
+            "model.elastic_prior.normalised = true: expected false with known_boundary",
         ),
         (SMALL + "model: {priors: {lam: {low: 3, high: 2}}}", 'model.priors.lam = {"low": 3, "high": 2}: a prior'),
         (SMALL.replace("paper", "paper, direction: [0, 0, 0]"), "simulate.direction = [0, 0, 0]: expected a direction"),
         (SMALL.replace("paper", "paper, making_edge_length: 9"), "simulate.making_edge_length = 9: unknown key"),
         (SMALL.replace("paper", "calibrated, making_edge_length: 20"), "expected less than mesh.edge_length, 15.5 mm"),
-        (SMALL + "model: {t_similarity: hot}", 'model.t_similarity = "hot": expected a number or keys with values'),
-        (SMALL + "model: {t_similarity: {median: 0}}", "model.t_similarity.median = 0: expected greater than 0"),
-        (SMALL + "model: {t_elastic: {log_sd: 1}}", "model.t_elastic.median: missing"),
-        (SMALL + "model: {degrees_of_freedom: 2}", "model.degrees_of_freedom = 2: expected greater than 2"),
+        (SMALL + similar("temperature: hot"), 'similarity.temperature = "hot": expected a number or keys with values'),
+        (SMALL + similar("temperature: {median: 0}"), "similarity.temperature.median = 0: expected greater than 0"),
+        (SMALL + similar("kind: student_t, degrees_of_freedom: 2"), "degrees_of_freedom = 2: expected greater than 2"),
+        (SMALL + similar("kind: correlation"), "expected one of 'ssd', 'student_t', 'lncc', 'mi', 'mind'"),
+        (SMALL + similar("kind: mi, temperature: {median: 1}"), "expected a number"),
+        (SMALL + similar("window_mm: 3"), "window_mm = 3: unknown key"),
+        (SMALL + "observations: [{kind: images, similarity: lncc, intensity_map: 1}]", "which has maps of its own"),
+        (SMALL + "observations: [{kind: images, independent_points: residual}]", "residual needs quadrature: voxels"),
+        (SMALL + "observations: [3]", "observations.0 = 3: expected keys with values, such as kind: landmarks"),
+        (SMALL + "observations: [{sd: 1}]", "the kind is missing; expected one of images, landmarks"),
+        (SMALL + "model: {elastic_prior: loud}", "expected one of 'boltzmann', 'loads'"),
+        (SMALL + "model: {elastic_prior: {kind: loads, nodes: all}}", 'nodes = "all": unknown key'),
+        (SMALL + "model: {elastic_prior: {temperature: {log_sd: 1}}}", "elastic_prior.temperature.median: missing"),
+        (SMALL + "model: {elastic_prior: {temperature: {median: 9}}}", "a T_r with a prior needs normalised: true"),
         (
-            SMALL + "model: {t_elastic: {median: 9}}",
-            'model.t_elastic = {"median": 9}: a T_r with a prior needs normalis',
+            SMALL + "model: {elastic_prior: {temperature: {median: 9}, normalised: true}, fixed: {}}",
+            "model.fixed = {}: t_elastic of the elastic prior has a prior",
         ),
         (
-            SMALL + "model: {t_elastic: {median: 9}, normalised: true, fixed: {}}",
-            "model.fixed = {}: t_elastic has a pri",
+            SMALL + "model: {elastic_prior: loads, fixed: {}, " + PRIORS + "}",
+            "body_load and surface_load of the elastic",
         ),
-        (SMALL + "model: {normalised: true}", "model.priors.lam: normalised: true needs a prior with a finite high"),
-        (SMALL + "model: {normalised: true, priors: {lam: {high: 9}}}", "model.priors.mu: normalised: true needs"),
-        (SMALL + PROPER.replace("csf: {high: 9}, ", "") + "}", "every free parameter, and lam of csf has none"),
-        (SMALL + PROPER + ", held: {3: [0, 0, 1]}}", "with normalised: true a node is held where it is"),
         (
-            SMALL + PROPER + ", held: {3: [0, 0, 0]}, rigid_sd: 2}",
-            "model.rigid_sd = 2: with normalised: true",
+            SMALL + "model: {elastic_prior: {normalised: true}}",
+            "model.priors.lam: elastic_prior: boltzmann, normalised, needs a prior with a finite high",
         ),
+        (
+            SMALL + "model: {elastic_prior: {normalised: true}, priors: {lam: {high: 9}}}",
+            "model.priors.mu: elastic_prior",
+        ),
+        (SMALL + PROPER.replace("csf: {high: 9}, ", "") + "}}", "every free parameter, and lam of csf has none"),
+        (SMALL + PROPER + ", held: {3: [0, 0, 1]}}}", "with normalised: true a node is held where it is"),
+        (SMALL + PROPER + ", held: {3: [0, 0, 0]}}, rigid_sd: 2}", "model.rigid_sd = 2: with normalised: true"),
         ("extends: 3", "extends = 3: expected the path of a file"),
         ("extends: base.yaml", "base.yaml does not exist"),
         ("extends: run.yaml", "extends itself"),
@@ -269,10 +298,10 @@ def test_relative_paths_are_looked_for_in_three_places(write, tmp_path, monkeypa
 
 
 def test_extends_merges_sections_key_by_key_and_replaces_values(write):
-    write(SMALL + "sampler: {thin: 5, chains: 4}\nmodel: {fixed: {mu: {gm: 1}}, t_similarity: 1}\n", "base.yaml")
+    write(SMALL + "sampler: {thin: 5, chains: 4}\nmodel: {fixed: {mu: {gm: 1}}, rigid_sd: 1}\n", "base.yaml")
     config = load_config(write("extends: base.yaml\nsampler: {chains: 2}\nmodel: {fixed: {lam: 3}}\n"))
     assert (config.sampler.thin, config.sampler.chains) == (5, 2)
-    assert (config.model.fixed, config.model.t_similarity) == ({"lam": 3.0}, 1)
+    assert (config.model.fixed, config.model.rigid_sd) == ({"lam": 3.0}, 1)
 
 
 def test_extends_replaces_a_section_of_another_kind(write):
@@ -311,9 +340,7 @@ def test_start_values_by_entry(write):
 
 
 def test_the_model_of_a_resolved_configuration_needs_no_files(write):
-    model = (
-        "model: {priors: {lam: {high: .inf}, mu: {gm: {high: 3}}}, held: {7: [0, 0.5, 0]}, t_similarity: {median: 1}}"
-    )
+    model = "model: {priors: {lam: {high: .inf}, mu: {gm: {high: 3}}}, elastic_prior: {held: {7: [0, 0.5, 0]}}}"
     config = load_config(write(SMALL + model))
     assert model_of(resolved_yaml(config)) == config.model
 
@@ -322,8 +349,11 @@ def test_schema_describes_every_section_and_forbids_unknown_keys():
     found = schema()
     assert set(found["properties"]) == {*Config.model_fields, "extends"}
     assert found["additionalProperties"] is False
-    temperature = found["$defs"]["ModelConfig"]["properties"]["t_elastic"]["anyOf"]
-    assert {"$ref": "#/$defs/TemperaturePrior"} in temperature
+    temperature = found["$defs"]["Boltzmann"]["properties"]["temperature"]["anyOf"]
+    assert {"$ref": "#/$defs/ScalePrior"} in temperature
+    kinds = found["properties"]["observations"]["items"]["anyOf"]
+    assert [{"$ref": f"#/$defs/{name}Section"} for name in ("Images", "Landmarks")] == kinds[:2]
+    assert "similarity" in found["$defs"]["ImagesSection"]["properties"]
     assert found["$defs"]["RandomWalk"]["properties"]["sigma_u"]["description"].endswith("mm.")
 
 
@@ -331,25 +361,30 @@ def test_schema_describes_every_section_and_forbids_unknown_keys():
     ("given", "preset"),
     [
         (FILES, "registration"),
-        (FILES + "model: {t_similarity: 0.02}", "registration"),
+        (FILES + "observations: [{kind: images, smoothing: 0.02}]", "registration"),
         (FILES + "model: {preset: paper}", "paper"),
         (FILES + "known_boundary: mesh.vtu\nmodel: {fixed: {lam: 1.0, mu: 1.0}}", "paper"),
-        (FILES + "observations: [{kind: landmarks, file: points.csv}]", "paper"),
-        (FILES + "observations: [{kind: images}]", "registration"),
+        (FILES + "observations: [{kind: landmarks, file: points.csv}]", "registration"),
+        ("data: {source: files}\nmesh: {file: mesh.vtu}\n" + POINTS, "registration"),
         (SMALL, "paper"),
     ],
 )
-def test_images_that_are_files_have_the_model_for_real_pairs(write, given, preset):
+def test_what_comes_from_files_has_the_model_for_real_data(write, given, preset):
     path = write(given)
     for name in ("mesh.vtu", "points.csv"):
         (path.parent / name).touch()
-    model = load_config(path).model
-    expected, changed = ModelConfig(preset=preset), {"t_similarity", "fixed"}
-    assert model.model_dump(exclude=changed) == expected.model_dump(exclude=changed)
-    assert (model.t_similarity == 0.02) == ("0.02" in given)
+    config = load_config(path)
+    expected = ModelConfig(preset=preset)
+    assert config.model.model_dump(exclude={"fixed"}) == expected.model_dump(exclude={"fixed"})
+    for pair in config.pairs_of_images:
+        usual = ImageOptions(**with_preset(preset, {}))
+        given_smoothing = {"smoothing": 0.02} if "0.02" in given else {}
+        assert ImageOptions(**pair.options) == usual.model_copy(update=given_smoothing)
 
 
-def test_windows_with_a_map_each_have_no_other_one():
-    model = ModelConfig(preset="registration", similarity="lncc")
-    assert model.intensity_map is None
-    assert model.elastic_prior == "loads"
+def test_an_override_names_the_first_observation_where_none_is_listed(write):
+    path = write(FILES)
+    config = load_config(path, ["observations.0.similarity=lncc"])
+    (images,) = config.observations
+    assert (images.similarity.kind, images.intensity_map, images.quadrature) == ("lncc", None, "voxels")
+    assert config.model.elastic_prior.kind == "loads"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import bayesreg as br
 from bayesreg.config.data import FilesData
 from bayesreg.image import Image
 from bayesreg.types import InputError
@@ -24,7 +25,10 @@ def with_metal(image):
     return image.with_voxels(voxels)
 
 
-def match(fixed=FIXED, moving=FIXED, similarity="student_t", **ignored):
+STUDENT_T = br.StudentT()
+
+
+def match(fixed=FIXED, moving=FIXED, similarity=STUDENT_T, **ignored):
     return match_images(DATA, similarity, DOMAIN, fixed, moving, **ignored)
 
 
@@ -71,5 +75,7 @@ def test_a_mask_of_all_the_organ_is_refused():
 
 def test_a_similarity_that_serves_any_contrast_is_named():
     inverted = FIXED.with_voxels(-np.asarray(FIXED.voxels))
-    assert "compared by mind, which serves any" in " ".join(match(moving=inverted, similarity="mind").notes)
+    assert "compared by mind, which serves any" in " ".join(
+        match(moving=inverted, similarity=br.SelfSimilarity()).notes
+    )
     assert "through a map of the fixed image" in " ".join(match(moving=inverted).notes)

@@ -100,7 +100,7 @@ def test_the_run_is_resumed_from_its_folder_alone(result, tmp_path):
     config = br.load_config(Path(result.folder).parent / "run.yaml", ["stop.max_steps=80"])
     (Path(result.folder).parent / "points.csv").unlink()
     again = br.run(config, out=result.folder, resume=True, progress=False)
-    assert again.idata.posterior.sizes["draw"] > result.idata.posterior.sizes["draw"]
+    assert again.idata.posterior.sizes["draw"] == 80
 
 
 def test_what_is_wrong_in_its_section_is_told_with_its_place(tmp_path):

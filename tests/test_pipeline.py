@@ -431,7 +431,7 @@ def test_an_observation_from_outside_goes_through_run_resume_and_report(folder, 
             "sampler={name: laplace, chains: 2}",
             f"stop={{rhat: 1.01, ess: null, max_steps: {steps}}}",
         ]
-        return br.load_config(folder / "run.yaml", [*settings, "model.interpolation=cubic"])
+        return br.load_config(folder / "run.yaml", [*settings, "observations.0.interpolation=cubic"])
 
     out, observed = tmp_path / "out", [MeanDisplacement()]
     with without_reports():

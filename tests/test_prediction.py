@@ -10,10 +10,11 @@ import xarray as xr
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.inference.draws.predictive import predictive_p
-from bayesreg.model.adequacy import DISCREPANCIES, discrepancies
+from bayesreg.model.observations.images.discrepancies import DISCREPANCIES, discrepancies
+from bayesreg.model.observations.images.report import predictive_p
 from bayesreg.pose import Pose
 from bayesreg.workflow.prediction import default_places, mean_values, predict, require_inside
+from tests.options import posterior_of
 from tests.phantoms import box_mesh, smooth_image
 
 MESH = box_mesh(3)
@@ -26,7 +27,7 @@ def problem() -> tuple[br.Posterior, xr.Dataset, np.ndarray]:
     """A posterior whose fixed image is the moving one, moved and with the noise of the model; draws near the truth."""
     rng = np.random.default_rng(0)
     moving = smooth_image(MESH.points, seed=2, blur=3.0)
-    posterior = br.build_posterior(moving, moving, MESH, br.ModelConfig(t_similarity=0.05))
+    posterior = posterior_of(moving, moving, MESH, t_similarity=0.05)
     images = posterior.images
     truth = {
         name: np.array(value) for name, value in posterior.reference().items() if name in ("u_boundary", "lam", "mu")
@@ -93,21 +94,21 @@ def _shares(corners: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 def test_noise_of_the_model_passes_the_checks():
     found = predicted()
-    near = found.observed[:2], found.replicated[:2]
+    near = found.observations["images/observed"][:2], found.observations["images/replicated"][:2]
     for k in range(len(DISCREPANCIES)):
         assert 0.02 < predictive_p(near[0][..., k], near[1][..., k]) < 0.98, DISCREPANCIES[k]
 
 
 def test_a_wrong_displacement_fails_them():
     found = predicted()
-    wrong = found.observed[2, :6], found.replicated[2, :6]
+    wrong = found.observations["images/observed"][2, :6], found.observations["images/replicated"][2, :6]
     assert [predictive_p(wrong[0][..., k], wrong[1][..., k]) for k in (0, 2)] == [0.0, 0.0]
 
 
 def test_replications_differ_between_draws_and_follow_the_seed():
     posterior, draws, _ = problem()
     found = predicted()
-    assert len(np.unique(found.replicated[..., 0])) == 36
+    assert len(np.unique(found.observations["images/replicated"][..., 0])) == 36
     mean = everywhere().mean(axis=(0, 1))
     again = predict(
         posterior,
@@ -119,7 +120,7 @@ def test_replications_differ_between_draws_and_follow_the_seed():
         seed=1,
         pose=REST,
     )
-    np.testing.assert_array_equal(again.replicated, found.replicated)
+    np.testing.assert_array_equal(again.observations["images/replicated"], found.observations["images/replicated"])
 
 
 def test_the_residual_at_the_truth_is_standard_normal():
@@ -135,8 +136,14 @@ def test_a_sampled_temperature_sets_the_unit_of_its_draw():
     heated = draws.assign(t_similarity=(("chain", "draw"), np.full((3, 12), 0.2)))
     mean = everywhere().mean(axis=(0, 1))
     found = predict(posterior, heated, mean_values(posterior, heated, mean), mean, mean, PLACES, seed=1, pose=REST)
-    np.testing.assert_allclose(found.observed[..., :2], predicted().observed[..., :2] / 2, rtol=1e-6)
-    np.testing.assert_allclose(found.residual, predicted().residual / 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        found.observations["images/observed"][..., :2],
+        predicted().observations["images/observed"][..., :2] / 2,
+        rtol=1e-6,
+    )
+    np.testing.assert_allclose(
+        found.observations["images/residual"], predicted().observations["images/residual"] / 2, rtol=1e-5
+    )
 
 
 class _Heated(br.Posterior):
@@ -191,8 +198,8 @@ def test_replicates_follow_students_t_where_the_model_does():
     """The data are drawn from the model: no discrepancy is extreme, as all were with Normal replicates."""
     rng, nu = np.random.default_rng(1), 3.0
     moving = smooth_image(MESH.points, seed=2, blur=3.0)
-    model = br.ModelConfig(t_similarity=0.05, similarity="student_t", degrees_of_freedom=nu, quadrature="gauss32")
-    posterior = br.build_posterior(moving, moving, MESH, model)
+    options = {"t_similarity": 0.05, "similarity": "student_t", "degrees_of_freedom": nu, "quadrature": "gauss32"}
+    posterior = posterior_of(moving, moving, MESH, **options)
     images = posterior.images
     noise = np.sqrt(0.05 / (2 * np.asarray(images.quadrature.weights))) * rng.standard_t(nu, len(images.fixed_values))
     shown = images._replace(fixed_values=images.fixed_values + noise)
@@ -204,8 +211,9 @@ def test_replicates_follow_students_t_where_the_model_does():
     )
     zero = np.zeros_like(MESH.points)
     found = predict(posterior, draws, mean_values(posterior, draws, zero), zero, zero, PLACES, seed=0, pose=REST)
-    for k in range(len(found.discrepancies)):
-        assert 0.01 < predictive_p(found.observed[..., k], found.replicated[..., k]) < 0.99, found.discrepancies[k]
+    checked = found.of_observation("images")
+    for k, name in enumerate(DISCREPANCIES):
+        assert 0.01 < predictive_p(checked["observed"][..., k], checked["replicated"][..., k]) < 0.99, name
 
 
 @pytest.mark.parametrize(
@@ -213,7 +221,7 @@ def test_replicates_follow_students_t_where_the_model_does():
 )
 def test_replicated_noise_has_the_distribution_of_the_likelihood(similarity, distribution):
     image = smooth_image(MESH.points, seed=2)
-    model = br.ModelConfig(t_similarity=0.05, similarity=similarity, quadrature="gauss32")
-    posterior = br.build_posterior(image, image, MESH, model)
+    options = {"t_similarity": 0.05, "similarity": similarity, "quadrature": "gauss32"}
+    posterior = posterior_of(image, image, MESH, **options)
     noise = posterior.images.standardised_noise(jax.random.key(0), np.zeros_like(MESH.points))
     assert stats.kstest(np.asarray(noise), distribution.cdf).pvalue > 1e-3

@@ -72,10 +72,10 @@ def test_a_table_is_named_or_lies_in_a_file(register):
 
 
 def test_options_are_set_as_in_run(register):
-    register.call("--labels", register.path("labels"), "--set", "stop.max_minutes=3", "--set", "model.similarity=lncc",
-                  "--set", "model.intensity_map=null")  # fmt: skip
+    register.call("--labels", register.path("labels"), "--set", "stop.max_minutes=3", "--set",
+                  "observations.0.similarity=lncc", "--set", "observations.0.intensity_map=null")  # fmt: skip
     config = register.calls[0][0]
-    assert (config.stop.max_minutes, config.model.similarity) == (3, "lncc")
+    assert (config.stop.max_minutes, config.image_options.similarity.kind) == (3, "lncc")
 
 
 def test_what_is_said_is_what_was_set(register):

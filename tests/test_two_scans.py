@@ -63,14 +63,17 @@ def folder(tmp_path_factory):
         whole.points - (5.0, -3.0, 8.0), whole.cells, np.zeros(len(whole.cells), int), ("organ",)
     )
     br.save_mesh(mesh, folder / "mesh.vtu")
+    compared = {
+        "kind": "images", "similarity": {"kind": "ssd", "temperature": 0.3}, "interpolation": "cubic",
+        "quadrature": "gauss32",
+    }  # fmt: skip
     content = {
         "data": {"source": "files", "fixed": "fixed.nii.gz", "moving": "moving.nii.gz", "labels": "organ.nii.gz",
                  "label_table": "mask", "moving_ignore": "cavity.nii.gz"},
         "mesh": {"file": "mesh.vtu"},
-        "observations": [{"kind": "images"}, {"kind": "images", "name": "flair", "fixed": "flair_fixed.nii.gz",
-                                              "moving": "flair_moving.nii.gz"}],
-        "model": {"preset": "paper", "t_similarity": 0.3, "interpolation": "cubic", "quadrature": "gauss32",
-                  "fixed": {"lam": 10.0, "mu": 1.0}},
+        "observations": [compared, {**compared, "name": "flair", "fixed": "flair_fixed.nii.gz",
+                                    "moving": "flair_moving.nii.gz"}],
+        "model": {"preset": "paper", "fixed": {"lam": 10.0, "mu": 1.0}},
         "sampler": {"name": "laplace", "chains": 2},
         "stop": {"rhat": None, "max_steps": 200},
         "results": {"draws": 4, "bids": {"subject": "01", "session": "or"}},

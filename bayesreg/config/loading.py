@@ -6,9 +6,9 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Union
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 from ruamel.yaml.representer import RoundTripRepresenter
@@ -16,6 +16,7 @@ from ruamel.yaml.representer import RoundTripRepresenter
 from bayesreg.config.errors import ConfigError, Keys, explain
 from bayesreg.config.sections import Config, complete
 from bayesreg.config.yaml_text import DEEPEST, parse
+from bayesreg.model.observations.registry import kinds
 from bayesreg.model.options import ModelConfig
 from bayesreg.settings import search_folders
 
@@ -111,6 +112,9 @@ def model_of(text: str) -> ModelConfig:
 def schema() -> dict[str, Any]:
     """JSON schema of a configuration file, for editors."""
     result = Config.model_json_schema()
+    observed = TypeAdapter(Union[tuple(kinds().values())]).json_schema()  # noqa: UP007 (the kinds are known here only)
+    result["$defs"] |= observed.pop("$defs")
+    result["properties"]["observations"]["items"] = observed
     result["properties"]["extends"] = {"type": "string", "description": "A file that this one takes over."}
     return result
 

@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from bayesreg.model.observations.landmarks_report import surprise
 
 from bayesreg.io.points import read_point_pairs
+from bayesreg.model.observations.landmarks_report import surprise
 from bayesreg.model.submesh import submesh_variance
 from bayesreg.results.nodal_draws import transform_of
 from bayesreg.results.result import load_result

@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Annotated, Any, get_args
 
-from pydantic import AfterValidator, BeforeValidator, SerializeAsAny, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
 
 from bayesreg.model.observations.images.section import ImagesSection
 from bayesreg.model.observations.landmarks import LandmarksSection
@@ -70,6 +70,5 @@ def _require_different_names(given: list[Any]) -> list[Any]:
     return given
 
 
-_SCHEMA = {"anyOf": [section.model_json_schema() for section in _registered.values()]}
-AnyObservation = Annotated[SerializeAsAny[ObservationSection], BeforeValidator(_as_section), WithJsonSchema(_SCHEMA)]
+AnyObservation = Annotated[SerializeAsAny[ObservationSection], BeforeValidator(_as_section)]
 Observations = Annotated[list[AnyObservation], AfterValidator(_require_different_names)]
