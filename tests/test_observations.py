@@ -189,7 +189,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
     assert result.idata.posterior["vessel_sd"].shape == (2, 10)
     assert (result.idata.posterior["vessel_sd"] > 0).all()
     assert list(result.run.manifest["observations"]) == ["images", "vessel"]
-    assert result.run.manifest["model"]["vessel_sd"] == {"median": 0.5, "log_sd": 1.0}
+    assert result.run.manifest["scales"]["vessel_sd"] == {"median": 0.5, "log_sd": 1.0}
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "vessel sd, mm" in page
     assert "Posterior predictive checks" in page

@@ -5,7 +5,8 @@
 RUN is a run's folder; without it a phantom is registered, a ball pressed in from the side, with a wall above it. All
 chains start at the same places, overdispersed about the mode. The search for it is on nobody's account, its last
 seconds on that of `hmc`. The others sample `bayesreg.inference.target.logdensity`, its elastic solves as for chains of
-`hmc`, in unconstrained coordinates and in those that `hmc` has whitened by the end of its warm-up: these they are given.
+`hmc`, in unconstrained coordinates and in those that `hmc` has whitened by the end of its warm-up, which they are
+given.
 
 - Warm-up counts, and takes the others a third of the budget. Compilation does not, tracing included; it is told.
 - NumPyro's chains are vectorised. It has its diagonal mass and a warm-up of 1,000 transitions, cut off when the third
