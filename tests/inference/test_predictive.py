@@ -6,7 +6,8 @@ import pytest
 import xarray as xr
 
 from bayesreg.inference.draws import predictive
-from bayesreg.inference.draws.predictive import predictive_p, push_forward, summarise, thin
+from bayesreg.inference.draws.predictive import push_forward, summarise, thin
+from bayesreg.model.observations.images.report import predictive_p
 
 DRAWS = {"u": np.random.default_rng(0).gamma(2.0, size=(3, 50, 4)), "scale": np.linspace(1, 2, 150).reshape(3, 50)}
 

@@ -50,7 +50,7 @@ def test_draws_do_not_depend_on_the_blocks():
         np.testing.assert_array_equal(values, draws(one)[name])
 
 
-@pytest.mark.parametrize("target", [GaussianTarget(wall=0.1), None], ids=["gaussian", "registration"])
+@pytest.mark.parametrize("target", [GaussianTarget(wall=0.1, width=0.0), None], ids=["gaussian", "registration"])
 def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_are(monkeypatch, target):
     each = SAMPLERS["rwmh"]._replace(make=lambda *given: rwmh(*given)._replace(outside=None))
     monkeypatch.setitem(SAMPLERS, "each", each)
