@@ -162,8 +162,8 @@ def _require_nothing_else(model: ModelConfig) -> None:
 def complete(given: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration, before it is checked, with the preset of its model and the observations that it leaves out.
 
-    What comes from files has `preset: registration` by default; so has a known boundary `preset: paper`, and what is
-    made here. Images that are there are compared, unless the observations are listed.
+    The default is `preset: registration` where data come from files, and `preset: paper` where the pair is made here or
+    the boundary is known. Images that are there are compared, unless the observations are listed.
     """
     data, found = given.get("data"), dict(given)
     if not isinstance(data, Mapping):

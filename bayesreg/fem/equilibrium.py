@@ -180,43 +180,6 @@ def _sensitivity(
 _differentiable.defvjp(_forward, _backward)
 
 
-def linear_response(
-    system: ElasticSystem,
-    matrix: scipy.sparse.csr_matrix,
-    nodes: Int[np.ndarray, "k"],
-    moved: Int[np.ndarray, "moved"],
-) -> Float[np.ndarray, "rows columns"]:
-    """Displacements of some nodes for those of some prescribed ones, as a matrix; to single precision.
-
-    Parameters
-    ----------
-    system : ElasticSystem
-        With a dense preconditioner, or without free nodes.
-    matrix : (3n, 3n) sparse matrix
-        K, at the λ and μ that the system is preconditioned at.
-    nodes : (k,) int array
-        Free or prescribed.
-    moved : (moved,) int array
-        Prescribed.
-
-    Returns
-    -------
-    (3k, 3 moved) array
-        Entries of −K_II⁻¹ K_IB, and of the identity for prescribed nodes.
-    """
-    free = np.asarray(system.free)
-    response = (unknowns_of(nodes)[:, None] == unknowns_of(moved)).astype(float)
-    if not np.isin(nodes, free).any():
-        return response
-    assert isinstance(system.preconditioner, ReferenceInverse)
-    scale = np.asarray(system.preconditioner.scale)
-    wanted = unknowns_of(np.searchsorted(free, nodes[np.isin(nodes, free)]))
-    inverse = np.asarray(system.preconditioner.inverse)[wanted]
-    coupling = (matrix[unknowns_of(free)][:, unknowns_of(moved)]).multiply(scale[:, None]).T.tocsr()
-    response[np.repeat(np.isin(nodes, free), 3)] = -scale[wanted, None] * (coupling @ inverse.T).T
-    return response
-
-
 def solve_interior(
     mesh: TetMesh,
     lam: Float[AnyArray, "entries"],

@@ -67,17 +67,6 @@ def marked(target: Placed, *names: str) -> Bool[np.ndarray, "dimension"]:
     return marks
 
 
-def displacements(target: Placed) -> slice:
-    """The entries of "u_boundary": three for each node."""
-    return slices(target)["u_boundary"]
-
-
-def node_count(target: Placed) -> int:
-    """The number of sampled nodes."""
-    own = displacements(target)
-    return (own.stop - own.start) // 3
-
-
 def others(target: Placed) -> Int[np.ndarray, "parameters"]:
     """The entries that are no displacements."""
     return np.flatnonzero(~marked(target, "u_boundary"))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import bayesreg as br
-import bayesreg.fem.equilibrium as fem_equilibrium
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, PAPER_LAM, PAPER_MU, ball_mesh
 
@@ -145,18 +144,3 @@ def test_gradient_through_the_solve(mesh, u_boundary):
             state[i] = state[i] + sign * 1e-4 * d
             values.append((weight * lu_solution(mesh, *state)[1]).sum())
         assert found[i] == pytest.approx((values[1] - values[0]) / 2e-4, rel=1e-6), name
-
-
-def test_the_linear_response_is_the_solution_for_unit_displacements(mesh, u_boundary):
-    """Of free and of prescribed nodes alike; against SciPy's factor, with half of the boundary free."""
-    prescribed, u = mesh.boundary[::2], u_boundary[::2]
-    system = fem_equilibrium.elastic_system(mesh, prescribed, LAM, MU)
-    nodes = np.arange(0, len(mesh.points), 3)
-    K = paper.stiffness(mesh.points, mesh.cells, LAM[mesh.tissue], MU[mesh.tissue])
-    response = fem_equilibrium.linear_response(system, K.tocsr(), nodes, np.asarray(system.prescribed))
-    expected = paper.solve_unknown(K, prescribed, u)[nodes]
-    np.testing.assert_allclose((response @ u.ravel()).reshape(-1, 3), expected, atol=1e-5)
-    assert np.isin(nodes, prescribed).any()
-    some = np.array([7, 2, 5])
-    found = fem_equilibrium.linear_response(system, K.tocsr(), nodes, prescribed[some])
-    np.testing.assert_allclose(found, response.reshape(len(response), -1, 3)[:, some].reshape(found.shape), atol=1e-6)
