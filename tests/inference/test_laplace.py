@@ -61,7 +61,7 @@ def test_the_mode_at_a_wall_is_that_of_the_quadratic_program():
     found, wall = problem(), float(MESH.points[:, 0].max()) + 0.1
     exact, skull = found.exact, flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
     images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
-    posterior = posterior_of(*images, MESH, skull, **OPTIONS, skull_width=1e-3)
+    posterior = posterior_of(*images, MESH, skull, **OPTIONS, skull_width=1e-2)
     mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
     root = np.linalg.cholesky(exact.precision).T
     highest = np.full(len(mode), np.inf)

@@ -11,7 +11,7 @@ import pytest
 from bayesreg.inference.gaussian import about_gaussian
 from bayesreg.inference.gaussian.laplace import laplace
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _with_step_size, tune
-from bayesreg.inference.gaussian.whitened import Moved, setup_about
+from bayesreg.inference.gaussian.whitened import Moved
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 
 
@@ -40,12 +40,10 @@ class Walk:
 
 def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_its_own():
     starts = {"u_boundary": jnp.zeros((4, 3)).at[3, 0].set(9.0)}
-    tuning = Tuning(60, 0.75, watched=True, quarter_turns=True)
+    tuning = Tuning(60, 0.75, quarter_turns=True)
     found = {}
     for apart in (True, False):
-        setup, points, path = tune(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
-        assert path.shape == (60, 4, 3)
-        np.testing.assert_array_equal(path[-1], points["u_boundary"])
+        setup, points = tune(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
         found[apart] = float(setup.step_size), float(points["u_boundary"][3, 0])
     assert found[True][1] < 3
     # With one step for all it stands where it began, and the others pay for it.
@@ -89,10 +87,10 @@ def test_chains_start_where_the_density_is_not_next_to_nothing():
     keys, mode = jax.random.split(jax.random.key(0), 8), np.zeros(DIMENSION)
     heights = {}
     for target in (GaussianTarget(), Ledge()):
-        setup = setup_about(target, laplace(target, mode), mode)
-        starts = about_gaussian._scatter(target, setup, jnp.asarray(mode), keys)["u_boundary"]
+        gaussian = laplace(target, mode)
+        starts = jnp.stack([about_gaussian._scatter(target, gaussian, key)["u_boundary"] for key in keys])
         heights[type(target)] = np.array([float(target.height(target.data, u)) for u in starts])
-        assert target.allowed(starts).all()
+        assert np.isfinite(heights[type(target)]).all()
         assert len(np.unique(np.asarray(starts)[:, 0, 0])) == 8
     # The curvature at the mode knows nothing of the slope: drawn from it, most chains would start far below.
     lowest = -about_gaussian.DEEPEST * DIMENSION
