@@ -93,8 +93,8 @@ def predict(
                  "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         of_draw = jax.random.fold_in(key, number.astype(int))
-        for name, one in checked.items():
-            figures = one.check_draw(data.terms[name], state, of_draw)
+        for index, (name, one) in enumerate(checked.items()):
+            figures = one.check_draw(data.terms[name], state, jax.random.fold_in(of_draw, index))
             found |= {f"{name}/{figure}": value for figure, value in figures.items()}
         return found
 

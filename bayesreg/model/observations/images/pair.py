@@ -11,7 +11,7 @@ from bayesreg.ignored import fill_ignored
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.observations.images.contrast import map_contrast
-from bayesreg.model.observations.images.options import ImageOptions, with_preset
+from bayesreg.model.observations.images.options import PRESETS, ImageOptions, with_preset
 from bayesreg.model.observations.images.prepared import MappedPair, PreparedPair, describe_pair
 from bayesreg.model.observations.observation import Placed
 from bayesreg.types import InputError
@@ -74,7 +74,7 @@ class ImagePair:
         self.fixed, self.moving, self.name = fixed, moving, name
         self.fixed_ignore, self.moving_ignore = fixed_ignore, moving_ignore
         self.one_contrast, self.tissue, self.options = one_contrast, tissue, dict(options)
-        _options_of(name, "paper", self.options)
+        _require_options(name, self.options)
 
     def prepared(self, mesh: TetMesh, preset: str = "paper") -> PreparedPair:
         """The pair as it is compared: f in the contrast of m, as far as a map tells at rest, or descriptors.
@@ -112,6 +112,18 @@ class ImagePair:
             If the mesh does not overlap an image, or the quadrature has no points or fewer than are independent.
         """
         return self.prepared(mesh, preset).on(mesh)
+
+
+def _require_options(name: str, given: dict[str, Any]) -> None:
+    """Raise InputError where options are wrong whatever the preset of the model, which is not known yet."""
+    errors = []
+    for preset in PRESETS:
+        try:
+            _options_of(name, preset, given)
+        except InputError as error:
+            errors.append(error)
+    if len(errors) == len(PRESETS):
+        raise errors[0]
 
 
 def _options_of(name: str, preset: str, given: dict[str, Any]) -> ImageOptions:
