@@ -25,7 +25,7 @@ def config(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def posterior(config):
-    return serve.posterior_of_run(config, lambda text: None)
+    return serve.posterior_of_run(config)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
 
 def test_what_is_impossible_is_a_number(address):
     log_posterior, start = (umbridge.HTTPModel(address, name) for name in ("log_posterior", "start"))
-    position = [np.full(len(part), 1e9).tolist() for part in start([])]
+    position = [np.full(len(part), 1e200).tolist() for part in start([])]
     assert log_posterior(position) == [[serve.IMPOSSIBLE]]
 
 

@@ -107,6 +107,8 @@ def test_the_draws_have_the_names_of_the_table(case):
 def test_the_report_names_every_tissue(case):
     names, result = case
     page = re.sub("data:[^\"']*", "", (result.folder / "report.html").read_text(encoding="utf-8"))
+    # The program that draws the three dimensions holds every word.
+    page = re.sub("<script.*?</script>", "", page, flags=re.DOTALL)
     for name in names:
         assert label_of(name) in page
         assert f"middle of {label_of(name)}" in page

@@ -15,7 +15,8 @@ LEVEL = 2.0**-12
 
 def in_levels(image: Image) -> Image:
     """Intensities of about [0, 1], rounded to multiples of `LEVEL`, far below their noise: single precision."""
-    return image.with_voxels((np.rint(np.asarray(image.voxels) / LEVEL) * LEVEL).astype(np.float32))
+    # Whole numbers know no negative zero.
+    return image.with_voxels((np.rint(np.asarray(image.voxels) / LEVEL) * LEVEL + 0.0).astype(np.float32))
 
 
 def save_in_levels(image: Image, path: str | Path, scale: IntensityScale | None = None) -> None:

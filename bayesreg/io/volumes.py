@@ -260,7 +260,8 @@ def write_nifti(
         image.header.set_intent(intent)
     if scaling is not None:
         image.header.set_slope_inter(*scaling)
-    with replacing(path) as temporary, Opener(str(temporary), "wb", compresslevel=COMPRESSION) as file:
+    compression = {"compresslevel": COMPRESSION} if path.name.endswith(".gz") else {}
+    with replacing(path) as temporary, Opener(str(temporary), "wb", **compression) as file:
         image.to_stream(file)  # type: ignore[arg-type]
 
 

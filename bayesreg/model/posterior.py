@@ -203,7 +203,8 @@ class Posterior:
     def _structure(self) -> tuple[Hashable, ...]:
         leaves, tree = jax.tree.flatten(self.data)
         shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-        return self.options.model_dump_json(), self.normaliser, tuple(self.sampled.tolist()), tree, shapes
+        options = [self.options, *(getattr(one, "options", None) for one in self.observations.values())]
+        return repr(options), self.normaliser, tuple(self.sampled.tolist()), tree, shapes
 
     def evaluate_estimands(
         self, data: Problem, estimands: Values, guess: Float[AnyArray, "nodes 3"] | None = None

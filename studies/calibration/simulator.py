@@ -35,7 +35,7 @@ BODY_LOAD, SURFACE_LOAD = 0.25, 0.6
 DEGREES_OF_FREEDOM = 4.0
 LOG_SD = 0.5
 PRIOR = {"alpha": 3.0, "beta": 3.0, "high": 4.0}
-WALL, WIDTH = 20.8, 0.5
+WALL, WIDTH = 20.8, 0.1
 
 
 class Variant(NamedTuple):
@@ -75,6 +75,8 @@ class Variant(NamedTuple):
             "t_similarity": T_SIMILARITY,
             "interpolation": "cubic",
             "rigid_sd": RIGID_SD,
+            # In voxels of one millimetre.
+            "skull_width": WIDTH,
             **elastic,
             **{name: {"median": median, "log_sd": LOG_SD} for name, median in self.inferred.items()},
         }

@@ -22,6 +22,7 @@ from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.samplers.registry import SAMPLERS
 from bayesreg.io import store
 from bayesreg.io.atomic import write_json, write_text
+from bayesreg.messages import show_messages
 from bayesreg.report.tables import in_terminal
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of

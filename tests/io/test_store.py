@@ -68,14 +68,17 @@ def test_a_run_comes_back_as_it_was_written(run, tmp_path):
 
 
 def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
-    arrays = {name: np.arange(k + 2.0) for k, name in enumerate(Predicted._fields)}
+    arrays = {name: np.arange(k + 2.0) for k, name in enumerate(Predicted._fields) if name != "observations"}
     by_cell = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
     arrays |= {name: np.linspace(0, k + 1.0, len(run.mesh.cells)) for k, name in enumerate(by_cell)}
-    names = {"place_names": np.array(["third ventricle", "λ"]), "discrepancies": np.array(["sd"])}
+    left = {"images/residual": np.arange(3.0), "points/names": np.array(["a", "b"])}
+    names = {"place_names": np.array(["third ventricle", "λ"]), "observations": left}
     write(tmp_path, replace(run, predicted=Predicted(**arrays | names)))
     back = store.read_run(tmp_path).predicted
     assert list(back.place_names) == ["third ventricle", "λ"]
     np.testing.assert_array_equal(back.reach, arrays["reach"])
+    np.testing.assert_array_equal(back.of_observation("images")["residual"], np.arange(3.0))
+    assert back.of_observation("points")["names"].tolist() == ["a", "b"]
     stored = pyvista.read(tmp_path / "mesh.vtu").cell_data
     for name in by_cell:
         np.testing.assert_array_equal(stored[name], arrays[name])

@@ -151,5 +151,5 @@ def test_a_flat_prior_would_be_improper():
 
 
 def test_a_given_boundary_has_no_normaliser():
-    with pytest.raises(ValueError, match="normalised"):
+    with pytest.raises(ValueError, match="expected false where no node is sampled"):
         posterior(normalised=True)
