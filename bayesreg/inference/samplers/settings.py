@@ -1,6 +1,6 @@
-"""The settings of every sampler: a record for each, from which its section of a configuration is made.
+"""The settings of every sampler, one record each; the sections of a configuration are made from these records.
 
-They stand apart from the kernels because a configuration is read before anything heavy is imported.
+They have a file of their own because a configuration is read before slow imports such as JAX.
 """
 
 from __future__ import annotations
