@@ -124,7 +124,7 @@ def force_between(
 
 @force_between.defjvp
 def _force_between_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[AnyArray, AnyArray]:
-    # Functions with chains as columns have no derivative; the derivative of `forces` has the same value.
+    # Functions with chains as columns have no derivative, so the same formula without this wrapper is differentiated.
     *shared, lam, mu, u = primals
 
     def force(*given: AnyArray) -> AnyArray:

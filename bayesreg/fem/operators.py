@@ -76,7 +76,8 @@ def symmetric_operator(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> 
 
 
 def _on_device(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> SparseMatrix:
-    # The next line sorts in place, and JAX may not have read yet other arrays of the caller in the same memory.
+    # The copy is needed because `sum_duplicates` sorts in place, and JAX may not have read yet an earlier array of the
+    # caller in the same memory.
     rows = scipy.sparse.csr_array(matrix, copy=True)
     rows.sum_duplicates()
     return SparseMatrix(jnp.asarray(rows.data), *(jnp.asarray(x, jnp.int32) for x in (rows.indices, rows.indptr)))

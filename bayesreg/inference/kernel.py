@@ -35,7 +35,7 @@ class Info(NamedTuple):
 def together(infos: Info) -> Info:
     """Summarise the stacked reports of several transitions in one.
 
-    Rates are averaged and costs are added. A flag is set if it is set for one of the transitions.
+    Rates are averaged and costs are added. A flag is set if it is set for at least one of the transitions.
     """
     return Info(
         acceptance_rate=infos.acceptance_rate.mean(),

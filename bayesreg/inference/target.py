@@ -81,14 +81,17 @@ class Normaliser(Protocol):
 
     @property
     def is_costly(self) -> bool:
-        """Whether it costs much more than the rest of the density."""
+        """Whether this factor costs much more than the rest of the density."""
 
     @property
     def depends_on(self) -> Sequence[str]:
-        """The names of the estimands on which it depends; some may not be sampled."""
+        """The names of the estimands on which this factor depends; some may not be sampled."""
 
     def smooth_coordinates(self, data: Any, estimands: Estimands) -> AnyArray:
-        """Compute k coordinates (k,), as many as it depends on, of which its logarithm is a smooth function."""
+        """Compute coordinates (k,) of which the logarithm of this factor is a smooth function.
+
+        Their number k is the number of estimands on which it depends.
+        """
 
     def log(self, data: Any, estimands: Estimands) -> Scalar:
         """Compute the logarithm of this factor, as part of the log density."""
@@ -178,9 +181,9 @@ class Target(Hashable, Protocol):
 
     @property
     def hard_wall(self) -> Callable[[Any, AnyArray], AnyArray] | None:
-        """The map from the data and "u_boundary" (b, 3) to the nodes (b,) that make the density zero.
+        """The map from the data and "u_boundary" (b, 3) to marks (b,) of the nodes that make the density zero.
 
-        None if the target has no hard wall.
+        The map is None if the target has no hard wall.
         """
 
     @property

@@ -49,7 +49,7 @@ OVERDISPERSION = 1.5
 # is found. For a Gaussian the difference is OVERDISPERSION² / 2. If tetrahedra are squeezed at the mode, wide draws
 # turn some of them inside out, and beyond the barrier no step is short enough to bring a chain back.
 DEEPEST = 10.0
-# The greatest number of draws for a start point; each later draw lies at half the distance from the mode.
+# The greatest number of attempts for a start point; each attempt is half as far from the mode as the one before.
 ATTEMPTS = 10
 
 # A Gaussian is averaged over the mode and the points of at most this number of chains, because each costs a curvature.

@@ -34,7 +34,7 @@ class Gaussian(NamedTuple):
     ----------
     centre : (d,) array
     factor : (d, d) array
-        Upper triangular; the whitened coordinates are ξ = factor⁻¹ (x − centre).
+        An upper triangular matrix; the whitened coordinates are ξ = factor⁻¹ (x − centre).
     """
 
     centre: Float[AnyArray, "dimension"]
@@ -120,7 +120,7 @@ def precision_at(
     """Compute a positive definite curvature of minus the log density.
 
     The curvature in the displacements and the field is Gauss–Newton's. The rows of the other coordinates are finite
-    differences of the gradient. Their eigenvalues are replaced by absolute values, and by the target's
+    differences of the gradient. The eigenvalues of this part are replaced by absolute values, and by the target's
     `least_curvature` if these are smaller.
 
     Parameters

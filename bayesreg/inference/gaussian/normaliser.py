@@ -27,7 +27,7 @@ from bayesreg.inference.layout import dimension, unravel
 from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
 
-# The degree of the polynomial is the highest one with at most MOST_TERMS terms, because each term needs its numbers.
+# The degree of the polynomial is the highest one with at most MOST_TERMS terms: the cost of the fit grows with them.
 HIGHEST_DEGREE, MOST_TERMS = 4, 150
 # The polynomial is fitted up to this distance from the middle, in standard deviations of the Gaussian: the posterior of
 # a parameter is wider than the Gaussian (see `average_gaussian`), and skew.

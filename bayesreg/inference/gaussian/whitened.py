@@ -1,4 +1,4 @@
-"""The coordinates in which Laplace's approximation is N(0, I), and the density there."""
+"""The coordinates in which Laplace's approximation is N(0, I), and the density in these coordinates."""
 
 from __future__ import annotations
 
