@@ -1,1 +1,1 @@
-"""Linear elastic finite elements: pure JAX, arrays in and out."""
+"""Linear elastic finite elements in JAX and NumPy; functions take and return arrays."""

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients for the free nodes of an elastic body, chains side by side."""
+"""Preconditioned conjugate gradients for the free nodes of an elastic body, for many chains at once."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class ElasticSystem(NamedTuple):
     prescribed, free : (b,), (f,) int arrays
         A partition of the nodes.
     order : (n,) int array
-        Where each node stands among the prescribed and, after them, the free.
+        The index of each node in the concatenation of the prescribed and the free nodes.
     free_derivative, prescribed_derivative : SparseOperator
-        The columns of `elements.derivative` that belong to these nodes.
+        The columns of `elements.derivative` that belong to the free and to the prescribed nodes.
     preconditioner : ReferenceInverse, Multigrid or None
-        None where no node is free.
+        None if no node is free.
     tolerance, adjoint_tolerance : scalar
-        On the relative residual in the norm of the inverse diagonal of K, so that it also speaks for tissues a million
-        times softer than their neighbours; of the equilibrium, and of the solve behind its derivative.
+        The greatest relative residuals of the equilibrium and of the solve for its derivative. The norm is that of the
+        inverse diagonal of K, so that they also hold for tissues a million times softer than their neighbours.
     """
 
     elements: Elements
@@ -51,7 +51,7 @@ class ElasticSystem(NamedTuple):
 
 
 class SolverInfo(NamedTuple):
-    """Relative residual, iterations, and whether the one is below the tolerance, of each chain."""
+    """The relative residual of each chain, its iterations, and whether the residual is within the tolerance."""
 
     residual: Float[AnyArray, "chains"]
     iterations: Int[AnyArray, "chains"]
@@ -66,10 +66,10 @@ def conjugate_gradients(
     load: Float[AnyArray, "free 3 chains"],
     *start: Float[AnyArray, "free 3 chains"],
 ) -> tuple[Float[AnyArray, "free 3 chains"], SolverInfo]:
-    """K_II⁻¹ times a load from `start`, else from zero, each chain with its own K.
+    """Multiply a load by K_II⁻¹, with the K of each chain; the iteration begins at `start` or at zero.
 
-    A chain that has arrived, or in which something is not a number, stands still while others go on: no chain knows of
-    another.
+    A chain does not change after it has converged or has become NaN, while the others continue. So the result of a
+    chain does not depend on the other chains.
     """
     system, tolerance = shared
     precondition, volumes = system.preconditioner, system.elements.volumes

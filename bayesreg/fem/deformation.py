@@ -1,6 +1,6 @@
-"""A displacement that is linear in every tetrahedron as a map of space, and its inverse (NumPy, on the host).
+"""The map of space that a displacement, linear in every tetrahedron, defines, and its inverse (NumPy, on the host).
 
-Around the mesh it goes on as `bayesreg.fem.surroundings` says, so that there is an image, and a source, of every point.
+`bayesreg.fem.surroundings` extends the displacement beyond the mesh, so that every point has an image and a source.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from bayesreg.fem.location import CellSearch, Location, barycentric_maps
 from bayesreg.fem.surroundings import Surroundings, surround
 from bayesreg.mesh import TetMesh, faces_across, signed_volumes
 
-# A place lies in a tetrahedron where no barycentric coordinate is below minus this; between two that a rounding parts,
-# minus the second.
+# A point lies in a tetrahedron if no barycentric coordinate is below −TOLERANCE. A point that rounding leaves between
+# two tetrahedra lies in one of them if none is below −GAP.
 TOLERANCE, GAP = 1e-9, 1e-4
-# Steps from tetrahedron to tetrahedron on the way to the one that holds a place.
+# The greatest number of steps between neighbouring tetrahedra in the search for the one that holds a point.
 MOST_STEPS = 12
-# So few places are tried in all tetrahedra.
+# At most this number of points are tried in all tetrahedra.
 FEW = 100
 CHUNK = 200_000
 
 
 class Deformer:
-    """Where the points of space lie in a mesh and around it, and what displacements of its nodes do to them.
+    """The search for points in a mesh and its surroundings, and the maps that displacements of its nodes define.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ class Deformer:
 
     @cached_property
     def surroundings(self) -> Surroundings:
-        """The mesh and what surrounds it."""
+        """The mesh with the tetrahedra around it."""
         return surround(self.mesh)
 
     @cached_property
     def across(self) -> Int[np.ndarray, "all_cells 4"]:
-        """The tetrahedron beyond the face opposite to each corner; −1 where there is none."""
+        """The tetrahedron beyond the face opposite to each corner; −1 if there is none."""
         return faces_across(self.surroundings.cells)
 
     @cached_property
@@ -51,21 +51,21 @@ class Deformer:
         return CellSearch(self.surroundings.points, self.surroundings.cells, queries=CHUNK)
 
     def locate(self, points: Float[np.ndarray, "k 3"]) -> Location:
-        """Find the tetrahedron of points, mm: of the mesh, which come first, or around it; −1 beyond the sphere."""
+        """Find the tetrahedra that hold points, mm; those of the mesh are numbered first; −1 beyond the sphere."""
         return _search_twice(self._search, points)
 
     def is_inside(self, location: Location) -> Bool[np.ndarray, "k"]:
-        """Tell which points lie in the mesh itself."""
+        """Mark the points that lie in the mesh itself."""
         return (location.cell >= 0) & (location.cell < len(self.mesh.cells))
 
     def displaced(self, u: Float[np.ndarray, "nodes 3"]) -> Displaced:
-        """The mesh with its nodes displaced, mm."""
+        """Displace the nodes of the mesh, mm."""
         return Displaced(self, np.asarray(u, float))
 
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """A displaced mesh: it knows where points went, and where places came from.
+    """A displaced mesh, with the displacement of points and its inverse.
 
     Attributes
     ----------
@@ -91,11 +91,11 @@ class Displaced:
 
     @property
     def folded(self) -> int:
-        """How many tetrahedra of the mesh are turned inside out; places in these have several sources."""
+        """The number of tetrahedra of the mesh that are turned inside out; points in these have several sources."""
         return int((~self._upright[: len(self.deformer.mesh.cells)]).sum())
 
     def displacement(self, points: Float[np.ndarray, "k 3"], location: Location) -> Float[np.ndarray, "k 3"]:
-        """Displacement of points, mm, which lie where `Deformer.locate` has found them."""
+        """Compute the displacement of points, mm; `location` is the result of `Deformer.locate` for them."""
         found = _interpolate(self._everywhere, self.deformer.surroundings.cells, location)
         far = location.cell < 0
         if far.any():
@@ -105,7 +105,10 @@ class Displaced:
 
     @cached_property
     def _to_barycentric(self) -> Float[np.ndarray, "all_cells 4 4"]:
-        """Coordinate a of a place y in a displaced tetrahedron is row a times (1, y); NaN where it is turned over."""
+        """The maps to barycentric coordinates: coordinate a of y in a displaced tetrahedron is row a times (1, y).
+
+        A map is NaN if its tetrahedron is turned inside out.
+        """
         corners = self._points[self.deformer.surroundings.cells]
         linear = np.full((len(corners), 4, 3), np.nan)
         linear[self._upright] = barycentric_maps(corners[self._upright])
@@ -121,19 +124,19 @@ class Displaced:
     def sources(
         self, places: Float[np.ndarray, "k 3"], near: Location | None = None
     ) -> tuple[Float[np.ndarray, "k 3"], Location]:
-        """The points x with x + u(x) = y, mm, and where they lie.
+        """Compute the points x with x + u(x) = y, mm, and their location in the mesh at rest.
 
         Parameters
         ----------
         places : (k, 3) array
             y, mm.
         near : Location, optional
-            Of the sources by a displacement that differs little, where the search begins.
+            The location of the sources for a similar displacement, where the search begins.
 
         Notes
         -----
-        A place has barycentric coordinates in one displaced tetrahedron, and its source has the same in the one at
-        rest: no more than rounding stands between the two. Where tetrahedra are folded one of several sources is taken.
+        The source has the same barycentric coordinates in a tetrahedron at rest as y has in the displaced one, so that
+        the inverse is exact up to rounding. If tetrahedra are folded, one of several sources is returned.
         """
         location = self._locate(places) if near is None else self._step(places, near)
         around = self.deformer.surroundings
@@ -151,7 +154,7 @@ class Displaced:
         return Location(np.where(cell < 0, -1, upright[cell]), barycentric)
 
     def _try_all(self, places: Float[np.ndarray, "k 3"]) -> Location:
-        """Find few places in all tetrahedra, without what it takes to search for many."""
+        """Find a few points by trying all tetrahedra, without the preparation of a `CellSearch`."""
         maps = self._to_barycentric
         found = np.einsum("mai,ki->kma", maps[:, :, 1:], places) + maps[:, :, 0]
         least = np.nan_to_num(found.min(axis=2), nan=-np.inf)
@@ -162,7 +165,7 @@ class Displaced:
         return Location(cell, barycentric)
 
     def _step(self, places: Float[np.ndarray, "k 3"], near: Location) -> Location:
-        """The displaced tetrahedra that hold places, by steps from those near by, else by search."""
+        """Find the displaced tetrahedra that hold points, by steps from `near`, or by a search if that fails."""
         across, cell = self.deformer.across, near.cell.copy()
         barycentric, left = np.full((len(places), 4), np.nan), np.flatnonzero(cell >= 0)
         lost = [np.flatnonzero(cell < 0)]
@@ -172,7 +175,7 @@ class Displaced:
             found = np.einsum("kai,ki->ka", maps[:, :, 1:], places[left]) + maps[:, :, 0]
             barycentric[left] = found
             least = found.argmin(axis=1)
-            # Where a tetrahedron is turned over nothing is less than NaN: such places are searched for.
+            # In a tetrahedron that is turned inside out all coordinates are NaN: its points are left to the search.
             outside = ~(found[np.arange(len(left)), least] >= -TOLERANCE)
             left, onwards = left[outside], across[here[outside], least[outside]]
             stuck = (onwards < 0) | np.isnan(found[outside]).any(axis=1)
@@ -187,7 +190,7 @@ class Displaced:
         return Location(cell, barycentric)
 
     def _rigid_sources(self, places: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-        """Beyond the sphere y = x + a + ω × (x − c)."""
+        """Compute the sources of points beyond the sphere, where y = x + a + ω × (x − c)."""
         around = self.deformer.surroundings
         motion = around.rigid_motion(self.u)
         linear = np.eye(3) + np.cross(motion[3:], np.eye(3)).T
@@ -197,7 +200,7 @@ class Displaced:
 def _interpolate(
     values: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], location: Location
 ) -> Float[np.ndarray, "k 3"]:
-    """Nodal values at points; NaN where these lie in no tetrahedron."""
+    """Interpolate nodal values at points; the result is NaN for points in no tetrahedron."""
     corners = cells[location.cell]
     found = location.barycentric[:, :1] * values[corners[:, 0]]
     for corner in range(1, 4):
@@ -206,7 +209,7 @@ def _interpolate(
 
 
 def _search_twice(search: CellSearch, points: Float[np.ndarray, "k 3"]) -> Location:
-    """Search once more, less strictly, for points that fell between two tetrahedra."""
+    """Find the tetrahedra that hold points; repeat with a larger tolerance for points between two tetrahedra."""
     cell, barycentric = search(points, TOLERANCE)
     out = np.flatnonzero(cell < 0)
     if len(out):

@@ -1,14 +1,15 @@
 """The determinant of the elastic prior: log pdet S(λ, μ) of the boundary Schur complement, and its derivative.
 
-With B the sampled nodes, I the free ones and S = K_BB − K_BI K_II⁻¹ K_IB, det K = det S · det K_II. What rigid
-motions the held nodes leave span the null space N of S, whatever λ and μ are; without a set J of as many unknowns
-that stops them, det S_{−J} = pdet S · det(N_J)² for an orthonormal N. Hence
+With the sampled nodes B, the free nodes I and S = K_BB − K_BI K_II⁻¹ K_IB, det K = det S · det K_II. The rigid motions
+that the held nodes allow span the null space N of S, whatever λ and μ are. Let J be a set of as many unknowns that
+stops these motions when it is removed. Then det S_{−J} = pdet S · det(N_J)² for an orthonormal N, and
 
     log pdet S = log det K_{−J} − log det K_II − 2 log |det N_J|.
 
-Both determinants are those of sparse matrices. Their nodes, ordered by Cuthill and McKee, make them narrow bands, and a
-Cholesky factorisation, some columns at a time, gives the determinant in about n w² operations for n unknowns of
-bandwidth w. Its derivative, tr(K⁻¹ ∂K), needs the inverse inside the band alone: twice as many again.
+Both determinants are those of sparse matrices. With the nodes in the order of Cuthill and McKee, the matrices are
+narrow bands. A Cholesky factorisation by blocks of columns gives the determinant in about n w² operations for n
+unknowns of bandwidth w. The derivative, tr(K⁻¹ ∂K), needs the inverse only inside the band: twice as many operations
+again.
 """
 
 from __future__ import annotations
@@ -31,22 +32,23 @@ from bayesreg.types import AnyArray, InputError, Scalar
 
 Band = Float[AnyArray, "columns blocks width width"]
 
-# Blocks below the diagonal one: with more of them more of the work is products of matrices, but of smaller ones.
+# The number of blocks below the diagonal block. With more blocks, a larger part of the work consists of products of
+# matrices, but the matrices are smaller.
 BLOCKS_BELOW = 6
-# Nodes from which an order of the unknowns is tried.
+# The number of nodes from which an order of the unknowns is tried.
 STARTS = 200
 
 
 class BandLayout(NamedTuple):
-    """Where the entries of K stand in a narrow order of some of its unknowns (a pytree).
+    """The layout of K as a narrow band, for some of its unknowns (a pytree).
 
     Attributes
     ----------
     places : (144, m) int array
-        Flat index of every entry of every element's stiffness into an array (columns, 1 + below, width, width): in
-        each block column the diagonal block, then those below it. Entries that are not wanted lie past its end.
+        The flat index of every entry of every element's stiffness into an array (columns, 1 + below, width, width). A
+        block column holds the diagonal block, then those below it. Unused entries have an index past the end.
     padding : (columns, width) array
-        One where the last block column has no unknown, else zero.
+        One for the columns past the last unknown, else zero.
     """
 
     places: Int[AnyArray, "entries cells"]
@@ -61,11 +63,11 @@ class SchurDeterminant(NamedTuple):
     supported : BandLayout
         The pattern of K_{−J}: all nodes that are not held, without the isostatic unknowns J.
     free : BandLayout or None
-        The pattern of K_II; None where every node is sampled or held.
+        The pattern of K_II; None if every node is sampled or held.
     log_null : scalar
         2 log |det N_J|.
     rank : scalar
-        The rank of S: 3b less the rigid motions that the held nodes leave (six where none is held).
+        The rank of S: 3b less the number of rigid motions that the held nodes allow (six if none is held).
     """
 
     supported: BandLayout
@@ -77,12 +79,12 @@ class SchurDeterminant(NamedTuple):
 def schur_determinant(
     mesh: TetMesh, sampled: Int[np.ndarray, "sampled"], held: Int[np.ndarray, "held"]
 ) -> SchurDeterminant:
-    """Prepare log pdet S on a mesh whose nodes are sampled, held, or follow from these.
+    """Prepare log pdet S on a mesh whose nodes are sampled, held or free.
 
     Raises
     ------
     InputError
-        If K has more null vectors than the rigid motions: parts of the mesh hang together by a node or an edge,
+        If K has more null vectors than the rigid motions: parts of the mesh are connected only by a node or an edge,
         or not at all.
     """
     null = rigid_freedom(mesh.points[sampled], mesh.points[held])
@@ -104,7 +106,7 @@ def schur_determinant(
 def rigid_freedom(
     sampled: Float[np.ndarray, "sampled 3"], held: Float[np.ndarray, "held 3"]
 ) -> Float[np.ndarray, "rows freedom"]:
-    """Orthonormal basis, on the sampled nodes, of the rigid motions that leave the held nodes where they are."""
+    """Compute an orthonormal basis, on the sampled nodes, of the rigid motions that do not move the held nodes."""
     modes = rigid_modes(np.concatenate([sampled, held]))
     rows = 3 * len(sampled)
     resting = scipy.linalg.null_space(modes[rows:], rcond=1e-9) if len(held) else np.eye(6)
@@ -120,7 +122,7 @@ def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLay
     kept = (row >= 0) & (column >= 0)
     width = -(-int(np.abs(row - column)[kept].max()) // BLOCKS_BELOW)
     columns, block, below = -(-len(unknowns) // width), column // width, row // width - column // width
-    # Blocks above the diagonal one are transposes of those below: not kept.
+    # Blocks above the diagonal are transposes of those below, so they are not kept.
     kept &= below >= 0
     places = ((block * (1 + BLOCKS_BELOW) + below) * width + row % width) * width + column % width
     padding = np.arange(columns * width).reshape(columns, width) >= len(unknowns)
@@ -129,7 +131,7 @@ def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLay
 
 
 def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[np.ndarray, "unknowns"]:
-    """The unknowns node by node, the nodes by Cuthill and McKee, from where the band is the narrowest."""
+    """Order the unknowns node by node, with the nodes in the order of Cuthill and McKee of the narrowest band."""
     nodes, count = np.unique(unknowns // 3), len(mesh.points)
     pairs = np.repeat(mesh.cells, 4, axis=1).ravel(), np.tile(mesh.cells, (1, 4)).ravel()
     graph = scipy.sparse.csr_matrix((np.ones(len(pairs[0])), pairs), shape=(count, count))[nodes][:, nodes]
@@ -138,9 +140,10 @@ def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[n
 
 
 def order_by_neighbours(graph: scipy.sparse.csr_matrix) -> Int[np.ndarray, "nodes"]:
-    """The best of some orders: that of a library, which knows graphs of several parts, and those from some nodes.
+    """Choose the order of the nodes with the least bandwidth among SciPy's and those that start at some nodes.
 
-    Breadth first is what Cuthill and McKee do, where of the neighbours those with the fewest of their own come first.
+    SciPy's order also serves graphs of several parts. The order of Cuthill and McKee is a breadth-first search that
+    visits the neighbours of a node by their number of neighbours, the fewest first.
     """
     count = graph.shape[0]
     by_degree = np.argsort(np.diff(graph.indptr), kind="stable")
@@ -153,14 +156,14 @@ def order_by_neighbours(graph: scipy.sparse.csr_matrix) -> Int[np.ndarray, "node
 
 
 def bandwidth(graph: scipy.sparse.csr_matrix, order: Int[np.ndarray, "nodes"]) -> int:
-    """How far apart two neighbours stand in an order of the nodes, at most."""
+    """Compute the greatest distance between two neighbours in an order of the nodes."""
     rank = np.argsort(order)
     row, column = graph.nonzero()
     return int(np.abs(rank[row] - rank[column]).max())
 
 
 def _require_definite(mesh: TetMesh, determinant: SchurDeterminant) -> None:
-    """A pivot that is nothing against the diagonal of K says that rigid motions are not all that costs nothing."""
+    """Raise InputError if a pivot is zero compared with the diagonal of K: K then has other null vectors than N."""
     one = jnp.ones(len(mesh.cells))
     band = _assemble(elements_of(mesh), one, one, determinant.supported)
     pivots = jnp.diagonal(_factorise(band)[0], axis1=1, axis2=2) ** 2 / jnp.diagonal(band[:, 0], axis1=1, axis2=2)
@@ -174,7 +177,7 @@ def _require_definite(mesh: TetMesh, determinant: SchurDeterminant) -> None:
 def log_pseudo_determinant(
     determinant: SchurDeterminant, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
 ) -> Scalar:
-    """log pdet S, λ and μ given by cell; differentiable, NaN where K is not definite."""
+    """Compute log pdet S for λ and μ by cell; differentiable, and NaN if K is not positive definite."""
     supported = log_determinant(determinant.supported, elements, lam, mu)
     free = 0.0 if determinant.free is None else log_determinant(determinant.free, elements, lam, mu)
     return supported - free - determinant.log_null
@@ -183,7 +186,7 @@ def log_pseudo_determinant(
 def log_determinant(
     layout: BandLayout, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
 ) -> Scalar:
-    """log det of the rows and columns of K(λ, μ) that are in a layout."""
+    """Compute log det of the rows and columns of K(λ, μ) that are in a layout."""
     return band_log_determinant(_assemble(elements, lam, mu, layout))
 
 
@@ -197,19 +200,19 @@ def _assemble(elements: Elements, lam: AnyArray, mu: AnyArray, layout: BandLayou
 
 @jax.custom_jvp
 def band_log_determinant(band: Band) -> Scalar:
-    """log det of a symmetric positive definite band matrix.
+    """Compute log det of a symmetric positive definite band matrix.
 
     Parameters
     ----------
     band : (columns, 1 + below, width, width) array
-        Block columns: the diagonal block, which is symmetric, and those below it; zero past the last row.
+        The block columns: the symmetric diagonal block, then those below it; zero past the last row.
     """
     return _log_determinant_of(_factorise(band)[0])
 
 
 @band_log_determinant.defjvp
 def _derivative(primals: tuple[Band], tangents: tuple[Band]) -> tuple[Scalar, Scalar]:
-    """∂ log det K = tr(K⁻¹ ∂K): outside the band ∂K is zero, and what is below the diagonal blocks counts twice."""
+    """Compute ∂ log det K = tr(K⁻¹ ∂K): ∂K is zero outside the band, and the blocks below the diagonal count twice."""
     factors, panels = _factorise(primals[0])
     products = _inverse_in_band(factors, panels).reshape(tangents[0].shape) * tangents[0]
     return _log_determinant_of(factors), 2 * products.sum() - products[:, 0].sum()
@@ -222,9 +225,9 @@ def _log_determinant_of(factors: Float[AnyArray, "columns width width"]) -> Scal
 def _factorise(
     band: Band,
 ) -> tuple[Float[AnyArray, "columns width width"], Float[AnyArray, "columns height width"]]:
-    """The Cholesky factor: its diagonal blocks L_kk, and the panels P_k below them.
+    """Compute the Cholesky factor: its diagonal blocks L_kk, and the panels P_k below them.
 
-    Every block column looks back at those that reach it, and they have zeros before the first.
+    Every block column is updated by the `BLOCKS_BELOW` columns before it; columns of zeros precede the first one.
     """
     columns, _, width, _ = band.shape
 
@@ -246,10 +249,10 @@ def _factorise(
 def _inverse_in_band(
     factors: Float[AnyArray, "columns width width"], panels: Float[AnyArray, "columns height width"]
 ) -> Float[AnyArray, "columns rows width"]:
-    """Block columns of Σ = K⁻¹ where K has entries, from the last to the first (Takahashi's recursion).
+    """Compute the entries of Σ = K⁻¹ inside the band of K, from the last block column to the first.
 
-    With J the rows of the panel and Y = P_k L_kk⁻¹: Σ_Jk = −Σ_JJ Y and Σ_kk = L_kk⁻ᵀ L_kk⁻¹ − Yᵀ Σ_Jk. A window
-    holds Σ_JJ.
+    This is Takahashi's recursion. With the rows J of the panel and Y = P_k L_kk⁻¹, Σ_Jk = −Σ_JJ Y and
+    Σ_kk = L_kk⁻ᵀ L_kk⁻¹ − Yᵀ Σ_Jk. The variable `window` holds Σ_JJ.
     """
     height, width = panels.shape[1:]
 

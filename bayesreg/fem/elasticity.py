@@ -1,4 +1,4 @@
-"""Isotropic linear elasticity: strain energy and stiffness, affine in the Lamé parameters.
+"""Strain energy and stiffness of isotropic linear elasticity, which are affine in the Lamé parameters.
 
 K(λ, μ) = Σ_t λ_t A_t + μ_t B_t, with one pair of matrices for each tissue (or each cell).
 """
@@ -26,18 +26,18 @@ def lame_by_cell(values: Float[AnyArray, "entries"], mesh: TetMesh) -> Float[Any
     Parameters
     ----------
     values : (1,), (T,) or (m,) array
-        Uniform, by tissue in the order of `mesh.names`, or by cell.
+        The parameter: uniform, by tissue in the order of `mesh.names`, or by cell.
 
     Raises
     ------
     InputError
-        If the number of entries is none of these.
+        If `values` has another shape.
     """
     return jnp.asarray(values)[lame_entries(mesh, np.shape(values))]
 
 
 def lame_entries(mesh: TetMesh, shape: tuple[int, ...]) -> np.ndarray:
-    """Index of each cell's entry in a uniform (1,), by-tissue (T,) or by-cell (m,) parameter vector."""
+    """Find the entry of each cell in a uniform (1,), by-tissue (T,) or by-cell (m,) parameter vector."""
     if shape == (len(mesh.names),):
         return mesh.tissue
     if shape == (len(mesh.cells),):
@@ -56,7 +56,7 @@ def strain_energy_density(
     mu: Float[AnyArray, "cells"],
     u: Float[AnyArray, "nodes 3"],
 ) -> Float[AnyArray, "cells"]:
-    """μ/4 Σ_jk (∂_j u_k + ∂_k u_j)² + λ/2 (div u)² in each cell: eq. (2), which equals eq. (3)."""
+    """Compute μ/4 Σ_jk (∂_j u_k + ∂_k u_j)² + λ/2 (div u)² in each cell: eq. (2), which equals eq. (3)."""
     gradient = displacement_gradient(elements.derivative, u)
     dilatation, distortion = strain_products(gradient, gradient)
     return (lam * dilatation + mu * distortion) / 2
@@ -65,9 +65,9 @@ def strain_energy_density(
 def strain_products(
     first: Gradient, second: Gradient
 ) -> tuple[Float[AnyArray, "cells *chains"], Float[AnyArray, "cells *chains"]]:
-    """div u · div w and ½ (∇u + ∇uᵀ) : (∇w + ∇wᵀ) of each cell: uᵀ K w is the integral of λ and μ times them.
+    """Compute div u · div w and ½ (∇u + ∇uᵀ) : (∇w + ∇wᵀ) of each cell, given ∇u and ∇w (`displacement_gradient`).
 
-    `first` and `second` are ∇u and ∇w, see `displacement_gradient`.
+    uᵀ K w is the integral of λ times the first plus μ times the second.
     """
     divergence = [g[0][0] + g[1][1] + g[2][2] for g in (first, second)]
     stretch = sum(first[i][i] * second[i][i] for i in range(3))
@@ -77,13 +77,13 @@ def strain_products(
 
 @jax.custom_jvp
 def total_strain_energy(elements: Elements, lam: AnyArray, mu: AnyArray, u: AnyArray) -> Scalar:
-    """E_r of eq. (3), with λ and μ given by cell; differentiable in these and in u."""
+    """Compute E_r of eq. (3) for λ and μ by cell; differentiable in λ, μ and u."""
     return elements.volumes @ strain_energy_density(elements, lam, mu, u)
 
 
 @total_strain_energy.defjvp
 def _strain_energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
-    """∂E_r/∂u = K u, ∂E_r/∂λ = V (div u)²/2."""
+    """Differentiate E_r: ∂E_r/∂u = K u, ∂E_r/∂λ = V (div u)²/2."""
     elements, lam, mu, u = primals
     _, d_lam, d_mu, d_u = tangents
     gradient = displacement_gradient(elements.derivative, u)
@@ -99,7 +99,7 @@ def internal_force(
     mu: Float[AnyArray, "cells"],
     u: Float[AnyArray, "nodes 3"],
 ) -> Float[AnyArray, "nodes 3"]:
-    """K(λ, μ) u of eq. (7): Σ_e V_e σ ∇N_a."""
+    """Compute K(λ, μ) u of eq. (7): Σ_e V_e σ ∇N_a."""
     return force_between(elements.derivative, elements.derivative, elements.volumes, lam, mu, u)
 
 
@@ -112,19 +112,19 @@ def force_between(
     mu: Float[AnyArray, "cells"],
     u: Float[AnyArray, "moved 3"],
 ) -> Float[AnyArray, "held 3"]:
-    """Forces on some nodes while others move by u: a block of K(λ, μ) times u.
+    """Compute the forces on some nodes while others move by u: a block of K(λ, μ) times u.
 
     Parameters
     ----------
     on, of : SparseOperator
-        The columns of `Elements.derivative` that belong to the nodes on which forces act, and to those that move.
+        The columns of `Elements.derivative` that belong to the nodes with forces, and to the nodes that move.
     """
     return _side_by_side((on, of, volumes), *(x[..., None] for x in (lam, mu, u)))[..., 0]
 
 
 @force_between.defjvp
 def _force_between_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[AnyArray, AnyArray]:
-    # Functions with chains as columns have no derivative: where one is asked for, the same formula gives it.
+    # Functions with chains as columns have no derivative, so the same formula without this wrapper is differentiated.
     *shared, lam, mu, u = primals
 
     def force(*given: AnyArray) -> AnyArray:
@@ -148,7 +148,10 @@ def forces(
     mu: Float[AnyArray, "cells chains"],
     u: Float[AnyArray, "moved 3 chains"],
 ) -> Float[AnyArray, "held 3 chains"]:
-    """`force_between` of many chains: Gᵀ V σ(G u), G the derivative, and Hooke's law σ = μ (∇u + ∇uᵀ) + λ (div u) I."""
+    """Compute `force_between` of many chains: Gᵀ V σ(G u), where G is the derivative.
+
+    Hooke's law is σ = μ (∇u + ∇uᵀ) + λ (div u) I.
+    """
     gradient = of(u.reshape(len(u), -1)).reshape(3, -1, *u.shape[1:])
     divergence = gradient[0, :, 0] + gradient[1, :, 1] + gradient[2, :, 2]
     dilatational = (lam * divergence)[:, None] * jnp.eye(3)[:, None, :, None]
@@ -162,12 +165,12 @@ def stiffness_diagonal(
     lam: Float[AnyArray, "cells chains"],
     mu: Float[AnyArray, "cells chains"],
 ) -> Float[AnyArray, "nodes 3 chains"]:
-    """The diagonal of K(λ, μ), one entry for each node and axis: Σ_e V_e ((λ + μ) (∂_i N_a)² + μ |∇N_a|²).
+    """Compute the diagonal of K(λ, μ) for each node and axis: Σ_e V_e ((λ + μ) (∂_i N_a)² + μ |∇N_a|²).
 
     Parameters
     ----------
     derivative : SparseOperator
-        `Elements.derivative`, or the columns of it that belong to these nodes.
+        `Elements.derivative`, or its columns that belong to the nodes of the result.
     """
     squares = SparseOperator(*(part._replace(entries=part.entries**2) for part in derivative))
     own = (lam + mu)[:, None] * jnp.eye(3)[:, None, :, None]
@@ -178,7 +181,7 @@ def stiffness_diagonal(
 def element_stiffness(
     elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
 ) -> Float[AnyArray, "4 3 4 3 cells"]:
-    """K_e = V BᵀCB of eq. (6), block (a, b): V (λ g_a g_bᵀ + μ (g_b g_aᵀ + (g_a · g_b) I))."""
+    """Compute K_e = V BᵀCB of eq. (6); its block (a, b) is V (λ g_a g_bᵀ + μ (g_b g_aᵀ + (g_a · g_b) I))."""
     gradients = elements.gradients
     outer = gradients[:, :, None, None] * gradients
     inner = (gradients[:, None] * gradients[None]).sum(axis=2)
@@ -189,7 +192,7 @@ def element_stiffness(
 def strain_energy(
     mesh: TetMesh, lam: Float[AnyArray, "entries"], mu: Float[AnyArray, "entries"], u: Float[AnyArray, "nodes 3"]
 ) -> Scalar:
-    """Linear elastic strain energy E_r = ½ ∫ εᵀ C ε dx (eq. 3).
+    """Compute the linear elastic strain energy E_r = ½ ∫ εᵀ C ε dx (eq. 3).
 
     Parameters
     ----------
@@ -202,7 +205,7 @@ def strain_energy(
     Returns
     -------
     scalar
-        In (unit of λ, μ) · mm³. Differentiable in `lam`, `mu` and `u`.
+        E_r in (unit of λ, μ) · mm³, differentiable in `lam`, `mu` and `u`.
 
     Raises
     ------
@@ -215,12 +218,12 @@ def strain_energy(
 
 
 def unknowns_of(nodes: Int[AnyArray, "*shape"]) -> Int[np.ndarray, "unknowns"]:
-    """Rows of K that belong to nodes: 3 · node + axis, axes fastest."""
+    """List the rows of K that belong to nodes: 3 · node + axis, axes fastest."""
     return (3 * np.asarray(nodes)[..., None] + np.arange(3)).ravel()
 
 
 def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_matrix:
-    """Global stiffness matrix K of eq. (7), assembled on the host.
+    """Assemble the global stiffness matrix K of eq. (7) on the host.
 
     Parameters
     ----------
@@ -231,7 +234,7 @@ def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_ma
     Returns
     -------
     (3n, 3n) sparse matrix
-        Row 3 · node + axis. Symmetric; its null space holds the six rigid motions.
+        K, with row 3 · node + axis. It is symmetric, and its null space contains the six rigid motions.
     """
     gradients = shape_gradients(mesh)
     lam_volume, mu_volume = (
@@ -249,7 +252,7 @@ def stiffness(mesh: TetMesh, lam: AnyArray, mu: AnyArray) -> scipy.sparse.csr_ma
 
 
 def rigid_modes(points: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "rows 6"]:
-    """Orthonormal basis of the translations and infinitesimal rotations of some points about their centroid."""
+    """Compute an orthonormal basis of the translations and infinitesimal rotations of points about their centroid."""
     centred = points - points.mean(axis=0)
     translations = np.tile(np.eye(3), (len(points), 1))
     rotations = np.stack([np.cross(axis, centred).ravel() for axis in np.eye(3)], axis=1)

@@ -1,7 +1,7 @@
 """Linear (P1) tetrahedra: shape gradients, displacement gradients and quadrature.
 
-Everything over cells keeps the cell as its *last* axis, and small sums over nodes and axes are written out: XLA then
-fuses them into one pass over the cells, where an `einsum` over 3 × 4 blocks runs several times slower on the CPU.
+Arrays over cells have the cell as their *last* axis, and small sums over nodes and axes are written out. XLA then fuses
+them into one pass over the cells; an `einsum` over 3 × 4 blocks is several times slower on the CPU.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Elements(NamedTuple):
     gradients : (4, 3, m) array
         ∂N_a/∂x_i of each node's shape function, 1/mm.
     volumes : (m,) array
-        mm³.
+        Volumes of the cells, mm³.
     derivative : SparseOperator
-        (3m, n): nodal values to ∂/∂x_j in each cell, row j · m + cell.
+        The (3m, n) map from nodal values to ∂/∂x_j in each cell, with row j · m + cell.
     """
 
     cells: Int[AnyArray, "4 cells"]
@@ -41,14 +41,14 @@ class Elements(NamedTuple):
 
 
 def elements_of(mesh: TetMesh) -> Elements:
-    """Shape gradients and volumes of a mesh."""
+    """Compute the shape gradients, volumes and derivative of a mesh."""
     gradients = np.moveaxis(shape_gradients(mesh), 0, -1)
     derivative = sparse_operator(derivative_matrix(mesh))
     return Elements(jnp.asarray(mesh.cells.T), jnp.asarray(gradients), jnp.asarray(mesh.volumes), derivative)
 
 
 def derivative_matrix(mesh: TetMesh) -> scipy.sparse.csr_array:
-    """Nodal values to ∂/∂x_j in each cell, on the host: (3m, n), row j · m + cell."""
+    """Make the (3m, n) map from nodal values to ∂/∂x_j in each cell, with row j · m + cell, on the host."""
     gradients = np.moveaxis(shape_gradients(mesh), 2, 0)
     columns, starts = np.broadcast_to(mesh.cells, gradients.shape), np.arange(0, gradients.size + 1, 4)
     shape = (3 * len(mesh.cells), len(mesh.points))
@@ -56,7 +56,7 @@ def derivative_matrix(mesh: TetMesh) -> scipy.sparse.csr_array:
 
 
 def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
-    """∂N_a/∂x_i of every cell, on the host, 1/mm."""
+    """Compute ∂N_a/∂x_i of every cell, 1/mm, on the host."""
     corners = mesh.points[mesh.cells]
     # Rows of the inverse Jacobian are the gradients of N_1, N_2, N_3; the four of them sum to zero.
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -65,20 +65,20 @@ def shape_gradients(mesh: TetMesh) -> Float[np.ndarray, "cells 4 3"]:
 
 
 def boundary_areas(mesh: TetMesh) -> Float[np.ndarray, "nodes"]:
-    """A third of the area of the boundary's faces about each node, mm²; zero inside."""
+    """Compute a third of the area of the boundary faces about each node, mm²; zero for inner nodes."""
     corners = mesh.points[mesh.boundary_faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     return np.bincount(mesh.boundary_faces.ravel(), np.repeat(areas / 3, 3), len(mesh.points))
 
 
-# ∂u_k/∂x_j of every cell by k, then j; where u has a last axis of chains, each entry has it, too.
+# ∂u_k/∂x_j of every cell, by k, then j. If u has a last axis of chains, each entry has this axis, too.
 Gradient = tuple[tuple[AnyArray, ...], ...]
 
 
 def displacement_gradient(derivative: SparseOperator, u: Float[AnyArray, "nodes 3 *chains"]) -> Gradient:
-    """∇u of every cell; `derivative` as in `Elements`.
+    """Compute ∇u of every cell, as a tuple of entries; `derivative` is that of `Elements`.
 
-    Entries and not one array: under `vmap` slices keep the chains where the product has them, side by side.
+    The entries are slices of the product, so that under `vmap` the chains stay next to each other in memory.
     """
     rows = derivative(u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
     count = len(rows) // 3
@@ -95,10 +95,10 @@ class Quadrature(NamedTuple):
     barycentric : (q, 4) array
         Its barycentric coordinates there.
     weights : (q,) array
-        mm³; those of a Gauss rule sum to the volume of Ω, those of voxels to the volume of the voxels whose centres
-        lie inside.
+        Weights, mm³. Those of a Gauss rule sum to the volume of Ω, those of voxels to the volume of the voxels whose
+        centres lie inside.
     interpolation : SparseOperator
-        (q, n): values at the nodes to values at the points, N_a(x_q).
+        The (q, n) map from values at the nodes to values at the points, N_a(x_q).
     """
 
     cells: Int[AnyArray, "points"]
@@ -107,7 +107,7 @@ class Quadrature(NamedTuple):
     interpolation: SparseOperator
 
     def positions(self, mesh: TetMesh) -> Float[np.ndarray, "points 3"]:
-        """World position of every point, mm."""
+        """Compute the world coordinates of every point, mm."""
         corners = mesh.points[mesh.cells[np.asarray(self.cells)]]
         return np.einsum("qa,qai->qi", np.asarray(self.barycentric), corners)
 
@@ -118,13 +118,13 @@ def quadrature_at(
     barycentric: Float[np.ndarray, "points 4"],
     weights: Float[np.ndarray, "points"],
 ) -> Quadrature:
-    """Points of given weights (mm³) at barycentric coordinates in some cells."""
+    """Make quadrature points with given cells, barycentric coordinates and weights (mm³)."""
     starts, shape = np.arange(0, 4 * len(cells) + 1, 4), (len(cells), len(mesh.points))
     matrix = scipy.sparse.csr_array((barycentric.ravel(), mesh.cells[cells].ravel(), starts), shape=shape)
     return Quadrature(jnp.asarray(cells), jnp.asarray(barycentric), jnp.asarray(weights), sparse_operator(matrix))
 
 
-# Four-point Gauss rule, exact for quadratics (the paper's; Zienkiewicz and Taylor).
+# The paper's four-point Gauss rule, exact for quadratics (Zienkiewicz and Taylor).
 _NEAR, _FAR = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
 _GAUSS4 = np.full((4, 4), _FAR) + (_NEAR - _FAR) * np.eye(4)
 
@@ -132,15 +132,15 @@ GAUSS_SUBDIVISIONS = {"gauss4": 0, "gauss32": 1, "gauss256": 2}
 
 
 def gauss_quadrature(mesh: TetMesh, rule: str = "gauss4") -> Quadrature:
-    """The four-point Gauss rule on every cell, or on the 8 or 64 equal parts of every cell.
+    """Make the four-point Gauss rule on every cell, or on the 8 or 64 equal parts of every cell.
 
     Parameters
     ----------
     mesh : TetMesh
     rule : {"gauss4", "gauss32", "gauss256"}
-        Number of points per cell. All weights are positive and equal within a cell: the noise model
-        behind the Boltzmann similarity gives a point of weight w_q the variance T_s / (2 w_q), which the
-        negative weights of Gauss rules of higher order would not allow.
+        The rule, named by its number of points per cell. All weights are positive and equal within a cell. The noise
+        model of the Boltzmann similarity gives a point of weight w_q the variance T_s / (2 w_q), so it excludes the
+        negative weights of Gauss rules of higher order.
     """
     barycentric = _subdivide(GAUSS_SUBDIVISIONS[rule])
     count, per_cell = len(mesh.cells), len(barycentric)
@@ -149,7 +149,7 @@ def gauss_quadrature(mesh: TetMesh, rule: str = "gauss4") -> Quadrature:
 
 
 def _subdivide(levels: int) -> Float[np.ndarray, "points 4"]:
-    """Four-point rule on the children of the reference tetrahedron, in barycentric coordinates."""
+    """Compute the points of the four-point rule on the parts of a tetrahedron, in barycentric coordinates."""
     children = [np.eye(4)]
     for _ in range(levels):
         children = [child for parent in children for child in _children(parent)]
@@ -157,7 +157,7 @@ def _subdivide(levels: int) -> Float[np.ndarray, "points 4"]:
 
 
 def _children(corners: Float[np.ndarray, "4 4"]) -> list[np.ndarray]:
-    """The eight equal parts of a tetrahedron: one at each corner, four in the octahedron between them."""
+    """Cut a tetrahedron into eight equal parts: one at each corner, four in the octahedron between them."""
     mid = {frozenset(pair): corners[list(pair)].mean(axis=0) for pair in combinations(range(4), 2)}
 
     def middle(a: int, b: int) -> np.ndarray:

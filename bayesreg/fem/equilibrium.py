@@ -45,12 +45,12 @@ def elastic_system(
 ) -> ElasticSystem:
     """Prepare the solves on a mesh whose `prescribed` nodes have given displacements.
 
-    The adjoint's tolerance is that of the equilibrium unless given.
+    The default of `adjoint_tolerance` is `tolerance`.
 
     Raises
     ------
     InputError
-        If the prescribed nodes do not hold the mesh in place.
+        If the prescribed nodes do not fix the mesh.
     """
     free = np.setdiff1d(np.arange(len(mesh.points)), np.asarray(prescribed))
     degrees = unknowns_of(free)
@@ -85,10 +85,10 @@ def equilibrium(
     u_prescribed: Float[AnyArray, "prescribed 3"],
     guess: Float[AnyArray, "nodes 3"] | None = None,
 ) -> Equilibrium:
-    """Displacement of every node, λ and μ given by cell; differentiable in λ, μ and u (implicitly).
+    """Compute the displacement of every node for λ and μ by cell; implicitly differentiable in λ, μ and u.
 
-    A `guess` (mm, the equilibrium of a state near by) saves iterations, and costs the derivative: reverse-mode
-    differentiation then raises.
+    A `guess` (the equilibrium of a similar state, mm) saves iterations. The result then has no derivative, and
+    reverse-mode differentiation raises an error.
     """
     if guess is None:
         return _differentiable(system, lam, mu, u_prescribed)
@@ -103,9 +103,9 @@ def _solve(
         return Equilibrium(u_prescribed[system.order], jnp.zeros(()), jnp.zeros((), int), fine)
     load = -_force(system, system.free_derivative, system.prescribed_derivative, lam, mu, u_prescribed)
     u_free, info = _response(system, system.tolerance, lam, mu, load, guess)
-    # Put together by a gather: XLA makes a loop of a scatter on the CPU.
+    # This is a gather because XLA turns a scatter into a loop on the CPU.
     u = jnp.concatenate([u_prescribed, u_free])[system.order]
-    # A node whose cells have no free node never enters the solve, but must be finite all the same.
+    # A node whose cells have no free node is not part of the solve, but must be finite, too.
     return Equilibrium(u, info.residual, info.iterations, info.converged & jnp.isfinite(u).all())
 
 
@@ -123,7 +123,7 @@ def _response(
     load: AnyArray,
     guess: AnyArray | None = None,
 ) -> tuple[AnyArray, SolverInfo]:
-    """K_II⁻¹ times a load on the free nodes; without a guess it has a derivative."""
+    """Multiply a load on the free nodes by K_II⁻¹; the result has a derivative only without a guess."""
     start = () if guess is None else (guess[system.free],)
 
     def solve(_: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
@@ -151,9 +151,10 @@ def _forward(
 def _backward(
     kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
 ) -> tuple[None, AnyArray, AnyArray, AnyArray]:
-    """The adjoint: K_II w = ū_I, w_B = 0, then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
+    """Solve the adjoint K_II w = ū_I, w_B = 0; then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
 
-    One for all that depends on u. The strain energy asks for none: it is least in u_I, so that its ū_I is the residual.
+    One solve serves all functions of u. The strain energy needs none: it is minimal in u_I, so that its ū_I is the
+    residual.
     """
     system, lam, mu, u = kept
     bar = cotangent.u
@@ -169,7 +170,7 @@ def _backward(
 def _sensitivity(
     system: ElasticSystem, u: Float[AnyArray, "nodes 3 chains"], w: Float[AnyArray, "free 3 chains"]
 ) -> tuple[Float[AnyArray, "cells chains"], Float[AnyArray, "cells chains"]]:
-    """−wᵀ (∂K/∂λ) u and −wᵀ (∂K/∂μ) u of every cell."""
+    """Compute −wᵀ (∂K/∂λ) u and −wᵀ (∂K/∂μ) u of every cell."""
     dilatation, distortion = strain_products(
         displacement_gradient(system.elements.derivative, u), displacement_gradient(system.free_derivative, w)
     )
@@ -187,7 +188,7 @@ def solve_interior(
     u_boundary: Float[AnyArray, "boundary 3"],
     tolerance: float = TOLERANCE,
 ) -> Equilibrium:
-    """Elastic equilibrium of the interior nodes for given boundary displacements (eq. 7).
+    """Compute the elastic equilibrium of the interior nodes for given boundary displacements (eq. 7).
 
     Parameters
     ----------
@@ -197,12 +198,12 @@ def solve_interior(
     u_boundary : (b, 3) array
         Displacements in the order of `mesh.boundary`, mm.
     tolerance : float
-        On the relative residual.
+        The greatest relative residual.
 
     Returns
     -------
     Equilibrium
-        Numbers never raise: NaN in gives ``converged=False``.
+        The equilibrium. Invalid numbers raise no error: for NaN the result has ``converged=False``.
 
     Raises
     ------
@@ -218,7 +219,10 @@ def solve_interior(
 def _reference(
     lam: Float[AnyArray, "entries"], mu: Float[AnyArray, "entries"]
 ) -> tuple[Float[np.ndarray, "entries"], Float[np.ndarray, "entries"]]:
-    """The parameters themselves to precondition with, where they are known and a factor of K would exist."""
+    """Choose the reference parameters of the preconditioner.
+
+    They are λ and μ themselves if these are known and K has a factor, else ones.
+    """
     known = not any(isinstance(values, jax.core.Tracer) for values in (lam, mu))
     if known and all(np.all((np.asarray(v) > 1e-12) & (np.asarray(v) < 1e12)) for v in (lam, mu)):
         return np.asarray(lam, float), np.asarray(mu, float)

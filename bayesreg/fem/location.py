@@ -1,4 +1,4 @@
-"""Search for the tetrahedron that holds a point, and P1 functions anywhere (NumPy, on the host)."""
+"""Search for the tetrahedron that holds a point, and evaluation of P1 functions at points (NumPy, on the host)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHUNK, _THREADS = 50_000, 4
 
 
 class Location(NamedTuple):
-    """Where points lie in a mesh.
+    """The location of points in a mesh.
 
     Attributes
     ----------
@@ -42,23 +42,23 @@ def locate(
     Parameters
     ----------
     points : (n, 3) array
-        Nodes, mm; of a deformed mesh as well as of a mesh at rest.
+        Nodes of a mesh at rest or of a deformed mesh, mm.
     cells : (m, 4) int array
         Tetrahedra of positive volume.
     query : (k, 3) array
         Points, mm.
     tolerance : float, default 1e-9
-        How far below zero a barycentric coordinate may lie, so that no point falls between two cells.
+        The greatest distance of a barycentric coordinate below zero, so that no point falls between two cells.
 
     Returns
     -------
     Location
-        Where two or more cells hold a point, the one of lowest index.
+        The location of each point. If two or more cells hold a point, it is the cell with the lowest index.
 
     Notes
     -----
-    A grid of bins lists the cells that reach into each bin; a point tests those of its own bin. About a
-    second for a million points.
+    A grid of bins lists the cells that reach into each bin, and each point is tested in the cells of its own bin. A
+    million points take about a second.
     """
     return CellSearch(points, cells, queries=len(query))(query, tolerance)
 
@@ -71,7 +71,7 @@ class CellSearch:
     points, cells
         As in `locate`.
     queries : int
-        About how many points it prepares for.
+        The approximate number of points, which determines the number of bins.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class CellSearch:
 def interpolation_at(
     mesh: TetMesh, points: Float[np.ndarray, "k 3"], labels: Sequence[str] | None = None
 ) -> tuple[Int[np.ndarray, "k 4"], Float[np.ndarray, "k 4"]]:
-    """Nodes and barycentric weights of points inside a mesh.
+    """Find the nodes and barycentric weights of points inside a mesh.
 
     Parameters
     ----------
@@ -99,14 +99,14 @@ def interpolation_at(
     points : (k, 3) array
         World RAS, mm.
     labels : sequence of str, optional
-        What to call each point in an error, such as "place 'ventricle'"; the default is its number.
+        The name of each point in an error, such as "place 'ventricle'"; the default is its number.
 
     Raises
     ------
     InputError
         If a point lies outside the mesh, where no displacement is estimated.
     """
-    # Nodes on a curved boundary may lie outside every cell by rounding.
+    # Rounding may put nodes on a curved boundary outside of every cell.
     cell, barycentric = locate(mesh.points, mesh.cells, points, tolerance=1e-6)
     outside = np.flatnonzero(cell < 0)
     if len(outside):
@@ -120,7 +120,10 @@ def interpolation_at(
 
 
 def barycentric_maps(corners: np.ndarray) -> np.ndarray:
-    """(m, 4, 3): coordinate a of x is row a times (x − first corner), plus one for a = 0."""
+    """Compute the (m, 4, 3) maps to barycentric coordinates of tetrahedra.
+
+    Coordinate a of x is row a times (x − first corner), plus one for a = 0.
+    """
     last_three = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
     return np.concatenate([-last_three.sum(axis=1, keepdims=True), last_three], axis=1)
 
@@ -128,7 +131,7 @@ def barycentric_maps(corners: np.ndarray) -> np.ndarray:
 def _search(
     query: np.ndarray, bins: _Bins, origin: np.ndarray, to_barycentric: np.ndarray, tolerance: float
 ) -> Location:
-    """Try the candidates of each point in turn, all points at once."""
+    """Test all points in their first candidates, then in their second ones, and so on."""
     cell, barycentric = np.full(len(query), -1), np.full((len(query), 4), np.nan)
     first, last = bins.candidates(query)
     left = np.flatnonzero(first < last)
@@ -145,7 +148,7 @@ def _search(
 
 
 class _Bins:
-    """A grid of cubes, with the cells that reach into each cube in ascending order."""
+    """A grid of cubes, with a list of the cells that reach into each cube, in ascending order."""
 
     def __init__(self, corners: np.ndarray, to_barycentric: np.ndarray, pairs: int) -> None:
         low, high = corners.min(axis=1), corners.max(axis=1)
@@ -166,9 +169,9 @@ class _Bins:
         self.starts = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=int(self.shape.prod())))])
 
     def candidates(self, query: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First and last (exclusive) position in `cells` of each point's candidates."""
+        """Find the first and last (exclusive) index in `cells` of the candidates of each point."""
         index = np.floor((query - self.low) / self.size)
-        # On the mesh's own bounding box rounding may say one bin too few or too many.
+        # On the bounding box of the mesh, rounding may give one bin too few or too many.
         inside = ((index >= -1) & (index <= self.shape)).all(axis=1)
         index = np.clip(np.where(inside[:, None], index, 0), 0, self.shape - 1).astype(int)
         flat = np.ravel_multi_index(tuple(index.T), tuple(self.shape))
@@ -176,7 +179,7 @@ class _Bins:
 
 
 def _bin_size(low: np.ndarray, high: np.ndarray, pairs: int) -> float:
-    """Edge of the smallest cubes for which cells and cubes make no more than about `pairs` pairs."""
+    """Compute the edge of the smallest cubes for which there are at most about `pairs` pairs of a cell and a cube."""
     extent = high - low
     size = float(extent.max())
     while np.prod(extent / (size / 1.3) + 1, axis=1).sum() < pairs and np.prod(np.ptp(low, axis=0) / size + 1) < pairs:
@@ -185,7 +188,7 @@ def _bin_size(low: np.ndarray, high: np.ndarray, pairs: int) -> float:
 
 
 def _overlaps(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every pair of a cell and a cube (3 indices) in the cell's box of cubes first … last."""
+    """List every pair of a cell and a cube (3 indices) in the cell's box of cubes first … last."""
     span = last - first + 1
     count = span.prod(axis=1)
     cell = np.repeat(np.arange(len(first)), count)
@@ -200,21 +203,22 @@ def nearest_on_surface(
     triangles: Int[np.ndarray, "triangles 3"],
     query: Float[np.ndarray, "queries 3"],
 ) -> Location:
-    """The nearest point of a triangulated surface, as a triangle and barycentric coordinates.
+    """Find the nearest point of a triangulated surface, as a triangle and barycentric coordinates.
 
     Parameters
     ----------
     points : (n, 3) array
         Nodes, mm.
     triangles : (t, 3) int array
-        For instance `TetMesh.boundary_faces`.
+        Node indices, for instance `TetMesh.boundary_faces`.
     query : (k, 3) array
         Points, mm.
 
     Notes
     -----
-    The point is exact for the triangles that own one of the four nearest sample points of the surface (3 to
-    36 on each triangle); a nearer triangle can be missed only by less than the distance between samples.
+    The result is the exact nearest point of the triangles that contain one of the four nearest sample points of the
+    surface (3 to 36 on each triangle). If another triangle is nearer, the error is less than the distance between
+    samples.
     """
     corners = points[triangles]
     lattice = _lattice(int(np.clip(np.sqrt(120_000 / len(triangles)), 2, 8)))
@@ -234,7 +238,7 @@ def nearest_on_surface(
 def _in_threads(
     search: Callable[[np.ndarray], Location], query: Float[np.ndarray, "queries 3"], corners: int
 ) -> Location:
-    """Search at points, some at a time, in threads: NumPy and SciPy let other threads run."""
+    """Search at groups of points in threads, because NumPy and SciPy release Python's lock."""
     cell, barycentric = np.empty(len(query), int), np.empty((len(query), corners))
     parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
     with ThreadPoolExecutor(max_workers=_THREADS) as pool:
@@ -244,7 +248,7 @@ def _in_threads(
 
 
 def _lattice(order: int) -> Float[np.ndarray, "samples 3"]:
-    """Centres of the upright parts of a triangle whose sides are cut in `order`; none lies on an edge."""
+    """List the centres of the upright parts of a triangle, its sides cut into `order` parts; none is on an edge."""
     return np.array([(i, j, order - 1 - i - j) for i in range(order) for j in range(order - i)]) / order + 1 / (
         3 * order
     )
@@ -253,7 +257,7 @@ def _lattice(order: int) -> Float[np.ndarray, "samples 3"]:
 def closest_in_triangles(
     corners: Float[np.ndarray, "*batch 3 3"], query: Float[np.ndarray, "*points 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Barycentric coordinates of the point of each triangle that is closest to a query point."""
+    """Compute the barycentric coordinates of the point of each triangle that is closest to a query point."""
     a, b, c = (corners[..., i, :] for i in range(3))
     ab, ac, aq = b - a, c - a, query - a
     normal = np.cross(ab, ac)
@@ -280,7 +284,7 @@ def _on_edge(corners: np.ndarray, query: np.ndarray, i: int, j: int) -> np.ndarr
 def transfer(
     u: Float[np.ndarray, "nodes 3"], from_mesh: TetMesh, points: Float[np.ndarray, "queries 3"]
 ) -> Float[np.ndarray, "queries 3"]:
-    """Values at any points of a P1 function given at the nodes of a mesh.
+    """Evaluate a P1 function, given at the nodes of a mesh, at points.
 
     Parameters
     ----------
@@ -288,7 +292,7 @@ def transfer(
         Values at the nodes of `from_mesh`, for instance displacements in mm.
     from_mesh : TetMesh
     points : (k, 3) array
-        Positions, mm. Outside the mesh the value at the nearest point of its surface is taken.
+        World coordinates, mm. A point outside the mesh takes the value at the nearest point of the surface.
 
     Returns
     -------

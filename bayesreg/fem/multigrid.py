@@ -1,7 +1,7 @@
-"""Smoothed aggregation (Vaněk, Mandel, Brezina 1996) as a preconditioner, for meshes beyond a dense inverse.
+"""Smoothed aggregation (Vaněk, Mandel, Brezina 1996) as a preconditioner, for meshes too large for a dense inverse.
 
-PyAMG makes the hierarchy once, on the host; a V-cycle runs on the device, with the chains as columns. The matrices are
-those of *one* reference (λ, μ) and so the same for all chains.
+PyAMG makes the hierarchy once, on the host. A V-cycle runs on the device, with the chains as columns. The matrices
+belong to *one* reference (λ, μ), so they are the same for all chains.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from bayesreg.types import AnyArray, InputError, Scalar
 
 # The coarsest matrix has a dense inverse.
 COARSEST = 600
-# Chebyshev's polynomials damp the eigenvalues above this share of the greatest.
+# Chebyshev's polynomials damp the eigenvalues above this share of the greatest one.
 LEAST_SHARE = 0.1
 DEGREE = 2
-# Below this a connection of two nodes does not bind them into one aggregate.
+# A weaker connection between two nodes does not put them into one aggregate.
 STRENGTH = 0.08
-# The least eigenvalue of the coarsest matrix, of unit diagonal: rigid motions are in it to rounding.
+# The bound of the least eigenvalue of the coarsest matrix, scaled to a unit diagonal. The coarsest matrix represents
+# rigid motions up to rounding.
 SINGULAR_BELOW = 1e-13
 
 
 class Level(NamedTuple):
-    """One level of the hierarchy, its matrix scaled to a unit diagonal; in single precision (a pytree).
+    """One level of the hierarchy, in single precision (a pytree).
 
     Attributes
     ----------
     matrix : SparseOperator
-        (k, k).
+        The (k, k) matrix, scaled to a unit diagonal.
     greatest : scalar
-        Above its eigenvalues.
+        An upper bound of the eigenvalues of the matrix.
     prolongation : SparseOperator
-        (k, next k).
+        The (k, next k) map from the next coarser level to this one.
     """
 
     matrix: SparseOperator
@@ -53,11 +54,11 @@ class Multigrid(NamedTuple):
     Attributes
     ----------
     scale : (3f,) array
-        diag(K_II)^(−1/2): the contrast between tissues, in double precision.
+        diag(K_II)^(−1/2), in double precision. It contains the contrast between tissues.
     levels : tuple of Level
-        From fine to coarse.
+        The levels, from fine to coarse.
     coarsest : (c, c) array
-        Inverse of the last matrix, in double precision: where tissues differ by much, it is far from the identity.
+        The inverse of the last matrix, in double precision: if tissues differ greatly, it is far from the identity.
     """
 
     scale: Float[AnyArray, "unknowns"]
@@ -65,14 +66,14 @@ class Multigrid(NamedTuple):
     coarsest: Float[AnyArray, "coarsest coarsest"]
 
     def __call__(self, residual: Float[AnyArray, "free 3 chains"]) -> Float[AnyArray, "free 3 chains"]:
-        """K_II⁻¹ r, approximately."""
+        """Compute an approximation of K_II⁻¹ r by one V-cycle."""
         scale = self.scale.reshape(-1, 3, 1)
         scaled = (scale * residual).astype(jnp.float32).reshape(len(self.scale), -1)
         return scale * _cycle(self.levels, self.coarsest, scaled).reshape(residual.shape)
 
 
 def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "unknowns modes"]) -> Multigrid:
-    """The hierarchy of a symmetric positive definite matrix; the same for the same matrix.
+    """Make the hierarchy of a symmetric positive definite matrix; the result is deterministic.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
     InputError
         If the matrix is singular or not finite.
     """
-    # A second to import, and of use to large meshes only.
+    # The import takes a second, and only large meshes need it.
     import pyamg
 
     diagonal = matrix.diagonal()
@@ -97,14 +98,14 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
         scipy.sparse.bsr_array(_scale(matrix, scale, scale), blocksize=(3, 3)),
         near_kernel / scale[:, None],
         strength=("symmetric", {"theta": STRENGTH}),
-        # PyAMG draws at random for an estimate of the greatest eigenvalue, but not for this one.
+        # PyAMG's other weightings estimate the greatest eigenvalue with random numbers; this one does not.
         smooth=("jacobi", {"omega": 4 / 3, "weighting": "local"}),
         improve_candidates=None,
-        # Counted in blocks; on coarse levels one for each of the six motions of an aggregate.
+        # PyAMG counts blocks; on coarse levels a block has the six motions of an aggregate.
         max_coarse=COARSEST // 6,
         max_levels=20,
     ).levels
-    # An aggregate of one or two nodes has fewer than six motions of its own: the others are columns of zeros.
+    # An aggregate of one or two nodes has fewer than six independent motions; the other columns are zero.
     kept = [np.flatnonzero(level.A.diagonal() > 1e-12) for level in hierarchy]
     inner = [scipy.sparse.csr_array(level.A)[own][:, own] for level, own in zip(hierarchy, kept, strict=True)]
     scales = [1 / np.sqrt(each.diagonal()) for each in inner]
@@ -135,7 +136,10 @@ def _scale(
 
 
 def _above_the_eigenvalues(matrix: scipy.sparse.csr_array) -> float:
-    """A tenth more than Lanczos' estimate of the greatest, which is some hundredths below it at most."""
+    """Compute an upper bound of the eigenvalues: 1.1 times Lanczos' estimate of the greatest one.
+
+    The estimate is at most a few percent too low.
+    """
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
     return 1.1 * float(scipy.sparse.linalg.eigsh(matrix, 1, v0=start, tol=0.05, return_eigenvectors=False)[0])
 
@@ -145,7 +149,7 @@ def _cycle(
     coarsest: Float[AnyArray, "coarsest coarsest"],
     load: Float[AnyArray, "unknowns chains"],
 ) -> Float[AnyArray, "unknowns chains"]:
-    """One V-cycle from zero, smoothed before and after by the same polynomial, so that it is symmetric."""
+    """Run one V-cycle from zero; the same polynomial smooths before and after, so that the cycle is symmetric."""
     if not levels:
         return (coarsest @ load.astype(coarsest.dtype)).astype(load.dtype)
     level, *coarser = levels
@@ -158,7 +162,7 @@ def _cycle(
 def _smooth(
     level: Level, x: Float[AnyArray, "unknowns chains"], residual: Float[AnyArray, "unknowns chains"]
 ) -> Float[AnyArray, "unknowns chains"]:
-    """x after `DEGREE` steps of Chebyshev's iteration (Saad 2003, algorithm 12.1), given its residual."""
+    """Apply `DEGREE` steps of Chebyshev's iteration (Saad 2003, algorithm 12.1) to x, given its residual."""
     centre, half = (level.greatest * (1 + way * LEAST_SHARE) / 2 for way in (1, -1))
     ratio = half / centre
     step = residual / centre

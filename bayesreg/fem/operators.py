@@ -1,7 +1,7 @@
 """Sparse matrices on the device, applied to the columns of many chains at once.
 
-On the CPU the product goes to a compiled loop over the rows with all columns inside, where gathers and scatters of XLA
-go entry by entry. It is a primitive of its own so that `vmap` adds columns: JAX would make a batch of products.
+On the CPU the product is a compiled loop over the rows with all columns inside; XLA's gathers and scatters would treat
+one entry at a time. The product is a JAX primitive, so that `vmap` adds columns instead of making a batch of products.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from jaxtyping import Float, Int
 
 from bayesreg.types import AnyArray
 
-# Rows of so many bytes are aligned; the product of others is three to five times slower.
+# Rows of a multiple of this number of bytes are aligned; the product with other rows is three to five times slower.
 ALIGNED = 32
 
 
 class SparseMatrix(NamedTuple):
-    """Compressed rows (a pytree).
+    """A matrix in compressed rows (a pytree).
 
     Attributes
     ----------
     entries : (k,) array
     columns : (k,) int array
     starts : (r + 1,) int array
-        Where each row begins.
+        The index of the first entry of each row.
     """
 
     entries: Float[AnyArray, "entries"]
@@ -42,41 +42,42 @@ class SparseMatrix(NamedTuple):
 class SparseOperator(NamedTuple):
     """A matrix A and its transpose (a pytree).
 
-    `operator(x)` is A x, differentiable in x, to any order and in both modes; under `vmap` chains join the columns. The
-    matrix is the same for all chains.
+    `operator(x)` is A x, differentiable in x to any order and in both modes. Under `vmap` the chains become further
+    columns; the matrix is the same for all chains.
 
     Attributes
     ----------
     matrix, transposed : SparseMatrix
-        (r, s) and (s, r).
+        A (r, s) and Aᵀ (s, r).
     """
 
     matrix: SparseMatrix
     transposed: SparseMatrix
 
     def __call__(self, x: Float[AnyArray, "s columns"]) -> Float[AnyArray, "r columns"]:
-        """A x."""
+        """Compute the product A x."""
         return _product.bind(*self.matrix, *self.transposed, x)
 
     @property
     def transpose(self) -> SparseOperator:
-        """Aᵀ, of the same arrays."""
+        """The operator of Aᵀ, which shares the arrays."""
         return SparseOperator(self.transposed, self.matrix)
 
 
 def sparse_operator(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> SparseOperator:
-    """A matrix of SciPy's for the device."""
+    """Convert a SciPy matrix to an operator on the device."""
     return SparseOperator(*(_on_device(each) for each in (matrix, matrix.T)))
 
 
 def symmetric_operator(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> SparseOperator:
-    """A symmetric matrix of SciPy's for the device, kept once."""
+    """Convert a symmetric SciPy matrix to an operator on the device, which keeps the matrix once."""
     rows = _on_device(matrix)
     return SparseOperator(rows, rows)
 
 
 def _on_device(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> SparseMatrix:
-    # A copy: what follows sorts in place, and JAX may not have read yet what the caller gave it of the same memory.
+    # The copy is needed because `sum_duplicates` sorts in place, and JAX may not have read yet an earlier array of the
+    # caller in the same memory.
     rows = scipy.sparse.csr_array(matrix, copy=True)
     rows.sum_duplicates()
     return SparseMatrix(jnp.asarray(rows.data), *(jnp.asarray(x, jnp.int32) for x in (rows.indices, rows.indptr)))
@@ -87,7 +88,7 @@ _product = Primitive("sparse_product")
 
 @_product.def_impl
 def _implementation(*operands: AnyArray) -> AnyArray:
-    """The product of the matrix and x, whose rows are padded to a multiple of `ALIGNED`."""
+    """Compute the product of the matrix and x, with the rows of x padded to a multiple of `ALIGNED` bytes."""
     *matrix, _, _, from_rows, x = operands
     columns = x.shape[1]
     padded = jnp.pad(x, ((0, 0), (0, -columns % (ALIGNED // x.dtype.itemsize))))

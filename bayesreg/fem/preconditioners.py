@@ -1,6 +1,6 @@
-"""Dense factors of the interior stiffness on the host, and the preconditioners made of them.
+"""Factors of the interior stiffness on the host, and the dense preconditioner made of them.
 
-A factor of K_II at *one* reference (λ, μ) serves all others: K is affine in the parameters, so the
+A factor of K_II at *one* reference (λ, μ) serves all other parameters. K is affine in the parameters, so the
 preconditioned spectrum lies between the least and the greatest ratio of a parameter to its reference.
 """
 
@@ -17,8 +17,9 @@ from jaxtyping import Float
 
 from bayesreg.types import AnyArray, InputError
 
-# Up to this many unknowns a solve by the dense inverse is faster than by multigrid, in the measured range: to about
-# 10,000 with 4 or 16 chains. But its making grows with their cube, thrice in a run (docs/speed.md).
+# With the dense inverse a solve is faster than with multigrid for up to about 10,000 unknowns, measured with 4 and 16
+# chains. The limit is lower because the time to make the inverse, three times in a run, grows with the cube of the
+# unknowns (docs/speed.md).
 DENSE_LIMIT = 6000
 
 SINGULAR = (
@@ -30,9 +31,9 @@ SINGULAR = (
 class ReferenceInverse(NamedTuple):
     """K_II⁻¹ at the reference parameters, scaled to a unit diagonal of K_II (a pytree).
 
-    The contrast between tissues is in the scale, in double precision; the inverse itself is kept in single
-    precision, which halves the memory traffic that bounds the speed of a solve and costs it no accuracy: a
-    preconditioner decides how many iterations are needed, not what they converge to.
+    The scale contains the contrast between tissues, in double precision. The inverse is in single precision, which
+    halves the memory traffic that limits the speed of a solve. This costs no accuracy: a preconditioner changes the
+    number of iterations, not their limit.
 
     Attributes
     ----------
@@ -46,14 +47,16 @@ class ReferenceInverse(NamedTuple):
     inverse: Float[AnyArray, "unknowns unknowns"]
 
     def __call__(self, residual: Float[AnyArray, "free 3 chains"]) -> Float[AnyArray, "free 3 chains"]:
-        """K_II⁻¹ r, approximately."""
+        """Compute an approximation of K_II⁻¹ r, with the reference parameters."""
         scale = self.scale.reshape(-1, 3, 1)
         scaled = (scale * residual).astype(self.inverse.dtype).reshape(len(self.inverse), -1)
         return scale * (self.inverse @ scaled).reshape(residual.shape)
 
 
 def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
-    """Dense inverse of the interior stiffness at the reference parameters, for at most some `DENSE_LIMIT` unknowns.
+    """Compute the dense inverse of the interior stiffness at the reference parameters.
+
+    It is meant for at most `DENSE_LIMIT` unknowns.
 
     Parameters
     ----------
@@ -67,7 +70,7 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
     Raises
     ------
     InputError
-        If the matrix is not positive definite: the prescribed nodes do not hold the mesh.
+        If the matrix is not positive definite, because the prescribed nodes do not fix the mesh.
     """
     found = _scaled_factor(matrix)
     if found is None:
@@ -80,10 +83,10 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
 def solve(
     matrix: scipy.sparse.csr_matrix, right: Float[np.ndarray, "unknowns columns"]
 ) -> Float[np.ndarray, "unknowns columns"]:
-    """K_II⁻¹ times many columns, to double precision.
+    """Multiply many columns by K_II⁻¹, to double precision.
 
-    Up to `DENSE_LIMIT` unknowns by a dense factor, whose solves are products of matrices, as those of a sparse one are
-    not. Where contrasts of stiffness leave no Cholesky factor, and beyond the limit, by a sparse one.
+    Up to `DENSE_LIMIT` unknowns the function uses a dense factor, whose solves are fast products of matrices. Beyond
+    the limit, or if contrasts of stiffness leave no Cholesky factor, it uses a sparse factor.
 
     Raises
     ------
@@ -103,9 +106,9 @@ def solve(
 def _scaled_factor(
     matrix: scipy.sparse.csr_matrix,
 ) -> tuple[Float[np.ndarray, "unknowns"], tuple[Float[np.ndarray, "unknowns unknowns"], bool]] | None:
-    """diag(K)^(−1/2), and the Cholesky factor of K scaled by it from both sides, for `scipy.linalg.cho_solve`.
+    """Compute diag(K)^(−1/2), and the Cholesky factor of K scaled by it from both sides, for `scipy.linalg.cho_solve`.
 
-    None where K, to double precision, is not positive definite.
+    The result is None if K is not positive definite in double precision.
     """
     if not np.isfinite(matrix.data).all():
         raise InputError(SINGULAR)

@@ -1,7 +1,7 @@
-"""A mesh with its surroundings: tetrahedra about it, out to a sphere, on which displacements of the mesh go on.
+"""The surroundings of a mesh: tetrahedra between the mesh and a sphere, to which its displacements are extended.
 
-Nothing is observed and nothing modelled out there. The displacement goes on as the rigid motion that is nearest to it
-and a harmonic rest, which has died away on the sphere; beyond it the rigid motion is left. It is continuous, linear in
+There are no observations and there is no model outside the mesh. The extension is the sum of the nearest rigid motion
+and a harmonic part, which is zero on the sphere; beyond the sphere it is the rigid motion. It is continuous, linear in
 the displacements of the mesh's nodes, and linear in every tetrahedron, so that it is inverted as inside the mesh.
 """
 
@@ -20,31 +20,33 @@ from bayesreg.fem.location import CellSearch
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.pose import rigid_projection
 
-# The sphere's radius in those of the smallest one about the mesh's centre, and the nodes on it.
+# The radius of the sphere, in radii of the smallest sphere about the mesh's centre that holds the mesh; and the number
+# of nodes on it.
 RADIUS, ON_SPHERE = 2.0, 400
-# Nodes between the two, by distance from the surface in mean edges of it: from, to, and apart.
+# Shells of nodes between the surface and the sphere, in mean edges of the surface: least distance from the surface,
+# greatest distance, and spacing.
 SHELLS = ((0.8, 2.0, 1.0), (2.0, 5.0, 2.0), (5.0, 1e9, 4.0))
-# The surface is refined until its triangles are faces of the surroundings: in so many rounds, to no more than so many
-# times its nodes, and not below this share of its mean edge.
+# The surface is refined until its triangles are faces of the surroundings. The limits are: the number of rounds, the
+# number of nodes in multiples of those of the surface, and the shortest edge as a share of the mean edge.
 MOST_ROUNDS, MOST_NODES, FINEST = 20, 12, 1 / 16
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """A mesh and what surrounds it.
+    """A mesh and the tetrahedra around it.
 
     Attributes
     ----------
     mesh : TetMesh
         The mesh itself.
     points : (N, 3) array
-        Its nodes, then those around it, mm.
+        The nodes of the mesh, then those around it, mm.
     cells : (M, 4) int array
-        Its tetrahedra, then those around it.
+        The tetrahedra of the mesh, then those around it.
     harmonic : (N − n, b) matrix
-        The harmonic part at the nodes around, of that at the nodes on the mesh's boundary.
+        The map from the harmonic part at the nodes of the mesh's boundary to that at the nodes around the mesh.
     centre : (3,) array
-        About which the rigid motion turns, mm.
+        The centre of rotation of the rigid motion, mm.
     projection : (6, n, 3) array
         See `bayesreg.pose.rigid_projection`.
     """
@@ -57,15 +59,15 @@ class Surroundings:
     projection: Float[np.ndarray, "6 nodes 3"]
 
     def rigid_motion(self, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "6"]:
-        """The small rigid motion nearest to a displacement: translation, mm, and rotation vector, radians."""
+        """Compute the small rigid motion nearest to a displacement: translation, mm, and rotation vector, radians."""
         return np.einsum("aki,ki->a", self.projection, u)
 
     def move_rigidly(self, motion: Float[np.ndarray, "6"], points: Float[np.ndarray, "k 3"]) -> np.ndarray:
-        """Displacement of points by a small rigid motion, mm, linear in both."""
+        """Compute the displacement of points by a small rigid motion, mm; linear in the motion and in the points."""
         return motion[:3] + np.cross(motion[3:], points - self.centre)
 
     def extend(self, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "all_nodes 3"]:
-        """A displacement of the mesh's nodes, mm, and how it goes on around it."""
+        """Extend a displacement of the mesh's nodes, mm, to the nodes around the mesh."""
         motion, boundary = self.rigid_motion(u), self.mesh.boundary
         rest = u[boundary] - self.move_rigidly(motion, self.mesh.points[boundary])
         around = self.points[len(self.mesh.points) :]
@@ -77,11 +79,12 @@ def surround(mesh: TetMesh) -> Surroundings:
 
     Notes
     -----
-    A Delaunay tetrahedralisation of the nodes on the boundary, of some on the sphere and of a lattice between the two
-    that grows coarser with the distance. Edges of triangles of the surface that are no faces of it are halved until
-    all are (conforming Delaunay refinement); displacements of the new nodes follow from those at the ends of an edge.
-    Where the surface is so creased that this has no end, tetrahedra may reach a little into the mesh: what lies in the
-    mesh is never looked for in them.
+    The tetrahedra are a Delaunay tetrahedralisation of the nodes on the boundary, of nodes on the sphere and of a
+    lattice between them that becomes coarser with the distance. Some triangles of the surface are not faces of it.
+    Their edges are halved until all triangles are faces (conforming Delaunay refinement); the displacement of a new
+    node is the mean of those at the ends of its edge. If the surface has sharp creases, the refinement may reach its
+    limits first, and some tetrahedra then extend a little into the mesh. A point in the mesh is never searched for in
+    these tetrahedra.
     """
     centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
     surface = _Surface.of(mesh)
@@ -97,7 +100,7 @@ def surround(mesh: TetMesh) -> Surroundings:
     cells = _outside(mesh, points, cells)
     count = len(surface.points)
     harmonic = _harmonic(points, cells, surface.weights, count, len(points) - ON_SPHERE)
-    # The nodes of the mesh's boundary come first, and are the mesh's own.
+    # The nodes of the mesh's boundary come first; they are nodes of the mesh, too.
     own = len(mesh.boundary)
     number = np.concatenate([mesh.boundary, len(mesh.points) + np.arange(len(points) - own)])
     return Surroundings(
@@ -117,12 +120,12 @@ class _Surface:
     Attributes
     ----------
     points : (p, 3) array
-        The nodes of the boundary, then those that halve edges.
+        The nodes of the boundary, then the midpoints of halved edges, mm.
     triangles : (t, 3) int array
     weights : (p, b) sparse matrix
-        Of each point, in those of the nodes of the boundary.
+        The weights of each point as a mean of the nodes of the boundary.
     finest : float
-        Edges that are shorter are not halved, mm.
+        The length below which edges are not halved, mm.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -137,17 +140,17 @@ class _Surface:
         return cls(points, triangles, scipy.sparse.eye_array(len(points), format="csr"), FINEST * mesh.boundary_edge)
 
     def missing(self, cells: Int[np.ndarray, "cells 4"]) -> Bool[np.ndarray, "t"]:
-        """Tell which triangles are no faces of tetrahedra."""
+        """Mark the triangles that are not faces of the tetrahedra."""
         faces = np.concatenate([np.delete(cells, corner, axis=1) for corner in range(4)])
         return ~np.isin(self._keys(self.triangles), self._keys(faces[(faces < len(self.points)).all(axis=1)]))
 
     def _keys(self, triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "t"]:
-        """A number for each triangle, whatever the order of its corners."""
+        """Compute a number for each triangle that does not depend on the order of its corners."""
         ordered, count = np.sort(triangles, axis=1).astype(np.int64), len(self.points)
         return (ordered[:, 0] * count + ordered[:, 1]) * count + ordered[:, 2]
 
     def refined(self, which: Bool[np.ndarray, "t"]) -> _Surface:
-        """Halve the longest edge of some triangles, and with it that of the triangle on its other side."""
+        """Halve the longest edge of some triangles, which also cuts the triangle on the other side of that edge."""
         corner = self.points[self.triangles]
         length = np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2)
         longest = length.argmax(axis=1)
@@ -170,7 +173,7 @@ class _Surface:
 
 
 def _split(triangle: list[int], middle: dict[tuple[int, int], int]) -> list[tuple[int, int, int]]:
-    """A triangle, cut from the middle of each of its halved edges in turn."""
+    """Cut a triangle at the midpoints of its halved edges, one edge after the other."""
     for start in range(3):
         a, b, c = triangle[start], triangle[(start + 1) % 3], triangle[(start + 2) % 3]
         new = middle.get((min(a, b), max(a, b)))
@@ -180,7 +183,7 @@ def _split(triangle: list[int], middle: dict[tuple[int, int], int]) -> list[tupl
 
 
 def _sphere(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
-    """Nodes on the sphere, on Fibonacci's spiral."""
+    """Compute nodes on the sphere along a Fibonacci spiral."""
     index = np.arange(ON_SPHERE) + 0.5
     z, turn = 1 - 2 * index / ON_SPHERE, np.pi * (1 + 5**0.5) * index
     flat = np.sqrt(1 - z**2)
@@ -192,7 +195,10 @@ def _radius(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> float:
 
 
 def _lattice(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
-    """Nodes between the surface and the sphere: body-centred, a little shaken, for no five are to lie on one sphere."""
+    """Compute nodes of a body-centred lattice between the surface and the sphere.
+
+    The nodes have small random shifts, so that no five of them lie on one sphere.
+    """
     edge, radius, rng = mesh.boundary_edge, _radius(mesh, centre), np.random.default_rng(0)
     search, boundary, found = CellSearch(mesh.points, mesh.cells), _samples(mesh), []
     for nearest, furthest, apart in SHELLS:
@@ -210,7 +216,7 @@ def _lattice(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray,
 
 
 def _samples(mesh: TetMesh) -> cKDTree:
-    """The surface as corners, middles of edges and centres of triangles."""
+    """Make a search tree of the corners, midpoints of edges and centres of the triangles of the surface."""
     corner = mesh.points[mesh.boundary_faces]
     edges = (corner + np.roll(corner, -1, axis=1)) / 2
     return cKDTree(np.concatenate([mesh.points[mesh.boundary], edges.reshape(-1, 3), corner.mean(axis=1)]))
@@ -219,7 +225,7 @@ def _samples(mesh: TetMesh) -> cKDTree:
 def _outside(
     mesh: TetMesh, points: Float[np.ndarray, "k 3"], cells: Int[np.ndarray, "cells 4"]
 ) -> Int[np.ndarray, "some 4"]:
-    """The tetrahedra that lie outside of a mesh, positively oriented."""
+    """Select the tetrahedra that lie outside of a mesh, and orient them positively."""
     volumes = signed_volumes(points, cells)
     cells = np.where((volumes < 0)[:, None], cells[:, [1, 0, 2, 3]], cells)
     longest = np.ptp(points[cells], axis=1).max(axis=1)
@@ -234,11 +240,11 @@ def _harmonic(
     first: int,
     last: int,
 ) -> Float[np.ndarray, "k boundary"]:
-    """What is harmonic between the surface, the first nodes, and the sphere, the last, where it is zero.
+    """Compute the harmonic extension from the surface (the first nodes) to zero on the sphere (the last nodes).
 
-    Edges conduct in proportion to their length, as face over distance does where the mesh is regular. Unlike the finite
-    elements' Laplacian, flat tetrahedra or not, this one makes every value a mean of those about it, and so of those on
-    the surface.
+    The weight of an edge in the Laplacian is its length, as the ratio of face area to distance is in a regular mesh.
+    With positive weights every value is a mean of the values at its neighbours, and so of the values on the surface,
+    even if tetrahedra are flat. The Laplacian of finite elements does not have this property.
     """
     pairs = np.array(list(combinations(range(4), 2)))
     one, other = np.unique(np.sort(cells[:, pairs].reshape(-1, 2), axis=1), axis=0).T
@@ -249,7 +255,7 @@ def _harmonic(
     laplacian = (scipy.sparse.diags_array(links.sum(axis=1)) - links).tocsr()
     found = np.zeros((count, surface.shape[1]))
     found[:first] = surface.toarray()
-    # A node of no tetrahedron outside, as within a crease, is nowhere needed.
+    # A node that belongs to no tetrahedron outside the mesh, for instance within a crease, is not needed.
     used = np.setdiff1d(cells, [*range(first), *range(last, count)])
     inner = laplacian[used]
     found[used] = splu(inner[:, used].tocsc()).solve(-(inner[:, :first] @ found[:first]))

@@ -1,1 +1,1 @@
-"""Sampling a posterior, and judging the draws."""
+"""Sampling of a posterior, and diagnostics of the draws."""

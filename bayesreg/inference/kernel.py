@@ -1,4 +1,4 @@
-"""The definition of a sampler: a handful of pure functions behind one small adapter."""
+"""The definition of a sampler: a record of pure functions."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from bayesreg.types import AnyArray
 
 
 class Info(NamedTuple):
-    """One transition: what the proposal met, the probability with which it was accepted, and what it cost.
+    """The report of one transition: acceptance probability, failures and cost.
 
     Attributes
     ----------
     acceptance_rate : scalar
     outside_support, diverging : scalar bool
     solver_failed, solver_iterations : scalar bool, scalar
-        Figures of the proposal's solve; zero where a transition has many (`Sampler.many_solves`).
+        Whether the elastic solve of the proposal failed, and its iterations; both are zero if a transition has many
+        solves (`Sampler.many_solves`).
     gradients, densities : scalar integer
-        Evaluations of the density with its gradient, and without.
+        The number of evaluations of the density with its gradient, and without it.
     """
 
     acceptance_rate: AnyArray
@@ -32,7 +33,10 @@ class Info(NamedTuple):
 
 
 def together(infos: Info) -> Info:
-    """One report of several transitions, stacked: rates are averaged, costs are added, and what befell one counts."""
+    """Summarise the stacked reports of several transitions in one.
+
+    Rates are averaged and costs are added. A flag is set if it is set for at least one of the transitions.
+    """
     return Info(
         acceptance_rate=infos.acceptance_rate.mean(),
         outside_support=infos.outside_support.any(),
@@ -45,24 +49,24 @@ def together(infos: Info) -> Info:
 
 
 class Draw(NamedTuple):
-    """Where a chain stands: estimands, and the `Evaluation` there."""
+    """The current estimands of a chain, and the `Evaluation` at them."""
 
     estimands: dict[str, AnyArray]
     evaluation: Any
 
 
 class Sampler(NamedTuple):
-    """A transition kernel.
+    """A transition kernel, as pure functions.
 
     Attributes
     ----------
     prepare : callable
-        (points, key) → (setup, points): start points (chains as the leading axis) to what the kernel needs
-        besides the data, a pytree that is found once, and the points from which chains then start.
+        (points, key) → (setup, points). It takes start points (chains as the leading axis). It returns the setup, a
+        pytree that the kernel needs besides the data and that is computed once, and the points at which chains start.
     data : callable
-        (setup) → the target's data as the functions below take them.
+        (setup) → the data of the target that the functions below take.
     blank : callable
-        () → a setup of the same structure, for reading one back.
+        () → a setup of the same structure; the reader of a stored setup needs it.
     init : callable
         (data, setup, estimands) → state.
     step : callable
@@ -70,13 +74,13 @@ class Sampler(NamedTuple):
     observe : callable
         (data, setup, state) → Draw.
     exact : bool
-        Whether the posterior is its stationary distribution.
+        Whether the posterior is the stationary distribution of the kernel.
     outside : callable, optional
-        (data, setup, key, state) → whether the step with this key proposes what lies outside the support, and so leaves
-        the state as it is. For samplers that can tell at a fraction of the price of a step: such steps are passed over,
-        and counted as outside the support and nothing else.
+        (data, setup, key, state) → whether the step with this key proposes a point outside the support, and so leaves
+        the state as it is. A sampler has this function if the answer costs much less than a step. Such steps are
+        skipped; only their number outside the support is counted.
     many_solves : bool
-        Whether a step has many solves, of which it does not tell: that of the draw is counted in their place.
+        Whether a step has many elastic solves and does not report them. The solve of the draw is counted instead.
     """
 
     prepare: Callable[[Any, AnyArray], tuple[Any, Any]]

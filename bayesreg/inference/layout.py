@@ -1,4 +1,4 @@
-"""Where each part of a position stands in a flat one: the only place that knows an order of the coordinates."""
+"""The order of the coordinates in a flat position. No other module knows this order."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from bayesreg.types import AnyArray
 
 @runtime_checkable
 class Placed(Hashable, Protocol):
-    """The part of a target that the order of the coordinates follows from."""
+    """The part of a target that defines the order of the coordinates."""
 
     @property
     def data(self) -> Any:
-        """See `Target`."""
+        """All arrays of the problem, as in `Target`."""
 
     @property
     def coordinates(self) -> Coordinates:
-        """See `Target`."""
+        """The map between estimands and the real line, as in `Target`."""
 
 
 def flat_position(target: Placed, data: Any, estimands: Estimands) -> AnyArray:
-    """The flat position of estimands."""
+    """Flatten the position of estimands."""
     return ravel_pytree(target.coordinates.unconstrain(data, estimands))[0]
 
 
 @lru_cache(maxsize=8)
 def unravel(target: Placed) -> Callable[[AnyArray], dict[str, AnyArray]]:
-    """The map from flat positions to positions."""
+    """Make the map from flat positions to positions."""
     return ravel_pytree(_at_rest(target))[1]
 
 
 @lru_cache(maxsize=8)
 def slices(target: Placed) -> dict[str, slice]:
-    """The entries of a flat position that hold each part of a position, by name."""
-    # Shapes alone: this may be asked for while something is traced.
+    """Find the entries of a flat position that hold each part of a position, by name."""
+    # Shapes are enough: this function may be called while JAX traces another one.
     shapes = jax.eval_shape(lambda: _at_rest(target))
     found, first = {}, 0
-    # In the order of the leaves, which is that of `ravel_pytree`.
+    # `ravel_pytree` concatenates the leaves in this order.
     for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
         found[path[0].key] = slice(first, first + math.prod(leaf.shape))
         first += math.prod(leaf.shape)
@@ -54,12 +54,12 @@ def slices(target: Placed) -> dict[str, slice]:
 
 
 def dimension(target: Placed) -> int:
-    """The number of coordinates."""
+    """Count the coordinates of a position."""
     return sum(part.stop - part.start for part in slices(target).values())
 
 
 def marked(target: Placed, *names: str) -> Bool[np.ndarray, "dimension"]:
-    """Mark the entries of a flat position that belong to the parts of these names; some parts may not exist."""
+    """Mark the entries of a flat position that belong to the named parts; a part need not exist."""
     marks = np.zeros(dimension(target), bool)
     for name in names:
         if name in slices(target):
@@ -68,7 +68,7 @@ def marked(target: Placed, *names: str) -> Bool[np.ndarray, "dimension"]:
 
 
 def others(target: Placed) -> Int[np.ndarray, "parameters"]:
-    """The entries that are no displacements."""
+    """List the entries of a flat position that are not displacements."""
     return np.flatnonzero(~marked(target, "u_boundary"))
 
 

@@ -1,8 +1,8 @@
-"""The posterior as the samplers see it: a small target, and objects that it may carry.
+"""The interface between a posterior and the samplers: a target, and the objects that it may have.
 
-Functions of a target take its `data`, a pytree with all its arrays, as an argument: no array is baked into compiled
-code, and the data of an easier or a prepared problem serve as well. A *target* is hashable, by all but the values in
-its data; what is compiled for one serves its equals.
+The functions of a target take its `data`, a pytree with all its arrays, as an argument. Compiled code then contains no
+array, and accepts the data of an easier or a prepared problem, too. A *target* is hashable; its hash ignores the values
+in its data. Code that is compiled for one target serves all equal ones.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Estimands = Mapping[str, AnyArray]
 
 @runtime_checkable
 class Evaluation(Protocol):
-    """The log density at one place, and what was found on the way."""
+    """The log density of some estimands, and the results of its computation."""
 
     logdensity: AnyArray
     u: AnyArray
@@ -30,24 +30,27 @@ class Evaluation(Protocol):
 
 @runtime_checkable
 class Coordinates(Protocol):
-    """The map between estimands and positions: a *position* holds the estimands mapped to the real line."""
+    """The map between estimands and positions. A *position* holds the estimands mapped to the real line."""
 
     def reference(self) -> dict[str, AnyArray]:
-        """Estimands at rest."""
+        """Return the estimands of the body at rest."""
 
     def constrain(self, data: Any, position: Estimands) -> tuple[dict[str, AnyArray], Scalar]:
-        """Estimands of a position, and the logarithm of the Jacobian."""
+        """Map a position to its estimands; return them and the logarithm of the Jacobian."""
 
     def unconstrain(self, data: Any, estimands: Estimands) -> dict[str, AnyArray]:
-        """Position of estimands."""
+        """Map estimands to their position."""
 
     def least_curvature(self, data: Any, position: Estimands) -> dict[str, AnyArray]:
-        """Curvature of −log density in every coordinate where next to nothing is known of it, positive."""
+        """Return a lower bound, positive, for the curvature of −log density in every coordinate.
+
+        It is the curvature of a coordinate about which almost nothing is known.
+        """
 
 
 @runtime_checkable
 class Variables(Protocol):
-    """How draws are shown to a reader: named as in xarray, known entries included."""
+    """The names and shapes of draws for a reader, as in xarray; known entries are included."""
 
     @property
     def dims(self) -> Mapping[str, Sequence[str]]:
@@ -55,7 +58,7 @@ class Variables(Protocol):
 
     @property
     def coords(self) -> Mapping[str, Any]:
-        """The labels along these dimensions; "node" are the node numbers of the rows of "u_boundary"."""
+        """The labels along these dimensions; "node" holds the node numbers of the rows of "u_boundary"."""
 
     @property
     def constants(self) -> Mapping[str, AnyArray]:
@@ -63,40 +66,43 @@ class Variables(Protocol):
 
     @property
     def attributes(self) -> Mapping[str, Mapping[str, str]]:
-        """What variables and constants mean, and their units: "long_name" and "units", as in xarray."""
+        """The meanings and units of variables and constants: "long_name" and "units", as in xarray."""
 
     def values(self, estimands: Estimands) -> dict[str, Any]:
-        """Variables of estimands whose arrays may have leading axes; on the host."""
+        """Convert estimands, whose arrays may have leading axes, to variables on the host."""
 
     def estimands(self, values: Estimands) -> dict[str, Any]:
-        """The sampled entries of variables; the inverse of `values`."""
+        """Take the sampled entries of variables; this is the inverse of `values`."""
 
 
 @runtime_checkable
 class Normaliser(Protocol):
-    """A factor of the density that depends on estimands other than "u_boundary" alone."""
+    """A factor of the density that does not depend on "u_boundary"."""
 
     @property
     def is_costly(self) -> bool:
-        """Whether it costs much more than the rest of the density."""
+        """Whether this factor costs much more than the rest of the density."""
 
     @property
     def depends_on(self) -> Sequence[str]:
-        """Names of what it depends on; some may not be sampled."""
+        """The names of the estimands on which this factor depends; some may not be sampled."""
 
     def smooth_coordinates(self, data: Any, estimands: Estimands) -> AnyArray:
-        """As many coordinates (k,) as it depends on, of which it is as smooth a function as can be."""
+        """Compute coordinates (k,) of which the logarithm of this factor is a smooth function.
+
+        Their number k is the number of estimands on which it depends.
+        """
 
     def log(self, data: Any, estimands: Estimands) -> Scalar:
-        """The logarithm of this factor, as part of the log density."""
+        """Compute the logarithm of this factor, as part of the log density."""
 
     def without(self, data: Any) -> Any:
-        """The data of the same problem without this factor."""
+        """Return the data of the same problem without this factor."""
 
 
 @runtime_checkable
 class Curvature(Protocol):
-    """The curvature of minus a log density: a positive semidefinite part, and what the exact one has besides."""
+    """The curvature of minus a log density, as the sum of a positive semidefinite part and a remainder."""
 
     @property
     def gauss_newton(self) -> AnyArray:
@@ -104,44 +110,50 @@ class Curvature(Protocol):
 
     @property
     def remainder(self) -> AnyArray:
-        """The rest of the exact curvature."""
+        """The exact curvature less the positive semidefinite part."""
 
 
 @runtime_checkable
 class ModeSearch(Protocol):
-    """The posterior as the search for a mode and Laplace's approximation there see it."""
+    """The parts of a posterior that the search for a mode and Laplace's approximation need."""
 
     @property
     def hyperparameters(self) -> Sequence[str]:
-        """Names of sampled parameters of the displacements' prior and noise, whose joint mode with these misleads."""
+        """The names of sampled parameters of the prior and the noise of the displacements.
+
+        The joint mode of these and the displacements is far from most of the probability.
+        """
 
     @property
     def approached(self) -> Estimands | None:
-        """Estimands near the mode, where the search begins; None: where the chains start."""
+        """Estimands near the mode, where the search begins; None if it begins where the chains start."""
 
     @property
     def tempering(self) -> Callable[[Estimands], Target] | None:
-        """Where the target has yet to be tempered: from estimands near the mode to the target that is to be sampled."""
+        """The map from estimands near the mode to the tempered target; None if the target needs no tempering."""
 
     def continuation(self) -> Iterable[Any]:
-        """Data of ever harder problems, in the displacements alone, that lead to the target's own."""
+        """Yield the data of problems of increasing difficulty that lead to the target's own problem.
+
+        Only the displacements are unknown in these problems.
+        """
 
     def curvature(self, data: Any, estimands: Estimands) -> Curvature:
-        """Curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""
+        """Compute the curvature of minus the log density in "field" (k entries or none) and "u_boundary"."""
 
     def quadratic_part(self, data: Any) -> Any:
-        """The data of the problem without the terms that are far from quadratic in the displacements."""
+        """Return the data of the problem without the terms that are far from quadratic in the displacements."""
 
     def quadratic_curvature(self, data: Any, estimands: Estimands, near: Estimands) -> Any:
-        """The part of `curvature` that belongs to `quadratic_part`, as a dense or a sparse matrix.
+        """Compute the part of `curvature` that belongs to `quadratic_part`, as a dense or a sparse matrix.
 
-        What follows "u_boundary" does so as at the estimands `near`.
+        The nodes that follow "u_boundary" do so as they do at the estimands `near`.
         """
 
 
 @runtime_checkable
 class Target(Hashable, Protocol):
-    """A posterior as the samplers see it; `bayesreg.Posterior` is one. What is optional may be None."""
+    """The posterior as the samplers use it; `bayesreg.Posterior` is an implementation."""
 
     @property
     def data(self) -> Any:
@@ -153,43 +165,49 @@ class Target(Hashable, Protocol):
 
     @property
     def variables(self) -> Variables:
-        """How draws are shown to a reader."""
+        """The names and shapes of draws for a reader."""
 
     def evaluate_estimands(self, data: Any, estimands: Estimands, guess: AnyArray | None = None) -> Any:
-        """An `Evaluation` in the constrained space; a guess of its u makes it faster and costs the gradient."""
+        """Evaluate the density of estimands, in the constrained space; return an `Evaluation`.
+
+        A guess of its u makes the function faster, but the result then has no gradient.
+        """
 
     def supports(self, data: Any, estimands: Estimands) -> AnyArray:
-        """Whether the density may be positive there; much cheaper than an evaluation."""
+        """Check whether the density may be positive at estimands; this is much cheaper than an evaluation."""
 
     def condition(self, estimands: Estimands) -> Any:
-        """The data of the same problem, prepared for fast densities near these estimands."""
+        """Prepare the data of the same problem for fast densities near these estimands."""
 
     @property
     def hard_wall(self) -> Callable[[Any, AnyArray], AnyArray] | None:
-        """From the data and "u_boundary" (b, 3) to the nodes (b,) where the density is zero; None: no such wall."""
+        """The map from the data and "u_boundary" (b, 3) to marks (b,) of the nodes that make the density zero.
+
+        The map is None if the target has no hard wall.
+        """
 
     @property
     def normaliser(self) -> Normaliser | None:
-        """The normaliser of the prior of "u_boundary"; None where the density leaves it out."""
+        """The normaliser of the prior of "u_boundary"; None if the density leaves it out."""
 
     @property
     def mode_search(self) -> ModeSearch | None:
-        """The posterior as the search for a mode sees it; None where no mode can be searched for."""
+        """The parts that the search for a mode needs; None if the target does not allow this search."""
 
 
 def logdensity(target: Target, data: Any, position: Estimands) -> Scalar:
-    """The log density of a position, the Jacobian included."""
+    """Compute the log density of a position, including the Jacobian."""
     estimands, log_jacobian = target.coordinates.constrain(data, position)
     return target.evaluate_estimands(data, estimands).logdensity + log_jacobian
 
 
 def estimands_of(target: Target, data: Any, position: Estimands) -> dict[str, AnyArray]:
-    """The estimands of a position."""
+    """Map a position to its estimands."""
     return target.coordinates.constrain(data, position)[0]
 
 
 def require_soft_wall(target: Target) -> None:
-    """Raise InputError where the target has a hard wall: no gradient tells of it."""
+    """Raise InputError if the target has a hard wall, which the gradient does not show."""
     if target.hard_wall is not None:
         raise InputError(
             "samplers that follow the gradient need a soft wall of the skull, and model.skull_width is 0: set it to "
@@ -198,10 +216,10 @@ def require_soft_wall(target: Target) -> None:
 
 
 def without_normaliser(target: Target, data: Any) -> Any:
-    """The data of the same problem without the normaliser."""
+    """Return the data of the same problem without the normaliser."""
     return data if target.normaliser is None else target.normaliser.without(data)
 
 
 def has_costly_normaliser(target: Target) -> bool:
-    """Whether the density has a normaliser that should not stand in every step of a trajectory."""
+    """Check whether the density has a normaliser that is too costly for every step of a trajectory."""
     return target.normaliser is not None and target.normaliser.is_costly

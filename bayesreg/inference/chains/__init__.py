@@ -1,1 +1,1 @@
-"""Chains: blocks of draws, devices, when to stop, and where to go on."""
+"""Running chains: start points, blocks of draws, devices, stop rule, checkpoints and progress."""

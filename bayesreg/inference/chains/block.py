@@ -1,4 +1,4 @@
-"""A block of draws of every chain, side by side: vmap over chains, a loop over steps."""
+"""A block of draws of every chain: vmap over chains, a loop over steps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bayesreg.types import AnyArray
 # (number of a step in the block, state) → (state, Info)
 Step = Callable[[AnyArray, Any], tuple[Any, Info]]
 
-# (number of a step in the block, state) → whether that step proposes what lies outside the support
+# (number of a step in the block, state) → whether that step proposes a point outside the support
 Outside = Callable[[AnyArray, Any], AnyArray]
 
 
@@ -30,12 +30,12 @@ class _Drawn(NamedTuple):
     Attributes
     ----------
     state : pytree
-        After the last step.
+        The state after the last step.
     moments : Moments
     places : dict of (draw, ...) arrays
-        Where the chain stood, as `_place` has it.
+        The estimands and energies of each draw, see `_place`.
     windows : Tally of (draw,) arrays
-        Tallies of the steps since the draw before each.
+        The tally of the steps between each draw and the draw before it.
     """
 
     state: Any
@@ -59,27 +59,27 @@ def run_block(
     moments: Moments,
     tally: Tally,
 ) -> tuple[Any, Moments, Tally, dict[str, AnyArray]]:
-    """So many draws of every chain, `thin` steps each.
+    """Draw a block from every chain: `length` draws of `thin` steps each.
 
     Parameters
     ----------
     chosen : Chosen
     length, thin : int
     devices : Mesh or None
-        Among which the chains are shared.
+        The devices that share the chains.
     data : pytree
-        As the sampler takes them.
+        The data that the sampler takes.
     seed, numbers, first : int, (c,) int array, int
-        What a chain draws follows from the seed, its number and how many draws it made before this block.
+        The seed, the number of each chain, and the number of draws before this block. They determine the random keys.
     setup, state, moments, tally : pytrees
-        As in a `Checkpoint`, after those draws.
+        As in a `Checkpoint`, before the block.
 
     Returns
     -------
     state, moments, tally
-        After the block.
+        As in a `Checkpoint`, after the block.
     kept : dict of (c, length, ...) arrays
-        The draws; rates and counts are over the steps since the draw before each.
+        The draws. Rates and counts cover the steps between each draw and the draw before it.
     """
     kernel = chosen.sampler
     _, key_chains = jax.random.split(jax.random.key(seed))
@@ -111,7 +111,7 @@ def run_block(
 
 
 def watched_values(draw: Draw) -> dict[str, Any]:
-    """The values of which moments are kept."""
+    """Take the values whose moments are computed."""
     return {"estimands": draw.estimands, "u": draw.evaluation.u}
 
 
@@ -124,7 +124,7 @@ def _in_step(
     state: Any,
     moments: Moments,
 ) -> _Drawn:
-    """All chains take each step together."""
+    """Run a block in which all chains take each step at the same time."""
 
     def one_draw(carry: tuple[Any, Moments], draw: AnyArray) -> tuple[tuple[Any, Moments], tuple[Any, Tally]]:
         def one_step(i: AnyArray | int, found: tuple[Any, Tally]) -> tuple[Any, Tally]:
@@ -151,10 +151,11 @@ def _at_own_pace(
     state: Any,
     moments: Moments,
 ) -> _Drawn:
-    """A chain passes over the steps that propose what lies outside the support, and waits for none but at the end.
+    """Run a block in which each chain skips the steps whose proposals lie outside the support.
 
-    Side by side all chains evaluate at once, each a step of its own, often of a draw of its own. A chain stands where a
-    step has led it until the next step that it takes, and all draws that end in between are the same.
+    All chains evaluate the density at the same time, but each at its own step and its own draw. Chains wait for each
+    other only at the end of the block. The state of a chain does not change between two steps that it takes, and all
+    draws that end between them are equal.
     """
 
     def next_taken(i: AnyArray, state: Any) -> AnyArray:
@@ -171,7 +172,7 @@ def _at_own_pace(
         return following, _Drawn(state, moments, places, windows)
 
     begun = observe(state)
-    # Row 0 is where the block begins, row d + 1 where the last step taken for draw d has led.
+    # Row 0 is the state before the block, row d + 1 the state after the last step that was taken for draw d.
     places = jax.tree.map(lambda x: jnp.zeros((length + 1, *jnp.shape(x)), x.dtype).at[0].set(x), _place(begun))
     first = next_taken(jnp.zeros((), int), state)
     moments = update(moments, watched_values(begun), first // thin)
@@ -193,7 +194,7 @@ def _place(drawn: Draw) -> dict[str, AnyArray]:
 
 
 def _statistics(windows: Tally) -> dict[str, AnyArray]:
-    """Rates and counts over the steps since the draw before."""
+    """Compute rates and counts over the steps between each draw and the draw before it."""
     return {
         "acceptance_rate": windows.acceptance / windows.steps,
         "solver_iterations": windows.solver_iterations / windows.steps,

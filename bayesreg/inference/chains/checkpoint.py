@@ -15,7 +15,7 @@ from bayesreg.types import AnyArray
 
 
 class Tally(NamedTuple):
-    """Number of steps, and the sums over them of the fields of `Info`, in its order; for each chain."""
+    """The number of steps of each chain, and the sums of the fields of `Info` over them, in the order of `Info`."""
 
     steps: AnyArray
     acceptance: AnyArray
@@ -28,21 +28,21 @@ class Tally(NamedTuple):
 
 
 class Checkpoint(NamedTuple):
-    """All that the next block needs (a pytree of arrays with chains as the leading axis).
+    """The state that the next block starts from (a pytree of arrays with chains as the leading axis).
 
     Attributes
     ----------
     draws : int
         Kept draws per chain so far.
     setup : pytree
-        What the sampler found before its first step.
+        The setup that the sampler computed before its first step.
     state : pytree
     moments : Moments
         Moments of the estimands and of u at every node.
     tally : Tally
-        Summed over all steps so far.
+        The tally of all steps so far.
     seconds : float
-        Spent sampling so far.
+        Seconds of sampling so far.
     """
 
     draws: AnyArray
@@ -54,22 +54,25 @@ class Checkpoint(NamedTuple):
 
 
 def no_steps(shape: tuple[int, ...] = ()) -> Tally:
-    """The tally before the first step."""
+    """Make the tally before the first step."""
     return Tally(*(jnp.zeros(shape),) * len(Tally._fields))
 
 
 def count_step(tally: Tally, info: Info) -> Tally:
-    """The tally with one step more."""
+    """Add one step to a tally."""
     return jax.tree.map(jnp.add, tally, Tally(jnp.ones(()), *info))
 
 
 def with_passed_over(tally: Tally, steps: AnyArray) -> Tally:
-    """The tally with so many steps more whose proposals lay outside the support, and cost nothing."""
+    """Add a number of skipped steps to a tally; their proposals lay outside the support and cost nothing."""
     return tally._replace(steps=tally.steps + steps, outside_support=tally.outside_support + steps)
 
 
 def with_solve(tally: Tally, evaluation: Evaluation, steps: int) -> Tally:
-    """The tally of steps that do not tell of their solves: the draw's iterations for each of them, its failure once."""
+    """Add the solve of a draw to the tally of its steps, which do not report their solves.
+
+    The iterations of the draw count for each of the steps, and its failure counts once.
+    """
     return tally._replace(
         solver_failed=tally.solver_failed + evaluation.solver_failed,
         solver_iterations=tally.solver_iterations + steps * evaluation.solver_iterations,
@@ -77,5 +80,5 @@ def with_solve(tally: Tally, evaluation: Evaluation, steps: int) -> Tally:
 
 
 def checkpoint_to_arrays(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
-    """A checkpoint as named arrays, for a file."""
+    """Convert a checkpoint to named arrays, for a file."""
     return {f"leaf_{i:03d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(checkpoint))}

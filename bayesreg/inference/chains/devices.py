@@ -1,4 +1,4 @@
-"""Chains on several devices of one process: each device runs its share, without a word to the others."""
+"""Chains on several devices of one process: each device runs its share, without communication between devices."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 _AXIS = "chains"
-# On a processor so many chains run side by side: what more of them work on leaves the cache (docs/speed.md#groups).
+# The greatest number of chains that a CPU runs at once: the arrays of more chains exceed its cache
+# (docs/speed.md#groups).
 _TOGETHER = 16
 
 
 def devices_for(chains: int) -> Mesh | None:
-    """The most devices that can have equal shares of so many chains; None if that is one."""
+    """Choose the most devices that can have equal shares of the chains; return None if that is one device."""
     every = jax.devices()
     count = max(n for n in range(1, len(every) + 1) if chains % n == 0)
     return Mesh(np.array(every[:count]), (_AXIS,)) if count > 1 else None
 
 
 def share(tree: Any, devices: Mesh | None) -> Any:
-    """Arrays whose leading axis is that of the chains, on these devices, as a block of draws leaves them.
+    """Distribute arrays, whose leading axis is the chains, among devices.
 
-    The first block would otherwise be compiled for other places than all after it.
+    A block of draws returns its arrays distributed in this way. Without it, JAX would compile the first block for
+    another distribution than the later ones.
     """
     if devices is None:
         return tree
@@ -33,20 +35,24 @@ def share(tree: Any, devices: Mesh | None) -> Any:
 
 
 def side_by_side(chain: Callable, devices: Mesh | None) -> Callable:
-    """A function of one chain as one of many, whose leading axis is that of the chains, on these devices.
+    """Make a function of many chains (chains as the leading axis) from a function of one chain, on these devices.
 
-    What the function closes over is on each device.
+    The arrays that the function closes over are copied to each device.
     """
     many = partial(_in_groups, chain)
     if devices is None:
         return many
-    # Not told apart: values that vary with the device, and those that do not, such as zeros that a sum begins with.
+    # JAX would otherwise require a distinction between values that vary with the device and values that do not, such as
+    # the zeros with which a sum begins.
     share = PartitionSpec(_AXIS)
     return jax.shard_map(many, mesh=devices, in_specs=share, out_specs=share, check_vma=False)
 
 
 def _in_groups(chain: Callable, *each: Any) -> Any:
-    """One group after the other; all together on a GPU, and where they are few or no size of a group divides them."""
+    """Run the chains in groups, one group after the other.
+
+    All chains run at once on a GPU, if there are few of them, or if no allowed size of a group divides their number.
+    """
     chains = len(jax.tree.leaves(each)[0])
     sizes = range(_TOGETHER, _TOGETHER // 2 - 1, -1) if jax.default_backend() == "cpu" else ()
     size = next((size for size in sizes if chains % size == 0), chains)

@@ -1,4 +1,4 @@
-"""Start values: overdispersed chains between identity and a given displacement."""
+"""Start points of the chains, overdispersed between no displacement and a given one."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from bayesreg.types import AnyArray, InputError
 
 
 class Start(NamedTuple):
-    """Where chains begin.
+    """The options for the start points of the chains.
 
     Attributes
     ----------
     field : (b, 3) array, optional
-        Displacement of the sampled nodes, mm, at the far end; None is no displacement.
+        Displacement of the sampled nodes, mm, at fraction 1; None is no displacement.
     fraction : (float, float)
-        Chains start at fractions of the field spread evenly over this range: 0 identity, 1 the field. A node
-        that this would put behind a hard wall starts at the nearest fraction that does not.
+        Chains start at fractions of the field, spread evenly over this range: 0 is no displacement, 1 is the field. A
+        node that would lie behind a hard wall starts at the nearest fraction at which it does not.
     lam, mu : mapping of entry name to float, optional
-        Centre of the start parameters, where it is not the posterior's own reference.
+        Centre of the start parameters; the default is the reference of the posterior.
     spread : float
         Standard deviation of the log of the start parameters between chains.
     """
@@ -38,7 +38,7 @@ class Start(NamedTuple):
 
 
 def starting_points(target: Target, start: Start, chains: int, key: AnyArray) -> dict[str, AnyArray]:
-    """Estimands of every chain (leading axis).
+    """Compute the estimands at which every chain (leading axis) starts.
 
     Raises
     ------
@@ -66,10 +66,10 @@ def starting_points(target: Target, start: Start, chains: int, key: AnyArray) ->
 
 
 def _admissible(target: Target, field: np.ndarray, fraction: float) -> AnyArray:
-    """A fraction of the field; a node that it would put behind a hard wall takes the nearest fraction that does not.
+    """Scale the field by a fraction; a node behind a hard wall takes the nearest fraction at which it is allowed.
 
-    Both ends of a node's path may be allowed and its middle not: a skull is not convex. At zero the node is at
-    rest, where it is allowed.
+    A skull is not convex: both ends of a node's path may be allowed while its middle is not. At fraction zero the node
+    is at rest, which is always allowed.
     """
     chosen = np.full(len(field), fraction)
     if target.hard_wall is None:
@@ -92,7 +92,7 @@ def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: T
 
 
 def require_numbers(points: Estimands) -> None:
-    """Raise InputError where a chain (leading axis) would start at what is not a finite number."""
+    """Raise InputError if a start point of a chain (leading axis) has an entry that is not finite."""
     for name, values in points.items():
         for chain, value in enumerate(np.asarray(values)):
             if not np.isfinite(value).all():
@@ -100,7 +100,7 @@ def require_numbers(points: Estimands) -> None:
 
 
 def require_density(found: Evaluation) -> None:
-    """Raise InputError where a chain (leading axis) would start with density zero."""
+    """Raise InputError if the density is zero at the start point of a chain (leading axis)."""
     for chain in np.flatnonzero(~np.isfinite(found.logdensity)):
         why = "a node lies in the skull, or a parameter outside its prior's range or without end"
         if not found.outside_support[chain]:

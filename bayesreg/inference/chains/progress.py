@@ -1,4 +1,4 @@
-"""A progress bar that shows what matters while chains run."""
+"""A progress bar with the state of the chains while they run."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from bayesreg.inference.draws.moments import greatest_rhat
 
 @runtime_checkable
 class Progress(Protocol):
-    """Told of every block."""
+    """A display of the progress, called after every block."""
 
     def __enter__(self) -> Progress:
-        """Begin."""
+        """Start the display of the progress."""
 
     def __exit__(self, *exception: object) -> None:
-        """End, also after an error."""
+        """End the display, also after an error."""
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
         """Show how far the chains are."""
 
 
-# Whether progress is shown, or what shows it, made of draws, the most seconds and the threshold of R̂.
+# Whether progress is shown, or the maker of a display: (draws, greatest seconds, threshold of R̂) → Progress.
 Showing = bool | Callable[[int, float | None, float | None], Progress]
 
 
 class NoProgress:
-    """Shows nothing."""
+    """A display that shows nothing."""
 
     def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
         pass
@@ -43,11 +43,11 @@ class NoProgress:
         return None
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
-        """Nothing."""
+        """Do nothing with the progress."""
 
 
 class SamplingProgress(NoProgress):
-    """Draws, acceptance, steps per second, greatest running R̂ and time left, on one line."""
+    """A line with draws, acceptance, steps per second, greatest running R̂ and time left."""
 
     def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
         self._draws, self._max_seconds, self._threshold = draws, max_seconds, threshold
@@ -67,7 +67,7 @@ class SamplingProgress(NoProgress):
         self._bar.stop()
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
-        """Acceptance inside the support and overall, steps per second of a chain, greatest R̂, time left."""
+        """Show acceptance inside the support and overall, steps per second of a chain, greatest R̂ and time left."""
         draws, seconds, tally = int(checkpoint.draws), float(checkpoint.seconds), checkpoint.tally
         if draws == 0:
             return
@@ -76,7 +76,7 @@ class SamplingProgress(NoProgress):
         accepted = float(np.sum(tally.acceptance))
         target = "" if self._threshold is None else f"/{self._threshold:g}"
         worst = greatest_rhat(rhat["estimands"])
-        # The first block holds the compilation: rates are taken from its end.
+        # The first block includes the compilation, so rates count from its end.
         self._first = self._first or (draws, seconds)
         figures = f"accepted {accepted / steps:.0%} (in support {accepted / inside:.0%})  R̂ {worst:.2f}{target}"
         left = ""
@@ -93,15 +93,15 @@ class SamplingProgress(NoProgress):
 
 
 def draws_until(seen: Sequence[tuple[int, float]], threshold: float | None) -> float | None:
-    """About how many draws of each chain R̂ needs to fall to a threshold; None where that cannot be told.
+    """Estimate the number of draws of each chain at which R̂ falls to a threshold; None if it cannot be estimated.
 
-    What R̂ exceeds one by falls like one over the draws once chains forget where they began. The median over the latest
-    looks is taken, which one lucky or unlucky look does not move.
+    R̂ − 1 is inversely proportional to the number of draws once the chains no longer depend on their start points. The
+    estimate is the median over the latest five checks, which one extreme R̂ does not change.
 
     Parameters
     ----------
     seen : sequence of (int, float)
-        Draws and the greatest R̂ at every look so far.
+        The draws and the greatest R̂ at every check so far.
     threshold : float, optional
     """
     latest = [draws * (rhat - 1) for draws, rhat in seen[-5:] if np.isfinite(rhat) and rhat > 1]
@@ -111,10 +111,10 @@ def draws_until(seen: Sequence[tuple[int, float]], threshold: float | None) -> f
 
 
 def time_left(budget: float, convergence: float | None) -> str:
-    """The seconds until convergence, where they are known and fewer, and those of the budget, in words.
+    """Describe the time left in the budget, and the time until convergence if it is known and shorter.
 
-    Where R̂ is low enough already and chains go on, it is the effective sample size that they are short of, about which
-    nothing is said.
+    If R̂ is already low enough and the chains continue, the effective sample size is still too small. The text says
+    nothing about that.
     """
     of_budget = f"{max(budget, 0) / 60:.1f} min to the budget"
     if convergence is None or not 0 < convergence <= budget:

@@ -1,4 +1,4 @@
-"""Running chains: vmap over chains, scan over draws, in blocks whose draws go to the host."""
+"""Running chains in blocks of draws; the draws of each block go to the host."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Samples:
     Attributes
     ----------
     posterior : Posterior
-        That of the draws: tempered, where residuals were to tell how.
+        The posterior of the draws, tempered if the options ask for it.
     blocks : Blocks
         The draws, as arrays (chain, draw, …) of the estimands and of their statistics.
     u_mean, u_sd : (n, 3) arrays
@@ -45,15 +45,15 @@ class Samples:
         R̂ = √(var⁺/W), unsplit, of every estimand (NaN with one chain).
     tally : Tally
     converged : bool or None
-        Whether the stop rule's R̂ was met; None where none was asked for.
+        Whether the stop rule was met; None if the rule has no R̂.
     reason : str
-        Why sampling stopped, in words.
+        A sentence that says why sampling stopped.
     seconds : float
-        Spent sampling, compilation included.
+        Seconds of sampling, including compilation.
     exact : bool
         Whether the sampler leaves the posterior unchanged.
     figures : Figures or None
-        Of all estimands, where the stop rule has asked for them.
+        The figures of all estimands, if the stop rule needed them.
     """
 
     posterior: Target
@@ -70,7 +70,7 @@ class Samples:
 
     @cached_property
     def idata(self) -> Any:
-        """All draws in memory, as ArviZ opens them (InferenceData or DataTree): posterior and sample_stats."""
+        """All draws in memory as ArviZ data (InferenceData or DataTree): posterior and sample_stats."""
         return to_inference_data(self.posterior, self.blocks)
 
     @cached_property
@@ -103,25 +103,25 @@ def sample(
     sampler : str
         A name in `bayesreg.inference.samplers.registry.SAMPLERS`.
     chains : int
-        Run side by side under `vmap`, in equal shares on as many devices as divide their number.
+        The number of chains. They run in parallel under `vmap`, in equal shares on the most devices that divide it.
     draws : int
-        Most draws to keep for each chain.
+        The greatest number of draws to keep for each chain.
     seed : int
-        Same seed, posterior and options: same draws, however they are cut into blocks.
+        The same seed, posterior and options give the same draws, whatever the length of a block.
     thin : int
         Steps per kept draw.
     block : int
-        Kept draws between two looks at the stop rule; only one block's draws are ever on the device.
+        Kept draws between two checks of the stop rule; the device holds the draws of one block only.
     start : Start, optional
         The default starts all chains at rest, the parameters spread by 10 %.
     stop : StopRule, optional
     progress : bool or callable
-        Show a progress bar; or what makes another one of draws, seconds and R̂ that are asked for, such as
-        `bayesreg.inference.chains.progress.SamplingProgress`.
+        Whether to show a progress bar; or the maker of another display, (draws, greatest seconds, threshold of R̂) →
+        Progress, such as `bayesreg.inference.chains.progress.SamplingProgress`.
     resume : (Checkpoint, Blocks), optional
-        Continue from there instead of from `start`; every new block is appended.
+        The run to continue, instead of a new one from `start`; every new block is appended to its blocks.
     on_block : callable, optional
-        Called with the block's number, its draws and the checkpoint after it, when the block is kept.
+        A function that is called after each block with its number, its draws and the checkpoint after it.
     **settings
         Settings of the sampler, see `bayesreg.inference.samplers.settings`.
 
@@ -132,8 +132,8 @@ def sample(
     Raises
     ------
     InputError
-        If an option is out of range, a chain cannot start, or those to resume are not where their draws end or are of
-        another posterior.
+        If an option is out of range, a chain cannot start, or the run to resume belongs to another posterior or does
+        not stand where its draws end.
     """
     for name, value in {"chains": chains, "draws": draws, "thin": thin, "block": block}.items():
         if value < 1:
@@ -172,7 +172,7 @@ def temper_target(
     seed: int,
     start: Start | None = None,
 ) -> Target:
-    """The posterior that `sample` draws from: tempered by its residuals, where the options want that, or as it is."""
+    """Temper a posterior by its residuals if its options ask for it; `sample` draws from the result."""
     points = starting_points(posterior, start or Start(), chains, _start_key(seed))
     require_numbers(points)
     return temper(posterior, points)
@@ -190,12 +190,12 @@ def first_checkpoint(
     start: Start | None = None,
     **settings: Any,
 ) -> Checkpoint:
-    """The checkpoint before any draw: where `sample` starts its chains, unless it resumes.
+    """Make the checkpoint before the first draw; `sample` starts its chains there unless it resumes a run.
 
     Raises
     ------
     InputError
-        If a chain cannot start there.
+        If a chain cannot start at its start point.
     """
     began = time.perf_counter()
     key_start = _start_key(seed)
@@ -212,7 +212,9 @@ def first_checkpoint(
 def checkpoint_from_arrays(
     arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: Any
 ) -> Checkpoint:
-    """The inverse of `checkpoint_to_arrays`, for the same posterior, sampler and number of chains.
+    """Convert named arrays to a checkpoint, for the same posterior, sampler and number of chains.
+
+    This is the inverse of `checkpoint_to_arrays`.
 
     Raises
     ------
@@ -233,7 +235,7 @@ def checkpoint_from_arrays(
 
 
 def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks) -> None:
-    """Raise InputError where a state is read otherwise than it was written: coordinates differ between versions."""
+    """Raise InputError if the chains do not stand at their last draws: coordinates differ between versions."""
     if len(blocks) == 0:
         return
     last = blocks[len(blocks) - 1]
@@ -268,7 +270,7 @@ def _advance(
     checkpoint: Checkpoint,
     began: float,
 ) -> Iterator[tuple[Block, Checkpoint]]:
-    """Blocks of draws, until there are `draws` of them."""
+    """Yield blocks of draws until each chain has `draws` draws."""
     spent = float(checkpoint.seconds)
     devices = devices_for(chains)
     data = chosen.sampler.data(checkpoint.setup)
@@ -294,7 +296,7 @@ def _advance(
 
 
 def _judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
-    """The verdict on the draws so far, and whether they are enough or time is up; show what is known before it."""
+    """Show the progress and judge the draws so far; return the verdict and whether the run ends."""
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
     verdict = judge(stop, checkpoint, blocks)
     return verdict, verdict.holds or out_of_time(stop, checkpoint)
@@ -310,7 +312,7 @@ def _gather_samples(
     draws: int,
 ) -> Samples:
     if stop.ess is not None and verdict.found is None:
-        # The last look may have been some blocks ago.
+        # The last check may have been some blocks ago.
         verdict = judge_all(stop, checkpoint, blocks)
     mean, sd = pool(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]

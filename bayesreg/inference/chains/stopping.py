@@ -1,4 +1,4 @@
-"""When to stop, and why a run did."""
+"""The rule that stops a run, and the reason why a run stopped."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from bayesreg.inference.draws.diagnostics import Figures, Worst, figures
 from bayesreg.inference.draws.moments import greatest_rhat, scale_reduction
 from bayesreg.types import AnyArray
 
-# Estimands that are judged before all others.
+# The number of estimands that are judged before the others.
 SUSPECTS = 32
-# So much longer is a run when its draws are judged again.
+# The draws are judged again when the run is longer by this factor.
 LONGER = 1.05
 
 
 class StopRule(NamedTuple):
-    """When to stop: converged, or out of budget.
+    """The rule that stops a run: convergence, or the end of the budget.
 
     Attributes
     ----------
     rhat : float, optional
-        Stop when R̂ is below this for every estimand; None never stops early. Without `ess` it is the paper's,
-        √(var⁺/W), unsplit; with it the rank-normalised, split one of Vehtari et al. (2021).
+        The run converges when R̂ is below this value for every estimand; with None it never stops early. Without `ess`
+        R̂ is the paper's unsplit √(var⁺/W). With `ess` it is the rank-normalised split R̂ of Vehtari et al. (2021).
     ess : float, optional
-        And when every estimand's bulk and tail effective sample sizes exceed this.
+        Convergence also requires that the bulk and tail effective sample sizes of every estimand exceed this value.
     max_seconds : float, optional
-        Seconds of sampling, compilation, search for the mode and warm-up included.
+        The greatest time of sampling, s, including compilation, the search for the mode and warm-up.
     min_draws : int
-        Kept draws per chain before R̂ is believed.
+        The least number of kept draws per chain before R̂ is used.
     """
 
     rhat: float | None = None
@@ -43,22 +43,22 @@ class StopRule(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Whether a rule holds, and the figures of all estimands where these had to be worked out."""
+    """Whether a stop rule holds, and the figures of all estimands if they were computed."""
 
     holds: bool
     found: Figures | None = None
 
 
 def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
-    """The verdict on all draws so far."""
+    """Judge all draws so far by a stop rule."""
     if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
         return Verdict(holds=False)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
     running = greatest_rhat(rhat)
     if stop.ess is None:
         return Verdict(running < stop.rhat)
-    # The running R̂ is cheap and close to the strict one: where it is far off, that need not be worked out. Nor need it
-    # for all estimands where one of the suspects fails.
+    # The running R̂ is cheap and close to the strict one. If it is far from the threshold, or if one of the suspects
+    # fails, the strict R̂ of all estimands need not be computed.
     if not running < 1 + 1.5 * (stop.rhat - 1) or not _is_due(len(blocks)):
         return Verdict(holds=False)
     if not _meets(figures(blocks, _suspects(rhat)).worst, stop):
@@ -67,21 +67,22 @@ def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
 
 
 def judge_all(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
-    """The verdict on all draws, of all estimands by a rule with effective sample sizes."""
+    """Judge all draws of all estimands by a stop rule with effective sample sizes."""
     found = figures(blocks)
     return Verdict(int(checkpoint.draws) >= stop.min_draws and _meets(found.worst, stop), found)
 
 
 def _is_due(count: int) -> bool:
-    """Whether draws are judged after so many blocks: all of them are read for it, so that those must be 5 % more.
+    """Check whether draws are judged after this number of blocks.
 
-    After every one of the first 20; all looks of a run together read some twenty times its draws, however long it is.
+    They are judged after each of the first 20 blocks, and then whenever the run is 5 % longer, because each check reads
+    all draws. All checks of a run together read about twenty times its draws, whatever its length.
     """
     return count <= 20 or math.floor(math.log(count, LONGER)) > math.floor(math.log(count - 1, LONGER))
 
 
 def _suspects(rhat: Mapping[str, AnyArray]) -> np.ndarray:
-    """The estimands of the greatest running R̂, by their place among all, which are sorted by name."""
+    """Find the estimands with the greatest running R̂, by their index among all estimands sorted by name."""
     return np.argsort(-np.concatenate([rhat[name].ravel() for name in sorted(rhat)]), kind="stable")[:SUSPECTS]
 
 
@@ -92,16 +93,16 @@ def _meets(found: Worst, stop: StopRule) -> bool:
 
 
 def out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
-    """Whether its seconds are spent."""
-    # A first block is drawn however long the search for the mode took: a run ends with draws.
+    """Check whether the time of a run is spent."""
+    # The first block is drawn however long the search for the mode took, so that every run has draws.
     begun = int(checkpoint.draws) > 0
     return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
 
 
 def reason(stop: StopRule, checkpoint: Checkpoint, verdict: Verdict, draws: int) -> str:
-    """Why sampling stopped, in words; `draws` is the greatest number for each chain.
+    """Describe why sampling stopped; `draws` is the greatest number of draws for each chain.
 
-    Of a rule with effective sample sizes the verdict tells the figures of all estimands.
+    For a rule with effective sample sizes the verdict must hold the figures of all estimands.
     """
     if stop.ess is None:
         greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])

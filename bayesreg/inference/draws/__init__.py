@@ -1,1 +1,1 @@
-"""Draws: ArviZ, what they say of convergence, and what follows from them."""
+"""Draws: conversion to ArviZ, convergence diagnostics, moments and functions of draws."""

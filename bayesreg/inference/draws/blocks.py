@@ -12,7 +12,7 @@ Block = Mapping[str, np.ndarray]
 
 @runtime_checkable
 class Blocks(Protocol):
-    """Blocks of draws in their order: a list, or what holds them elsewhere and hands out one at a time."""
+    """A sequence of blocks of draws: a list, or an object that reads one block at a time."""
 
     def __len__(self) -> int: ...
 
@@ -21,4 +21,4 @@ class Blocks(Protocol):
     def __iter__(self) -> Iterator[Block]: ...
 
     def append(self, block: Block, /) -> None:
-        """Keep one block more."""
+        """Append a block of draws."""

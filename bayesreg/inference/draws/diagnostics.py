@@ -16,15 +16,16 @@ from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import DERIVED, PIECE, STATISTICS, arviz, dataset, to_inference_data
 from bayesreg.inference.target import Target
 
-# Memory does not grow with the draws. Numbers that are judged at once (8 MB): ArviZ takes many times as much. Numbers
-# that are read at once (256 MB): for each part of the estimands every block of draws is read anew.
+# Both limits keep the memory constant as the draws grow. AT_ONCE numbers (8 MB) are judged at once; ArviZ takes many
+# times as much. READ_AT_ONCE numbers (256 MB) are read at once; every block is read again for each part of the
+# estimands.
 AT_ONCE, READ_AT_ONCE = 2**20, 2**25
-# Threads: sorting and Fourier transforms, which take the time, let each other run.
+# Threads help because sorting and Fourier transforms, which take most of the time, release Python's lock.
 MOST_THREADS = 4
 
 
 class Convergence(NamedTuple):
-    """Diagnostics of every estimand, as datasets shaped like the posterior; NaN where an entry is known.
+    """Diagnostics of every estimand, as datasets shaped like the posterior; known entries are NaN.
 
     Attributes
     ----------
@@ -48,7 +49,7 @@ class Worst(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """Diagnostics of estimands side by side; NaN where there are too few draws, or one that stands still.
+    """Diagnostics of estimands as flat arrays; NaN with too few draws, or if all draws of an estimand are equal.
 
     Attributes
     ----------
@@ -64,7 +65,10 @@ class Figures(NamedTuple):
 
     @property
     def worst(self) -> Worst:
-        """The worst of each: infinite R̂ and no effective sample where one is not known, or none is there."""
+        """The greatest R̂ and the least effective sample sizes of all estimands.
+
+        R̂ is infinite and the effective sample sizes are zero if one R̂ is unknown or there is no estimand.
+        """
         if not self.rhat.size:
             return Worst(np.inf, 0.0, 0.0)
         unknown = np.isnan(self.rhat)
@@ -73,9 +77,9 @@ class Figures(NamedTuple):
 
 
 def convergence(idata: Any) -> Convergence:
-    """R̂ and effective sample sizes of every estimand; of few draws (below 4) all NaN.
+    """Compute R̂ and effective sample sizes of every estimand; all are NaN with fewer than 4 draws.
 
-    Draws that lie in a file are read in parts.
+    Draws in a file are read in parts.
     """
     draws = dataset(idata, "posterior")
     judged = [_judge(values) for name, values in draws.items() if name not in DERIVED]
@@ -83,7 +87,7 @@ def convergence(idata: Any) -> Convergence:
 
 
 def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
-    """R̂, bulk and tail ESS of one variable."""
+    """Compute R̂, bulk and tail ESS of one variable."""
     draws = draws.transpose("chain", "draw", ...)
     like = draws.isel(chain=0, draw=0, drop=True)
     parts = [_diagnose(part.to_numpy().reshape(*part.shape[:2], -1)) for part in _parts(draws)]
@@ -94,7 +98,7 @@ def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
 
 
 def _parts(draws: xr.DataArray) -> Iterator[xr.DataArray]:
-    """All draws of some of the entries, then of others, in whole pieces of a file."""
+    """Yield all draws of one range of entries after the other, in whole pieces of a file."""
     if draws.ndim == 2:
         yield draws
         return
@@ -106,52 +110,52 @@ def _parts(draws: xr.DataArray) -> Iterator[xr.DataArray]:
 
 
 def figures(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Figures:
-    """The figures of blocks of draws (see `to_inference_data`), of all estimands or of those chosen.
+    """Compute the figures of all or of the chosen estimands from blocks of draws (see `to_inference_data`).
 
-    Estimands are numbered in the order of their names, each as it lies in memory.
+    Estimands are numbered in the order of their names; the entries of each are numbered in C order.
     """
     parts = [_diagnose(part) for part in _columns(blocks, chosen)] if len(blocks) else []
     return Figures(*map(np.concatenate, zip(*parts, strict=True))) if parts else Figures(*(np.zeros(0),) * 3)
 
 
 def worst(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Worst:
-    """The worst of all estimands, or of those chosen, as `figures` numbers them."""
+    """Compute the worst figures of all or of the chosen estimands, numbered as in `figures`."""
     return figures(blocks, chosen).worst
 
 
 def labelled(target: Target, blocks: Blocks, found: Figures) -> Convergence:
-    """The figures of all estimands as `convergence` has them of the same draws."""
+    """Convert the figures of all estimands to datasets, equal to those that `convergence` returns for these draws."""
     first = blocks[0]
     names, statistics = _names(first), {name: np.zeros((1, 1)) for name in STATISTICS}
     shapes = [first[name].shape[2:] for name in names]
     ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
 
     def variables(figure: np.ndarray) -> xr.Dataset:
-        """The variables of one draw."""
+        """Arrange one figure of each estimand as the variables of one draw."""
         entries = zip(names, np.split(figure, ends), shapes, strict=True)
         block = {name: part.reshape(1, 1, *shape) for name, part, shape in entries}
         data = dataset(to_inference_data(target, [block | statistics]), "posterior")
         return data.isel(chain=0, draw=0, drop=True).drop_vars(DERIVED, errors="ignore")
 
-    # What is the same whatever the estimands are is known.
+    # An entry that does not depend on the estimands is known.
     zeros, ones = (variables(np.full(found.rhat.shape, value)) for value in (0.0, 1.0))
     return Convergence(*(variables(figure).where(zeros != ones) for figure in found))
 
 
 def _columns(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None) -> Iterator[np.ndarray]:
-    """All draws of some of the estimands, (chain, draw, estimand), then of others."""
+    """Yield all draws (chain, draw, estimand) of one group of estimands after the other."""
     first, last = _flat(blocks[0]), _flat(blocks[len(blocks) - 1])
     chains, length, count = first.shape
     draws = length * (len(blocks) - 1) + last.shape[1]
     places = np.arange(count) if chosen is None else chosen
     width = max(1, READ_AT_ONCE // max(1, chains * draws))
     for low in range(0, len(places), width):
-        # Taken by their numbers and so copied: a view would keep its whole block.
+        # An index array makes a copy; a view would keep its whole block in memory.
         yield np.concatenate([_flat(block)[..., places[low : low + width]] for block in blocks], axis=1)
 
 
 def _flat(block: Block) -> np.ndarray:
-    """All estimands of a block side by side, by name: blocks of one run need not agree in their order."""
+    """Concatenate all estimands of a block, sorted by name: blocks of one run may differ in their order."""
     return np.concatenate([block[name].reshape(*block[name].shape[:2], -1) for name in _names(block)], axis=-1)
 
 
@@ -160,11 +164,11 @@ def _names(block: Block) -> list[str]:
 
 
 def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
-    """R̂, bulk and tail ESS of estimands side by side."""
+    """Compute R̂, bulk and tail ESS of the columns of an array."""
     chains, length, count = draws.shape
     if length < 4 or not count:
         return Figures(*(np.full(count, np.nan),) * 3)
-    # It takes a second to import, for which the first draws need not wait.
+    # The import takes a second, so it is left until there are enough draws.
     az = arviz()
     width = max(1, AT_ONCE // (chains * length))
 
@@ -172,12 +176,12 @@ def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
         part = draws[..., low : low + width].astype(float)
         moved = part.min(axis=(0, 1)) != part.max(axis=(0, 1))
         data = xr.Dataset({"draws": (["chain", "draw", "estimand"], part)})
-        # ArviZ divides zero by zero for what has stood still.
+        # ArviZ divides zero by zero if all draws of an estimand are equal.
         with np.errstate(invalid="ignore"):
             found = az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail")
         return Figures(*(np.where(moved, one["draws"].to_numpy(), np.nan) for one in found))
 
-    # Of a machine that is shared the process may have some cores alone.
+    # On a shared machine the process may be allowed to use only some of the cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with ThreadPoolExecutor(min(MOST_THREADS, cores)) as pool:
         parts = list(pool.map(judge, range(0, count, width)))

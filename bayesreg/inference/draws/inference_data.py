@@ -1,8 +1,7 @@
-"""Draws to ArviZ and back, in memory and in files.
+"""Conversion of draws to ArviZ data and back, in memory and in files.
 
-The one module that knows which ArviZ it has: 0.23 (InferenceData) and 1.x (xarray.DataTree) differ in
-how draws are handed over, and read each other's NetCDF files. It takes a second to import, which sampling need not
-wait for: hence inside the functions.
+No other module depends on the version of ArviZ. Versions 0.23 (InferenceData) and 1.x (xarray.DataTree) take draws in
+different forms, and read each other's NetCDF files. ArviZ takes a second to import, so the functions import it.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ STATISTICS = (
     "lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "solver_failed",
     "outside_support", "diverging", "n_steps",
 )  # fmt: skip
-# Of the steps since the draw before.
+# Rates and counts cover the steps between a draw and the draw before it.
 MEANINGS = {
     "lp": "log posterior density, up to a constant",
     "acceptance_rate": "mean acceptance probability",
@@ -45,32 +44,33 @@ MEANINGS = {
     "diverging": "whether the energy error of a trajectory was beyond bounds",
     "n_steps": "gradients of the log density",
 }
-# Functions of estimands that stand beside them.
+# Variables of the posterior that are functions of estimands.
 DERIVED = ("ratio",)
-# The file's pieces hold so many nodes (or modes, elements) and so many draws of every chain: both few nodes of all
-# draws and all nodes of few draws are to be read at little cost.
+# A chunk of the file holds PIECE nodes (or modes, elements) and STRETCH draws of every chain. It is then cheap to read
+# few nodes of all draws, and all nodes of few draws.
 PIECE, STRETCH = 64, 100
-# Numbers (32 MB) that are written at once, unless a block has more: each time costs as much as some thousands of them.
+# The numbers (32 MB) that are written at once, unless one block has more. Each write costs as much as some thousands of
+# numbers.
 WRITTEN_AT_ONCE = 2**22
 
 
 def to_inference_data(target: Target, blocks: Blocks) -> Any:
-    """Blocks of draws as ArviZ data.
+    """Convert blocks of draws to ArviZ data.
 
     Parameters
     ----------
     target : Target
-        Its variables say what the draws are called, and which entries are known.
+        The target whose variables define the names of the draws and the known entries.
     blocks : Blocks
         Arrays (chain, draw, …) of the estimands and of `STATISTICS`.
 
     Returns
     -------
     arviz.InferenceData or xarray.DataTree
-        posterior: u_boundary (chain, draw, node, axis) in mm, lam, mu and ratio = λ/μ (chain, draw, tissue),
-        known entries included, where they were sampled t_similarity, t_elastic, field_sd (chain, draw) and
-        field (chain, draw, mode), the components of the log-stiffness; sample_stats;
-        constant_data.
+        The groups posterior, sample_stats and constant_data. The posterior holds u_boundary (chain, draw, node, axis)
+        in mm, and lam, mu and ratio = λ/μ (chain, draw, tissue), including known entries. If they were sampled, it
+        holds t_similarity, t_elastic and field_sd (chain, draw), and field (chain, draw, mode), the components of the
+        log-stiffness.
     """
     az, variables = arviz(), target.variables
     every = list(blocks)
@@ -96,7 +96,10 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
 
 
 def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
-    """The inverse of `to_inference_data`: blocks of so many draws of each chain, the last with what is left."""
+    """Yield blocks of `length` draws of each chain from ArviZ data; the last block may be shorter.
+
+    This is the inverse of `to_inference_data`.
+    """
     posterior, statistics = dataset(idata, "posterior"), dataset(idata, "sample_stats")
     for first in range(0, posterior.sizes["draw"], length):
         some = slice(first, first + length)
@@ -107,9 +110,10 @@ def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
 
 
 def arviz() -> Any:
-    """ArviZ, without its announcement of version 1, which is written for those who call it themselves.
+    """Import ArviZ without its announcement of version 1, which is meant for its direct users.
 
-    That it was shown ArviZ notes in the user's cache, and cannot be imported where that is full or read-only.
+    ArviZ records in the user's cache that it has shown the announcement. If the cache is full or read-only, the import
+    fails. So a temporary folder replaces the cache during the import.
     """
     if "arviz" in sys.modules:
         return sys.modules["arviz"]
@@ -125,15 +129,15 @@ def arviz() -> Any:
 
 
 def dataset(idata: Any, group: str) -> xr.Dataset:
-    """One group of the draws as an xarray Dataset, whichever ArviZ made them."""
+    """Return one group of ArviZ data as an xarray Dataset, for both versions of ArviZ."""
     found = getattr(idata, group)
     return found if isinstance(found, xr.Dataset) else found.to_dataset()
 
 
 def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
-    """Write draws as NetCDF, displacements in single precision and compressed; few blocks are in memory at a time.
+    """Write draws as NetCDF, with displacements in single precision and compressed; hold few blocks in memory.
 
-    The file opens as what `to_inference_data` makes of all of them.
+    The file opens as the ArviZ data that `to_inference_data` makes of all blocks.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -150,7 +154,7 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
 
 
 def _together(blocks: Blocks) -> Iterator[list[Block]]:
-    """Blocks that follow one another, as many as are written at once."""
+    """Yield lists of consecutive blocks; each list is written at once."""
     some: list[Block] = []
     held = 0
     for block in blocks:
@@ -165,7 +169,7 @@ def _together(blocks: Blocks) -> Iterator[list[Block]]:
 
 @contextmanager
 def _storing(path: Path) -> Iterator[None]:
-    """Raise OSError where NetCDF cannot write, which says so by a RuntimeError, and not why."""
+    """Raise OSError with a reason if NetCDF cannot write; NetCDF itself raises a RuntimeError without a reason."""
     try:
         yield
     except RuntimeError as error:
@@ -176,7 +180,7 @@ def _storing(path: Path) -> Iterator[None]:
 
 
 def _begin(idata: Any, path: Path) -> None:
-    """A file with the first draws, to which more can be appended."""
+    """Write a file with the first draws, to which more draws can be appended."""
     for index, group in enumerate(_groups(idata)):
         data = dataset(idata, group)
         encoding: dict[Any, dict[str, Any]] = {
@@ -209,7 +213,7 @@ def _extend(file: netCDF4.Dataset, idata: Any) -> None:
 
 
 def append_groups(path: str | Path, groups: Mapping[str, xr.Dataset]) -> None:
-    """Add groups, such as `log_likelihood`, to a file of `save_posterior`, those of the same names being replaced."""
+    """Add groups, such as `log_likelihood`, to a file of `save_posterior`; replace groups with the same names."""
     for name, data in groups.items():
         encoding = {variable: {"zlib": True, "complevel": 1} for variable in data.data_vars}
         with _storing(Path(path)):
@@ -221,7 +225,7 @@ def _groups(idata: Any) -> list[str]:
 
 
 def open_posterior(path: str | Path) -> Any:
-    """Read draws written by `save_posterior`; InputError where there are none."""
+    """Read draws written by `save_posterior`; raise InputError if the file is missing."""
     if not Path(path).is_file():
         raise InputError(f"{path} is missing: the folder holds no draws")
     return arviz().from_netcdf(str(path))

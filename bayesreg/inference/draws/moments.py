@@ -1,4 +1,4 @@
-"""Running means and variances (Welford), and the scale reduction that follows from them."""
+"""Running means and variances (Welford), and R̂ computed from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bayesreg.types import AnyArray
 
 
 class Moments(NamedTuple):
-    """Count, mean and sum of squared deviations of a pytree; its size does not grow with the draws."""
+    """The count, mean and sum of squared deviations of a pytree; their size does not grow with the draws."""
 
     count: AnyArray
     mean: Any
@@ -21,13 +21,13 @@ class Moments(NamedTuple):
 
 
 def zero_moments(like: Any) -> Moments:
-    """Moments of no draw."""
+    """Make the moments before the first draw."""
     zeros = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x)), like)
     return Moments(jnp.zeros(()), zeros, zeros)
 
 
 def update(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
-    """Moments with one draw more, or with so many that are all the same (West 1979)."""
+    """Add a draw to the moments, counted `times` times (West 1979)."""
     count = moments.count + times
     share = times / jnp.maximum(count, 1)
     mean = jax.tree.map(lambda m, x: m + share * (x - m), moments.mean, draw)
@@ -38,12 +38,12 @@ def update(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
 
 
 def extend(moments: Moments, block: Any) -> Moments:
-    """Moments of several chains with a block of draws more (Chan et al.), on the host.
+    """Add a block of draws to the moments of several chains (Chan et al.), on the host.
 
     Parameters
     ----------
     moments : Moments
-        Chains leading.
+        The moments, with chains as the leading axis.
     block : pytree
         NumPy arrays (chain, draw, …).
     """
@@ -67,7 +67,7 @@ def extend(moments: Moments, block: Any) -> Moments:
 
 
 def pool(moments: Moments) -> tuple[Any, Any]:
-    """Mean and standard deviation over all draws of all chains (leading axis), each chain of equal length."""
+    """Compute mean and standard deviation over all draws of all chains (leading axis) of equal length."""
     count = np.asarray(moments.count)[0]
 
     def total(mean: AnyArray, squares: AnyArray) -> np.ndarray:
@@ -81,9 +81,9 @@ def pool(moments: Moments) -> tuple[Any, Any]:
 
 
 def scale_reduction(moments: Moments) -> Any:
-    """R̂ = √(var⁺ / W) of Gelman et al. (the paper's reference 12), chains not split, for every entry.
+    """Compute R̂ = √(var⁺ / W) of Gelman et al. (the paper's reference 12), with unsplit chains, for every entry.
 
-    NaN where there are fewer than two chains or two draws; infinite where chains stand still.
+    R̂ is NaN with fewer than two chains or two draws, and infinite if the draws of each chain are all equal.
     """
     count = float(np.asarray(moments.count)[0])
 
@@ -100,6 +100,6 @@ def scale_reduction(moments: Moments) -> Any:
 
 
 def greatest_rhat(rhat: Mapping[str, AnyArray]) -> float:
-    """The worst of all estimands; NaN where it cannot be told, of one of them or because there is none."""
+    """Find the greatest R̂ of all estimands; NaN if one R̂ is NaN or there is no estimand."""
     every = np.concatenate([np.zeros(0), *(np.ravel(value) for value in rhat.values())])
     return float(every.max()) if every.size else np.nan

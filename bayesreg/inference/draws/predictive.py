@@ -1,7 +1,7 @@
-"""Push posterior draws forward: any function of them, in blocks, with mean, sd and quantiles in bounded memory.
+"""Functions of posterior draws, in blocks, with mean, sd and quantiles in bounded memory.
 
-Functions are handed in and take one draw, a mapping of arrays, and what else they are given. They are compiled: what is
-large (a mesh, an image) is to be given, or it becomes a constant of the program.
+A function takes one draw, a mapping of arrays, and a further argument. It is compiled: large arrays (a mesh, an image)
+belong in the further argument, because they would otherwise become constants of the program.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ class Summary(NamedTuple):
     Attributes
     ----------
     mean, sd : pytree
-        Over all draws of all chains.
+        Mean and sd over all draws of all chains.
     chain_mean : pytree
-        Over the draws of each chain, chains leading.
+        Mean over the draws of each chain, with chains as the leading axis.
     quantiles : pytree
-        Over all chains, probabilities leading; of at most about `MOST_KEPT` evenly spaced draws of each chain.
+        Quantiles over all chains, with probabilities as the leading axis. They come from at most about `MOST_KEPT`
+        evenly spaced draws of each chain.
     """
 
     mean: Any
@@ -45,20 +46,20 @@ class Summary(NamedTuple):
 
 
 def evenly_spaced(total: int, most: int) -> Int[np.ndarray, "k"]:
-    """Up to so many indices below a total: the middles of equal stretches."""
+    """List at most `most` indices below `total`, the middles of ranges of equal length."""
     count = min(total, most)
     return ((np.arange(count) + 0.5) * total / count).astype(int)
 
 
 def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np.ndarray]:
-    """Evenly spaced draws of the named variables.
+    """Take evenly spaced draws of the named variables.
 
     Parameters
     ----------
     posterior : xarray.Dataset
     names : iterable of str
     most : int
-        Most draws over all chains together, but at least one of each.
+        The greatest number of draws over all chains together; at least one of each chain is taken.
 
     Returns
     -------
@@ -69,7 +70,7 @@ def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np
     chosen = evenly_spaced(total, max(1, most // posterior.sizes["chain"]))
     given = posterior[list(names)].transpose("chain", "draw", ...)
     found: dict[str, list[np.ndarray]] = {str(name): [] for name in given.data_vars}
-    # A file holds stretches of draws: a single one costs as much to read as all that lie about it.
+    # A chunk of the file holds STRETCH draws: one draw costs as much to read as its whole chunk.
     for first in range(0, total, STRETCH):
         within = chosen[(chosen >= first) & (chosen < first + STRETCH)] - first
         if len(within):
@@ -80,7 +81,7 @@ def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np
 
 
 def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, block: int = BLOCK) -> Iterator[Any]:
-    """A function of every draw, block by block.
+    """Evaluate a function at every draw, block by block.
 
     Parameters
     ----------
@@ -96,13 +97,13 @@ def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, 
     Yields
     ------
     pytree
-        NumPy arrays (chain, stretch, …), the stretches following one another along the draws.
+        NumPy arrays (chain, stretch, …) of consecutive ranges of draws.
     """
     chains, total = next(iter(draws.values())).shape[:2]
     stretch = max(1, min(total, block // chains))
     batched = jax.jit(jax.vmap(jax.vmap(function, (0, None)), (0, None)))
     for first in range(0, total, stretch):
-        # The last stretch is filled up with its last draw: another shape would be compiled anew.
+        # The last draw fills up the last stretch, because JAX would compile another shape again.
         chosen = np.minimum(np.arange(first, first + stretch), total - 1)
         found = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, given)
         wanted = slice(total - first)
@@ -110,7 +111,10 @@ def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, 
 
 
 def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.5, 0.975)) -> Summary:
-    """Mean, sd and quantiles of what `push_forward` yields; one block and `MOST_KEPT` draws in memory at a time."""
+    """Compute mean, sd and quantiles of the blocks from `push_forward`.
+
+    One block and `MOST_KEPT` draws of each chain are in memory at a time.
+    """
     moments, kept, stride, seen = None, None, 1, 0
     for block in blocks:
         moments = extend(_nothing(block) if moments is None else moments, block)

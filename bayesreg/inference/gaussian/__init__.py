@@ -1,1 +1,1 @@
-"""The Gaussian that a posterior looks like about its mode, and coordinates in which it is N(0, I)."""
+"""The Gaussian approximation of a posterior about its mode, and the coordinates in which it is N(0, I)."""

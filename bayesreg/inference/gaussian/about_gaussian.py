@@ -1,7 +1,7 @@
 """Samplers about a Gaussian, in the coordinates in which it is N(0, I).
 
-A transition there is all that such a sampler needs to bring; the search for the mode, the starts, the warm-up and the
-way back to the estimands are the same for all.
+Such a sampler defines only a transition in these coordinates. The search for the mode, the start points, the warm-up
+and the map back to the estimands are common to all of them.
 """
 
 from __future__ import annotations
@@ -43,42 +43,43 @@ from bayesreg.inference.target import (
 )
 from bayesreg.types import AnyArray, InputError
 
-# Chains start that much wider than Laplace's approximation.
+# Start points have standard deviations larger than those of Laplace's approximation by this factor.
 OVERDISPERSION = 1.5
-# But, where it can, no chain starts where the log density is less than at the mode by more than this for each unknown;
-# of a Gaussian it is half the square of the above. Where tetrahedra are squeezed at the mode, wide draws turn some
-# inside out, and behind the barrier no step is short enough to lead out.
+# The greatest difference, for each unknown, between the log density at the mode and at a start point, if such a point
+# is found. For a Gaussian the difference is OVERDISPERSION² / 2. If tetrahedra are squeezed at the mode, wide draws
+# turn some of them inside out, and beyond the barrier no step is short enough to bring a chain back.
 DEEPEST = 10.0
-# So often, at most, a start that lies too low is drawn again, half as far from the mode.
+# The greatest number of attempts for a start point; each attempt is half as far from the mode as the one before.
 ATTEMPTS = 10
 
-# A Gaussian is averaged over the mode and the places of so many chains at most: each costs a curvature.
+# A Gaussian is averaged over the mode and the points of at most this number of chains, because each costs a curvature.
 AVERAGED = 16
 
-# Laplace's approximation keeps several dense matrices of the square of this, of 1.2 GB each.
+# Laplace's approximation keeps several dense matrices with this number of rows, of 1.2 GB each.
 MOST_UNKNOWNS = 12_000
 
 
 @dataclass(frozen=True)
 class Walk:
-    """Chains of whitened coordinates by a transition, as pure functions of (data, setup, …), see `Sampler`.
+    """A transition in whitened coordinates, as pure functions of (data, setup, …), see `Sampler`.
 
-    Two are equal if their targets are and their functions are the same: what is compiled for one serves the other.
+    Two are equal if their targets are equal and their functions are the same. Code that is compiled for one then serves
+    the other.
     """
 
     target: Target
     transition: Transition
     begin: Callable[[AnyArray, Callable], Any]
 
-    # Compiled by itself: the warm-up and the chains begin with the same program.
+    # This function is compiled separately, because the warm-up and the chains begin with the same program.
     @partial(jax.jit, static_argnums=0)
     def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
-        """The state of a chain there."""
+        """Make the state of a chain at estimands."""
         flat = flat_position(self.target, data, estimands)
         return self.begin(whiten(setup.gaussian, flat), whitened_density(self.target, data, setup))
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
-        """The state after a transition."""
+        """Make one transition."""
         state, moved = self.transition(self.target, data, setup, key, state)
         info = Info(
             acceptance_rate=moved.acceptance_rate,
@@ -92,11 +93,11 @@ class Walk:
         return state, info
 
     def estimands(self, data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
-        """Where a chain is."""
+        """Compute the current estimands of a chain."""
         return estimands_of(self.target, data, whitened_position(self.target, setup.gaussian, state.position))
 
     def observe(self, data: Any, setup: Setup, state: Any) -> Draw:
-        """Where a chain is, and the evaluation of the density there."""
+        """Compute the current estimands of a chain, and evaluate the density at them."""
         estimands = self.estimands(data, setup, state)
         return Draw(estimands, self.target.evaluate_estimands(data, estimands))
 
@@ -109,7 +110,7 @@ def about_gaussian(
     mode_search: str = "once",
     exact: bool = True,
 ) -> Sampler:
-    """A sampler of the whitened coordinates.
+    """Make a sampler of the whitened coordinates.
 
     Parameters
     ----------
@@ -117,11 +118,11 @@ def about_gaussian(
     transition : callable
         (target, data, setup, key, state) → (state, Moved).
     tuning : Tuning, optional
-        How the step size is tuned; without it there is no warm-up.
+        The options of the warm-up that tunes the step size; None if there is no warm-up.
     begin : callable
-        (position, log density) → the state that the transition takes, with a field `position`.
+        (whitened coordinates, log density) → the state that the transition takes, with a field `position`.
     mode_search : str
-        "once": one mode, from the mean of the start points; "per_chain": one from each, see `modes`.
+        "once" searches for one mode from the mean of the start points, "per_chain" for one from each; see `modes`.
     exact : bool
 
     Raises
@@ -139,7 +140,7 @@ def about_gaussian(
         )
 
     walk = Walk(target, transition, begin)
-    # Made here and not while something is traced, where it would leave the target's own arrays in the program.
+    # The first call must be outside of a trace: inside, the target's own arrays would become constants of the program.
     unravel(target)
 
     def prepare(points: Any, key: AnyArray) -> tuple[Setup, Any]:
@@ -157,34 +158,34 @@ def about_gaussian(
 
     data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
-    # A sampler that is approximate anyway does without the normaliser's own value.
+    # An approximate sampler does not need the exact normaliser.
     return _with_normaliser(target, sampler) if has_costly_normaliser(target) and exact else sampler
 
 
 def _condition(target: Target, setup: Setup) -> Any:
-    """The target's data, prepared for chains about the middle."""
+    """Prepare the data of the target for chains about the middle."""
     return target.condition(estimands_of(target, target.data, unravel(target)(setup.middle)))
 
 
 def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyArray) -> tuple[Setup, Any]:
-    """The setup that the chains go on with, and where they then are.
+    """Warm the chains up; return their setup and their estimands at the end.
 
-    Two stages of one length, compiled once: the first leads the chains to where the second is whitened. Already the
-    first is whitened by the curvature where they start: that at the mode alone can be so much less that no step is
-    short enough for a chain to leave.
+    Two stages have the same length, so that they are compiled once. The second stage is whitened at the points that the
+    chains reach in the first one. The first stage is whitened by the curvature at the start points, too: the curvature
+    at the mode can be so much smaller that no step is short enough for a chain to leave its start.
     """
     target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
     key_settle, key_tune = jax.random.split(key)
     first = _setup_on_average(target, mode, points)
     first = first._replace(stand_in=make_stand_in(target, first.gaussian, first.middle))
     _, points = tune(_condition(target, first), walk, first, points, key_settle, stage, apart=True)
-    # The stand-in reaches far about both middles.
+    # The stand-in is accurate far about both middles.
     second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
     return tune(_condition(target, second), walk, second, points, key_tune, stage)
 
 
 def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
-    """A sampler of the density with the stand-in made one of the density with the normaliser."""
+    """Turn a sampler of the density with the stand-in into a sampler of the density with the normaliser."""
 
     assert target.normaliser is not None
     normaliser = target.normaliser
@@ -205,9 +206,9 @@ def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
 
 
 def _setup_on_average(target: Target, mode: AnyArray, points: Any) -> Setup:
-    """The setup about the Gaussian averaged over the mode and where the chains are, if it has a slope there.
+    """Make the setup, without a stand-in, about the Gaussian averaged over the mode and the points of the chains.
 
-    It has no stand-in yet.
+    Points at which the density has no finite slope are left out.
     """
     flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
@@ -216,18 +217,18 @@ def _setup_on_average(target: Target, mode: AnyArray, points: Any) -> Setup:
 
 
 def _scatter_all(target: Target, modes: Modes, keys: AnyArray) -> Any:
-    """The estimands at which each chain starts, about its own mode."""
+    """Draw the estimands at which each chain starts, about the mode of the chain."""
     starts = [_scatter(target, modes.gaussians[mode], key) for mode, key in zip(modes.chains, keys, strict=True)]
     return jax.tree.map(lambda *parts: jnp.stack(parts), *starts)
 
 
 def _scatter(target: Target, gaussian: Gaussian, key: AnyArray) -> Any:
-    """A draw of a Gaussian wider than Laplace's, or, where the density is too low there, nearer to the mode.
+    """Draw estimands from a Gaussian wider than Laplace's; move them nearer to the mode if the density is too low.
 
     Raises
     ------
     InputError
-        If the density is zero, or no number, at every place that was tried.
+        If the density is zero or NaN at every point that was tried.
     """
     plain = without_normaliser(target, target.data)
     lowest = height_and_slope(target, plain, np.asarray(gaussian.centre))[0] - DEEPEST * dimension(target)

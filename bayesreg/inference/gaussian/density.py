@@ -1,4 +1,4 @@
-"""The log density of a flat position and its slope, as the search for a mode and Laplace's approximation see them."""
+"""The log density of a flat position and its slope, for the search for a mode and Laplace's approximation."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from bayesreg.inference.layout import marked, unravel
 from bayesreg.inference.target import Target, estimands_of, logdensity, without_normaliser
 from bayesreg.types import AnyArray, Scalar
 
-# Step of differences between gradients, in Normal scores and logarithms.
+# The step of finite differences of the gradient, in Normal scores and logarithms.
 STEP = 1e-4
 
 
 def height_and_slope(
     target: Target, data: Any, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[float, Float[np.ndarray, "dimension"]]:
-    """log π and ∇log π.
+    """Compute log π and ∇log π.
 
     Parameters
     ----------
     target : Target
     data : pytree
-        The target's, or that of a similar problem.
+        The data of the target or of a similar problem.
     flat : (d,) array
         Flat position.
     """
@@ -42,17 +42,17 @@ def _height_and_slope(target: Target, data: Any, flat: AnyArray) -> tuple[AnyArr
 
 @partial(jax.jit, static_argnums=0)
 def estimands_at(target: Target, data: Any, flat: AnyArray) -> Any:
-    """The estimands at a flat position."""
+    """Map a flat position to its estimands."""
     return estimands_of(target, data, unravel(target)(flat))
 
 
 def regular(curvature: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
-    """A trace of the identity keeps directions finite that neither images nor elasticity see."""
+    """Add a small multiple of the identity, for directions that neither images nor elasticity determine."""
     return curvature + 1e-9 * np.trace(curvature) * np.eye(len(curvature))
 
 
 def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
-    """The logarithm of the normaliser at a flat position, as part of the log density; zero where there is none."""
+    """Compute the logarithm of the normaliser at a flat position, as part of the log density; zero without one."""
     if target.normaliser is None:
         return jnp.zeros(())
     return target.normaliser.log(data, estimands_of(target, data, unravel(target)(flat)))
@@ -61,7 +61,7 @@ def log_normaliser_at(target: Target, data: Any, flat: AnyArray) -> Scalar:
 def normaliser_and_slope(
     target: Target, flat: Float[np.ndarray, "dimension"]
 ) -> tuple[float, Float[np.ndarray, "dimension"]]:
-    """The part of the normaliser in `height_and_slope` of the target's own data."""
+    """Compute the normaliser's part of `height_and_slope`, with the target's own data."""
     value, slope = _normaliser_and_slope(target, target.data, jnp.asarray(flat))
     return float(value), np.asarray(slope)
 
@@ -77,10 +77,11 @@ def mark_normaliser(target: Target) -> Bool[np.ndarray, "dimension"]:
 def hessian_rows(
     target: Target, data: Any, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "rows"]
 ) -> Float[np.ndarray, "rows dimension"]:
-    """Rows of the Hessian of the log density, by differences of its gradient.
+    """Compute rows of the Hessian of the log density, by finite differences of its gradient.
 
-    The coordinates are Normal scores and logarithms, so that one step suits all. Exact rows would cost more to compile
-    than the search. The normaliser, which may be costly, has a part in the rows of what it depends on alone.
+    The coordinates are Normal scores and logarithms, so that one step suits all. Exact rows would take longer to
+    compile than the search takes. The normaliser, which may be costly, is evaluated only for the rows of the entries
+    on which it depends.
     """
     rows, plain, normalised = [], without_normaliser(target, data), mark_normaliser(target)
     for entry in entries:

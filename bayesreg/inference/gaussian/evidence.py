@@ -1,13 +1,13 @@
 """The search for hyperparameters: the maximum of their evidence, with the displacements integrated out.
 
-The joint mode of displacements and hyperparameters misleads (see `hierarchy`). Of the displacements u, the images alone
-are far from quadratic. With these to second order about a place u_0, A their curvature and g their slope, all else is
-quadratic in u at given hyperparameters θ, and the evidence is
+The joint mode of displacements and hyperparameters is far from most of the probability (see `hierarchy`). Only the
+images are far from quadratic in the displacements u. They are expanded to second order about u_0, with the curvature A
+and the slope g. All other terms, the rest, are quadratic in u at given hyperparameters θ. The evidence is then
 
 log p(θ | data) = g · d − ½ dᵀ A d + log rest(u_0 + d, θ) − ½ log det (A + R(θ)) + const,
 
-R the curvature of the rest and d = (A + R)⁻¹ (g + ∇ log rest(u_0, θ)), the maximum over u. Its derivative is that of
-log rest there, less ½ tr((A + R)⁻¹ ∂R).
+where R is the curvature of the rest, and d = (A + R)⁻¹ (g + ∇ log rest(u_0, θ)) is the maximum over u. The derivative
+of the evidence is that of log rest at u_0 + d, less ½ tr((A + R)⁻¹ ∂R).
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from bayesreg.inference.layout import marked
 from bayesreg.inference.target import Target, without_normaliser
 from bayesreg.types import Matrix
 
-# Step of differences between curvatures, in the logarithm of a scale or a Normal score.
+# The step of finite differences of the curvature, in the logarithm of a scale or a Normal score.
 STEP = 0.01
-# Hyperparameters move by no more in one search: far away another place is the better one to expand about.
+# The greatest change of a hyperparameter in one search; the expansion is not accurate for greater ones.
 FARTHEST = 3.0
-# Of a search, whose coordinates are standard deviations: most iterations, the slope at which it ends, and the least
-# curvature of a hyperparameter's evidence, that of a prior of ±3.
+# The greatest number of iterations of a search, whose coordinates are standard deviations; the slope at which it ends;
+# and the least curvature of a hyperparameter's evidence, which is that of a prior of ±3.
 MOST_ITERATIONS, PRECISE, LEAST_CURVATURE = 10, 0.02, 0.1
 
 
 class Expansion(NamedTuple):
-    """The density about a flat position.
+    """The expansion of the density about a flat position.
 
     Attributes
     ----------
     flat : (d,) array
     entries : (k,) int array
-        The hyperparameters.
+        The entries of `flat` that hold hyperparameters.
     images : (r, r) array
-        A, in "field" and "u_boundary".
+        A, the curvature of the images' part in "field" and "u_boundary".
     slope : (d,) array
-        Of the images' part.
+        The slope of the images' part.
     """
 
     flat: Float[np.ndarray, "dimension"]
@@ -64,16 +64,16 @@ class Expansion(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a search for hyperparameters found.
+    """The result of a search for hyperparameters.
 
     Attributes
     ----------
     flat : (d,) array
-        The hyperparameters at the maximum of their evidence, and u following them.
+        The hyperparameters at the maximum of their evidence, with the displacements of highest density given them.
     moved : float
-        How far the hyperparameters have moved, in units of their standard deviations.
+        The greatest change of the hyperparameters, in their standard deviations.
     units : (k, k) array or None
-        These units, one in each column; None before a search.
+        The directions of these standard deviations, one in each column; None before a search.
     """
 
     flat: Float[np.ndarray, "dimension"]
@@ -93,12 +93,12 @@ def maximise_evidence(
     ----------
     target : Target
     flat : (d,) array
-        A mode given the hyperparameters, or near to one.
+        A mode given the hyperparameters, or a point near one.
     curvature : (r, r) array
-        Gauss and Newton's there, in "field" and "u_boundary".
+        The Gauss–Newton curvature at `flat`, in "field" and "u_boundary".
     units : (k, k) array, optional
-        Those of a search near by. Without them they are found from the evidence's curvature, which costs several
-        evaluations.
+        The units of an earlier search near `flat`. Without them they are computed from the curvature of the evidence,
+        which costs several evaluations.
     """
     entries = np.flatnonzero(mark_hyperparameters(target))
     about = _expand(target, flat, entries, curvature)
@@ -111,7 +111,7 @@ def maximise_evidence(
         height, slope, place = evidence(target, about, flat[entries] + units @ xi)
         slope = units.T @ slope
         if not (np.isfinite(height) and np.isfinite(slope).all()):
-            # A wall for the line search: uphill from the best place so far, sloping back to it.
+            # A value that makes the line search turn back: it rises with the distance from the best point so far.
             top, _, at, there = best[-1]
             return -top + 2 * abs(there @ (xi - at)), there
         if not best or height > best[-1][0]:
@@ -128,9 +128,9 @@ def maximise_evidence(
 def evidence_curvature(
     target: Target, about: Expansion, curvature: Float[np.ndarray, "rows rows"]
 ) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
-    """Minus the second derivatives of the log evidence at the place of the expansion.
+    """Compute minus the second derivatives of the log evidence at the point of the expansion.
 
-    The displacements follow the hyperparameters: the evidence is less curved than the density at given ones.
+    The displacements follow the hyperparameters: the evidence is less curved than the density at fixed displacements.
     """
     assert target.mode_search is not None
     data = target.mode_search.quadratic_part(target.data)
@@ -144,13 +144,13 @@ def evidence_curvature(
 def evidence(
     target: Target, about: Expansion, theta: Float[np.ndarray, "hyperparameters"]
 ) -> tuple[float, Float[np.ndarray, "hyperparameters"], Float[np.ndarray, "dimension"]]:
-    """The log evidence of θ, its slope, and the flat position there with the displacements of highest density."""
+    """Compute the log evidence of θ, its slope, and the flat position with θ and the most likely displacements."""
     assert target.mode_search is not None
     data = target.mode_search.quadratic_part(target.data)
     there = np.array(about.flat)
     there[about.entries] = theta
     own, rows = marked(target, "u_boundary"), marked(target, "field", "u_boundary")
-    # θ is the same at both places: so is the normaliser, which may be costly.
+    # θ is the same at both points, and so is the normaliser, which may be costly.
     plain = without_normaliser(target, data)
     log_normaliser, push_of_normaliser = normaliser_and_slope(target, there)
     slope = height_and_slope(target, plain, there)[1]
@@ -158,7 +158,7 @@ def evidence(
     factor = scipy.linalg.cho_factor(precision, lower=True, check_finite=False)
     moving = own[rows]
     push = np.where(moving, (about.slope + slope)[rows], 0.0)
-    # The field rests: its part in the rest is not quadratic.
+    # The field does not move, because the rest is not quadratic in it.
     inner = factor if moving.all() else scipy.linalg.cho_factor(precision[np.ix_(moving, moving)], lower=True)
     step = np.zeros(len(push))
     step[moving] = scipy.linalg.cho_solve(inner, push[moving])
@@ -194,7 +194,7 @@ def _expand(
 def slopes_of_curvature(
     target: Target, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "hyperparameters"]
 ) -> list[Matrix]:
-    """The derivatives of the curvature in u of all but images, in hyperparameters."""
+    """Differentiate the curvature in u of all terms but the images by the hyperparameters."""
     found = []
     for entry in entries.tolist():
         ahead, behind = (_curvature(target, _moved(flat, {entry: way * STEP}), flat) for way in (1, -1))
@@ -205,7 +205,7 @@ def slopes_of_curvature(
 def volume_at(
     target: Target, flat: Float[np.ndarray, "dimension"], curvature: Float[np.ndarray, "rows rows"]
 ) -> Volume:
-    """−½ log det H as a function of the hyperparameters, H the curvature in "field" and "u_boundary" there."""
+    """Expand −½ log det H in the hyperparameters, where H is the curvature in "field" and "u_boundary"."""
     entries = np.flatnonzero(mark_hyperparameters(target)).tolist()
     covariance = _inverse(scipy.linalg.cho_factor(curvature, lower=True)[0])
 
@@ -225,13 +225,13 @@ def volume_at(
 
 
 def _inverse(lower: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
-    """The inverse of a matrix from its lower Cholesky factor."""
+    """Compute the inverse of a matrix from its lower Cholesky factor."""
     found, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
     return np.tril(found) + np.tril(found, -1).T
 
 
 def trace(covariance: Float[np.ndarray, "rows rows"], matrix: Matrix) -> float:
-    """tr(C M) of two symmetric matrices; of C the lower triangle is enough."""
+    """Compute tr(C M) of two symmetric matrices; only the lower triangle of C is used."""
     if scipy.sparse.issparse(matrix):
         entries = scipy.sparse.tril(matrix, format="coo")
         below = float(covariance[entries.row, entries.col] @ entries.data)
@@ -241,7 +241,7 @@ def trace(covariance: Float[np.ndarray, "rows rows"], matrix: Matrix) -> float:
 
 
 def dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
-    """The matrix as an array."""
+    """Convert a matrix to a dense array."""
     return matrix.toarray() if scipy.sparse.issparse(matrix) else np.asarray(matrix)
 
 
@@ -253,7 +253,10 @@ def _moved(flat: Float[np.ndarray, "dimension"], steps: dict[int, float]) -> Flo
 
 
 def _curvature(target: Target, flat: Float[np.ndarray, "dimension"], near: Float[np.ndarray, "dimension"]) -> Matrix:
-    """The curvature of all but images, where the inside follows the sampled nodes as at a place near by."""
+    """Compute the curvature of all terms but the images at `flat`.
+
+    The free nodes follow the sampled nodes as they do at `near`.
+    """
     assert target.mode_search is not None
     data = target.mode_search.quadratic_part(target.data)
     one, other = (estimands_at(target, data, jnp.asarray(place)) for place in (flat, near))

@@ -1,19 +1,20 @@
-"""Scales of what has many components, where a mode would mislead.
+"""Scales of quantities with many components, whose joint mode is far from most of the probability.
 
-With a field s = sd · B z, z ~ N(0, I), the joint mode of (z, log sd) lies at a great sd and small z: it ignores how
-much less room z has the greater sd is. The Gaussian is better placed where the evidence of sd has its maximum, by
-MacKay's fixed point (1992): |z|² = γ, the number of components that the data determine.
+Let a field be s = sd · B z with z ~ N(0, I). The joint mode of (z, log sd) lies at a large sd and a small z, because it
+ignores that the volume of likely z decreases as sd grows. The maximum of the evidence of sd is a better centre of the
+Gaussian. MacKay's fixed point (1992) gives it: |z|² = γ, the number of components that the data determine.
 
-T_r is such a scale of u_B, whose prior's curvature P falls as 1 / T_r: the joint mode lies next to T_r = 0, where
-nothing moves. So is the sd of landmarks: nodes may follow all of them, and the joint mode lies next to sd = 0. λ and μ
-are in the prior's curvature, too: the joint mode would have them wherever they let all displacements pass. With u_B
-integrated out by Laplace's approximation, H its curvature and C = H⁻¹, the log density of such hyperparameters θ, in
-the coordinates of a position, gains −½ log det H, whose derivatives are
+T_r is such a scale of u_B: the curvature P of the prior of u_B is proportional to 1 / T_r, and the joint mode lies next
+to T_r = 0, where all displacements are zero. The sd of landmarks is another one: nodes can follow all landmarks, and
+the joint mode lies next to sd = 0. λ and μ are in the curvature of the prior, too, and at the joint mode they would
+allow any displacements. The displacements u_B are therefore integrated out by Laplace's approximation, with the
+curvature H and C = H⁻¹. The log density of such hyperparameters θ, in the coordinates of a position, then gains
+−½ log det H, whose derivatives are
 
 ∂/∂θ_k = −½ tr(C H_k) and −∂²/∂θ_k∂θ_l = ½ tr(C H_kl) − ½ tr(C H_k C H_l).
 
-For T_r these are ½ tr(C P) and ½ tr(C P − (C P)²), so that 2 E_r / T_r = γ where its prior says nothing. At a typical
-draw of u_B, whose energies are greater than at the mode, the density itself is more curved in θ, by ½ tr(C H_kl).
+For T_r these are ½ tr(C P) and ½ tr(C P − (C P)²), so that 2 E_r / T_r = γ if its prior is flat. A typical draw of u_B
+has greater energies than the mode. At such a draw the density itself is more curved in θ, by ½ tr(C H_kl).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def balance_field(
     flat: Float[np.ndarray, "dimension"],
     factor: Callable[[], Float[np.ndarray, "dimension dimension"]],
 ) -> Float[np.ndarray, "dimension"]:
-    """A flat position with sd nearer to the maximum of its evidence and the field s as it was.
+    """Move sd towards the maximum of its evidence, with the field s unchanged.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def balance_field(
     flat : (d,) array
         A mode given sd.
     factor : callable
-        () → F, where F Fᵀ is the covariance there; not asked for where there is no field.
+        () → F, where F Fᵀ is the covariance at `flat`; it is called only if there is a field.
     """
     scale = np.flatnonzero(marked(target, SCALE))
     if not len(scale):
@@ -65,11 +66,11 @@ def balance_field(
     components = np.flatnonzero(marked(target, COMPONENTS))
     rows = np.asarray(factor())[np.concatenate([components, scale])]
     covariance = rows @ rows.T
-    # Given sd.
+    # These are the variances of the components given sd.
     variances = np.diag(covariance)[:-1] - covariance[:-1, -1] ** 2 / covariance[-1, -1]
     determined = max(float((1 - variances).sum()), 1.0)
     z = flat[components]
-    # The one: log sd has the density of sd times sd, and that of a half-normal sd is flat near zero.
+    # The 1 comes from the density of log sd, which is that of sd times sd; the half-normal density is flat near zero.
     change = float(np.clip(0.5 * np.log((z @ z + 1) / determined), -_MOST, _MOST))
     moved = np.array(flat)
     moved[components], moved[scale] = z * np.exp(-change), flat[scale] + change
@@ -78,16 +79,16 @@ def balance_field(
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Second derivatives of −½ log det H in hyperparameters θ.
+    """The second derivatives of −½ log det H in hyperparameters θ.
 
     Attributes
     ----------
     covariance : (r, r) array
-        C.
+        C = H⁻¹.
     second_traces : (k, k) array
         tr(C H_kl).
     slopes : callable
-        () → H_k of every hyperparameter, dense or sparse, which not everybody needs.
+        () → H_k of every hyperparameter, dense or sparse; a function because only `curvature` needs them.
     """
 
     covariance: Float[np.ndarray, "rows rows"]
@@ -96,13 +97,13 @@ class Volume:
 
     @property
     def excess(self) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
-        """By how much the log density is more curved in θ at a typical draw of the displacements than at their mode."""
+        """The curvature of −log density in θ at a typical draw of the displacements, less that at their mode."""
         return self.second_traces / 2
 
     @cached_property
     def curvature(self) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
-        """Minus the second derivatives."""
-        # Products of dense matrices are faster than those with a sparse one of so many entries.
+        """Minus the second derivatives of −½ log det H in θ."""
+        # Dense products are faster: the sparse matrices have too many entries.
         shares = [(one.toarray() if scipy.sparse.issparse(one) else one) @ self.covariance for one in self.slopes()]
         squares = np.zeros(self.second_traces.shape)
         for row, one in enumerate(shares):

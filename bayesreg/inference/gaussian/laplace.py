@@ -18,11 +18,12 @@ from bayesreg.inference.layout import marked, unravel
 from bayesreg.inference.target import Curvature, Target
 from bayesreg.types import AnyArray, InputError
 
-# A parameter that exceeds so many times the greatest start value of its kind runs away.
+# The search has no end if a parameter exceeds the greatest reference value of its kind by this factor.
 FAR = 1e6
-# Precision of the other coordinates where the displacements alone are moved.
+# The precision of the coordinates other than the displacements if only the displacements move.
 ALONE = 10.0
-# Where residuals make the exact curvature less than Gauss–Newton's, or negative, this share of the latter counts.
+# Residuals can make the exact curvature less than Gauss–Newton's, or negative; at least this share of the latter is
+# kept.
 LEAST_RATIO = 0.25
 
 
@@ -33,32 +34,33 @@ class Gaussian(NamedTuple):
     ----------
     centre : (d,) array
     factor : (d, d) array
-        Upper triangular; the whitened coordinates are ξ = factor⁻¹ (x − centre).
+        An upper triangular matrix; the whitened coordinates are ξ = factor⁻¹ (x − centre).
     """
 
     centre: Float[AnyArray, "dimension"]
     factor: Float[AnyArray, "dimension dimension"]
 
     def place(self, xi: AnyArray) -> AnyArray:
-        """The flat position at whitened coordinates ξ."""
+        """Map whitened coordinates ξ to a flat position."""
         return self.centre + self.factor @ xi
 
 
 def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Gaussian:
-    """The Gaussian about a flat position, with the curvature there (see `precision_at`)."""
+    """Make the Gaussian about a flat position with the curvature at it (see `precision_at`)."""
     return gaussian_of(flat, precision_at(target, flat, data, joint))
 
 
 def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
-    """The Gaussian with the mean of the exact curvatures at places of which the mode is the first, `recentre` by all.
+    """Make the Gaussian with the mean of the exact curvatures at several points; the first of them is the mode.
 
-    Where the images say little at the mode and much beside it, the curvature at the mode alone makes a Gaussian too
-    wide, and trajectories meet forces in it that ask for short steps. Gauss–Newton's alone does so where a model leaves
-    large residuals. Of the parameters the curvature at the mode is kept: that of a logarithm grows with its argument,
-    and its mean over places would be that of the largest. In the logarithm of a scale it is that at draws about the
-    mode, which trajectories meet, though the posterior of the scale is wider.
+    Its centre is that of `recentre`. If the images are informative beside the mode but not at it, the curvature at the
+    mode makes a Gaussian that is too wide, and trajectories meet forces that require short steps. Gauss–Newton's
+    curvature has the same effect if a model leaves large residuals. The parameters keep their curvature at the mode:
+    the curvature in a logarithm grows with its argument, and the largest one would dominate a mean over points. The
+    curvature in the logarithm of a scale is that at draws about the mode, because trajectories meet it, although the
+    posterior of the scale is wider.
     """
-    # One after the other: each holds more than these two arrays.
+    # A generator keeps one curvature in memory, which holds more than these two arrays.
     curvatures = (_curvature(target, target.data, flat) for flat in flats)
     pairs = [(found.gauss_newton, found.remainder) for found in curvatures]
     approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
@@ -68,10 +70,10 @@ def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimensio
 
 
 def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
-    """The Gaussian of the same shape that at some places pulls, on average, as the density does.
+    """Move a Gaussian so that its mean slope at some points equals that of the density.
 
-    Its centre is the mean of x + C ∇log π(x). A scale stays where it is: its force at the mode of what it scales is no
-    hint (see `hierarchy`).
+    The new centre is the mean of x + C ∇log π(x). A scale does not move: its slope at the mode of the components that
+    it scales does not point to its own posterior (see `hierarchy`).
     """
     slopes = np.mean([slope_at(target, flat) for flat in flats], axis=0)
     factor, moving = np.asarray(gaussian.factor), 1 - mark_scales(target).astype(float)
@@ -80,16 +82,17 @@ def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarra
 
 
 def slope_at(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """∇log π."""
+    """Compute ∇log π at a flat position."""
     return height_and_slope(target, target.data, flat)[1]
 
 
 def _add_convexly(
     approximate: Float[np.ndarray, "rows rows"], remainder: Float[np.ndarray, "rows rows"]
 ) -> Float[np.ndarray, "rows rows"]:
-    """The sum of a positive definite curvature and another, made positive definite.
+    """Add a curvature to a positive definite one, and make the sum positive definite.
 
-    In coordinates that whiten the first, eigenvalues of the sum count by their size, and as no less than `LEAST_RATIO`.
+    In coordinates that whiten the first, eigenvalues of the sum are replaced by their absolute values, and by
+    `LEAST_RATIO` if these are smaller.
     """
     lower = np.linalg.cholesky(approximate)
     half = scipy.linalg.solve_triangular(lower, remainder, lower=True)
@@ -101,7 +104,7 @@ def _add_convexly(
 def gaussian_of(
     centre: Float[np.ndarray, "dimension"], precision: Float[np.ndarray, "dimension dimension"]
 ) -> Gaussian:
-    """The Gaussian of a centre and a precision."""
+    """Make the Gaussian of a centre and a precision."""
     lower = np.linalg.cholesky(precision)
     factor = scipy.linalg.solve_triangular(lower, np.eye(len(centre)), lower=True).T
     return Gaussian(jnp.asarray(centre), jnp.asarray(factor))
@@ -114,10 +117,11 @@ def precision_at(
     joint: bool = True,
     fixed: Bool[np.ndarray, "dimension"] | None = None,
 ) -> Float[np.ndarray, "dimension dimension"]:
-    """A positive definite curvature of minus the log density.
+    """Compute a positive definite curvature of minus the log density.
 
-    The curvature in the displacements and the field is Gauss–Newton's, the rows of the others are differences of the
-    gradient; directions in which these are not convex count by their size, and as no less than the target says.
+    The curvature in the displacements and the field is Gauss–Newton's. The rows of the other coordinates are finite
+    differences of the gradient. The eigenvalues of this part are replaced by absolute values, and by the target's
+    `least_curvature` if these are smaller.
 
     Parameters
     ----------
@@ -126,14 +130,14 @@ def precision_at(
     data : pytree, optional
         Data of a problem other than the target's own.
     joint : bool
-        Whether the other coordinates are given curvature; else they are left uncorrelated.
+        Whether the curvature of the other coordinates is computed; else they are left uncorrelated.
     fixed : (d,) bool array, optional
-        Some of the others that are left uncorrelated all the same.
+        The other coordinates that are left uncorrelated also if `joint` is true.
 
     Raises
     ------
     InputError
-        If a parameter runs away, or its curvature is not finite.
+        If a parameter grows without bound, or its curvature is not finite.
     """
     data = target.data if data is None else data
     return _jointly(target, data, flat, regular(_curvature(target, data, flat).gauss_newton), joint, fixed=fixed)
@@ -166,14 +170,15 @@ def _jointly(
     at_draws: bool = False,
     fixed: Bool[np.ndarray, "dimension"] | None = None,
 ) -> Float[np.ndarray, "dimension dimension"]:
-    """The curvature in all coordinates, given that in the displacements and, jointly, the field.
+    """Complete the curvature in the displacements and, if `joint`, the field to that in all coordinates.
 
-    In the hyperparameters it is that of their evidence, or that at draws of the displacements (see `hierarchy`).
+    The curvature in the hyperparameters is that of their evidence, or that at draws of the displacements (see
+    `hierarchy`).
     """
     curved = _mark_curved(target, joint)
     alone = ~curved if not joint else np.zeros(len(flat), bool) if fixed is None else fixed & ~curved
     found = ALONE * np.eye(len(flat))
-    # Where not jointly, the field's share of the given is left out.
+    # Without `joint`, the field's part of the given curvature is left out.
     first = len(curvature) - int(curved.sum())
     found[np.ix_(curved, curved)] = curvature[first:, first:]
     entries = np.flatnonzero(~curved & ~alone)
@@ -198,5 +203,5 @@ def _jointly(
 
 
 def _mark_curved(target: Target, joint: bool) -> Bool[np.ndarray, "dimension"]:
-    """Entries of a flat position whose curvature the target knows: "u_boundary" and, jointly, "field"."""
+    """Mark the entries whose curvature the target computes: "u_boundary" and, if `joint`, "field"."""
     return marked(target, "u_boundary", "field") if joint else marked(target, "u_boundary")

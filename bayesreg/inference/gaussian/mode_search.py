@@ -27,11 +27,11 @@ from bayesreg.types import InputError
 
 _log = logging.getLogger(__name__)
 
-# The last stage is repeated so often, at most, or until no coordinate moves by more, and no hyperparameter by more of
-# its standard deviations.
+# The greatest number of repeats of the last stage. It ends earlier if no coordinate moves by more than SETTLED and no
+# hyperparameter by more than SETTLED_SD standard deviations.
 REPEATS, SETTLED, SETTLED_SD = 20, 3e-3, 0.1
-# A stage ends where an iteration gains less than this share of the height. On the way nothing is owed to a place that
-# the next stage leaves: with that of the last, twice as many gradients led to the same modes.
+# A stage ends if an iteration gains less than this share of the log density. ROUGH is enough for all but the last
+# stage: with FINE for all, twice as many gradients led to the same modes.
 ROUGH, FINE = 1e-4, 1e-10
 
 
@@ -40,7 +40,7 @@ def find_mode(
     start: Float[np.ndarray, "dimension"],
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
-    """A mode of the log density of the position, by L-BFGS along the target's continuation.
+    """Find a mode of the log density of the position, by L-BFGS along the target's continuation.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def find_mode(
     start : (d,) array
         Flat position to start from.
     iterations : int
-        Most iterations of a stage; the last is repeated, whitened anew, until it moves nothing.
+        The greatest number of iterations of a stage. The last stage is whitened and run again until it converges.
 
     Returns
     -------
@@ -68,7 +68,10 @@ def approach(
     start: Float[np.ndarray, "dimension"],
     iterations: int = 40,
 ) -> Float[np.ndarray, "dimension"]:
-    """Where the target's continuation leads the displacements from a flat position, or where a search has been."""
+    """Move the displacements along the target's continuation.
+
+    The start is the target's `approached` estimands if it has them, else the given flat position.
+    """
     assert target.mode_search is not None
     flat = np.asarray(start)
     if target.mode_search.approached is not None:
@@ -84,9 +87,9 @@ def settle(
     iterations: int = 40,
     repeats: int = REPEATS,
 ) -> Float[np.ndarray, "dimension"]:
-    """The mode next to a flat position: L-BFGS on the problem itself, whitened anew until it moves nothing.
+    """Find the mode next to a flat position by L-BFGS on the target's own problem.
 
-    With fewer `repeats`, a place near it.
+    The coordinates are whitened again before each repeat. With fewer `repeats` the result is a point near the mode.
     """
     resting, before = mark_hyperparameters(target), flat
     better = Found(flat, np.inf)
@@ -94,11 +97,11 @@ def settle(
         found = _improve(target, target.data, better.flat, True, iterations)
         balanced = balance_field(target, found, partial(_factor, target, found))
         moved = np.abs(balanced - before)[~resting].max()
-        # Once they rest, what else moves is too little for them to follow.
+        # Once the hyperparameters have settled, the other coordinates move too little to change them.
         if better.moved < SETTLED_SD:
             better = better._replace(flat=balanced)
         else:
-            # The units of a search that did not end at its bounds still hold.
+            # The units are reused if the last search did not end at its bounds.
             better = _improve_hyperparameters(target, balanced, better.units if better.moved < FARTHEST else None)
         before = balanced
         if moved < SETTLED and better.moved < SETTLED_SD:
@@ -113,14 +116,14 @@ def _improve_hyperparameters(
     flat: Float[np.ndarray, "dimension"],
     units: Float[np.ndarray, "hyperparameters hyperparameters"] | None,
 ) -> Found:
-    """The hyperparameters, if any, at the maximum of their evidence about a flat position."""
+    """Move the hyperparameters, if there are any, to the maximum of their evidence about a flat position."""
     assert target.mode_search is not None
     if not mark_hyperparameters(target).any():
         return Found(flat, 0.0)
     estimands = estimands_at(target, target.data, jnp.asarray(flat))
     curvature = target.mode_search.curvature(target.data, estimands).gauss_newton
     found = maximise_evidence(target, flat, curvature, units)
-    # To second order the displacements may go too far: where the density itself is lower for that, they rest.
+    # The expansion is of second order, so the displacements may go too far. If that lowers the density, they stay.
     data, resting = without_normaliser(target, target.data), np.where(mark_hyperparameters(target), found.flat, flat)
     higher = height_and_slope(target, data, found.flat)[0] >= height_and_slope(target, data, resting)[0]
     return found if higher else found._replace(flat=resting)
@@ -138,11 +141,11 @@ def _improve(
     iterations: int,
     gain: float = FINE,
 ) -> Float[np.ndarray, "dimension"]:
-    """L-BFGS in the coordinates whitened where it starts."""
+    """Run L-BFGS in coordinates whitened at its start."""
     resting = mark_scales(target)
     log_normaliser = 0.0
     if not moves or resting[mark_normaliser(target)].all():
-        # The normaliser is the same for all that moves.
+        # The normaliser depends on no coordinate that moves.
         data = without_normaliser(target, data)
         log_normaliser = normaliser_and_slope(target, flat)[0] if moves else 0.0
     gaussian = gaussian_of(flat, _decouple(precision_at(target, flat, data, moves, resting), resting))
@@ -158,7 +161,7 @@ def _improve(
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
-            # A wall for the line search: uphill from the best place so far, sloping back to it.
+            # A value that makes the line search turn back: it rises with the distance from the best point so far.
             place, least, slope = best[-1]
             return least + 2 * abs(slope @ (xi - place)), -slope
         if not best or value < best[-1][1]:
@@ -172,7 +175,8 @@ def _improve(
     return np.asarray(_place(gaussian, moving * place))
 
 
-# On the device: the threads of NumPy's products stay awake for a while and are in the way of what comes next.
+# These products run on the device, because the threads of NumPy's products stay active for a while and slow down the
+# next computation.
 _place = jax.jit(Gaussian.place)
 _pull_back = jax.jit(lambda gaussian, slope: gaussian.factor.T @ slope)
 
@@ -180,7 +184,7 @@ _pull_back = jax.jit(lambda gaussian, slope: gaussian.factor.T @ slope)
 def _decouple(
     precision: Float[np.ndarray, "dimension dimension"], held: Bool[np.ndarray, "dimension"]
 ) -> Float[np.ndarray, "dimension dimension"]:
-    """Without what couples the held entries to the others: no move of the whitened others moves the held then."""
+    """Remove the coupling of the held entries to the others, so that a move of the others leaves them unchanged."""
     precision = np.array(precision)
     precision[held] = precision[:, held] = 0.0
     precision[held, held] = 1.0

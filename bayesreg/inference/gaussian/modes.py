@@ -1,4 +1,4 @@
-"""Where the chains start: about one mode of the posterior, or each about the one that its own start leads to."""
+"""The modes about which the chains start: one for all of them, or one that is found from the start of each."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from bayesreg.inference.target import Target, estimands_of, logdensity
 
 _log = logging.getLogger(__name__)
 
-# Residuals are near those of the mode where the search has been whitened anew so often.
+# After this number of repeats of the search, residuals are close to those at the mode.
 FEW = 2
-# Modes count as one where no coordinate lies further apart than this, in its standard deviations.
+# Two modes count as one if no coordinate differs by more than this number of its standard deviations.
 SAME = 1.0
 
 
 class Modes(NamedTuple):
-    """The modes that were found.
+    """The modes of a posterior, and the mode of each chain.
 
     Attributes
     ----------
     gaussians : list of Gaussian
-        Laplace's approximation about each, the mode of the highest density first.
+        Laplace's approximation about each mode; the mode of the highest density comes first.
     chains : (chains,) list of int
-        Whose mode each chain's is.
+        The number of the mode of each chain.
     """
 
     gaussians: list[Gaussian]
@@ -39,9 +39,9 @@ class Modes(NamedTuple):
 
 
 def search_modes(target: Target, points: Any, each: bool) -> Modes:
-    """Modes from the start points (chains as the leading axis): one from their mean, or one from each.
+    """Search for modes from the start points (chains as the leading axis): one from their mean, or one from each.
 
-    One search costs as much as all of a short run; that it leads elsewhere from other starts is the exception.
+    One search costs as much as a short run, and searches from other starts seldom end at another mode.
     """
     chains = len(next(iter(points.values())))
     if not each:
@@ -54,7 +54,7 @@ def search_modes(target: Target, points: Any, each: bool) -> Modes:
 
 
 def temper(target: Target, points: Any) -> Target:
-    """The target, tempered near the mode that the mean of the start points leads to, if it has yet to be."""
+    """Temper the target near the mode found from the mean of the start points, if it is not tempered yet."""
     if target.mode_search is None or target.mode_search.tempering is None:
         return target
     there = settle(target, approach(target, _middle(target, points)), repeats=FEW)
@@ -62,7 +62,7 @@ def temper(target: Target, points: Any) -> Target:
 
 
 def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
-    """The modes among those of every chain that differ, by their distance in standard deviations (see `SAME`)."""
+    """Group the modes of all chains into distinct ones, by their distance in standard deviations (see `SAME`)."""
     heights = [_height(target, mode) for mode in found]
     gaussians: list[Gaussian] = []
     chains = [0] * len(found)
@@ -76,13 +76,13 @@ def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> 
 
 
 def distance(gaussian: Gaussian, flat: Float[np.ndarray, "dimension"]) -> float:
-    """How far a flat position is from the centre, in standard deviations of the coordinate in which it is furthest."""
+    """Compute the greatest distance of a coordinate from the centre of a Gaussian, in its standard deviations."""
     sd = np.linalg.norm(np.asarray(gaussian.factor), axis=1)
     return float(np.abs((flat - np.asarray(gaussian.centre)) / sd).max())
 
 
 def report_modes(target: Target, modes: Modes) -> Modes:
-    """Report the modes and return them."""
+    """Report the modes in the log, and return them."""
     if len(modes.gaussians) == 1:
         _log.info("modes: every chain's search ended at one and the same")
         return modes

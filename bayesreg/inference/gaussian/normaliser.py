@@ -1,10 +1,10 @@
-"""A normaliser too costly for every step of a trajectory, which sees a polynomial instead: the test sees both.
+"""A polynomial stand-in for a normaliser that is too costly for every step of a trajectory.
 
-The normaliser of the elastic prior depends on the parameters alone, and is a smooth function of a few coordinates. A
-kernel that is reversible for the density with a stand-in proposes; its proposal is accepted with the ratio of the
-normaliser to the stand-in, there over here. That is exact (the surrogate transition method, Liu 2001; delayed
-acceptance, Christen and Fox 2005). So is a test of several transitions at once, for a reversible kernel repeated is
-reversible; together they cost one normaliser.
+The normaliser of the elastic prior depends on the parameters only, and is a smooth function of a few coordinates. A
+kernel that is reversible for the density with the stand-in makes a proposal. The proposal is accepted with the ratio of
+the normaliser to the stand-in at the proposal, divided by the same ratio at the current state. This is exact (the
+surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005). A test of several transitions at once
+is exact, too, because repeated transitions of a reversible kernel are reversible; they cost one normaliser together.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ from bayesreg.inference.layout import dimension, unravel
 from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
 
-# The degree of the polynomial is as high as its number of terms allows, which cost as many numbers to find.
+# The degree of the polynomial is the highest one with at most MOST_TERMS terms: the cost of the fit grows with them.
 HIGHEST_DEGREE, MOST_TERMS = 4, 150
-# The polynomial is fitted so far about the middle, in standard deviations of the Gaussian: the posterior of a parameter
-# is wider (see `average_gaussian`), and skew.
+# The polynomial is fitted up to this distance from the middle, in standard deviations of the Gaussian: the posterior of
+# a parameter is wider than the Gaussian (see `average_gaussian`), and skew.
 REACH = 5.0
-# So many values and slopes are found for each coefficient.
+# The number of values and slopes that are computed for each coefficient.
 REDUNDANCY = 2
-# Transitions that are tested at once: the normaliser costs several of them, and a good stand-in is seldom refused.
+# The number of transitions that are tested at once: one normaliser costs as much as several transitions, and the test
+# seldom rejects a good stand-in.
 TOGETHER = 4
 
 
 class StandIn(NamedTuple):
-    """A polynomial in the normaliser's smooth coordinates (a pytree), the normaliser up to a constant.
+    """A polynomial in the normaliser's smooth coordinates (a pytree) that approximates its logarithm up to a constant.
 
     Attributes
     ----------
     centre, unit : (k,) arrays
-        The factors of its terms are the coordinates less the centre, over these units.
+        The factors of the terms are z = (coordinates − centre) / unit.
     reach : scalar
-        Length of a vector of factors beyond which the polynomial goes on linearly.
+        The length of z beyond which the polynomial is continued linearly.
     factors : (terms, degree) int array
-        The factors of each term: 0 is one, and i + 1 is that of coordinate i.
+        The factors of each term: 0 stands for the number 1, and i + 1 for z_i.
     coefficients : (terms,) array
     """
 
@@ -59,7 +60,7 @@ class StandIn(NamedTuple):
     coefficients: Float[AnyArray, "terms"]
 
     def __call__(self, coordinates: Float[AnyArray, "coordinates"]) -> Scalar:
-        """The value at smooth coordinates."""
+        """Evaluate the polynomial at smooth coordinates."""
         z = (coordinates - self.centre) / self.unit
         near = z * jnp.minimum(1.0, self.reach / jnp.sqrt((z**2).sum() + 1e-12))
         value, change = jax.jvp(self._polynomial, (near,), (z - near,))
@@ -70,13 +71,13 @@ class StandIn(NamedTuple):
 
 
 class Delayed(NamedTuple):
-    """A chain whose kernel sees the stand-in.
+    """The state of a chain whose kernel uses the stand-in.
 
     Attributes
     ----------
     kernel : state of the kernel
     log_normaliser : scalar
-        The true one, where the chain stands.
+        The logarithm of the true normaliser at the state of the chain.
     """
 
     kernel: Any
@@ -84,19 +85,19 @@ class Delayed(NamedTuple):
 
 
 def terms_of(factors: Int[AnyArray, "terms degree"], z: Float[AnyArray, "entries"]) -> Float[AnyArray, "terms"]:
-    """The terms of a polynomial at z."""
+    """Evaluate the terms of a polynomial at z."""
     return jnp.concatenate([jnp.ones(1), z])[factors].prod(axis=1)
 
 
 def smooth_coordinates(target: Target, data: Any, flat: AnyArray) -> Float[AnyArray, "coordinates"]:
-    """The normaliser's smooth coordinates at a flat position; none where there is no normaliser."""
+    """Compute the normaliser's smooth coordinates at a flat position; the array is empty without a normaliser."""
     if target.normaliser is None:
         return jnp.zeros(0)
     return target.normaliser.smooth_coordinates(data, estimands_of(target, data, unravel(target)(flat)))
 
 
 def no_stand_in(target: Target) -> StandIn:
-    """The stand-in of a density without a normaliser, or before it is found: zero."""
+    """Make a stand-in that is zero, for a density without a normaliser or before the fit."""
     count = len(jax.eval_shape(partial(smooth_coordinates, target), target.data, jnp.zeros(dimension(target))))
     degrees = range(HIGHEST_DEGREE, 1, -1)
     degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
@@ -106,14 +107,14 @@ def no_stand_in(target: Target) -> StandIn:
 
 
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
-    """The polynomial that fits the normaliser and its slopes about a flat position best, by least squares."""
+    """Fit a polynomial to the normaliser and its slopes about a flat position, by least squares."""
     found = no_stand_in(target)
     if not has_costly_normaliser(target) or not len(found.centre):
         return found
     entries, middle = np.flatnonzero(mark_normaliser(target)), np.asarray(middle)
     unit, rng = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), np.random.default_rng(0)
     seen = []
-    # Some more than there are numbers for, so that a linear one, too, is found from several places.
+    # The 2 makes sure that a linear polynomial is fitted at several points, too.
     for _ in range(2 + REDUNDANCY * len(found.factors) // (len(entries) + 1)):
         direction = rng.normal(size=len(entries))
         there = np.array(middle)
@@ -143,7 +144,7 @@ _slopes_of_terms = jax.jit(jax.jacfwd(terms_of, argnums=1))
 def _coordinates_and_change(
     target: Target, data: Any, flat: AnyArray, entries: AnyArray
 ) -> tuple[Float[AnyArray, "coordinates"], Float[AnyArray, "coordinates entries"]]:
-    """The smooth coordinates at a flat position, and their derivatives in some of its entries."""
+    """Compute the smooth coordinates at a flat position, and their derivatives by some of its entries."""
 
     def there(some: AnyArray) -> AnyArray:
         return smooth_coordinates(target, data, flat.at[entries].set(some))
@@ -157,7 +158,7 @@ def delay_acceptance(
     log_normaliser: Callable[[Any, AnyArray], Scalar],
     stand_in: Callable[[Any, Any, AnyArray], Scalar],
 ) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Any]]:
-    """Steps for the density with the stand-in, `TOGETHER` of them, made one for the density with the normaliser.
+    """Turn `TOGETHER` steps for the density with the stand-in into one step for the density with the normaliser.
 
     Parameters
     ----------
@@ -166,9 +167,9 @@ def delay_acceptance(
     flat_of : callable
         (setup, state) → flat position.
     log_normaliser : callable
-        (data, flat position) → the true one.
+        (data, flat position) → the logarithm of the true normaliser.
     stand_in : callable
-        (data, setup, flat position) → what the kernel sees.
+        (data, setup, flat position) → the value of the stand-in.
     """
 
     def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Any]:

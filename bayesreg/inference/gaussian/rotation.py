@@ -1,9 +1,9 @@
 """Hamiltonian dynamics about a Gaussian, for BlackJAX.
 
-In coordinates ξ in which the Gaussian is N(0, I), the Hamiltonian splits into that of the Gaussian, ½|ξ|² + ½|p|²,
-whose flow is a rotation of (ξ, p), and what the posterior adds to it, −log π(ξ) − ½|ξ|², whose flow is a kick. Their
-Strang composition is exact where the posterior is Gaussian, in any dimension (Beskos et al. 2011), and so takes long
-steps where it is nearly so.
+In coordinates ξ in which the Gaussian is N(0, I), the Hamiltonian has two parts. The part of the Gaussian is
+½|ξ|² + ½|p|², and its flow is a rotation of (ξ, p). The remainder is −log π(ξ) − ½|ξ|², and its flow changes only p, a
+kick. The Strang composition of the two flows is exact for a Gaussian posterior, in any dimension (Beskos et al. 2011),
+and so allows long steps for a posterior that is nearly Gaussian.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from bayesreg.types import AnyArray
 
 
 def rotation(precision: AnyArray | float = 1.0) -> Callable:
-    """An integrator for BlackJAX: half a kick, a rotation about the Gaussian N(0, I / precision), half a kick.
+    """Make an integrator for BlackJAX: half a kick, a rotation about the Gaussian N(0, I / precision), half a kick.
 
-    The mass is the precision, of which BlackJAX takes the inverse.
+    The mass is the precision; BlackJAX takes the inverse of the mass.
     """
 
     def integrator(logdensity_fn: Callable, kinetic_energy_fn: Any) -> Callable:
@@ -37,7 +37,7 @@ def rotation(precision: AnyArray | float = 1.0) -> Callable:
             return IntegratorState(position, momentum, logdensity, gradient)
 
         def _excess(gradient: AnyArray, position: AnyArray) -> AnyArray:
-            """The force of the density beyond that of the Gaussian."""
+            """Compute the force of the density less that of the Gaussian."""
             return gradient + precision * position
 
         return one_step

@@ -1,4 +1,4 @@
-"""Warm-up: the step size that meets an acceptance, by dual averaging; what it settles on is then kept."""
+"""The warm-up: dual averaging finds the step size for an acceptance; the step size is then fixed."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from bayesreg.types import AnyArray
 
 _log = logging.getLogger(__name__)
 
-# The tuning of the step starts here, and is drawn to ten times as much.
+# The tuning starts at this step size; dual averaging pulls it towards ten times as much.
 FIRST_STEP = 0.05
-# Steps of a trajectory while chains are tuned apart: it ends when the slowest of them does.
+# The greatest number of steps of a trajectory while each chain has a step size of its own: all chains wait for the
+# slowest one.
 FEW_STEPS = 8
 
 
 class Tuning(NamedTuple):
-    """How the step size is found.
+    """The options for the tuning of the step size.
 
     Attributes
     ----------
     warm_up : int
-        Transitions in which it is tuned and that are not kept.
+        The number of transitions that tune the step size and are not kept.
     acceptance : float
-        Between 0 and 1, averaged over chains.
+        The desired acceptance, between 0 and 1, averaged over chains.
     least, greatest : float
-        Bounds of the step. Beyond a quarter turn, the default, there is nothing to gain.
+        The bounds of the step size. A step longer than a quarter turn, the default, has no advantage.
     quarter_turns : bool
-        Whether a transition has as many steps as make a quarter turn of the Gaussian, of one size no greater than what
-        the acceptance allows.
+        Whether a transition is a quarter turn of the Gaussian, in equal steps that are no longer than the acceptance
+        allows.
     """
 
     warm_up: int
@@ -50,19 +51,19 @@ class Walking(Protocol):
     """A hashable object that moves the chains (`bayesreg.inference.gaussian.about_gaussian.Walk`)."""
 
     def init(self, data: Any, setup: Any, estimands: Estimands) -> Any:
-        """See `Sampler`."""
+        """Make the state of a chain, as in `Sampler`."""
 
     def step(self, data: Any, setup: Any, key: AnyArray, state: Any) -> tuple[Any, Info]:
-        """See `Sampler`."""
+        """Make one transition, as in `Sampler`."""
 
     def estimands(self, data: Any, setup: Any, state: Any) -> dict[str, AnyArray]:
-        """Where a chain is."""
+        """Compute the current estimands of a chain."""
 
 
 def tune(
     data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False
 ) -> tuple[Any, Any]:  # fmt: skip
-    """The setup with its step size, and where the chains then are.
+    """Tune the step size; return the setup with it, and the estimands of the chains at the end.
 
     Parameters
     ----------
@@ -70,13 +71,13 @@ def tune(
     walk : Walking
     setup : Setup
     starts : pytree
-        Estimands, chains as the leading axis.
+        The estimands at which chains start, with chains as the leading axis.
     key : PRNG key
     tuning : Tuning
     apart : bool
-        Tune each chain's step by itself, and let no trajectory have more than `FEW_STEPS`. A chain that starts where
-        the density is steep takes short steps until it is back; with one step for all it would stand still for as long
-        as the others take longer ones, or shorten theirs.
+        Whether each chain has a step size of its own, and trajectories have at most `FEW_STEPS` steps. A chain that
+        starts where the density is steep then takes short steps until it has left that region. With one step size for
+        all chains, it would not move, or would shorten the steps of the others.
     """
     keys = jax.random.split(key, tuning.warm_up)
     first = jax.vmap(partial(walk.init, data, setup))(starts)
@@ -97,7 +98,7 @@ def _run(
     keys: AnyArray,
     apart: AnyArray,
 ) -> tuple[Any, AnyArray, AnyArray]:
-    """Estimands and step size by chain, and the acceptance of every transition."""
+    """Run the transitions; return estimands and step size of each chain, and the acceptance of each transition."""
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(jax.tree.leaves(first)[0])
 
@@ -122,6 +123,6 @@ def _with_step_size(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
     size = jnp.clip(size, tuning.least, tuning.greatest)
     if not tuning.quarter_turns:
         return setup._replace(step_size=size)
-    # Less leaves what is not refused correlated with where it came from, and much more its square.
+    # After less than a quarter turn, the new position is correlated with the old one; after much more, its square is.
     steps = jnp.maximum(jnp.ceil(jnp.pi / 2 / size), 1).astype(int)
     return setup._replace(step_size=jnp.pi / 2 / steps, steps=steps)

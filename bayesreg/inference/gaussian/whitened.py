@@ -1,4 +1,4 @@
-"""The coordinates in which Laplace's approximation is N(0, I), and the density there."""
+"""The coordinates in which Laplace's approximation is N(0, I), and the density in these coordinates."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Setup(NamedTuple):
-    """The setup of a sampler about a Gaussian, found once (a pytree).
+    """The setup of a sampler about a Gaussian, which is computed once (a pytree).
 
     Attributes
     ----------
     gaussian : Gaussian
     middle : (d,) array
-        Flat position that the chains are about: the mode, or the mean of the chains' places. Solves are preconditioned
-        there.
+        The flat position at the middle of the chains: the mode, or the mean of the chains' positions. The elastic
+        solves are preconditioned there.
     step_size : scalar
-        In whitened coordinates; π/2 is a quarter turn of the Gaussian's motion.
+        The step size in whitened coordinates; π/2 is a quarter turn of the Gaussian's motion.
     steps : scalar integer
-        Steps of a trajectory of fixed length: as many as make a quarter turn.
+        The number of steps of a trajectory of fixed length, a quarter turn.
     stand_in : StandIn
-        The stand-in of the density's normaliser, where it has one.
+        The stand-in for the normaliser of the density; zero without a costly normaliser.
     """
 
     gaussian: Gaussian
@@ -47,7 +47,7 @@ class Setup(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """The report of a transition: see `Info`."""
+    """The report of a transition in whitened coordinates, see `Info`."""
 
     acceptance_rate: AnyArray
     diverging: AnyArray | bool = False
@@ -60,22 +60,22 @@ Transition = Callable[[Target, Any, Setup, AnyArray, Any], tuple[Any, Moved]]
 
 @partial(jax.jit, static_argnums=0)
 def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray) -> Setup:
-    """A setup before its tuning."""
+    """Make a setup before its tuning."""
     return Setup(gaussian, jnp.asarray(middle), jnp.asarray(FIRST_STEP), jnp.asarray(1, int), no_stand_in(target))
 
 
 def whiten(gaussian: Gaussian, flat: AnyArray) -> AnyArray:
-    """The whitened coordinates ξ of a flat position."""
+    """Map a flat position to whitened coordinates ξ."""
     return jax.scipy.linalg.solve_triangular(gaussian.factor, flat - gaussian.centre, lower=False)
 
 
 def whitened_position(target: Target, gaussian: Gaussian, xi: AnyArray) -> dict[str, AnyArray]:
-    """The position at ξ."""
+    """Map whitened coordinates ξ to a position."""
     return unravel(target)(gaussian.place(xi))
 
 
 def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
-    """log π(ξ), up to a constant, with the stand-in for its normaliser."""
+    """Make the function log π(ξ), up to a constant, with the stand-in for a costly normaliser."""
     gaussian = setup.gaussian
     if not has_costly_normaliser(target):
         return lambda xi: logdensity(target, data, whitened_position(target, gaussian, xi))
@@ -89,5 +89,5 @@ def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyAr
 
 
 def stand_in_at(target: Target, data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
-    """The stand-in for the normaliser at a flat position."""
+    """Evaluate the stand-in for the normaliser at a flat position."""
     return setup.stand_in(smooth_coordinates(target, data, flat))

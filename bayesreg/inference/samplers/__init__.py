@@ -1,1 +1,1 @@
-"""Samplers, one file a family."""
+"""The samplers, with one file for each family."""

@@ -17,13 +17,16 @@ from bayesreg.inference.samplers.settings import Hmc, Nuts
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray
 
-# Every step of a trajectory is longer or shorter by a random factor of this range: trajectories of one length may be
-# periodic.
+# The step size of every trajectory is multiplied by a random factor in this range, because trajectories of one fixed
+# length may be periodic.
 JITTER = (0.8, 1.2)
 
 
 def hmc(target: Target, settings: Hmc) -> Sampler:
-    """Hamiltonian Monte Carlo: a quarter turn about the Gaussian, in as many steps as acceptance asks for."""
+    """Make a Hamiltonian Monte Carlo sampler.
+
+    Each trajectory is a quarter turn about the Gaussian, in as many steps as the acceptance requires.
+    """
     tuning = Tuning(settings.warm_up, settings.target_acceptance, quarter_turns=True)
     return about_gaussian(target, _quarter_turn, tuning, mode_search=settings.mode_search)
 
@@ -38,7 +41,7 @@ def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state:
 
 
 def nuts(target: Target, settings: Nuts) -> Sampler:
-    """The No-U-Turn sampler about the Gaussian."""
+    """Make a No-U-Turn sampler about the Gaussian."""
     tuning = Tuning(settings.warm_up, settings.target_acceptance)
     return about_gaussian(target, _no_u_turn, tuning, mode_search=settings.mode_search)
 

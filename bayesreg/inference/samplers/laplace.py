@@ -1,4 +1,4 @@
-"""Independent draws from Laplace's approximation: a quick look, approximate."""
+"""Independent draws from Laplace's approximation, a fast approximation of the posterior."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bayesreg.types import AnyArray
 
 
 def laplace(target: Target, settings: Laplace) -> Sampler:
-    """Independent draws from the Gaussian with the curvature at the mode: a quick look, not the posterior."""
+    """Make a sampler of independent draws from the Gaussian with the curvature at the mode, not the posterior."""
     return about_gaussian(target, _draw, begin=_begin, mode_search=settings.mode_search, exact=False)
 
 
 class _Place(NamedTuple):
-    """The whitened coordinates of a chain."""
+    """The state of a chain: its whitened coordinates."""
 
     position: AnyArray
 

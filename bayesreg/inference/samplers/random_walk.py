@@ -15,19 +15,21 @@ from bayesreg.types import AnyArray, InputError
 
 
 class State(NamedTuple):
-    """One chain of the paper's kernel: BlackJAX's state, and the evaluation of the density at its position."""
+    """The state of a chain: BlackJAX's state, and the evaluation of the density at its position."""
 
     kernel: Any
     evaluation: Any
 
 
 def rwmh(target: Target, settings: RandomWalk) -> Sampler:
-    """Random-walk Metropolis with the paper's three Normal kernels (eqs. 13 and 14), all proposed at once.
+    """Make a random-walk Metropolis sampler with the paper's three Normal kernels (eqs. 13 and 14).
+
+    One proposal changes all estimands.
 
     Raises
     ------
     InputError
-        If a temperature is to be sampled: the paper has no step for it.
+        If a temperature is sampled: the paper has no step for it.
     """
     sigma = {"u_boundary": settings.sigma_u, "lam": settings.sigma_lam, "mu": settings.sigma_mu}
     warm = [name for name in target.coordinates.reference() if name not in sigma]
@@ -40,7 +42,7 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
         return State(kernel.init(estimands), evaluation)
 
     def proposed(data: Any, key: AnyArray, position: Estimands) -> tuple[Estimands, Estimands, AnyArray]:
-        """A move, where it leads, and whether that lies in the support."""
+        """Draw a move; return it, the proposal, and whether the proposal lies in the support."""
         move = _normal_step(key, position, sigma)
         proposal = jax.tree.map(jnp.add, position, move)
         return move, proposal, target.supports(data, proposal)
@@ -49,12 +51,13 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
         return ~proposed(data, jax.random.split(key)[0], state.kernel.position)[-1]
 
     def step(data: Any, _: Any, key: AnyArray, state: State) -> tuple[State, Info]:
-        # The proposal is drawn and evaluated here, once, so that its energies and its solve are seen;
-        # BlackJAX is handed both and decides.
+        # The proposal is drawn and evaluated here, once, because BlackJAX does not return its energies and its solve.
+        # BlackJAX takes both and accepts or rejects.
         key_proposal, key_accept = jax.random.split(key)
         position, current = state.kernel.position, state.evaluation
         move, proposal, inside = proposed(data, key_proposal, position)
-        # A proposal outside the support needs no solve: the chain evaluates where it stands, at no iteration.
+        # A proposal outside the support needs no solve. The current position is evaluated in its place; with its own u
+        # as the guess that takes no iteration.
         place = jax.tree.map(lambda new, old: jnp.where(inside, new, old), proposal, position)
         evaluation = target.evaluate_estimands(data, place, guess=current.u)
         logdensity = jnp.where(inside, evaluation.logdensity, -jnp.inf)
@@ -73,7 +76,7 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
         return State(kernel_state, kept), info
 
     return Sampler(
-        # The setup is where the chains start, on average: the data are prepared for that neighbourhood.
+        # The setup is the mean of the start points: the data are prepared for their neighbourhood.
         prepare=lambda points, _key: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
         data=lambda start: target.condition(start),
         blank=lambda: target.coordinates.reference(),

@@ -1,8 +1,8 @@
-"""The registry of samplers, all through BlackJAX: name to record of settings and maker.
+"""The registry of samplers: the settings and the maker of each name. All of them use BlackJAX.
 
-The paper's kernel moves in the constrained space of the estimands; the others in the coordinates in which Laplace's
-approximation is N(0, I) (`bayesreg.inference.gaussian.whitened`). Any other kernel of BlackJAX is a user's own: the log
-density of a posterior is a function of a pytree (docs/samplers.md has an example).
+The paper's kernel moves in the constrained space of the estimands. The other kernels move in the coordinates in which
+Laplace's approximation is N(0, I) (`bayesreg.inference.gaussian.whitened`). A user can run any other BlackJAX kernel,
+because the log density of a posterior is a function of a pytree (docs/samplers.md has an example).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ SAMPLERS: dict[str, Entry] = {
 class Chosen:
     """A sampler of the registry, made for a target.
 
-    Two are equal if name, target and settings are: what is compiled for one serves the other, such as a second run with
-    another seed, or for another pair of images on the same mesh.
+    Two of them are equal if their names, targets and settings are equal. Code that is compiled for one then serves the
+    other: a second run with another seed, or a run for another pair of images on the same mesh.
 
     Raises
     ------
     InputError
-        If the target is not for this sampler.
+        If the sampler does not accept the target.
     """
 
     name: str
@@ -63,12 +63,12 @@ class Chosen:
 
 
 def choose_sampler(name: str, target: Target, **given: Any) -> Chosen:
-    """The sampler of that name, made for a target with these settings.
+    """Make the named sampler for a target with these settings.
 
     Raises
     ------
     InputError
-        If there is no such sampler or setting, a setting is out of range, or see `Chosen`.
+        If there is no such sampler or setting, a setting is out of range, or the sampler does not accept the target.
     """
     if name not in SAMPLERS:
         raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
@@ -82,7 +82,7 @@ def choose_sampler(name: str, target: Target, **given: Any) -> Chosen:
 
 
 def _explain(details: Any, record: type[Settings]) -> str:
-    """One of pydantic's errors as a message."""
+    """Turn one of pydantic's errors into a message."""
     key = ".".join(map(str, details["loc"]))
     if details["type"] == "extra_forbidden":
         return f"there is no setting {key}; there are {', '.join(record.model_fields) or 'none'}"

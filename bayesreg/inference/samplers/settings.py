@@ -1,6 +1,6 @@
-"""The settings of every sampler: a record for each, from which its section of a configuration is made.
+"""The settings of every sampler, one record each; the sections of a configuration are made from these records.
 
-They stand apart from the kernels because a configuration is read before anything heavy is imported.
+They have a file of their own because a configuration is read before slow imports such as JAX.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class AboutMode(Settings):
     """Settings of all samplers about a mode; see docs/samplers.md."""
 
     mode_search: Literal["once", "per_chain"] = "once"
-    """once: one mode, from the mean of the chains' starts; per_chain: one from the start of each, at as many times the
-    cost, and where they differ chains start about their own."""
+    """once: one search for a mode, from the mean of the chains' starts; per_chain: one search from the start of each
+    chain, which costs more by the number of chains. If the modes differ, each chain starts about its own."""
 
 
 class Laplace(AboutMode):
-    """Draws from the Gaussian with the curvature at the mode: a quick look, approximate."""
+    """Draws from the Gaussian with the curvature at the mode, a fast approximation of the posterior."""
 
 
 class Tuned(AboutMode):
@@ -48,7 +48,7 @@ class Tuned(AboutMode):
 
 
 class Hmc(Tuned):
-    """Hamiltonian Monte Carlo in coordinates whitened at the mode, trajectories of a quarter turn."""
+    """Hamiltonian Monte Carlo in coordinates whitened at the mode, with trajectories of a quarter turn."""
 
 
 class Nuts(Tuned):
@@ -59,9 +59,9 @@ class Nuts(Tuned):
 
 
 class Smc(Tuned):
-    """Particles tempered from a broad Gaussian into the posterior; chains start there and go on as with hmc."""
+    """Particles move from a broad Gaussian to the posterior; chains start at some of them and continue as with hmc."""
 
     particles: Count = 128
-    """At least as many as chains. Many: they are what finds several modes and weighs them."""
+    """Number of particles, at least that of the chains. Many particles find several modes and weigh them."""
     spread: Annotated[float, Field(strict=True, ge=1)] = 2.0
-    """How much wider than Laplace's approximation the first distribution is."""
+    """The factor by which the first distribution is wider than Laplace's approximation."""

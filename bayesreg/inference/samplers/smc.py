@@ -1,4 +1,4 @@
-"""Sequential Monte Carlo: particles tempered from a broad Gaussian into the posterior, where chains go on."""
+"""Sequential Monte Carlo: particles move from a broad Gaussian to the posterior, and chains start at some of them."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from bayesreg.types import AnyArray, InputError
 
 _log = logging.getLogger(__name__)
 
-# Trajectories of each particle at each temperature; the share of the particles that a rise of the inverse temperature
-# leaves effective; how many are moved at once; the most temperatures.
+# Trajectories of each particle at each temperature; the share of the particles that remain effective after a rise of
+# the inverse temperature; the number of particles moved at once; the greatest number of temperatures.
 _MOVES, _SHARE, _BATCH, _MOST = 2, 0.7, 32, 500
 
 
 def smc(target: Target, settings: Smc) -> Sampler:
-    """Adaptive tempered sequential Monte Carlo, whose particles are where chains of `hmc` start.
+    """Make a sampler that starts chains of `hmc` at particles of adaptive tempered sequential Monte Carlo.
 
-    Particles drawn from Laplace's approximation π₀, widened, are reweighted, resampled and moved by the kernel of `hmc`
-    along π₀^(1−β) π^β, β rising from 0 to 1. Modes that the broad Gaussian reaches then hold particles in proportion to
-    their mass, up to the noise of so many. Chains start at a resampled few and go on with `hmc`, which leaves the
-    posterior unchanged: it, not the tempering, is what makes the draws exact.
+    The particles are drawn from Laplace's approximation π₀, widened. They are reweighted, resampled and moved by the
+    kernel of `hmc` along π₀^(1−β) π^β, while β rises from 0 to 1. The modes that the broad Gaussian reaches then hold
+    particles in proportion to their mass, up to Monte Carlo noise. Chains start at resampled particles and continue
+    with `hmc`. The draws are exact because `hmc` leaves the posterior unchanged, not because of the tempering.
     """
     particles, spread, target_acceptance = settings.particles, settings.spread, settings.target_acceptance
     chains_of = hmc(target, Hmc(**settings.model_dump(include=set(Hmc.model_fields))))
@@ -63,7 +63,7 @@ def _temper(
     acceptance: float,
     key: AnyArray,
 ) -> tuple[AnyArray, AnyArray]:
-    """Particles and weights at β = 1; from one temperature to the next the step size follows the acceptance."""
+    """Compute particles and weights at β = 1; the step size is adapted to the acceptance at each temperature."""
     state, size = adaptive_tempered.init(particles), setup.step_size
     for number in range(_MOST):
         state, rate = _rise(target, data, setup, spread, state, size, jax.random.fold_in(key, number))
@@ -93,13 +93,13 @@ def _rise(
     size: AnyArray,
     key: AnyArray,
 ) -> tuple[Any, AnyArray]:
-    """Resample, move, and reweight for the next β; and the acceptance of the moves."""
+    """Resample, move and reweight the particles for the next β; return them and the acceptance of the moves."""
     density = whitened_density(target, data, setup)
 
     def broad(xi: AnyArray) -> AnyArray:
         return -0.5 * (xi @ xi) / spread**2
 
-    # The precision of the tempered Gaussian, about which trajectories rotate.
+    # Trajectories rotate about the tempered Gaussian, which has this precision.
     precision = (1 - state.tempering_param) / spread**2 + state.tempering_param
     kernel = adaptive_tempered.build_kernel(
         broad,
