@@ -92,7 +92,7 @@ def find_pose(
         level = _Level.of(fixed, moving, around, kept, size * edge, share)
         # The start from the headers stays at every level: if the headers are right, no other start is nearer.
         given, *others = (level.improve(start) for start in (given, *starts[:most]))
-        # A step of the optimiser may also make it worse.
+        # A step of the optimiser can also make a pose worse, so that the headers stay among the candidates.
         starts = sorted((headers, given, *others), key=level.value, reverse=True)
         best = starts[0]
     information, as_given = level.value(best), level.value(headers)
@@ -177,7 +177,7 @@ class _Level(NamedTuple):
             method.SetMetricSamplingStrategy(method.RANDOM)
             method.SetMetricSamplingPercentage(self.share, 1)
         method.SetInterpolator(SimpleITK.sitkLinear)
-        # One thread adds up in one order: the same images give the same pose to the last bit.
+        # One thread sums in a fixed order, so that the same images give the same pose exactly.
         method.SetNumberOfThreads(1)
         method.SetNumberOfWorkUnits(1)
         return method

@@ -130,7 +130,7 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.
 
 
 def _is_volume(path: Path) -> bool:
-    """Tell a field on a grid from displacements of nodes, by its name."""
+    """Decide by the name of a file whether it holds a field on a grid or displacements of nodes."""
     return not path.name.lower().endswith(NODAL_SUFFIXES)
 
 

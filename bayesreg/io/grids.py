@@ -79,13 +79,13 @@ def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]
 
 
 def is_same_grid(a: Image, b: Image) -> bool:
-    """Tell whether two images share their grid (corners within a tenth of a voxel)."""
+    """Check whether two images have the same grid (corners within a tenth of a voxel)."""
     apart = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
     return a.shape == b.shape and bool(apart <= SAME_GRID * a.voxel_sizes.min())
 
 
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
-    """Raise InputError unless two images share their grid (corners within a tenth of a voxel)."""
+    """Raise InputError unless two images have the same grid (corners within a tenth of a voxel)."""
     if a.shape != b.shape:
         raise InputError(
             f"the {names[0]} and the {names[1]} image must share one grid, but have shapes {a.shape} and {b.shape}; "

@@ -9,7 +9,7 @@ import numpy as np
 from bayesreg.image import Image, IntensityScale
 from bayesreg.io.volumes import save_image, write_nifti
 
-# Intensities are multiples of this.
+# Stored intensities are multiples of this.
 LEVEL = 2.0**-12
 
 

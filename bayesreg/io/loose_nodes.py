@@ -76,7 +76,7 @@ def _contract(
 
 
 def may_be_contracted(cells: Int[np.ndarray, "cells 4"], a: int, b: int) -> bool:
-    """Check whether Lk a ∩ Lk b = Lk ab, so that the mesh after contraction of the edge ab is homeomorphic to it before.
+    """Check whether Lk a ∩ Lk b = Lk ab; then contraction of the edge ab gives a homeomorphic mesh.
 
     The mesh is closed by tetrahedra from every boundary face to a point outside. Some edges that violate the condition
     could be contracted as well, such as those of a tetrahedron with one face in the mesh (Dey, Edelsbrunner, Guha and

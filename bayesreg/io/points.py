@@ -291,7 +291,7 @@ def _position(point: Any, path: str) -> list[float]:
 
 
 def _read_tag(text: str, path: str, space: Space | None) -> Points | PointPairs:
-    """Read MNI's tag points: each row has three RAS coordinates per volume, and optionally a weight, ids and a label."""
+    """Read MNI's tag points; a row has three RAS coordinates per volume, and optionally a weight, ids and a label."""
     _require_unsaid(space, path)
     plain = "\n".join("" if line.lstrip().startswith("%") else line for line in text.splitlines())
     volumes, body = re.search(r"Volumes\s*=\s*(\d+)\s*;", plain), re.search(TAG_ROWS, plain)
