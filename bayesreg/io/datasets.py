@@ -257,7 +257,7 @@ def _outstanding(image: Image) -> np.ndarray:
 def _on_grid(
     grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str], anywhere: bool = False
 ) -> Image:
-    """Call `on_grid_of` after `require_forms_taken`."""
+    """Resample an image by `on_grid_of`, after a check by `require_forms_taken`."""
     require_forms_taken(grid, grid_path, image, path, names)
     return on_grid_of(grid, image, names, anywhere)
 

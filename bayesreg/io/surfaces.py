@@ -116,7 +116,7 @@ def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BR
 
 
 def _from_outside_in(labels: Int[np.ndarray, "X Y Z"], names: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Order the labels: solid tissues, first the one with the largest part of the surface, and separately fluids."""
+    """List the labels of the solid tissues, in the order of `tissue_surfaces`, and those of the fluids."""
     fluids = [index for index, name in enumerate(names, start=1) if is_fluid(name)]
     solids = [index for index in range(1, len(names) + 1) if index not in fluids]
     solid = np.isin(labels, solids)

@@ -68,8 +68,8 @@ def apply(
         mean > d) for each distance d. Around the mesh, where nothing is observed, all columns except the coordinates
         are NaN.
     image : path, optional
-        An image, which the posterior mean transforms with linear interpolation, on the grid of the image that shows the
-        other world.
+        An image. The posterior mean transforms it with linear interpolation to the grid of the image of the other
+        world.
     labels : path, optional
         Whole numbers. The output is the most probable label of each voxel, and a folder with the probability of every
         label.
@@ -82,7 +82,7 @@ def apply(
         Treatment of the region around the mesh: the displacement continues harmonically
         (`bayesreg.fem.surroundings`), or values are missing (NaN; label 0; points of a surface are removed).
     like : path, optional
-        An image whose grid images and labels are written on.
+        An image whose grid the output images and labels have.
     far : sequence of float
         The distances d, mm.
     draws : int, optional

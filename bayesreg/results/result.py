@@ -77,7 +77,7 @@ class Result:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the stop rule and the report's rank-normalised R̂ show convergence; None if no rule was set."""
+        """True if the stop rule and the report's rank-normalised R̂ both show convergence; None if no rule was set."""
         return self.run.manifest["stopped"]["converged"]
 
     @property

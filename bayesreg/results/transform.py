@@ -125,16 +125,16 @@ class Transform:
                 yield from pool.map(function, range(first, min(first + side_by_side, len(self.draws))))
 
     def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
-        """Compute the standard deviation, mm, of the Normal number that is added to draws of u at points (see Notes).
+        """Compute the standard deviation of the Normal number that is added to draws of u at points, mm.
 
-        It is zero around the mesh.
+        The notes of `Transform` define it. It is zero around the mesh.
         """
         return np.sqrt(self._unresolved_variance(near, self._drawn_covariance(near)))
 
     def covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
-        """Compute the posterior covariance of u at points, mm² (see Notes), along the axes of the fixed image's world.
+        """Compute the posterior covariance of u at points, mm², along the axes of the fixed image's world.
 
-        It is NaN around the mesh, where nothing is observed.
+        The notes of `Transform` define it. It is NaN around the mesh, where nothing is observed.
         """
         drawn = self._drawn_covariance(near)
         found = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
