@@ -38,7 +38,7 @@ def read_start(path: Path, mesh: TetMesh, pose: Pose) -> Float[np.ndarray, "node
     path : path
         A file of all nodes (`read_displacement`), or a displacement field on a grid. A field is interpolated linearly;
         beyond its grid the values at the border hold. A field maps the fixed image's world to the moving image's world;
-        its pose is removed. Nodal displacements do not include the pose.
+        the pose is then removed. Nodal displacements do not include the pose.
     mesh : TetMesh
     pose : Pose
 
