@@ -1,1 +1,1 @@
-"""Files and native libraries: volumes, meshes, data sets, run folders."""
+"""Code for files and native libraries: volumes, meshes, data sets, run folders."""

@@ -1,4 +1,4 @@
-"""Whether a mesh from a file lies where the labels are, and calls the tissues as they do."""
+"""The check that a mesh from a file agrees with the labels in position and in the order of its tissues."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from bayesreg.io.spaces import LPS
 from bayesreg.mesh import TetMesh
 from bayesreg.types import InputError
 
-# Other readings of a file: its unit in mm, and the axes that may be reversed.
+# The units, in mm, in which the coordinates of a file may be written.
 UNITS = {1.0: "mm", 10.0: "cm", 1000.0: "m"}
-# A mesh of these labels agrees with them in four fifths of its volume, less where tissues are thin; what is reversed in
-# a brain from left to right loses .07 of it.
+# A mesh of these labels agrees with them in four fifths of its volume, or in less if tissues are thin. A brain mesh
+# that is reversed from left to right loses 0.07 of this share.
 LEAST, BETTER = 0.3, 0.05
-# Advice is given where a reading disagrees in so much less of the volume.
+# Another reading is advised if the share of the volume in which it disagrees is below this fraction of the file's own.
 LESS = 0.8
-# How unusual a reading is: of those that agree about as well (an organ is much the same reversed) the most usual is
-# meant. Formats differ by LPS and RAS, and by units; single axes are reversed, and tissues renumbered, by mistake.
+# How unusual a reading is. Several readings can agree about equally well, since an organ is nearly symmetric; then the
+# most usual one is chosen. LPS and RAS, and units, differ between formats. Reversed single axes and renumbered tissues
+# are mistakes, and so less usual.
 COSTS: dict[tuple[int, ...], int] = {(1, 1, 1): 0, tuple(LPS.astype(int).tolist()): 1}
 COST_OF_UNIT, COST_OF_SIGNS, COST_OF_ORDER = 1, 2, 2
 
 
 class _Reading(NamedTuple):
-    """How a file may be read, and the share of the mesh's volume that has the tissue of the labels then."""
+    """A way to read a file, and the share of the mesh's volume whose tissue then agrees with the labels."""
 
     share: float
     unit: float
@@ -38,7 +39,7 @@ class _Reading(NamedTuple):
 
 
 def require_agreement(mesh: TetMesh, tissue: Image, path: str | Path) -> None:
-    """Raise InputError where a mesh does not lie where the labels do, or another reading of it would do so better.
+    """Raise InputError if a mesh disagrees with the labels, or if another reading of its file agrees clearly better.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def require_agreement(mesh: TetMesh, tissue: Image, path: str | Path) -> None:
     tissue : Image
         0 outside, 1 + index into `mesh.names` inside.
     path : path
-        Of the mesh, for the message.
+        The path of the mesh, for the message.
     """
     as_is = tuple(range(len(mesh.names)))
     own = float(np.trace(_volumes(mesh, tissue, 1.0, (1, 1, 1))))
@@ -80,14 +81,17 @@ def _cost(reading: _Reading) -> int:
 
 
 def _best_order(mesh: TetMesh, tissue: Image, unit: float, signs: tuple[int, ...]) -> _Reading:
-    """The reading with the tissues named as the labels are in most of the volume."""
+    """Find the order of the tissues that agrees with the labels in most of the volume."""
     volumes = _volumes(mesh, tissue, unit, signs)
     rows, columns = linear_sum_assignment(-volumes)
     return _Reading(float(volumes[rows, columns].sum()), unit, signs, tuple(columns.tolist()))
 
 
 def _volumes(mesh: TetMesh, tissue: Image, unit: float, signs: tuple[int, ...]) -> Float[np.ndarray, "tissues tissues"]:
-    """Share of the mesh's volume by its tissue and by that of the labels at the centre of each tetrahedron."""
+    """Compute the share of the mesh's volume for each pair of mesh tissue (rows) and label tissue (columns).
+
+    The label is read at the centre of each tetrahedron.
+    """
     centres = mesh.points[mesh.cells].mean(axis=1) * unit * np.array(signs)
     labels = tissue.nearest(centres).astype(int)
     found = np.zeros((len(mesh.names), len(mesh.names) + 1))

@@ -1,4 +1,4 @@
-"""Where a search may begin, by SimpleITK: the pose of an organ between two images, and a field of Demons."""
+"""Starting points of a search, from SimpleITK: the pose of an organ between two images, and a field from Demons."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from bayesreg.io.spaces import LPS, convert_motion
 from bayesreg.pose import Motion, Pose
 from bayesreg.types import InputError
 
-# Lengths are those for a human brain, in mm, and in proportion for other organs.
-# About the organ its surroundings, such as skull and scalp, are compared, too.
+# Lengths hold for a human brain, in mm; for other organs they are scaled in proportion.
+# The comparison includes the organ's surroundings, such as skull and scalp, up to this distance.
 SURROUNDINGS = 15.0
-# Level by level: edge of the voxels, share of them that are looked at, and how many candidates it begins with.
+# For each level: edge of the voxels, share of the voxels that are sampled, and number of candidates at its start.
 LEVELS: tuple[tuple[float, float, int | None], ...] = ((8.0, 1.0, None), (4.0, 1.0, 3), (2.0, 0.5, 1))
-# Degrees about each axis that a head in a scanner or on a table may be turned by, besides none.
+# Rotations about each axis, in degrees, of a head in a scanner or on a table that are tried besides no rotation.
 TURNS = (-25.0, 25.0)
-# Of Demons: voxels that become one, and iterations, level by level.
+# For each level of Demons: factor by which each axis is coarsened, and number of iterations.
 DEMONS = ((4, 200), (2, 100), (1, 50))
 BINS = 32
 ITERATIONS = 200
 
 
 class Alignment(NamedTuple):
-    """A pose and what speaks for it.
+    """A pose and the mutual information that supports it.
 
     Attributes
     ----------
     pose : Pose
     information : float
-        Mutual information of both images about the organ, nats.
+        Mutual information of both images around the organ by this pose, nats.
     as_given : float
-        The same as the headers place the images.
+        Mutual information if the images lie where their headers place them, nats.
     """
 
     pose: Pose
@@ -58,16 +58,17 @@ def find_pose(
 ) -> Alignment:
     """Find the pose by Mattes' mutual information, coarse to fine, from several starts.
 
-    The starts are the headers', and centre on centre, by the grids and by the intensities; each as it is and turned
-    about each axis. The coarsest level compares them all, the others the best and what the headers lead to.
+    The first start places the images by their headers, two more match the centres of the grids and the centres of mass
+    of the intensities. Each is tried without rotation and rotated about each axis. The coarsest level compares all
+    starts; the finer levels compare the best ones and the one from the headers.
 
     Parameters
     ----------
     fixed, moving : Image
     organ : Image
-        Nonzero in the organ, on the grid of the fixed image; it is compared with some millimetres around it.
+        Nonzero in the organ, on the grid of the fixed image. The comparison includes some millimetres around it.
     fixed_ignore, moving_ignore : Image, optional
-        Nonzero where the image of that name is not looked at, on any grid in its world.
+        Nonzero where the image of that name is ignored, on any grid in its world.
 
     Raises
     ------
@@ -76,22 +77,22 @@ def find_pose(
 
     Notes
     -----
-    The same images give the same pose: the points that are looked at are chosen by a fixed seed.
+    The same images give the same pose, since a fixed seed chooses the points that are sampled.
     """
     size = relative_size(np.asarray(organ.voxels) != 0, organ.voxel_volume)
     around = _around(organ, size * SURROUNDINGS)
     kept = None if moving_ignore is None else moving.with_voxels(~ignored_voxels(moving, moving_ignore))
     if fixed_ignore is not None:
         around = around.with_voxels(np.asarray(around.voxels) * ~ignored_voxels(around, fixed_ignore))
-    # Smoothing and the centre of mass know nothing of what is ignored, either.
+    # Smoothing and the centre of mass must not use ignored voxels, either.
     fixed, moving = fill_ignored(fixed, fixed_ignore), fill_ignored(moving, moving_ignore)
     headers = _euler(Pose.identity(), _centre_of(organ))
     starts, given, best = list(_starts(fixed, moving, organ)), headers, headers
     for edge, share, most in LEVELS:
         level = _Level.of(fixed, moving, around, kept, size * edge, share)
-        # From the headers at every level: where they are right, nothing that a coarser level preferred is nearer.
+        # The start from the headers stays at every level: if the headers are right, no other start is nearer.
         given, *others = (level.improve(start) for start in (given, *starts[:most]))
-        # A step of the optimiser may also make it worse.
+        # A step of the optimiser can also make a pose worse, so that the headers stay among the candidates.
         starts = sorted((headers, given, *others), key=level.value, reverse=True)
         best = starts[0]
     information, as_given = level.value(best), level.value(headers)
@@ -103,16 +104,16 @@ def find_pose(
 
 
 def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
-    """The displacement that diffeomorphic Demons find between two aligned images of one contrast.
+    """Find the displacement between two aligned images of one contrast by diffeomorphic Demons.
 
-    On three levels, the field smoothed by 1.5 voxels after each iteration; the histogram of the moving image is first
-    matched to that of the fixed one, since Demons compare intensities. (Vercauteren et al. 2009, "Diffeomorphic demons:
-    efficient non-parametric image registration".)
+    The search has three levels and smooths the field by 1.5 voxels after each iteration. The histogram of the moving
+    image is first matched to that of the fixed image, since Demons compare intensities. (Vercauteren et al. 2009,
+    "Diffeomorphic demons: efficient non-parametric image registration".)
 
     Returns
     -------
     tuple of Image
-        Its x, y and z components, mm, world RAS.
+        The x, y and z components of the displacement, mm, world RAS.
     """
     one, other = (to_itk(image, "float32") for image in (fixed.on_orthogonal_grid(), moving.on_orthogonal_grid()))
     other = SimpleITK.Resample(other, one, SimpleITK.Transform(), SimpleITK.sitkLinear, 0.0)
@@ -132,7 +133,7 @@ def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
 
 
 def _thinned(image: SimpleITK.Image, factor: int) -> SimpleITK.Image:
-    """Every so many voxels of the smoothed image."""
+    """Smooth an image and keep every n-th voxel along each axis, with n the factor."""
     if factor == 1:
         return image
     sd = [factor / 2 * size for size in image.GetSpacing()]
@@ -150,7 +151,7 @@ def _starts(fixed: Image, moving: Image, organ: Image) -> Iterator[SimpleITK.Eul
 
 
 class _Level(NamedTuple):
-    """Both images on grids of one resolution, and how they are compared."""
+    """Both images on grids of one resolution, and the options of their comparison."""
 
     fixed: SimpleITK.Image
     moving: SimpleITK.Image
@@ -176,13 +177,13 @@ class _Level(NamedTuple):
             method.SetMetricSamplingStrategy(method.RANDOM)
             method.SetMetricSamplingPercentage(self.share, 1)
         method.SetInterpolator(SimpleITK.sitkLinear)
-        # One thread adds up in one order: the same images give the same pose to the last bit.
+        # One thread sums in a fixed order, so that the same images give the same pose exactly.
         method.SetNumberOfThreads(1)
         method.SetNumberOfWorkUnits(1)
         return method
 
     def improve(self, start: SimpleITK.Euler3DTransform) -> SimpleITK.Euler3DTransform:
-        """The best pose near a start; the start where they do not overlap."""
+        """Find the best pose near a start; return the start if the images do not overlap."""
         method, found = self.method(), SimpleITK.Euler3DTransform(start)
         method.SetOptimizerAsRegularStepGradientDescent(self.edge / 2, 1e-3 * self.edge, ITERATIONS, 0.6)
         method.SetOptimizerScalesFromPhysicalShift()
@@ -194,7 +195,7 @@ class _Level(NamedTuple):
         return found
 
     def value(self, transform: SimpleITK.Euler3DTransform) -> float:
-        """Mutual information, nats; 0 where the images do not overlap."""
+        """Compute the mutual information, nats; 0 if the images do not overlap."""
         method = self.method()
         method.SetInitialTransform(SimpleITK.Euler3DTransform(transform), inPlace=True)
         try:
@@ -204,13 +205,16 @@ class _Level(NamedTuple):
 
 
 def _around(organ: Image, distance: float) -> Image:
-    """The organ and its surroundings."""
+    """Mark the organ and its surroundings up to a distance, mm."""
     away = ndimage.distance_transform_edt(np.asarray(organ.voxels) == 0, organ.voxel_sizes)
     return organ.with_voxels((away <= distance).astype(np.uint8))
 
 
 def _coarser(image: Image, edge: float, order: int) -> Image:
-    """The image on orthogonal axes with voxels of about this edge, mm; smoothed first, unless by nearest voxels."""
+    """Resample an image on orthogonal axes with voxels of about this edge, mm.
+
+    The image is smoothed first, unless the order is 0 (nearest voxels).
+    """
     sizes, wanted = image.voxel_sizes, np.maximum(image.voxel_sizes, edge)
     if order:
         blur = np.where(wanted > sizes, wanted / sizes / 2, 0.0)
@@ -232,7 +236,7 @@ def _mass_centre(image: Image) -> Float[np.ndarray, "3"]:
 
 
 def _euler(pose: Pose, centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTransform:
-    """A motion of RAS as ITK's of LPS, with its centre of rotation."""
+    """Convert a motion in RAS to ITK's transform in LPS with a given centre of rotation."""
     lps, about = convert_motion(pose.matrix), centre * LPS
     found = SimpleITK.Euler3DTransform()
     found.SetCenter(about.tolist())
@@ -242,7 +246,7 @@ def _euler(pose: Pose, centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTrans
 
 
 def _pose(transform: SimpleITK.Euler3DTransform) -> Pose:
-    """The motion of RAS of one of ITK."""
+    """Convert ITK's transform in LPS to a motion in RAS."""
     found = np.eye(4)
     found[:3, :3] = np.array(transform.GetMatrix()).reshape(3, 3)
     centre = np.array(transform.GetCenter())

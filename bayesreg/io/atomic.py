@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: a killed process leaves the old content in place."""
+"""Writers of files that appear complete or not at all: if the process is killed, the old content stays."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ import numpy as np
 
 from bayesreg.types import AnyArray, InputError
 
-# How the names of files begin that are not whole yet.
+# The names of files that are not complete yet begin with this.
 PARTIAL = ".partial-"
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside a file, which replaces it when the block ends well and is removed when it does not."""
+    """Provide a temporary path beside a file; it replaces the file if the block succeeds and is removed otherwise."""
     path = Path(path)
-    # The name's end stays, since writers choose the format by it.
+    # The suffix stays, since writers choose the format by it.
     temporary = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
     try:
         yield temporary
@@ -39,22 +39,22 @@ def save_arrays(path: str | Path, arrays: Mapping[str, AnyArray]) -> None:
 
 
 def load_arrays(path: str | Path, advice: str) -> dict[str, np.ndarray]:
-    """Read an .npz file; InputError, with advice on what to do then, where it is none or damaged."""
+    """Read an .npz file; raise InputError with this advice if it is damaged or of another format."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             return dict(archive)
     except (zipfile.BadZipFile, zlib.error, EOFError, TypeError, ValueError) as error:
-        # A TypeError: NumPy opens a lone array (.npy) under this name, too.
+        # TypeError: NumPy also opens a single array (.npy) under this name, which cannot become a dict.
         raise InputError(f"{path} is damaged or no .npz file ({error}); {advice}") from error
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON in one step; NumPy values become plain ones, and numbers that are not finite become null."""
+    """Write JSON in one step; NumPy values become plain values, and numbers that are not finite become null."""
     write_text(path, json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_json(path: str | Path) -> Any:
-    """Read JSON; InputError names the file where it is damaged."""
+    """Read a JSON file; raise InputError if it is damaged."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:

@@ -1,4 +1,4 @@
-"""Cavities that fTetWild leaves inside a mesh by mistake, filled."""
+"""Removal of the cavities that fTetWild leaves inside a mesh by mistake."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from bayesreg.mesh import boundary_faces_of, signed_volumes
 def without_cavities(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]
 ) -> tuple[Float[np.ndarray, "all_nodes 3"], Int[np.ndarray, "all_cells 4"]]:
-    """A mesh with its small cavities filled.
+    """Fill the small cavities of a mesh.
 
-    fTetWild takes for outside what has a low winding number, and its inner surfaces are locally turned inside
-    out: then a few tetrahedra that touch one are missing. Such a hole gets a node in its middle, unless it is a
-    single tetrahedron. One that has no point in sight of all its walls stays open.
+    fTetWild treats regions with a low winding number as outside. If its inner surfaces are locally turned inside out, a
+    few tetrahedra at such a surface are missing. A cavity gets a node in its middle, unless a single tetrahedron fills
+    it. A cavity stays open if no point inside it sees all its faces.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def without_cavities(
     Returns
     -------
     points, cells
-        The given ones first.
+        The given points and cells first, then the new ones.
     """
     faces = boundary_faces_of(cells)
     part = _surface_parts(faces)
@@ -40,7 +40,10 @@ def without_cavities(
 
 
 def _surface_parts(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces"]:
-    """Number of the closed surface of each face; surfaces that meet along an edge, of four faces then, are two."""
+    """Number the closed surfaces and return the number for each face.
+
+    Two surfaces that touch along an edge, which then has four faces, count as two.
+    """
     edges = np.sort(faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2), axis=1)
     _, edge, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
     order = np.argsort(edge, kind="stable")
@@ -52,7 +55,7 @@ def _surface_parts(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces"
 def _fill(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], walls: Int[np.ndarray, "walls 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with the hole between walls filled, their normals pointing into it."""
+    """Fill the cavity between faces (`walls`) whose normals point into it."""
     corners = np.unique(walls)
     if len(corners) == 4:
         last = np.setdiff1d(corners, walls[0])
@@ -66,7 +69,7 @@ def _fill(
 
 
 def _middle(points: Float[np.ndarray, "nodes 3"], walls: Int[np.ndarray, "walls 3"]) -> Float[np.ndarray, "3"]:
-    """The point deepest inside all walls: centre of the largest ball between their planes."""
+    """Compute the centre of the largest ball between the planes of the faces (`walls`) of a cavity."""
     a, b, c = np.moveaxis(points[walls], 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Blocks of draws and the last state of a run, from which one that was cut off goes on."""
+"""Blocks of draws and the last state of a run, from which an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ STATE, DRAWS = "state.npz", "draws"
 
 
 def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:
-    """Write one block of draws in one step; a block of the same index is replaced."""
+    """Write one block of draws in one step; replace a block of the same index."""
     with writing(folder) as place:
         save_arrays(place(_block_name(index)), arrays)
 
 
 class StoredBlocks:
-    """The first blocks of draws in draws/ of a run folder, each read when it is asked for; see `save_block`.
+    """The first `count` blocks of draws in draws/ of a run folder; each is read when it is needed (see `save_block`).
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class StoredBlocks:
     Raises
     ------
     InputError
-        If one is missing or, when it is asked for, damaged.
+        If a block is missing or, when it is read, damaged.
     """
 
     def __init__(self, folder: str | Path, count: int) -> None:
@@ -52,7 +52,7 @@ class StoredBlocks:
         return (self[index] for index in range(self.count))
 
     def append(self, block: Mapping[str, AnyArray], /) -> None:
-        """Write one block more."""
+        """Write one more block of draws."""
         save_block(self.folder, self.count, block)
         self.count += 1
 
@@ -62,26 +62,26 @@ def _block_name(index: int) -> str:
 
 
 def save_state(folder: str | Path, arrays: Mapping[str, AnyArray], stage: Stage | None = None) -> None:
-    """Replace state.npz, what the next block starts from, in one step; the run may come to another stage with it."""
+    """Replace state.npz, from which the next block starts, in one step; optionally set the run's stage with it."""
     with writing(folder, stage) as place:
         save_arrays(place(STATE), arrays)
 
 
 def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
-    """The content of state.npz; None where no chain has started yet."""
+    """Read state.npz; return None if no chain has started yet."""
     return load_arrays(require_file(folder, STATE), ANEW) if is_listed(folder, STATE) else None
 
 
 def remove_blocks(folder: str | Path) -> None:
-    """Remove draws/ of a run whose results are complete; state.npz stays, from which it can be continued."""
+    """Remove draws/ of a run whose results are complete; keep state.npz, from which the run can continue."""
     drop(folder, DRAWS)
     shutil.rmtree(Path(folder) / DRAWS, ignore_errors=True)
 
 
 def reopen(folder: str | Path, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
-    """Make of a finished run one that was cut off after these blocks, which hold all its draws.
+    """Turn a finished run into an interrupted run that stopped after these blocks, which hold all its draws.
 
-    Killed between any two of its steps, it leaves a finished run, or what it is to leave.
+    If the process is killed between two steps, the folder holds either the finished run or the interrupted one.
     """
     state = load_arrays(require_file(folder, STATE), ANEW)
     kept = StoredBlocks(folder, 0)

@@ -1,4 +1,4 @@
-"""Anatomies to register: MNI152 from nilearn's wheel, BrainWeb and Colin27, and one's own, from files."""
+"""Anatomies to register: MNI152 from nilearn's package, BrainWeb with Colin27, and anatomies from a user's files."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ __all__ = ["Anatomy", "brainweb", "check_same_grid", "check_same_space", "from_f
 _log = logging.getLogger(__name__)
 
 BRAINWEB_INTRACRANIAL = (1, 2, 3, 8)
-# Gaps in an organ that is found by its brightness are closed by a ball of this radius, mm.
+# Radius, mm, of the ball that closes gaps in an organ that was segmented by its brightness.
 CLOSING = 3.0
-# How far the skull lies from the brain mask of the skull-stripped MNI152, mm.
+# Distance of the skull from the brain mask of the skull-stripped MNI152, mm.
 MNI152_SKULL = 3.0
-# Its grid ends so many voxels beyond the skull.
+# The grid of MNI152 ends this number of voxels beyond the skull.
 MNI152_MARGIN = 8
 
 
 class Anatomy(NamedTuple):
-    """One organ: an image, its tissues, and where it may be.
+    """One organ: an image, its tissues, and the region in which the organ must stay.
 
     Attributes
     ----------
     image : Image or None
-        None where there is none.
+        None if the anatomy has no image.
     tissue : Image
         int8 on the grid of the image: 0 outside, 1 + index into the names inside.
     intracranial : Image or None
-        uint8 on the grid of the image, 1 inside the skull; None where it is not known.
+        uint8 on the grid of the image, 1 inside the skull; None if the skull is not known.
     names : tuple of str
         Names of the tissues.
     """
@@ -57,13 +57,13 @@ class Anatomy(NamedTuple):
 
 
 def mni152() -> Anatomy:
-    """The MNI152 (ICBM 2009a, symmetric, 1 mm) that ships with nilearn; no network.
+    """Load the MNI152 (ICBM 2009a, symmetric, 1 mm) that ships with nilearn; needs no network.
 
     The T1, in [0, 1], is stripped of its skull. The tissue is the likeliest of GM, WM and the rest (CSF) inside
     the brain mask; the intracranial mask is the brain mask dilated by 3 mm.
     Fonov et al., "Unbiased average age-appropriate atlases for pediatric studies", 2011.
     """
-    # Takes seconds to import, and only this anatomy needs it.
+    # nilearn takes seconds to import, and only this anatomy needs it.
     from nilearn import datasets
 
     t1, gm, wm = (
@@ -74,7 +74,7 @@ def mni152() -> Anatomy:
     likelihood = np.stack([1 - gm.voxels - wm.voxels, gm.voxels, wm.voxels])
     tissue = np.where(brain, likelihood.argmax(axis=0) + 1, 0)
     inside = edt.edt(~brain, anisotropy=tuple(t1.voxel_sizes)) <= MNI152_SKULL
-    # Beyond that the image is zero.
+    # Beyond the margin the image is zero.
     some = _box_about(inside, MNI152_MARGIN)
     return Anatomy(
         t1.part(some),
@@ -84,7 +84,7 @@ def mni152() -> Anatomy:
 
 
 def _box_about(mask: np.ndarray, margin: int) -> list[slice]:
-    """The voxels that hold a mask and a margin about it."""
+    """Compute the box of voxels that holds a mask and a margin around it, as slices."""
     box = []
     for axis in range(3):
         known = np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis})))
@@ -97,7 +97,7 @@ def brainweb(
     t1_path: str | Path | None = None,
     intracranial_labels: Sequence[int] = BRAINWEB_INTRACRANIAL,
 ) -> Anatomy:
-    """BrainWeb's label phantom with Colin27, the scan that it was drawn from.
+    """Load BrainWeb's label phantom with Colin27, the scan from which it was made.
 
     Parameters
     ----------
@@ -105,14 +105,14 @@ def brainweb(
         Discrete BrainWeb labels: 1 CSF, 2 GM, 3 WM, 8 glial (counted as GM). The default is
         brainweb_crisp_1mm.nii.gz in the folder that the environment variable BAYESREG_DATA names.
     t1_path : path, optional
-        T1 on the same grid; the default is colin27_t1_1mm_unedited.nii.gz there.
+        T1 on the same grid; the default is colin27_t1_1mm_unedited.nii.gz in the same folder.
     intracranial_labels : sequence of int
         Labels inside the skull; the largest connected part of their union is the intracranial mask.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, lacks a label, the grids differ, or the mask has several large parts.
+        If a file is missing, unreadable or lacks a label, if the grids differ, or if the mask has several large parts.
 
     References
     ----------
@@ -135,31 +135,32 @@ def from_files(
     label_table: LabelTable,
     intracranial_path: str | Path | None = None,
 ) -> Anatomy:
-    """An anatomy of one's own.
+    """Load an anatomy from a user's files.
 
     Parameters
     ----------
     image_path : path, optional
         The fixed image.
     labels_path : path
-        Tissue labels; on another grid than its own the nearest is taken.
+        Tissue labels. If their grid differs from that of the image, the nearest voxel is used.
     label_table : mapping
-        Label values of every tissue by its name, in the order that the mesh will have. Zero, where it is listed, stands
-        for the rest of the intracranial mask.
+        Label values of every tissue by its name, in the order of the mesh's tissues. Zero, if it is listed, stands for
+        the rest of the intracranial mask.
     intracranial_path : path, optional
-        Mask of where the organ may be (`load_mask`), likewise.
+        Mask of the region in which the organ must stay (`load_mask`), on any grid likewise.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, no tissue of the table is there, one lies off the grid of the image, a label
-        is not listed, zero is and there is no mask, or the grids lie apart or are one by the other form of a header.
+        If a file is missing or unreadable, the file holds no tissue of the table, a tissue lies outside the image's
+        grid, a label is not listed, zero is listed without a mask, the grids hardly overlap, or the grids agree only by
+        the form of a header (q-form) that is not used.
     """
     tissue, names = _tissues_there(load_labels(labels_path, label_table, unlisted="refused"), label_table, labels_path)
     image = None
     rest = next((name for name in names if REST in np.atleast_1d(label_table[name])), None)
     if rest is not None:
-        # Until the mask is there its voxels are as those beyond the labels' grid, and the background is neither.
+        # Until the mask is read, the rest equals the voxels beyond the labels' grid (0), and the background is −1.
         index = names.index(rest) + 1
         tissue = tissue.with_voxels(np.select([tissue.voxels == index, tissue.voxels == 0], [0, -1], tissue.voxels))
     if image_path is not None:
@@ -186,9 +187,9 @@ def from_files(
 
 
 def _tissues_there(tissue: Image, table: LabelTable, path: str | Path) -> tuple[Image, tuple[str, ...]]:
-    """Labels without the tissues of a table that none of them belongs to, as tables for many people have some.
+    """Remove the tissues of a table that have no voxel; a table that serves many people can list such tissues.
 
-    The rest of the mask stays: where labels are cropped, it may lie beyond them.
+    The tissue that stands for the rest of the mask stays, since it may lie beyond cropped labels.
     """
     names, present = tissue_names(table), set(np.unique(tissue.voxels).tolist())
     kept = [k for k, name in enumerate(names, start=1) if k in present or REST in np.atleast_1d(table[name])]
@@ -204,20 +205,20 @@ def _tissues_there(tissue: Image, table: LabelTable, path: str | Path) -> tuple[
 
 
 def without_labels(image_path: str | Path, mask_path: str | Path | None = None) -> Anatomy:
-    """An anatomy of one tissue: all that a mask holds, which then also bounds its motion, or what stands out.
+    """Load an anatomy of one tissue: the inside of a mask, which also bounds its motion, or an image's bright part.
 
     Parameters
     ----------
     image_path : path
         The fixed image.
     mask_path : path, optional
-        Without it the organ is what is bright by Otsu's threshold (1979, "A threshold selection method from gray-level
-        histograms"): its largest part, closed by 3 mm and filled. The log says how much that is.
+        Without a mask the organ is the largest part above Otsu's threshold (1979, "A threshold selection method from
+        gray-level histograms"), closed by 3 mm and filled. The log reports its volume.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, the grids lie apart, or nothing stands out.
+        If a file is missing or unreadable, the grids hardly overlap, or no voxel is above the threshold.
     """
     image = _load_fixed(image_path)
     if mask_path is not None:
@@ -232,7 +233,7 @@ def without_labels(image_path: str | Path, mask_path: str | Path | None = None) 
 
 
 def _load_fixed(path: str | Path) -> Image:
-    """The image whose grid is that of the results; on one at right angles where its own is sheared."""
+    """Load the fixed image, whose grid the results have; resample it on orthogonal axes if its grid is sheared."""
     image = load_image(path)
     if image.is_orthogonal:
         return image
@@ -241,7 +242,7 @@ def _load_fixed(path: str | Path) -> Image:
 
 
 def _outstanding(image: Image) -> np.ndarray:
-    """The largest bright part of an image, its gaps closed and its holes filled."""
+    """Find the largest bright part of an image; close its gaps and fill its holes."""
     voxels = SimpleITK.GetImageFromArray(np.asarray(image.voxels, np.float32).transpose(2, 1, 0))
     radius = [max(round(CLOSING / size), 1) for size in image.voxel_sizes]
     bright = SimpleITK.OtsuThreshold(SimpleITK.Median(voxels, [1] * 3), 0, 1)
@@ -256,7 +257,7 @@ def _outstanding(image: Image) -> np.ndarray:
 def _on_grid(
     grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str], anywhere: bool = False
 ) -> Image:
-    """`on_grid_of`; InputError where they share a grid by the form of a header that was not taken."""
+    """Resample an image by `on_grid_of`, after a check by `require_forms_taken`."""
     require_forms_taken(grid, grid_path, image, path, names)
     return on_grid_of(grid, image, names, anywhere)
 
@@ -264,7 +265,7 @@ def _on_grid(
 def require_forms_taken(
     grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]
 ) -> None:
-    """Raise InputError where two images share a grid by the form of a header that was not taken."""
+    """Raise InputError if two images share a grid only by the form of a header (q-form) that is not used."""
     for one, source, taken in ((grid, grid_path, image), (image, path, grid)):
         other = read_grid(source).other
         if other is not None and is_same_grid(Image(one.voxels, other), taken):

@@ -1,4 +1,4 @@
-"""Displacements from files: of the nodes of a mesh (.npz, .vtu), or a field on a grid."""
+"""Readers of displacements: of the nodes of a mesh (.npz, .vtu), or a field on a grid."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from bayesreg.mesh import TetMesh
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 
-# Files of displacements of the nodes of a mesh; all others hold a field on a grid.
+# Files with these suffixes hold displacements of the nodes of a mesh; all other files hold a field on a grid.
 NODAL_SUFFIXES = (".npz", ".vtu")
 IDENTITY = Pose.identity()
-# A field ends where zeros beside a place take away more than this of it, mm.
+# A field ends at a point if zeros in the voxels beside the point reduce the displacement by more than this, mm.
 ENDS = 0.25
 
 
 def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
-    """Named nodal arrays of a mesh file; InputError where one is missing."""
+    """Read named nodal arrays of a mesh file; raise InputError if one is missing."""
     data = _point_data(Path(path))
     missing = [name for name in names if name not in data]
     if missing:
@@ -31,20 +31,21 @@ def read_point_data(path: str | Path, *names: str) -> list[np.ndarray]:
 
 
 def read_start(path: Path, mesh: TetMesh, pose: Pose) -> Float[np.ndarray, "nodes 3"]:
-    """A displacement of every node to start from, from a file of all nodes or a displacement field on a grid, mm.
+    """Read the displacement of every node, mm, from which a search starts.
 
     Parameters
     ----------
     path : path
-        A field on a grid is interpolated linearly, and beyond it goes on as at its border. It leads from one world to
-        the other; nodes of a file (`read_displacement`) to where the pose has laid the moving image.
+        A file of all nodes (`read_displacement`), or a displacement field on a grid. A field is interpolated linearly;
+        beyond its grid the values at the border hold. A field maps the fixed image's world to the moving image's world;
+        the pose is then removed. Nodal displacements do not include the pose.
     mesh : TetMesh
     pose : Pose
 
     Raises
     ------
     InputError
-        As `read_displacement` and `bayesreg.io.fields.load_displacement`.
+        As in `read_displacement` and `bayesreg.io.fields.load_displacement`.
     """
     if not _is_volume(path):
         return read_displacement(path, mesh)
@@ -53,18 +54,18 @@ def read_start(path: Path, mesh: TetMesh, pose: Pose) -> Float[np.ndarray, "node
 
 
 def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarray, "nodes 3"]:
-    """A displacement of every node: array "u" of an .npz file, or "u" or "u_mean" of a .vtu mesh, mm.
+    """Read the displacement of every node, mm: array "u" or "u_mean" of an .npz file or a .vtu mesh.
 
     Parameters
     ----------
     path : path
     mesh : TetMesh, optional
-        Whose nodes the displacement must fit; None where there is no mesh yet.
+        The displacement must have one row per node of this mesh; None if there is no mesh yet.
 
     Raises
     ------
     InputError
-        If the file holds none, or one for another mesh.
+        If the file holds no displacement, or one for another mesh.
     """
     data = load_arrays(path, "give another file") if path.suffix == ".npz" else _point_data(path)
     found = [data[name] for name in ("u", "u_mean") if name in data]
@@ -87,7 +88,7 @@ def require_displacement(path: Path, mesh: TetMesh | None = None) -> None:
 
 
 def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.ndarray, "boundary 3"]:
-    """Displacement of the boundary nodes from a file of all nodes (.npz, .vtu) or a displacement field on a grid.
+    """Read the displacement of the boundary nodes from a file of all nodes (.npz, .vtu) or a field on a grid.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.
     ------
     InputError
         If the file holds no displacement or one for another mesh, the field's grid does not reach the boundary,
-        or the field ends there: it jumps to zero.
+        or the field jumps to zero at the boundary.
     """
     if not _is_volume(path):
         return read_displacement(path, mesh)[mesh.boundary]
@@ -115,7 +116,8 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.
         )
     defined = components[0].with_voxels(np.any([np.asarray(one.voxels) != 0 for one in components], axis=0) * 1.0)
     found = np.stack([np.asarray(one.interpolate(places)) for one in components], axis=1)
-    # Zeros beside a place halve what is interpolated there, unless the field itself goes to zero.
+    # Zeros beside a point reduce the interpolated value by the share of nonzero voxels; a field that decreases
+    # smoothly to zero has small values there.
     share = np.maximum(np.asarray(defined.interpolate(places)), 1e-9)
     ends = np.linalg.norm(found, axis=1) * (1 - share) / share > ENDS
     if ends.any():
@@ -128,7 +130,7 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.
 
 
 def _is_volume(path: Path) -> bool:
-    """Tell a field on a grid from displacements of nodes, by its name."""
+    """Decide by the name of a file whether it holds a field on a grid or displacements of nodes."""
     return not path.name.lower().endswith(NODAL_SUFFIXES)
 
 

@@ -1,4 +1,4 @@
-"""The region to mesh, Ω, and its tissues, from a tissue map and an intracranial mask."""
+"""The region to mesh, Ω, and its tissues, computed from a tissue map and an intracranial mask."""
 
 from __future__ import annotations
 
@@ -20,17 +20,20 @@ _log = logging.getLogger(__name__)
 
 
 class MeshError(InputError):
-    """Labels cannot be meshed, or a mesh does not stand for its labels."""
+    """The error for labels that cannot be meshed, or for a mesh that does not represent its labels."""
 
 
 def relative_size(mask: Bool[np.ndarray, "X Y Z"], voxel_volume: float) -> float:
-    """The size of a body beside a human brain: the ratio of the cube roots of the volumes; 0.07 for a mouse's brain."""
+    """Compute the size of a body relative to a human brain: the cube root of the ratio of the volumes.
+
+    A mouse's brain gives 0.07.
+    """
     volume = max(int(np.count_nonzero(mask)), 1) * voxel_volume
     return float(np.cbrt(volume / BRAIN_VOLUME))
 
 
 def size_of_solid(tissue: Image, names: Sequence[str] = BRAIN) -> float:
-    """`relative_size` of the tissues that are no fluid."""
+    """Compute the `relative_size` of the solid tissues."""
     solid = [index for index, name in enumerate(names, start=1) if not is_fluid(name)]
     return relative_size(np.isin(np.asarray(tissue.voxels), solid), tissue.voxel_volume)
 
@@ -38,17 +41,17 @@ def size_of_solid(tissue: Image, names: Sequence[str] = BRAIN) -> float:
 def mesh_domain(
     tissue: Image, intracranial: Image | None = None, closing: float = BRAIN_CLOSING, names: Sequence[str] = BRAIN
 ) -> Image:
-    """The region Ω: the hull of the solid tissues, inside the intracranial mask.
+    """Compute the region Ω: the hull of the solid tissues, inside the intracranial mask.
 
-    Where there is a fluid (`bayesreg.tissues.is_fluid`), the hull is the solid tissues closed by a ball, so that
-    ventricles and sulci belong to it. Its holes are filled.
+    If the tissues include a fluid (`bayesreg.tissues.is_fluid`), the hull is the solid tissues closed by a ball, so
+    that it includes ventricles and sulci. Holes of the hull are filled.
 
     Parameters
     ----------
     tissue : Image
         0 outside, 1 + index into the names inside.
     intracranial : Image, optional
-        Nonzero inside the skull, on the grid of the tissue map; without it nothing bounds the hull.
+        Nonzero inside the skull, on the grid of the tissue map. Without it nothing bounds the hull.
     closing : float
         Radius of the ball, mm. Exact for affines whose axes are orthogonal.
     names : sequence of str
@@ -62,8 +65,8 @@ def mesh_domain(
     Raises
     ------
     MeshError
-        If there is none of a solid tissue, the intracranial mask is empty or misses them, or a mask has several
-        large parts. Parts below 1 % of a mask are left out, and the log says so.
+        If a solid tissue has no voxel, the intracranial mask is empty or excludes more than half of the solid tissues,
+        or a mask has several large parts. Parts below 1 % of a mask are removed, and the log reports them.
     """
     voxels = np.asarray(tissue.voxels)
     solid_names = {index: name for index, name in enumerate(names, start=1) if not is_fluid(name)}
@@ -81,19 +84,19 @@ def mesh_domain(
                 f"more than half of {' and '.join(map(label_of, solid_names.values()))} lies outside the intracranial "
                 "mask; do the two belong together?"
             )
-    # The skull may cut the hull, and what it cuts off may leave holes.
+    # The intracranial mask may cut the hull and so leave separate parts and holes.
     return tissue.with_voxels(_fill(main_part(hull, "region to mesh")).astype(np.uint8))
 
 
 def domain_labels(tissue: Image, domain: Image, names: Sequence[str] = BRAIN) -> Image:
-    """Tissue of every voxel of Ω, int8: 0 outside, 1 + index into the names inside.
+    """Label the tissue of every voxel of Ω, int8: 0 outside, 1 + index into the names inside.
 
-    What has no label in Ω is the first fluid, or where there is none the nearest tissue.
+    A voxel of Ω without a label becomes the first fluid or, if there is no fluid, the nearest tissue.
 
     Raises
     ------
     MeshError
-        If a tissue is missing.
+        If a tissue has no voxel in Ω.
     """
     labels = np.where(np.asarray(domain.voxels) != 0, labels_everywhere(tissue, names).voxels, 0).astype(np.int8)
     missing = [name for index, name in enumerate(names, start=1) if not (labels == index).any()]
@@ -103,7 +106,7 @@ def domain_labels(tissue: Image, domain: Image, names: Sequence[str] = BRAIN) ->
 
 
 def labels_everywhere(tissue: Image, names: Sequence[str]) -> Image:
-    """The tissue map without zeros: they become the first fluid, or where there is none the nearest tissue."""
+    """Replace the zeros of a tissue map by the first fluid or, if there is no fluid, by the nearest tissue."""
     voxels = np.asarray(tissue.voxels)
     fluid = next((index for index, name in enumerate(names, start=1) if is_fluid(name)), None)
     if fluid is not None:
@@ -114,7 +117,10 @@ def labels_everywhere(tissue: Image, names: Sequence[str]) -> Image:
 
 
 def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X Y Z"]:
-    """The connected part of a mask that is all but specks; MeshError if it is empty or has several large parts."""
+    """Return the main connected part of a mask, without parts below 1 % of it.
+
+    Raise MeshError if the mask is empty or has several large parts.
+    """
     parts, count = ndimage.label(mask)
     if count == 0:
         raise MeshError(f"the {name} is empty")
@@ -131,10 +137,10 @@ def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X
 
 
 def without_ridges(intracranial: Image) -> Image:
-    """The intracranial mask by the majority of each voxel's surroundings, its largest part.
+    """Smooth the intracranial mask by the majority around each voxel, and keep its largest part.
 
-    Drawn or classified voxel by voxel, a mask has ridges and pits a voxel wide that no skull has. A Gaussian of one
-    voxel decides; walls thinner than two voxels go with the ridges.
+    A mask that was drawn or classified voxel by voxel has ridges and pits of one voxel that no skull has. The majority
+    is weighted by a Gaussian of one voxel. Parts of the mask thinner than two voxels vanish, too.
     """
     inside = ndimage.gaussian_filter((np.asarray(intracranial.voxels) != 0).astype(float), 1.0) > 0.5
     return intracranial.with_voxels(main_part(inside, "intracranial mask").astype(np.uint8))
@@ -146,7 +152,7 @@ def _intracranial_part(tissue: Image, intracranial: Image) -> Bool[np.ndarray, "
 
 
 def _close(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: float) -> Bool[np.ndarray, "X Y Z"]:
-    """Dilated, then eroded by a ball (mm); the surroundings of the grid count as empty."""
+    """Dilate, then erode a mask by a ball (radius in mm); voxels beyond the grid count as empty."""
     box = ndimage.find_objects(mask.astype(np.int8))[0]
     margin = [(n, n) for n in np.ceil(radius / voxel_sizes).astype(int) + 1]
     near = np.pad(mask[box], margin)
@@ -158,6 +164,6 @@ def _close(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: flo
 
 
 def _fill(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
-    """The mask and its holes: what cannot be reached from beyond the grid."""
+    """Fill the holes of a mask, which are the empty voxels that have no connection to the outside of the grid."""
     parts, _ = ndimage.label(~np.pad(mask, 1))
     return (parts != parts[0, 0, 0])[1:-1, 1:-1, 1:-1]

@@ -1,4 +1,4 @@
-"""Displacement fields on a grid, in files, by the conventions of those who write them."""
+"""Files of displacement fields on a grid, by the conventions of the programs that write them."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from bayesreg.io.volumes import write_nifti
 from bayesreg.types import AnyArray, InputError
 
 TRANSFORM_SUFFIXES = (".h5", ".tfm")
-# Codes of NIfTI's intents: displacement vectors, as FreeSurfer has them in RAS; vectors, as ITK has them in LPS; and
-# FSL's, in coordinates of its own.
+# Codes of NIfTI's intents: displacement vectors (FreeSurfer, RAS), vectors (ITK, LPS), and FSL's fields, which have
+# FSL's own coordinates.
 DISPLACEMENT_INTENT, VECTOR_INTENT, FSL_INTENTS = 1006, 1007, range(2001, 2020)
 
 
@@ -31,8 +31,8 @@ def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affin
     path : path
         Ends in .nii or .nii.gz.
     field : (X, Y, Z, 3) array
-        Displacement at every voxel centre, mm, world RAS. The file holds it as (X, Y, Z, 1, 3) with intent
-        1007 (vector), its values in LPS.
+        Displacement at every voxel centre, mm, world RAS. The file has the shape (X, Y, Z, 1, 3), the intent 1007
+        (vector), and values in LPS.
     affine : (4, 4) array
         Voxel index to world RAS, mm.
     """
@@ -43,10 +43,10 @@ def save_displacement(path: str | Path, field: Float[AnyArray, "X Y Z 3"], affin
 def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
     """Read a displacement field; the inverse of `save_displacement`.
 
-    A NIfTI header tells who has written it. ITK and ANTs (intent 1007, or none) have displacements in LPS; FreeSurfer
-    (intent 1006) and NiftyReg ("NREG_TRANS", first parameter 1) have them in RAS; SPM (named "Mapping") and NiftyReg
-    (first parameter 0) have the places in RAS where the voxels go, from which the displacement is taken. NRRD,
-    MetaImage and ITK's transforms (.h5, .tfm) hold LPS.
+    A NIfTI header shows which program wrote the file. ITK and ANTs (intent 1007, or none) store displacements in LPS.
+    FreeSurfer (intent 1006) and NiftyReg ("NREG_TRANS", first parameter 1) store displacements in RAS. SPM (named
+    "Mapping") and NiftyReg (first parameter 0) store the RAS coordinates to which the voxels move; the displacement is
+    computed from them. NRRD, MetaImage and ITK's transforms (.h5, .tfm) hold LPS.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
     Raises
     ------
     InputError
-        If there is no such file, it is no field or damaged, or is of a kind that is not known.
+        If the file does not exist, is damaged, holds no field, or holds a field of an unknown kind.
     """
     path = Path(path)
     volume = _transform_field(path) if path.name.lower().endswith(TRANSFORM_SUFFIXES) else read_volume(path)
@@ -85,7 +85,7 @@ def load_displacement(path: str | Path) -> tuple[Image, Image, Image]:
 def _displacements(
     vectors: Float[np.ndarray, "X Y Z 3"], grid: Image, volume: Volume, path: Path
 ) -> Float[np.ndarray, "X Y Z 3"]:
-    """In world RAS, mm, by what the header says of the vectors."""
+    """Convert the vectors of a file to displacements in world RAS, mm, according to its header."""
     if not isinstance(volume.header, nib.Nifti1Header):
         return vectors * LPS
     code, name = int(volume.header["intent_code"]), str(volume.header.get_intent("code")[2])
@@ -102,7 +102,7 @@ def _displacements(
 
 
 def _whole_field(transform: SimpleITK.Transform) -> SimpleITK.Image:
-    """The displacement of one of ITK's transforms; of a composite one on the grid of the field that it holds."""
+    """Compute the displacement field of an ITK transform; a composite is evaluated on the grid of its one field."""
     if transform.GetName() != "CompositeTransform":
         return SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
     parts = SimpleITK.CompositeTransform(transform)
@@ -118,7 +118,7 @@ def _whole_field(transform: SimpleITK.Transform) -> SimpleITK.Image:
 
 
 def _transform_field(path: Path) -> Volume:
-    """The displacement field of one of ITK's transforms."""
+    """Read the displacement field of a file with an ITK transform."""
     if not path.is_file():
         raise InputError(f"displacement field {path}: there is no such file")
     try:

@@ -1,4 +1,4 @@
-"""Boundary nodes pulled to a distance from the skull, without inverting a tetrahedron."""
+"""Displacement of boundary nodes to a distance from the skull without inverting a tetrahedron."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from bayesreg.io.quality import mean_ratio
 from bayesreg.mesh import TetMesh
 
 LEAST_MEAN_RATIO = 0.1
-# Beyond the gap asked for, mm: rounding must not lose it again.
+# Nodes move this much further than the gap, mm, so that rounding does not undo it.
 MARGIN = 0.01
 
 
 def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
-    """The mesh with every boundary node at least `gap` from the forbidden region.
+    """Move the boundary nodes of a mesh to a distance of at least `gap` from the forbidden region.
 
-    Nodes that are too near move along the gradient of the distance. Where that would spoil a tetrahedron
-    (mean ratio below 0.1, or below its present one), they move part of the way, the interior nodes around are
-    smoothed, and they go on.
+    Nodes that are too near move along the gradient of the distance. If a full step would give a tetrahedron a mean
+    ratio below 0.1, or below its present one, the node moves part of the way. Then the interior nodes around it are
+    smoothed, and the node moves on.
 
     Parameters
     ----------
     mesh : TetMesh
     distance : Image
-        Signed distance to the forbidden region, mm, positive outside it, as `signed_distance` makes it.
+        Signed distance to the forbidden region, mm, positive outside it, from `signed_distance`.
     gap : float
-        mm.
+        Least distance, mm.
 
     Raises
     ------
     MeshError
-        If there is no allowed place, or a node cannot get to one.
+        If there is no allowed point, or a node cannot reach one.
     """
     points = mesh.points.copy()
     moving = mesh.boundary[_sample(distance, points[mesh.boundary]) < gap]
@@ -55,7 +55,7 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
 
 
 def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: float) -> Float[np.ndarray, "n 3"]:
-    """The points, followed up the gradient of the distance until they are far enough from the skull."""
+    """Move points along the gradient of the distance until they are far enough from the skull."""
     start, points = points, points.copy()
     for _ in range(20):
         value = _sample(distance, points)
@@ -65,13 +65,13 @@ def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: floa
         slope = _gradient(distance, points[near])
         steep = np.maximum((slope**2).sum(axis=1), 0.25)
         points[near] += slope * ((gap + MARGIN - value[near]) / steep)[:, None]
-    # In a crevice of the skull the gradient leads from wall to wall.
+    # In a narrow gap of the skull the gradient leads from one side to the other and back.
     points[near] = _nearest_allowed(distance, start[near], gap)
     return points
 
 
 def _nearest_allowed(distance: Image, points: Float[np.ndarray, "n 3"], gap: float) -> Float[np.ndarray, "n 3"]:
-    """The nearest voxel centres that are far enough from the skull."""
+    """Find the nearest voxel centres that are far enough from the skull."""
     shell = (distance.voxels >= gap + MARGIN) & (distance.voxels < gap + 3 * distance.voxel_sizes.max())
     if not shell.any():
         raise MeshError(f"the intracranial mask is nowhere thick enough for a gap of {gap:g} mm to the skull")
@@ -84,7 +84,7 @@ def _sample(distance: Image, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarr
 
 
 def _gradient(distance: Image, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Central differences over two voxels, wide enough to see past the kinks of a voxelwise distance."""
+    """Compute the gradient by central differences over two voxels, which smooths the kinks of a voxelwise distance."""
     step = distance.voxel_sizes.max() * np.eye(3)
     ahead, behind = (np.stack([_sample(distance, points + sign * e) for e in step], axis=1) for sign in (1, -1))
     return (ahead - behind) / (2 * step[0, 0])
@@ -96,7 +96,7 @@ def _advance(
     moving: Int[np.ndarray, "n"],
     goal: Float[np.ndarray, "n 3"],
 ) -> None:
-    """Move nodes towards their goals, in place, each as far as its tetrahedra stay sound."""
+    """Move nodes towards their goals, in place, each as far as its tetrahedra keep their quality."""
     touched = cells[np.isin(cells, moving).any(axis=1)]
     least = np.minimum(mean_ratio(points, touched), LEAST_MEAN_RATIO)
     start = points[moving]
@@ -111,7 +111,7 @@ def _advance(
 
 
 def _interior_near(mesh: TetMesh, moving: Int[np.ndarray, "n"]) -> Int[np.ndarray, "k"]:
-    """Interior nodes within two rings of tetrahedra around the moving nodes."""
+    """Find the interior nodes within two rings of tetrahedra around the moving nodes."""
     near = _neighbours(mesh.cells, _neighbours(mesh.cells, moving))
     return np.setdiff1d(near, mesh.boundary)
 
@@ -123,7 +123,7 @@ def _neighbours(cells: Int[np.ndarray, "cells 4"], nodes: Int[np.ndarray, "n"]) 
 def _smooth(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], nodes: Int[np.ndarray, "n"]
 ) -> None:
-    """Move nodes to the centre of their neighbours, in place, where that makes their worst tetrahedron better."""
+    """Move nodes to the centre of their neighbours, in place, if that improves their worst tetrahedron."""
     for node in nodes:
         around = cells[(cells == node).any(axis=1)]
         before, old = mean_ratio(points, around).min(), points[node].copy()

@@ -1,4 +1,4 @@
-"""Grids of voxels: what a file says of its own, and whether two images share one; world RAS, mm."""
+"""Grids of voxels: the grid of a file, and tests whether two images share one; world RAS, mm."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from bayesreg.image import Image
 from bayesreg.memory import memory_of_machine
 from bayesreg.types import InputError
 
-# Grids are one where no corner lies further apart than this share of a voxel.
+# Two grids are the same if the distance between their corners is at most this share of a voxel.
 SAME_GRID = 0.1
 
 _log = logging.getLogger(__name__)
 
 
 class Volume(NamedTuple):
-    """What a file holds.
+    """The voxels and the affine of a file.
 
     Attributes
     ----------
     voxels : (X, Y, Z, ...) array
-        The file's scale of intensities applied. Components of vectors are the last axis.
+        Values after the file's intensity scale. Components of vectors are the last axis.
     affine : (4, 4) array
         Voxel index to world RAS, mm.
     header : object
-        That of nibabel; None where SimpleITK has read the file.
+        The header from nibabel; None if SimpleITK read the file.
     """
 
     voxels: np.ndarray
@@ -41,7 +41,7 @@ class Volume(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Where the voxels of a file lie, by its header alone.
+    """The grid of a file, from its header only.
 
     Attributes
     ----------
@@ -49,9 +49,9 @@ class Grid(NamedTuple):
     affine : (4, 4) array
         Voxel index to world RAS, mm.
     other : (4, 4) array or None
-        The q-form of a NIfTI header, where it says something else than the s-form, which is taken.
+        The q-form of a NIfTI header if it differs from the s-form, which is used.
     remarks : tuple of str
-        What a user should know.
+        Messages for the user.
     """
 
     shape: tuple[int, ...]
@@ -61,7 +61,7 @@ class Grid(NamedTuple):
 
 
 def require_memory(shape: Sequence[int], path: Path) -> None:
-    """Raise InputError where a header speaks of more voxels than the machine could hold."""
+    """Raise InputError if the voxels that a header declares need more memory than the machine has."""
     needed = 8 * prod(map(int, shape))
     held = memory_of_machine()
     if needed > held:
@@ -73,19 +73,19 @@ def require_memory(shape: Sequence[int], path: Path) -> None:
 
 
 def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], shape: tuple[int, ...]) -> float:
-    """How far apart two affines place a corner of a grid, at most, mm."""
+    """Compute the largest distance, mm, between the corners of a grid under two affines."""
     corners = np.stack(np.meshgrid(*((0.0, n - 1.0) for n in shape[:3]), indexing="ij"), axis=-1).reshape(-1, 3)
     return float(np.linalg.norm(corners @ (one - other)[:3, :3].T + (one - other)[:3, 3], axis=1).max())
 
 
 def is_same_grid(a: Image, b: Image) -> bool:
-    """Tell whether two images share their grid (corners within a tenth of a voxel)."""
+    """Check whether two images have the same grid (corners within a tenth of a voxel)."""
     apart = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
     return a.shape == b.shape and bool(apart <= SAME_GRID * a.voxel_sizes.min())
 
 
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
-    """Raise InputError unless two images share their grid (corners within a tenth of a voxel)."""
+    """Raise InputError unless two images have the same grid (corners within a tenth of a voxel)."""
     if a.shape != b.shape:
         raise InputError(
             f"the {names[0]} and the {names[1]} image must share one grid, but have shapes {a.shape} and {b.shape}; "
@@ -102,15 +102,17 @@ def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "seco
 def on_grid_of(
     grid: Image, image: Image, names: tuple[str, str] = ("first", "second"), anywhere: bool = False
 ) -> Image:
-    """Labels or a mask on the grid of another image: as they are, or by the nearest voxel, and the log says so.
+    """Resample labels or a mask on the grid of another image by the nearest voxel; the log reports it.
+
+    If the grids are the same, the voxels stay as they are.
 
     Parameters
     ----------
     grid : Image
     image : Image
-        Beyond its own grid it counts as zero.
+        Labels or a mask; zero beyond its own grid.
     names : pair of str
-        What to call them in a message.
+        Names of the two images in a message.
     anywhere : bool
         Whether the image may be a small part of the grid.
 
@@ -145,9 +147,9 @@ def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "sec
     Parameters
     ----------
     a, b : Image
-        On grids of their own.
+        The two images, on any grids.
     names : pair of str
-        What to call them in the message.
+        Names of the two images in the message.
     least : float
         Least fraction of the first image's extent that the second must cover.
     """

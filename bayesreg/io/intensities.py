@@ -1,4 +1,4 @@
-"""Intensities of about [0, 1] in files, two bytes each: rounded far below the noise of images."""
+"""Files of intensities of about [0, 1] in two bytes each; the rounding is far below the noise of images."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from bayesreg.image import Image, IntensityScale
 from bayesreg.io.volumes import save_image, write_nifti
 
-# Intensities are multiples of this.
+# Stored intensities are multiples of this.
 LEVEL = 2.0**-12
 
 
 def in_levels(image: Image) -> Image:
-    """Intensities of about [0, 1], rounded to multiples of `LEVEL`, far below their noise: single precision."""
+    """Round intensities of about [0, 1] to multiples of `LEVEL`, far below their noise; float32."""
     # Whole numbers know no negative zero.
     return image.with_voxels((np.rint(np.asarray(image.voxels) / LEVEL) * LEVEL + 0.0).astype(np.float32))
 
 
 def save_in_levels(image: Image, path: str | Path, scale: IntensityScale | None = None) -> None:
-    """Write intensities of about [0, 1], rounded as by `in_levels`, in two bytes each where that holds them all.
+    """Write intensities of about [0, 1], rounded by `in_levels`, in two bytes each.
 
-    A file of the same image in single precision takes twice as much. With a scale the file has the intensities before
-    that.
+    If two bytes cannot hold the values, they are written as float32, which takes twice the space. If a scale is given,
+    the file holds the intensities before that scale was applied.
     """
     image = in_levels(image)
     levels = np.rint(np.asarray(image.voxels) / LEVEL)

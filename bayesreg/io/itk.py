@@ -1,4 +1,4 @@
-"""Images of SimpleITK: NRRD, MetaImage and DICOM in files, and those in memory; LPS inside, RAS outside."""
+"""Images of SimpleITK in LPS, converted to and from RAS: NRRD, MetaImage and DICOM files, and images in memory."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from bayesreg.io.grids import Grid, Volume, require_memory
 from bayesreg.io.spaces import LPS, convert_affine
 from bayesreg.types import InputError
 
-# What SimpleITK reads and nibabel does not.
+# Suffixes of files that SimpleITK reads and nibabel does not.
 ITK_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd", ".dcm")
-# Slices of a series are evenly spaced where none lies further than this share of their distance from its place.
+# Slices of a series are evenly spaced if each lies within this share of their spacing from its expected position.
 EVEN = 0.02
 
 _log = logging.getLogger(__name__)
 
 
 def is_itk(path: Path) -> bool:
-    """Tell whether SimpleITK reads a file, by its name."""
+    """Decide by its name whether SimpleITK reads a file."""
     return path.name.lower().endswith(ITK_SUFFIXES)
 
 
 def read_grid_by_itk(path: Path) -> Grid:
-    """Where the voxels of a file or of a DICOM series in a folder lie."""
+    """Read the grid of a file or of a DICOM series in a folder."""
     if path.is_dir():
         return _grid_of_series(_names_of_series(path), path)
     header = _itk_header(path)
@@ -37,7 +37,7 @@ def read_grid_by_itk(path: Path) -> Grid:
 
 
 def _itk_header(path: Path) -> Any:
-    """A reader of SimpleITK that has read the header of a file."""
+    """Read the header of a file; return SimpleITK's reader, which holds it."""
     header = SimpleITK.ImageFileReader()
     header.SetFileName(str(path))
     try:
@@ -51,7 +51,7 @@ def _itk_header(path: Path) -> Any:
 
 
 def read_by_itk(path: Path) -> Volume:
-    """Read a file by SimpleITK; InputError where it is damaged, or a single slice of DICOM."""
+    """Read a file by SimpleITK; raise InputError if it is damaged or a single slice of DICOM."""
     header = _itk_header(path)
     try:
         image = header.Execute()
@@ -65,7 +65,7 @@ def read_by_itk(path: Path) -> Volume:
 
 
 def _names_of_series(folder: Path) -> tuple[str, ...]:
-    """The files of the one DICOM series in a folder, in their order."""
+    """List the files of the one DICOM series in a folder, in the order of the slices."""
     series = SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(str(folder))
     if len(series) != 1:
         listed = f": {', '.join(series)}" if series else ""
@@ -79,7 +79,7 @@ def _names_of_series(folder: Path) -> tuple[str, ...]:
 
 
 def _grid_of_series(names: tuple[str, ...], folder: Path) -> Grid:
-    """The grid of slices that are evenly spaced; a gantry tilt becomes a shear of the affine."""
+    """Compute the grid of evenly spaced slices; a gantry tilt becomes a shear of the affine."""
     headers = [_itk_header(Path(name)) for name in names]
     shape, affine = list(headers[0].GetSize()), _affine_of_itk(headers[0])
     if len(names) == 1:
@@ -98,14 +98,14 @@ def _grid_of_series(names: tuple[str, ...], folder: Path) -> Grid:
 
 
 def read_series(folder: Path) -> Volume:
-    """Read the one DICOM series in a folder; InputError where a slice is missing or damaged."""
+    """Read the one DICOM series in a folder; raise InputError if a slice is missing or damaged."""
     names = _names_of_series(folder)
     volume = _series(names, folder)
     return volume._replace(affine=_grid_of_series(names, folder).affine)
 
 
 def _looks_like_dicom(path: Path) -> bool:
-    """By its name, or the four letters that begin its content."""
+    """Decide whether a file is DICOM, by its suffix or by the letters DICM at byte 128."""
     if not path.is_file() or path.name.upper() == "DICOMDIR":
         return False
     if path.name.lower().endswith(".dcm"):
@@ -117,7 +117,7 @@ def _looks_like_dicom(path: Path) -> bool:
 def _series(names: tuple[str, ...], folder: Path) -> Volume:
     reader = SimpleITK.ImageSeriesReader()
     reader.SetFileNames(names)
-    # What it warns of is checked here.
+    # The conditions of SimpleITK's warnings are checked in `_grid_of_series`.
     warns = SimpleITK.ProcessObject.GetGlobalWarningDisplay()
     SimpleITK.ProcessObject.SetGlobalWarningDisplay(False)
     try:
@@ -131,7 +131,7 @@ def _series(names: tuple[str, ...], folder: Path) -> Volume:
 
 
 def _affine_of_itk(image: Any) -> Float[np.ndarray, "4 4"]:
-    """Voxel index to world RAS, mm, of an image of SimpleITK or of a header that it has read."""
+    """Compute the affine from voxel index to world RAS, mm, of a SimpleITK image or header."""
     dimension = image.GetDimension()
     size = min(dimension, 3)
     affine = np.eye(4)
@@ -142,14 +142,14 @@ def _affine_of_itk(image: Any) -> Float[np.ndarray, "4 4"]:
 
 
 def from_itk(image: Any) -> Volume:
-    """What an image of SimpleITK holds."""
+    """Convert a SimpleITK image to a `Volume`."""
     array, dimension = SimpleITK.GetArrayFromImage(image), image.GetDimension()
     axes = (*range(dimension - 1, -1, -1), *range(dimension, array.ndim))
     return Volume(np.ascontiguousarray(array.transpose(axes)), _affine_of_itk(image))
 
 
 def to_itk(image: Image, dtype: str) -> SimpleITK.Image:
-    """An image whose axes are orthogonal."""
+    """Convert an image with orthogonal axes to SimpleITK."""
     found = SimpleITK.GetImageFromArray(np.asarray(image.voxels).astype(dtype).transpose(2, 1, 0))
     affine = convert_affine(image.affine)
     found.SetSpacing(image.voxel_sizes.tolist())

@@ -1,8 +1,9 @@
-"""What stands in the folder of a run: status.json, with the stage it has come to and the SHA-256 of its files.
+"""The record of a run's folder, status.json: the stage of the run and the SHA-256 digests of its files.
 
-A file belongs to a run if it is in the list, and is read only with a content that the list knows. To replace files, the
-new contents are written beside them and announced, each along with the one that stands there; then every file is
-replaced in one step. Whoever dies in between leaves a folder in which each file has one of its two contents, whole.
+A file belongs to a run if status.json lists it. It is read only if its content has a listed digest. To replace files,
+the new contents are first written beside the old ones. Then status.json lists the old and the new digest of each file.
+Then every file is replaced in one step. If the process dies in between, each file has one of its two contents,
+complete.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from bayesreg.types import InputError
 STATUS, LOCK = "status.json", ".lock"
 ANEW = "run anew, into another folder"
 
-# Inputs stand, and a run can be resumed; results stand.
+# "prepared": all inputs are written, and the run can be resumed. "finished": all results are written.
 Stage = Literal["prepared", "finished"]
 
 
@@ -35,9 +36,10 @@ class Status(NamedTuple):
     Attributes
     ----------
     stage : {"prepared", "finished"} or None
-        None until all inputs stand.
+        None until all inputs are written.
     files : mapping
-        Path relative to the folder, with slashes, to the SHA-256 that its content has; to two while it is replaced.
+        From the path of a file, relative to the folder and with slashes, to the SHA-256 of its content; to two digests
+        while the file is replaced.
     """
 
     stage: Stage | None = None
@@ -45,7 +47,7 @@ class Status(NamedTuple):
 
 
 def read_status(folder: str | Path) -> Status | None:
-    """The status of a folder; None where there is none, InputError where it is damaged."""
+    """Read the status of a folder; return None if it has none, and raise InputError if it is damaged."""
     path = Path(folder) / STATUS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -71,7 +73,10 @@ def _leads_out(name: str) -> bool:
 
 
 def _path_of(folder: Path, name: str) -> Path:
-    """The path of a file of a run; InputError where a link leads out of its folder, which may be a stranger's."""
+    """Build the path of a file of a run; raise InputError if a link leads out of the folder.
+
+    The folder may come from another person, whose links must not reach other files.
+    """
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{path} leads out of its folder by a link; put the file itself there")
@@ -79,13 +84,13 @@ def _path_of(folder: Path, name: str) -> Path:
 
 
 def stage_of(folder: str | Path) -> Stage | None:
-    """How far the run in a folder has come; None where there is none, or none whose inputs stand."""
+    """Read the stage of the run in a folder; return None if there is no run or its inputs are incomplete."""
     status = read_status(folder)
     return None if status is None else status.stage
 
 
 def holds_run(folder: str | Path) -> bool:
-    """Whether there is a run in a folder; another program's status.json is none."""
+    """Check whether a folder holds a run; a status.json of another program does not count."""
     try:
         return read_status(folder) is not None
     except InputError:
@@ -93,18 +98,18 @@ def holds_run(folder: str | Path) -> bool:
 
 
 def is_listed(folder: str | Path, name: str) -> bool:
-    """Whether a file belongs to the run in a folder."""
+    """Check whether a file belongs to the run in a folder."""
     status = read_status(folder)
     return status is not None and name in status.files
 
 
 def require_file(folder: str | Path, name: str) -> Path:
-    """The path of a file of a run.
+    """Return the path of a file of a run after a check of its content.
 
     Raises
     ------
     InputError
-        If there is none of that name, or its content is not the one that the run has written.
+        If the run has no file of that name, or its content is not what the run wrote.
     """
     folder = Path(folder)
     status = read_status(folder)
@@ -121,15 +126,15 @@ def require_file(folder: str | Path, name: str) -> Path:
 
 
 def is_sound(folder: str | Path, name: str) -> bool:
-    """Whether a file of a run has the content that the run has written."""
+    """Check whether a file of a run has the content that the run wrote."""
     status = read_status(folder)
     return status is not None and digest_of(Path(folder) / name) in status.files.get(name, ())
 
 
 def require_unchanged(folder: str | Path, but: str) -> None:
-    """Raise InputError where a file of a run, but for one of a name, has not the content that the run has written.
+    """Raise InputError if a file of a run, except the file `but`, has other content than the run wrote.
 
-    Files that are read by other programs alone may be gone.
+    Missing files are allowed, since some are only for other programs.
     """
     folder = Path(folder)
     status = read_status(folder) or Status()
@@ -140,26 +145,26 @@ def require_unchanged(folder: str | Path, but: str) -> None:
 
 @contextmanager
 def writing(folder: str | Path, stage: Stage | None = None) -> Iterator[Callable[[str], Path]]:
-    """Write files of a run, all of which appear when the block ends well, and none if it does not.
+    """Write files of a run; all of them appear if the block succeeds, and none otherwise.
 
     Parameters
     ----------
     folder : path
-        It is made if need be.
+        The folder of the run; it is created if necessary.
     stage : {"prepared", "finished"}, optional
-        Which the run has come to when all of them stand; the same as before where none is given.
+        The stage of the run after all files are written; by default the stage does not change.
 
     Yields
     ------
     callable
-        From the path of a file, relative to the folder, to where its content is to be written.
+        From the path of a file, relative to the folder, to the temporary path where its content is to be written.
     """
     folder, temporaries = Path(folder), dict[str, Path]()
 
     def place(name: str) -> Path:
         target = _path_of(folder, name)
         target.parent.mkdir(parents=True, exist_ok=True)
-        # The name's end stays, since writers choose the format by it.
+        # The suffix stays, since writers choose the format by it.
         temporaries[name] = target.with_name(f"{PARTIAL}{os.getpid()}-{target.name}")
         return temporaries[name]
 
@@ -173,7 +178,7 @@ def writing(folder: str | Path, stage: Stage | None = None) -> Iterator[Callable
 
 def _replace(folder: Path, temporaries: Mapping[str, Path], stage: Stage | None) -> None:
     before = read_status(folder) or Status()
-    # Of a run whose inputs never stood nothing is kept.
+    # If the inputs of an earlier run were never complete, none of its files is kept.
     listed = {} if before.stage is None and stage is not None else before.files
     standing = {name: _standing(folder, name, digests) for name, digests in listed.items()}
     new = {name: (_require_digest(path),) for name, path in temporaries.items()}
@@ -186,7 +191,7 @@ def _replace(folder: Path, temporaries: Mapping[str, Path], stage: Stage | None)
 
 
 def _standing(folder: Path, name: str, digests: tuple[str, ...]) -> tuple[str, ...]:
-    """Tell which of the contents that were announced stands there."""
+    """Find which of the listed digests the file has; the first one if it has none of them."""
     if len(digests) == 1:
         return digests
     found = digest_of(folder / name)
@@ -194,7 +199,7 @@ def _standing(folder: Path, name: str, digests: tuple[str, ...]) -> tuple[str, .
 
 
 def drop(folder: str | Path, within: str) -> None:
-    """Take all files of a subfolder from the list, and then from the disk."""
+    """Remove all files of a subfolder from the list, and then from the disk."""
     folder = Path(folder)
     status = read_status(folder)
     if status is not None:
@@ -206,14 +211,15 @@ def drop(folder: str | Path, within: str) -> None:
 
 @contextmanager
 def locked(folder: str | Path) -> Iterator[None]:
-    """Keep other processes out of a folder, which is made if need be, and clear what a killed one left half-written.
+    """Lock a folder against other processes, and remove the partial files of a killed process.
 
-    The lock is the operating system's, and ends with the process that holds it, however that ends.
+    The folder is created if necessary. The lock belongs to the operating system and ends with the process that holds
+    it, even if that process is killed.
 
     Raises
     ------
     InputError
-        If another process holds it, or nothing can be written there.
+        If another process holds the lock, or the folder is not writable.
     """
     folder = Path(folder)
     lock = FileLock(folder / LOCK, timeout=0, is_singleton=True)
@@ -235,7 +241,10 @@ def locked(folder: str | Path) -> Iterator[None]:
 
 
 def _half_written(folder: Path) -> list[Path]:
-    """What was being written to a folder, but not to those of other runs within it, which may be written to now."""
+    """List the partial files in a folder.
+
+    Folders of other runs within it are excluded, since another process may be writing to them.
+    """
     found = []
     for place, folders, files in os.walk(folder):
         folders[:] = [name for name in folders if not (Path(place, name, LOCK).exists())]
@@ -244,7 +253,7 @@ def _half_written(folder: Path) -> list[Path]:
 
 
 def digest_of(path: Path) -> str | None:
-    """SHA-256 of the content of a file; None where there is none."""
+    """Compute the SHA-256 of the content of a file; return None if there is no such file."""
     try:
         known = path.stat()
         return _digest_of_file(path, known.st_ino, known.st_size, known.st_mtime_ns)
@@ -254,7 +263,7 @@ def digest_of(path: Path) -> str | None:
 
 @lru_cache(maxsize=10_000)
 def _digest_of_file(path: Path, _inode: int, _size: int, _changed: int) -> str:
-    """Taken again where the file system says that the file has changed."""
+    """Compute the SHA-256 of a file again only if its inode, size or modification time has changed."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -1,4 +1,4 @@
-"""Tissue labels to a tetrahedral mesh, and meshes in files."""
+"""Construction of a tetrahedral mesh from tissue labels, and files of meshes."""
 
 from __future__ import annotations
 
@@ -45,26 +45,27 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How to mesh. The defaults give a brain about as many nodes as the paper's (801, 349 on the boundary).
+    """Options of the mesh. The defaults give a brain about as many nodes as in the paper (801, 349 on the boundary).
 
     Attributes
     ----------
     edge_length : float
-        Wanted length of an edge on the boundary, mm.
+        Target length of an edge on the boundary, mm.
     inner_edge_length : float, optional
-        At most this length deep inside, mm; the default is 1.9 edge lengths. Tissue boundaries may make it shorter.
+        Largest length of an edge deep inside, mm; the default is 1.9 edge lengths. Tissue boundaries may make edges
+        shorter.
     envelope : float, optional
-        How far faces may lie from the surfaces of the labels, mm; the default is 0.32 edge lengths.
+        Largest distance of faces from the surfaces of the labels, mm; the default is 0.32 edge lengths.
     skull_gap : float
-        Least distance of the boundary nodes from what lies outside the intracranial mask, mm.
+        Least distance of the boundary nodes from the outside of the intracranial mask, mm.
     closing : float
-        Radius of the closing that makes the hull where there is a fluid, mm.
+        Radius of the closing that makes the hull if the tissues include a fluid, mm.
     stop_energy : float
-        Quality at which fTetWild may stop (AMIPS energy, 3 at best); half as much takes several times as long.
+        Quality at which fTetWild may stop (AMIPS energy, 3 at best). Half this value takes several times as long.
     threads : int
         Threads of fTetWild; 0 for all cores.
     attempts : int
-        fTetWild is not deterministic: how many meshes to try before giving up.
+        Largest number of meshes to try. fTetWild is not deterministic, so that a new attempt can succeed.
     quiet : bool
         Whether to suppress fTetWild's own output.
     """
@@ -101,26 +102,26 @@ def build_mesh(
     domain: Image | None = None,
     names: Sequence[str] = BRAIN,
 ) -> TetMesh:
-    """Mesh an organ: Ω, one tissue per tetrahedron, the boundary nodes clear of the skull.
+    """Mesh the region Ω of an organ, with one tissue per tetrahedron and boundary nodes at a distance from the skull.
 
-    Not deterministic, since fTetWild is not: keep the mesh, do not build it again.
+    The result is not deterministic, since fTetWild is not. Keep the mesh instead of building it again.
 
     Parameters
     ----------
     tissue : Image
         0 outside, 1 + index into the names inside.
     intracranial : Image, optional
-        Nonzero inside the skull, on the same grid; without it nothing bounds the mesh.
+        Nonzero inside the skull, on the same grid. Without it nothing bounds the mesh.
     options : MeshOptions
     domain : Image, optional
-        Ω, where `mesh_domain` has made it already.
+        The region Ω, if `mesh_domain` has already computed it.
     names : sequence of str
         Names of the tissues; the default is those of the brains that the package ships.
 
     Returns
     -------
     TetMesh
-        World RAS, mm.
+        The mesh in world RAS, mm.
 
     Raises
     ------
@@ -146,7 +147,7 @@ def build_mesh(
 def tissue_of_cells(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], labels: Image, samples: int = 6
 ) -> Int[np.ndarray, "cells"]:
-    """The tissue that holds most of each tetrahedron, an index into the names.
+    """Find the tissue that fills most of each tetrahedron, as an index into the names.
 
     Parameters
     ----------
@@ -170,7 +171,7 @@ def save_mesh(
     point_data: Mapping[str, AnyArray] | None = None,
     cell_data: Mapping[str, AnyArray] | None = None,
 ) -> None:
-    """Write a mesh as .vtu, all of it or nothing.
+    """Write a mesh as a .vtu file in one step.
 
     Parameters
     ----------
@@ -185,7 +186,8 @@ def save_mesh(
     Raises
     ------
     InputError
-        If the path ends otherwise, its folder does not exist, or an array has not one row per node or tetrahedron.
+        If the path has another suffix, its folder does not exist, or an array does not have one row per node or
+        tetrahedron.
     """
     import pyvista
 
@@ -200,7 +202,7 @@ def save_mesh(
     for target, arrays in ((grid.point_data, nodal), (grid.cell_data, by_cell)):
         for name, values in arrays.items():
             target[name] = values
-    # UTF-8 bytes between zeros: texts in VTK's files are ASCII.
+    # The names are UTF-8 bytes, separated by zeros, since texts in VTK's files are ASCII.
     grid.field_data[NAMES_FIELD] = np.frombuffer("\0".join(mesh.names).encode(), np.uint8)
     with replacing(path) as temporary:
         save_dataset(grid, temporary)
@@ -215,19 +217,19 @@ def _rows(given: Mapping[str, AnyArray] | None, count: int, what: str) -> dict[s
 
 
 def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
-    """Read a mesh as `save_mesh` writes it.
+    """Read a mesh in the format of `save_mesh`.
 
     Parameters
     ----------
     path : path
     names : sequence of str
-        Names of the tissues, where the file does not say them; the default is those of brains.
+        Names of the tissues if the file has none; the default is those of brains.
 
     Raises
     ------
     InputError
-        If there is no such file, it cannot be read, holds other cells than tetrahedra or none, has no "tissue"
-        per cell, is no valid mesh, or has a tetrahedron twice.
+        If the file does not exist or cannot be read, holds no cells or cells other than tetrahedra, has no "tissue" per
+        cell, is not a valid mesh, or has a tetrahedron twice.
     """
     path = Path(path)
     if not path.is_file():
@@ -253,7 +255,7 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
 
 
 def _require_one_body(mesh: TetMesh, path: Path) -> None:
-    """Raise InputError where tetrahedra lie on one another, as far as their faces tell."""
+    """Raise InputError if tetrahedra overlap, as far as shared nodes and faces show it."""
     cells, times = np.unique(np.sort(mesh.cells, axis=1), axis=0, return_counts=True)
     if (times > 1).any():
         raise InputError(
@@ -289,13 +291,13 @@ def _attempt(
 
 
 def _inner_lattice(samples: int) -> Float[np.ndarray, "points 4"]:
-    """Barycentric coordinates of a regular lattice strictly inside a tetrahedron."""
+    """Compute the barycentric coordinates of a regular lattice strictly inside a tetrahedron."""
     steps = np.array([s for s in product(range(samples), repeat=3) if sum(s) < samples])
     steps = np.column_stack([steps, samples - 1 - steps.sum(axis=1)])
     return (steps + 0.25) / samples
 
 
 def _nearest(labels: Image, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """Label of the voxel nearest to each point."""
+    """Look up the label of the voxel nearest to each point."""
     index = np.clip(np.rint(labels.world_to_voxel(points)).astype(int), 0, np.array(labels.shape) - 1)
     return np.asarray(labels.voxels)[tuple(index.T)].astype(int)

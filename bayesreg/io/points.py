@@ -1,8 +1,8 @@
-"""Points and pairs of points from files: CSV, 3D Slicer's .fcsv and .mrk.json, MNI's .tag; in world RAS, mm.
+"""Readers of points and pairs of points: CSV, 3D Slicer's .fcsv and .mrk.json, MNI's .tag; in world RAS, mm.
 
-A CSV has a header: `fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z` for pairs or `x, y, z` for points,
-and where wanted `sd` (mm) and `name`. It is RAS unless a line `# CoordinateSystem = LPS` says otherwise. The other
-formats say by themselves whether they are LPS or RAS; MNI's is RAS.
+A CSV has a header: `fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z` for pairs or `x, y, z` for points, and
+optionally `sd` (mm) and `name`. It is in RAS unless it has a line `# CoordinateSystem = LPS`. The other formats state
+whether they are in LPS or RAS; MNI's format is in RAS.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from bayesreg.types import InputError
 
 FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
 PLAIN = ("x", "y", "z")
-# Factors that take points in a file's system to RAS.
+# Factors that convert points from a file's coordinate system to RAS.
 SYSTEMS = {**TO_RAS, "0": TO_RAS["RAS"], "1": TO_RAS["LPS"]}
 
 
-# The rows of a tag file: up to the first semicolon outside of quotes.
+# The rows of a tag file end at the first semicolon outside quotes.
 TAG_ROWS = r'Points\s*=((?:"[^"]*"|[^";])*);'
 
 
@@ -41,9 +41,9 @@ class Points(NamedTuple):
     points : (k, 3) array
         World RAS, mm.
     names : tuple of str
-        Empty where a point has none.
+        Empty for a point without a name.
     sd : (k,) array or None
-        Standard deviation of each coordinate, mm, where the file gives it.
+        Standard deviation of each coordinate, mm, if the file gives it.
     """
 
     points: Float[np.ndarray, "k 3"]
@@ -52,7 +52,7 @@ class Points(NamedTuple):
 
 
 class PointPairs(NamedTuple):
-    """Pairs of points that show the same place.
+    """Pairs of points; the two points of a pair mark the same place of the anatomy.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class PointPairs(NamedTuple):
         World RAS, mm.
     names : tuple of str
     sd : (k,) array or None
-        Standard deviation of each coordinate, mm, where the file gives it.
+        Standard deviation of each coordinate, mm, if the file gives it.
     """
 
     fixed: Float[np.ndarray, "k 3"]
@@ -69,12 +69,12 @@ class PointPairs(NamedTuple):
     sd: Float[np.ndarray, "k"] | None = None
 
     def as_arrays(self) -> dict[str, np.ndarray]:
-        """The fields that there are as arrays, for files."""
+        """Convert the fields that are not None to named arrays, for files."""
         return {name: np.asarray(value) for name, value in self._asdict().items() if value is not None}
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PointPairs:
-        """What `as_arrays` made."""
+        """Create pairs from the arrays of `as_arrays`."""
         return cls(arrays["fixed"], arrays["moving"], tuple(arrays["names"].tolist()), arrays.get("sd"))
 
 
@@ -84,7 +84,7 @@ def read_points(path: str | Path) -> Points:
     Raises
     ------
     InputError
-        If the file is missing, of an unknown kind, or something in it is wrong.
+        If the file is missing or of an unknown kind, or its content is invalid.
     """
     found = _read(Path(path))
     if isinstance(found, PointPairs):
@@ -100,20 +100,20 @@ def read_side(path: str | Path, side: Literal["fixed", "moving"], space: Space |
     path : path
     side : "fixed" or "moving"
     space : "RAS" or "LPS", optional
-        Of the coordinates of a CSV or .fcsv that does not say it; the default is RAS.
+        The space of a CSV or .fcsv that does not state it; the default is RAS.
 
     Raises
     ------
     InputError
-        As in `read_points`; if the file says another space; if it looks as ANTs writes points, which are in LPS, and no
-        space is given.
+        As in `read_points`; also if the file states another space, or if it has the columns of ANTs, which writes
+        points in LPS, and no space is given.
     """
     found = _read(Path(path), space)
     return Points(getattr(found, side), found.names, found.sd) if isinstance(found, PointPairs) else found
 
 
 def write_table(path: str | Path, columns: Mapping[str, Sequence[Any]]) -> None:
-    """Write columns of one length as CSV, in one step; numbers with six decimals."""
+    """Write columns of equal length as CSV, in one step; numbers have six decimals."""
     lines = io.StringIO()
     writer = csv.writer(lines, lineterminator="\n")
     writer.writerow(columns)
@@ -130,13 +130,14 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
     path : path
         Both points of each pair (CSV, or a .tag of two volumes), or the points in the fixed image.
     moving : path, optional
-        The points in the moving image: those of the same names where all names differ and are the same in both files,
-        else in the same order. Names that differ within each file and agree in part alone are an error.
+        The points in the moving image. They are paired by name if the names are unique in each file and both files have
+        the same names. They are paired in order if names repeat or the files share no name. Unique names of which only
+        some agree are an error.
 
     Raises
     ------
     InputError
-        If a file is missing, of an unknown kind, or something in it is wrong; if the files do not fit each other.
+        If a file is missing or of an unknown kind, its content is invalid, or the files do not fit each other.
     """
     found = _read(Path(path))
     if isinstance(found, PointPairs):
@@ -154,7 +155,7 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
 
 
 def _order(found: Points, other: Points, files: str) -> list[int]:
-    """Where the partner of each point stands in the other file."""
+    """Find the index in the other file of the partner of each point."""
     names, others = found.names, other.names
     unique = len(set(names)) == len(names) and len(set(others)) == len(others)
     shared = set(names) & set(others) - {""}
@@ -290,7 +291,7 @@ def _position(point: Any, path: str) -> list[float]:
 
 
 def _read_tag(text: str, path: str, space: Space | None) -> Points | PointPairs:
-    """MNI's tag points: one row of three coordinates for each volume, RAS, and perhaps weights, ids and a label."""
+    """Read MNI's tag points; a row has three RAS coordinates per volume, and optionally a weight, ids and a label."""
     _require_unsaid(space, path)
     plain = "\n".join("" if line.lstrip().startswith("%") else line for line in text.splitlines())
     volumes, body = re.search(r"Volumes\s*=\s*(\d+)\s*;", plain), re.search(TAG_ROWS, plain)
@@ -312,7 +313,7 @@ def _read_tag(text: str, path: str, space: Space | None) -> Points | PointPairs:
 
 
 def _tag_row(line: str, wanted: int, where: str) -> tuple[list[float], str]:
-    """Coordinates and label of a row; a weight and two ids may stand between them, and a comment at the end."""
+    """Read the coordinates and the label of a row; a weight, two ids and a comment are optional and ignored."""
     numbers, *quoted = re.split(r'"([^"]*)"', line)
     if "%" in numbers:
         numbers, quoted = numbers.partition("%")[0], []
@@ -327,7 +328,7 @@ def _tag_row(line: str, wanted: int, where: str) -> tuple[list[float], str]:
 
 
 def _space_of(text: str, space: Space | None, path: str) -> str:
-    """The space that a file names, or else the one that is given, or else RAS."""
+    """Choose the space that a file names, or else the given one, or else RAS."""
     named = _named_system(text, "", path)
     if named in SYSTEMS and space and not np.array_equal(SYSTEMS[named], SYSTEMS[space]):
         raise InputError(f"{path} says that its coordinates are {named}, and {space} is given: leave the space out")
@@ -340,7 +341,7 @@ def _require_unsaid(space: Space | None, path: str) -> None:
 
 
 def _named_system(text: str, default: str, path: str) -> str:
-    """The coordinate system that a line such as `# CoordinateSystem = LPS` names."""
+    """Read the coordinate system from a line such as `# CoordinateSystem = LPS`."""
     comments = "\n".join(re.findall(r"^\s*#.*$", text, re.MULTILINE))
     named = re.findall(r"Coordinate\s*System\s*[=:]\s*(.*?)[\s,]*$", comments, re.MULTILINE | re.IGNORECASE)
     if not named and re.search(r"\bLPS\b|Coordinate\s*System", comments, re.IGNORECASE):

@@ -1,4 +1,4 @@
-"""Is a mesh sound, and does it stand for its labels?"""
+"""Checks of a mesh: its topology, the shapes of its tetrahedra, and the volumes of its tissues."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from bayesreg.mesh import TetMesh, signed_volumes
 
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 LEAST_MEAN_RATIO = 0.05
-# Volumes may be off by this times edge length over the cube root of the volume of Ω: an interface is known
-# to within a fraction of an edge length, and what is thinner than that is lost.
+# The largest error of a volume, relative to the volume of Ω, is this times the edge length over the cube root of that
+# volume: the mesh shows an interface to within a fraction of an edge length, and loses thinner parts.
 VOLUME_TOLERANCE = 0.75
 
 
 class MeshQuality(NamedTuple):
-    """Figures of a mesh.
+    """The measured qualities of a mesh.
 
     Attributes
     ----------
     nodes, cells, boundary_nodes : int
     genus : int
-        Handles of the boundary surface; 0 for a ball.
+        Number of handles of the boundary surface; 0 for a ball.
     edge_length : float
-        Median, mm.
+        Median length of the edges, mm.
     mean_ratio : float
-        Least 12 (3V)^(2/3) / Σ l² over the tetrahedra; 1 is regular, 0 flat.
+        Least 12 (3V)^(2/3) / Σ l² over the tetrahedra; 1 is regular, 0 is flat.
     median_mean_ratio : float
     dihedral_angle : float
         Least angle between two faces of a tetrahedron, degrees.
     tissue_cells : dict
         Number of tetrahedra by tissue name.
     tissue_volumes, label_volumes : dict
-        mm³ by tissue name, in the mesh and in the labels.
+        Volumes in the mesh and in the labels, mm³, by tissue name.
     volume_tolerance : float
-        What the difference of the two may be, mm³.
+        Largest allowed difference of the two volumes, mm³.
     """
 
     nodes: int
@@ -58,14 +58,14 @@ class MeshQuality(NamedTuple):
 
 
 def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
-    """Check a mesh against the labels that it was made of, and measure it.
+    """Check a mesh against the labels from which it was made, and measure its quality.
 
     Parameters
     ----------
     mesh : TetMesh
-        Positively oriented, which its making has checked.
+        The mesh; its construction has checked the orientation of the tetrahedra.
     labels : Image
-        Tissue in Ω and 0 outside, as `domain_labels` makes it; 1 + index into the mesh's names.
+        0 outside Ω, 1 + index into the mesh's names inside, from `domain_labels`.
 
     Returns
     -------
@@ -74,9 +74,9 @@ def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
     Raises
     ------
     MeshError
-        If the mesh has several parts, its boundary is not one closed manifold surface, a tetrahedron is
-        nearly flat (mean ratio below 0.05), a tissue has no tetrahedron, or the volume of Ω or a tissue
-        differs from that of its labels by more than 0.75 h |Ω|^(2/3), h the median edge length.
+        If the mesh has several parts, its boundary is not one closed manifold surface, a tetrahedron is nearly flat
+        (mean ratio below 0.05), a tissue has no tetrahedron, or the volume of Ω or a tissue differs from that of its
+        labels by more than 0.75 h |Ω|^(2/3), with h the median edge length.
     """
     genus = check_topology(mesh)
     ratio = mean_ratio(mesh.points, mesh.cells)
@@ -90,7 +90,7 @@ def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
 
 
 def check_topology(mesh: TetMesh) -> int:
-    """The genus of the boundary of a mesh.
+    """Check the topology of a mesh, and return the genus of its boundary.
 
     Raises
     ------
@@ -102,7 +102,10 @@ def check_topology(mesh: TetMesh) -> int:
 
 
 def mean_ratio(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> Float[np.ndarray, "cells"]:
-    """Shape of every tetrahedron, 12 (3V)^(2/3) / Σ l²: 1 regular, 0 flat or inverted (Liu and Joe, 1994)."""
+    """Compute the mean ratio of every tetrahedron, 12 (3V)^(2/3) / Σ l² (Liu and Joe, 1994).
+
+    A regular tetrahedron has 1; a flat or inverted one has 0.
+    """
     volume = np.maximum(signed_volumes(points, cells), 0)
     return 12 * np.cbrt(3 * volume) ** 2 / (edge_lengths(points, cells) ** 2).sum(axis=1)
 
@@ -110,7 +113,7 @@ def mean_ratio(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cel
 def edge_lengths(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]
 ) -> Float[np.ndarray, "cells 6"]:
-    """Lengths of the edges of every tetrahedron, mm."""
+    """Compute the lengths of the edges of every tetrahedron, mm."""
     ends = points[cells[:, EDGES]]
     return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
 
@@ -118,7 +121,7 @@ def edge_lengths(
 def dihedral_angles(
     points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]
 ) -> Float[np.ndarray, "cells 6"]:
-    """Angles between the faces of every tetrahedron, degrees."""
+    """Compute the angles between the faces of every tetrahedron, degrees."""
     corner = points[cells]
     # The gradients of the barycentric coordinates are the inward normals of the faces.
     inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])
@@ -135,7 +138,7 @@ def _check_connected(mesh: TetMesh) -> None:
 
 
 def _check_boundary(mesh: TetMesh) -> int:
-    """Genus of the boundary, once it is known to be one closed manifold surface."""
+    """Check that the boundary is one closed manifold surface, and return its genus."""
     faces = mesh.boundary_faces
     half_edges = faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2)
     edges, count = np.unique(np.sort(half_edges, axis=1), axis=0, return_counts=True)
@@ -152,9 +155,12 @@ def _check_boundary(mesh: TetMesh) -> int:
 
 
 def _check_fans(faces: Int[np.ndarray, "faces 3"]) -> None:
-    """Around each node of a manifold, the faces form one ring: corners linked across shared edges stay one part."""
+    """Check that the faces around each boundary node form one ring, as on a manifold.
+
+    Corners of faces are linked across shared edges; the linked corners of a node must be one part.
+    """
     number = np.arange(faces.size).reshape(-1, 3)
-    # Each half-edge (a → b) of one face meets (b → a) of another: their corners at a, and at b, are neighbours.
+    # Each half-edge (a → b) of one face meets (b → a) of another, so that their corners at a and at b are neighbours.
     half = np.concatenate(
         [np.stack([faces[:, i], faces[:, j], number[:, i], number[:, j]], axis=1) for i, j in ((0, 1), (1, 2), (2, 0))]
     )

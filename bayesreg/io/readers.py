@@ -1,4 +1,4 @@
-"""Files that hold volumes, read by nibabel or SimpleITK, and where their voxels lie: world RAS, mm."""
+"""Readers of volumes and their grids by nibabel or SimpleITK; world RAS, mm."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from bayesreg.io.grids import Grid, Volume, corners_apart, require_memory
 from bayesreg.io.itk import is_itk, read_by_itk, read_grid_by_itk, read_series
 from bayesreg.types import InputError
 
-# Millimetres per unit of a NIfTI header; files that name none hold millimetres.
+# Millimetres per unit of a NIfTI header. Files without a unit are in millimetres.
 MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "micron": 1e-3, "meter": 1e3}
-# Two forms of a header say the same where they place no corner further apart than this share of a voxel.
+# Two forms of a header agree if the distance between their corners is at most this share of a voxel.
 SAME_FORM = 0.1
-# How far rounding may take a unit quaternion's square above one.
+# The largest excess over one, due to rounding, of the squared norm of a unit quaternion.
 ROUNDED = 1e-5
 
 _log = logging.getLogger(__name__)
@@ -34,13 +34,13 @@ class _LaxHeader(nib.Nifti1Header):
 
 
 class _LaxNifti(nib.Nifti1Image):
-    """NIfTI whose quaternion may be rounded up, which nibabel's own refuses."""
+    """A NIfTI image whose quaternion may be rounded up, which nibabel's own class refuses."""
 
     header_class = _LaxHeader
 
 
 def read_volume(path: str | Path) -> Volume:
-    """Read a volume: NIfTI, MGZ and what else nibabel knows; NRRD, MetaImage and DICOM by SimpleITK.
+    """Read a volume: NIfTI, MGZ and other formats by nibabel; NRRD, MetaImage and DICOM by SimpleITK.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def read_volume(path: str | Path) -> Volume:
     Raises
     ------
     InputError
-        If there is no such file, it cannot be read, is damaged or cut short, or a series has gaps.
+        If the file does not exist, cannot be read, is damaged or cut short, or a series has gaps.
     """
     path = Path(path)
     if _is_folder(path):
@@ -65,7 +65,7 @@ def read_volume(path: str | Path) -> Volume:
 
 
 def read_grid(path: str | Path) -> Grid:
-    """Read where the voxels of a volume lie, and no voxel; InputError as in `read_volume`."""
+    """Read the grid of a volume without its voxels; raise InputError as in `read_volume`."""
     path = Path(path)
     if _is_folder(path) or is_itk(path):
         return read_grid_by_itk(path)
@@ -73,7 +73,7 @@ def read_grid(path: str | Path) -> Grid:
 
 
 def _is_folder(path: Path) -> bool:
-    """Tell a folder from a file; InputError where there is neither, or it may not be read."""
+    """Check whether a path is a folder; raise InputError if it does not exist or may not be read."""
     try:
         folder, there = path.is_dir(), path.exists()
     except OSError as error:
@@ -93,7 +93,7 @@ def _open(path: Path) -> SpatialImage:
             if "w2 should be positive" not in str(error):
                 raise
             source = _LaxNifti.from_filename(path)
-    except Exception as error:  # Its readers have no common class of errors.
+    except Exception as error:  # The readers of nibabel have no common class of errors.
         raise InputError(f"image {path} cannot be read: {_first_line(error)}") from error
     if not isinstance(source, SpatialImage) or source.affine is None:
         raise InputError(f"{path} holds no image on a grid, but {type(source).__name__}")
@@ -104,7 +104,7 @@ def _open(path: Path) -> SpatialImage:
 
 
 def _shape(source: SpatialImage) -> tuple[int, ...]:
-    """The shape that a header gives; trailing zeros, which some programs write, are no axes."""
+    """Read the shape from a header, without the trailing zeros that some programs write."""
     shape = tuple(map(int, source.shape))
     while len(shape) > 3 and shape[-1] == 0:
         shape = shape[:-1]
@@ -132,7 +132,7 @@ def _grid_of(source: SpatialImage) -> Grid:
 
 
 def _unit(header: Any) -> tuple[str, bool]:
-    """The unit of lengths, and whether its code is known."""
+    """Read the unit of lengths, and whether its code is known."""
     try:
         return str(header.get_xyzt_units()[0]), True
     except KeyError:
@@ -140,7 +140,7 @@ def _unit(header: Any) -> tuple[str, bool]:
 
 
 def _qform(header: Any) -> Float[np.ndarray, "4 4"] | None:
-    """The q-form; None where it has no inverse."""
+    """Read the q-form; return None if it has no inverse."""
     try:
         found = np.asarray(header.get_qform(), float)
     except ValueError:
@@ -155,7 +155,11 @@ def _is_regular(affine: Float[np.ndarray, "4 4"]) -> bool:
 def _choose_form(
     sform: Float[np.ndarray, "4 4"], qform: Float[np.ndarray, "4 4"] | None, shape: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"] | None, list[str]]:
-    """The s-form and, where it differs, the q-form; the q-form alone where the s-form has no inverse."""
+    """Choose the affine of a header that has both forms.
+
+    The result is the s-form, and the q-form if it differs; only the q-form if the s-form has no inverse. Messages for
+    the user come last.
+    """
     if qform is None:
         return sform, None, []
     if not _is_regular(sform):
@@ -177,7 +181,7 @@ def _voxels(source: SpatialImage, path: Path) -> np.ndarray:
     if isinstance(source, nib.Nifti1Image):
         least = source.header.single_vox_offset
         if data.offset < least:
-            # A single file begins with its header, whatever an offset of 0 says.
+            # A single file begins with its header, even if its offset is 0.
             _log.warning("%s: its voxels are said to begin inside the header; read from byte %d on", path, least)
         if data.offset < least or shape != source.shape:
             data = ArrayProxy(str(path), (shape, data.dtype, max(data.offset, least), data.slope, data.inter))
@@ -185,14 +189,14 @@ def _voxels(source: SpatialImage, path: Path) -> np.ndarray:
         if path.name.lower().endswith(".gz"):
             _require_whole(path, int(data.offset) + prod(shape) * data.dtype.itemsize)
         return np.array(np.asarray(data))
-    except Exception as error:  # As above.
+    except Exception as error:  # See `_open`.
         raise InputError(f"image {path}: the file is cut short or damaged ({_first_line(error)})") from error
 
 
 def _require_whole(path: Path, expected: int) -> None:
-    """Read a compressed file to its end, where its checksum stands.
+    """Read a compressed file to its end, so that gzip verifies the checksum there.
 
-    An error of gzip or zlib tells of damage; a ValueError that the file holds much more bytes than expected.
+    Damage causes an error of gzip or zlib. A file that holds many more bytes than expected causes a ValueError.
     """
     count = 0
     with gzip.open(path) as file:

@@ -1,4 +1,4 @@
-"""The inputs and the results of a run, in memory."""
+"""Records of the inputs and the results of a run in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesreg.types import AnyArray
 
 
 class Truth(NamedTuple):
-    """The truth of a synthetic pair.
+    """The true displacement and parameters of a synthetic pair.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Truth(NamedTuple):
     lam, mu : (T,) array
         True Lamé parameters by tissue.
     initial : (n, 3) array or None
-        Centre of the displacements that the chains started from, mm; None for the identity.
+        Centre of the displacements from which the chains started, mm; None for the identity.
     """
 
     u: AnyArray
@@ -36,45 +36,52 @@ class Truth(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Predictions of thinned draws, computed at the end of a run, since they need the posterior itself.
+    """Predictions from thinned draws, computed at the end of a run because they need the posterior.
 
     Attributes
     ----------
     chain_mean : (chains, n, 3) array
-        Mean displacement of every node, mm, chain by chain.
+        Mean displacement of every node for each chain, mm.
     far_mm : scalar
+        A distance, mm, for `far`.
     far : (n,) array
-        P(|u − ū| > far_mm) at every node, ū the posterior mean, what the mesh cannot follow included.
+        P(|u − ū| > far_mm) at every node, with ū the posterior mean. The variance that the mesh cannot resolve is
+        included.
     reach : (n,) array
-        Within which a point at each node lies about its mean place with 95 %, mm; in the same way.
+        Radius of the ball around the mean that holds each displaced node with 95 % probability, mm. The variance that
+        the mesh cannot resolve is included.
     place_names : (L,) array of str
+        Names of the points that the report shows.
     place_points : (L, 3) array
-        World mm, in the fixed image.
+        Coordinates of these points in the fixed image's world, mm.
     place_draws : (chains, draws, L, 3) array
-        Displacement of the places, mm.
+        Displacement of these points, mm.
     motion : (chains, draws, 6) array
-        The rigid part of the displacement of the whole mesh, the pose included: translation of its centre, mm, and
-        rotation about it, a vector in degrees, world RAS.
+        The rigid part of the displacement of the whole mesh, including the pose, world RAS: translation of the mesh's
+        centre, mm, and the rotation vector about the centre, degrees.
     centre : (3,) array
-        That centre, mm, in the fixed image.
+        The mesh's centre in the fixed image's world, mm.
     total_sd : (n, 3) array or None
-        Standard deviation of the displacement of every node along the axes of the moving image's world, mm; None where
-        there is no pose, and these axes are those of the fixed image.
+        Standard deviation of the displacement of every node along the axes of the moving image's world, mm; None
+        without a pose, when these axes are those of the fixed image.
     observations : mapping
-        What each observation leaves for the report, by "<observation>/<array>".
+        The arrays of each observation for the report, by "<observation>/<array>".
     evaluation_names, evaluation_points : (k,), (k, 3) arrays or None
-        Landmarks that were held out: names, and places in the fixed image.
+        Held-out landmarks: their names, and their coordinates in the fixed image's world, mm.
     evaluation_before, evaluation_posed : (k,) arrays or None
-        Their distances, mm, by the headers and by the pose alone.
+        Distances between the two points of each held-out pair, mm, by the headers and by the pose only.
     evaluation_residual, evaluation_covariance : (k, 3), (k, 3, 3) arrays or None
-        Found less predicted by the posterior mean, mm, in the moving image's world, and the covariance of that.
+        The observed point minus its prediction by the posterior mean, mm, in the moving image's world, and the
+        covariance of this difference.
     evaluation_inside : (k,) bool array or None
-        Which lie in the mesh.
+        Whether each held-out landmark lies in the mesh.
     stiffness_mean, stiffness_sd : (m,) array or None
-        Posterior mean and standard deviation of every element's stiffness over its tissue's; None without a field.
+        Posterior mean and standard deviation of the ratio of every element's stiffness to that of its tissue; None
+        without a stiffness field.
     stiffer : scalar or None
+        A ratio, for `stiffer_probability`.
     stiffer_probability : (m,) array or None
-        P(stiffness over the tissue's > stiffer).
+        P(ratio of the element's stiffness to that of its tissue > stiffer).
     """
 
     chain_mean: AnyArray
@@ -101,7 +108,7 @@ class Predicted(NamedTuple):
     stiffer_probability: AnyArray | None = None
 
     def of_observation(self, name: str) -> dict[str, AnyArray]:
-        """What the observation of this name has left."""
+        """Select the arrays of one observation."""
         return {
             key.removeprefix(f"{name}/"): value
             for key, value in self.observations.items()
@@ -110,16 +117,16 @@ class Predicted(NamedTuple):
 
     @property
     def known(self) -> dict[str, AnyArray]:
-        """The entries that there are."""
+        """The entries that are not None, without those of observations."""
         return {name: value for name, value in self._asdict().items() if value is not None and name != "observations"}
 
     def as_arrays(self) -> dict[str, AnyArray]:
-        """All entries as named arrays, for files; those of observations have a slash in their names."""
+        """Collect all entries as named arrays, for files; names of observations' arrays contain a slash."""
         return {**self.known, **self.observations}
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, AnyArray]) -> Predicted:
-        """What `as_arrays` made."""
+        """Create the record from the arrays of `as_arrays`."""
         own = {name: value for name, value in arrays.items() if "/" not in name}
         return cls(**own, observations={name: value for name, value in arrays.items() if "/" in name})
 
@@ -131,16 +138,17 @@ class Predicted(NamedTuple):
 
 
 class Matching(NamedTuple):
-    """How the moving image was brought beside the fixed one before the model saw it.
+    """The preparation of the moving image for comparison with the fixed image.
 
     Attributes
     ----------
     pose : Pose
-        The moving image lies in the world of the fixed one by its inverse.
+        The rigid map from the fixed image's world to the moving image's world; its inverse places the moving image in
+        the fixed image's world.
     one_contrast : bool
-        Whether the intensities of both mean the same.
+        Whether both images have the same contrast.
     scale : IntensityScale or None
-        That of the moving image as the model sees it; None where it was made so.
+        The scale that maps the moving image's intensities to those of the model; None if no scale was applied.
     """
 
     pose: Pose = Pose.identity()
@@ -148,26 +156,26 @@ class Matching(NamedTuple):
     scale: IntensityScale | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """As mappings and lists, for files."""
+        """Convert the record to mappings and lists, for files."""
         pose = np.asarray(self.pose.matrix).tolist()
         return {"pose": pose, "one_contrast": self.one_contrast, "scale": self.scale and list(self.scale)}
 
     @classmethod
     def of_json(cls, given: Mapping[str, Any]) -> Matching:
-        """What `as_json` made."""
+        """Create the record from the mapping of `as_json`."""
         scale = None if given["scale"] is None else IntensityScale(*given["scale"])
         return cls(Pose(np.array(given["pose"])), bool(given["one_contrast"]), scale)
 
 
 class Channel(NamedTuple):
-    """A further pair of images of the same two visits, as the model sees it.
+    """A further pair of images from the same two visits, as the model uses it.
 
     Attributes
     ----------
     fixed, moving : Image
-        In the world of the fixed image of the first pair, on their scales of intensities.
+        The images in the world of the first pair's fixed image, with scaled intensities.
     one_contrast : bool
-        Whether the intensities of both mean the same.
+        Whether both images have the same contrast.
     """
 
     fixed: Image
@@ -176,7 +184,7 @@ class Channel(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """The inputs of a run, which a resumed run must find unchanged.
+    """The inputs of a run, which must not change when the run is resumed.
 
     Attributes
     ----------
@@ -184,20 +192,19 @@ class Inputs(NamedTuple):
         The resolved configuration, YAML.
     mesh : TetMesh
     fixed, moving : Image or None
-        As the model saw them, in one world and on their scales of intensities; None where no images were observed.
+        The images as the model uses them, in one world and with scaled intensities; None without observed images.
     tissue : Image
-        Tissue labels on a grid of the fixed space, 0 outside, 1 + index into `mesh.names` inside.
+        Tissue labels on a grid in the fixed image's world, 0 outside, 1 + index into `mesh.names` inside.
     skull : Image or None
-        Nonzero where no sampled node may go.
+        Nonzero in the region that sampled nodes must not enter.
     truth : Truth or None
     boundary : (b, 3) array or None
-        Displacement of the boundary nodes, mm, where it is known and not sampled.
+        Displacement of the boundary nodes, mm, if it is known and not sampled.
     observed : mapping
-        Arrays that were read for each observation, by its name, and those of landmarks that were held out, as
-        "evaluation"; as they were given.
+        The arrays of each observation by its name, as given, and those of held-out landmarks as "evaluation".
     matching : Matching
     fixed_ignore, moving_ignore : Image or None
-        Not zero where the image of that name says nothing, each in the world of the fixed image.
+        Nonzero where the image of that name is ignored; both in the fixed image's world.
     channels : mapping
         Further pairs of images, by the name of the observation.
     """
@@ -219,7 +226,7 @@ class Inputs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A finished run in memory; its draws travel beside it.
+    """A finished run in memory, without its draws.
 
     Attributes
     ----------
@@ -231,11 +238,11 @@ class Run:
     u_mean, u_sd : (n, 3) array
         Posterior mean and standard deviation of the displacement of every node, mm.
     warped : Image or None
-        Moving image resampled on the fixed grid by the posterior mean; None without images.
+        The moving image, resampled on the fixed grid by the posterior mean; None without images.
     metrics : dict or None
-        The content of metrics.json, where the truth is known.
+        The content of metrics.json, if the truth is known.
     predicted : Predicted or None
-        The content of predicted.npz; None for runs of versions that wrote none.
+        The content of predicted.npz; None for a run of a version that did not write this file.
     """
 
     config: str
@@ -260,5 +267,5 @@ class Run:
 
     @property
     def background(self) -> Image:
-        """The image that maps are drawn on: the fixed one, or where there is none the tissue map."""
+        """The background image of maps: the fixed image or, without one, the tissue map."""
         return self.tissue if self.fixed is None else self.fixed

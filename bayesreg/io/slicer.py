@@ -1,4 +1,4 @@
-"""Scenes and points for 3D Slicer: an index of files (.mrml, XML) beside these, and markups (.mrk.json)."""
+"""Files for 3D Slicer: scenes (.mrml, an XML index of the files beside it), and points as markups (.mrk.json)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCHEMA = (
 
 
 class Item(NamedTuple):
-    """A file of a scene.
+    """One file of a scene.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class Item(NamedTuple):
         "volume", "transform", "model" or "markups".
     name : str
     file : str
-        Beside the scene.
+        The name of the file, in the folder of the scene.
     transform : str
-        The name of an earlier item of the kind "transform" that carries this one; empty for none.
+        The name of an earlier item of the kind "transform" that Slicer applies to this item; empty for none.
     colour : tuple
-        Of a model: red, green, blue and opacity.
+        Red, green, blue and opacity of a model, each in [0, 1].
     """
 
     kind: str
@@ -43,7 +43,7 @@ class Item(NamedTuple):
     colour: tuple[float, float, float, float] = (0.8, 0.8, 0.8, 1.0)
 
 
-# By kind: the elements of the node and of its storage, and the classes behind them.
+# For each kind: the XML element and the class of its node, and those of its storage.
 ELEMENTS = {
     "volume": ("Volume", "vtkMRMLScalarVolumeNode", "VolumeArchetypeStorage", "vtkMRMLVolumeArchetypeStorageNode"),
     "transform": ("Transform", "vtkMRMLTransformNode", "TransformStorage", "vtkMRMLTransformStorageNode"),
@@ -60,7 +60,7 @@ DISPLAYS = {
 
 
 def write_scene(path: str | Path, items: Sequence[Item]) -> None:
-    """Write a scene whose items lie beside it, in one step."""
+    """Write a scene in one step; the files of its items must be in the same folder."""
     scene = ET.Element("MRML", version="Slicer5.0.0", userTags="")
     transforms: dict[str, str] = {}
     for number, item in enumerate(items, start=1):
@@ -84,7 +84,7 @@ def write_scene(path: str | Path, items: Sequence[Item]) -> None:
 
 
 def write_markups(path: str | Path, names: Sequence[str], points: Float[np.ndarray, "k 3"]) -> None:
-    """Write points, world RAS mm, as a .mrk.json file."""
+    """Write named points, world RAS, mm, as a .mrk.json file."""
     controls = [
         {"id": str(number), "label": name, "position": (point * LPS).tolist(), "positionStatus": "defined"}
         for number, (name, point) in enumerate(zip(names, points, strict=True), start=1)

@@ -1,4 +1,4 @@
-"""The inputs and the results of a run in its folder; what is read has the content that was written (`ledger`)."""
+"""Writers and readers of a run's folder; readers verify that files have the content that was written (`ledger`)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RESULTS = (
 
 
 def require_fresh(folder: str | Path) -> None:
-    """Raise InputError where a folder (or a file in its place) already holds a run, or cannot be written."""
+    """Raise InputError if a path is a file, or a folder that holds a run, lies in a run's folder or is not writable."""
     folder = Path(folder)
     nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if folder.is_symlink() and not folder.exists():
@@ -46,18 +46,18 @@ def require_fresh(folder: str | Path) -> None:
         )
 
 
-# From the name of a file of a run, relative to its folder, to where it is to be written (`ledger.writing`).
+# A function from the path of a file, relative to the run's folder, to the temporary path of `ledger.writing`.
 Place = Callable[[str], Path]
 
 
 def write_inputs(place: Place, inputs: Inputs) -> None:
-    """Write config.yaml, mesh.vtu and what is in inputs/, where they have their places."""
+    """Write config.yaml, mesh.vtu and the files in inputs/."""
     labels = {name: getattr(inputs, name) for name in ("tissue", "skull", "fixed_ignore", "moving_ignore")}
     saved: list[Future] = []
     images = {"fixed": inputs.fixed, "moving": inputs.moving}
     for name, channel in inputs.channels.items():
         images |= {f"channel-{name}-fixed": channel.fixed, f"channel-{name}-moving": channel.moving}
-    # The compression lets other threads run.
+    # Compression releases the interpreter's lock, so that threads run in parallel.
     with ThreadPoolExecutor() as pool:
         for save, given in ((save_image, labels), (save_in_levels, images)):
             for name, image in given.items():
@@ -74,20 +74,20 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
     channels = {name: channel.one_contrast for name, channel in inputs.channels.items()}
     write_json(place("inputs/matching.json"), inputs.matching.as_json() | {"channels": channels})
     save_mesh(inputs.mesh, place("inputs/mesh.vtu"))
-    # Where it is looked for, too; results come beside it there.
+    # Users look for mesh.vtu here; later the results are added to this file.
     save_mesh(inputs.mesh, place("mesh.vtu"))
     write_text(place("config.yaml"), inputs.config)
 
 
 def write_observed(place: Place, observed: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Write inputs/observed.npz, arrays named "<observation>/<array>", if there are any."""
+    """Write inputs/observed.npz, with arrays named "<observation>/<array>", if there are any arrays."""
     named = {f"{name}/{key}": value for name, arrays in observed.items() for key, value in arrays.items()}
     if named:
         save_arrays(place("inputs/observed.npz"), named)
 
 
 def read_inputs(folder: str | Path) -> Inputs:
-    """Read what `write_inputs` wrote; InputError where a part is missing or damaged."""
+    """Read the files of `write_inputs`; raise InputError if a file is missing or damaged."""
     config = require_file(folder, "config.yaml").read_text(encoding="utf-8")
     mesh = load_mesh(require_file(folder, "inputs/mesh.vtu"))
     tissue = load_image(require_file(folder, "inputs/tissue.nii.gz"))
@@ -134,16 +134,16 @@ def write_results(
     displacement_mean: Float[np.ndarray, "X Y Z 3"],
     displacement_sd: Float[np.ndarray, "X Y Z 3"],
 ) -> None:
-    """Write what a finished run adds to its inputs.
+    """Write the result files of a finished run.
 
     Parameters
     ----------
     place : callable
-        As of `ledger.writing`.
+        The callable from `ledger.writing`.
     run : Run
     displacement_mean, displacement_sd : (X, Y, Z, 3) arrays
-        Posterior mean and standard deviation of u on the grid of the background, world RAS, mm. The mean is
-        written as a resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
+        Posterior mean and standard deviation of u on the grid of `run.background`, world RAS, mm. The mean is written
+        as a resampling transform (LPS vectors, intent 1007), the standard deviation as positive vectors.
     """
     by_cell = {} if run.predicted is None else run.predicted.by_cell
     save_mesh(run.mesh, place("mesh.vtu"), {"u_mean": run.u_mean, "u_sd": run.u_sd}, by_cell)
@@ -151,7 +151,7 @@ def write_results(
         save_in_levels(run.warped, place("warped_mean.nii.gz"), run.matching.scale)
     affine = run.background.affine
     save_displacement(place("displacement_mean.nii.gz"), displacement_mean, affine)
-    # The writer converts vectors to LPS; a standard deviation is no vector, and stays positive.
+    # The writer converts vectors to LPS. A standard deviation is no vector and must stay positive.
     unsigned = np.asarray(displacement_sd) * LPS
     save_displacement(place("displacement_sd.nii.gz"), unsigned, affine)
     if run.metrics is not None:
@@ -162,12 +162,12 @@ def write_results(
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read what `write_inputs` and `write_results` wrote.
+    """Read the files of `write_inputs` and `write_results`.
 
     Raises
     ------
     InputError
-        If the folder holds no finished run, or a part of it is missing or damaged.
+        If the folder holds no finished run, or a file of it is missing or damaged.
     """
     require_finished(folder)
     manifest = read_json(require_file(folder, "run.json"))
@@ -190,7 +190,7 @@ def read_run(folder: str | Path) -> Run:
 
 
 def require_finished(folder: str | Path) -> None:
-    """Raise InputError where a folder holds no finished run."""
+    """Raise InputError if a folder holds no finished run."""
     stage = stage_of(folder)
     if stage == "prepared":
         raise InputError(f"the run in {folder} has not ended; bayesreg run --resume goes on with it")
@@ -199,5 +199,5 @@ def require_finished(folder: str | Path) -> None:
 
 
 def _file(folder: str | Path, name: str) -> Path | None:
-    """The path of a file that not every run has."""
+    """Return the path of an optional file of a run, or None if the run has no such file."""
     return require_file(folder, name) if is_listed(folder, name) else None

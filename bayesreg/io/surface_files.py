@@ -1,6 +1,6 @@
-"""Surfaces and lines in files, as electrodes, tracts and outlines of tumours come; world RAS, mm.
+"""Files of surfaces and lines, such as electrodes, tracts and outlines of tumours; world RAS, mm.
 
-PyVista takes seconds to import, which nothing else need wait for: hence inside the functions.
+The functions import PyVista themselves, since its import takes seconds and other code does not need it.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ SUFFIXES = (".vtk", ".vtp", ".vtu", ".stl", ".ply", ".obj")
 
 
 class SurfaceFile(NamedTuple):
-    """What a file holds.
+    """The content of a file with a surface or lines.
 
     Attributes
     ----------
     content : pyvista.PolyData or pyvista.UnstructuredGrid
-        As in the file.
+        The dataset, with the coordinates of the file.
     points : (k, 3) array
-        World RAS, mm.
+        The points in world RAS, mm.
     space : str
-        That of the file, "RAS" or "LPS".
+        The space of the file's coordinates, "RAS" or "LPS".
     is_said : bool
-        Whether the file, or who gave it, says so.
+        Whether the file or the user stated the space.
     """
 
     content: Any
@@ -45,7 +45,7 @@ class SurfaceFile(NamedTuple):
     is_said: bool
 
     def part(self, chosen: Bool[np.ndarray, "k"]) -> SurfaceFile:
-        """The chosen points, with the cells that have no other, and what is left of lines."""
+        """Select points, the cells with chosen points only, and the parts of lines between chosen points."""
         import pyvista
 
         number = np.cumsum(chosen) - 1
@@ -73,25 +73,25 @@ class SurfaceFile(NamedTuple):
 
 
 def _runs(chosen: Bool[np.ndarray, "k"], line: np.ndarray) -> list[np.ndarray]:
-    """What is left of a line where some of its points are left out."""
+    """Split a line into its runs of chosen points."""
     borders = np.flatnonzero(np.diff(chosen[line].astype(int))) + 1
     return [part for part in np.split(line, borders) if chosen[part].all()]
 
 
 def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
-    """Read points with what connects them.
+    """Read a surface or lines: points and the cells that connect them.
 
     Parameters
     ----------
     path : path
-        .vtk, .vtp, .vtu, .stl, .ply or .obj.
+        A .vtk, .vtp, .vtu, .stl, .ply or .obj file.
     space : "RAS" or "LPS", optional
-        Of its coordinates, where the file does not say it as 3D Slicer does (SPACE=LPS); the default is RAS.
+        The space of the coordinates if the file does not state it as 3D Slicer does (SPACE=LPS); the default is RAS.
 
     Raises
     ------
     InputError
-        If there is no such file, it is of another kind or damaged, or holds no points; if it says another space.
+        If the file does not exist, is of another kind, is damaged, holds no points, or states another space.
     """
     import pyvista
 
@@ -117,12 +117,12 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
 
 
 READERS = {".vtk": read_legacy, ".ply": read_ply, ".obj": read_obj}
-# XML that compresses its arrays holds at most so many times as many numbers as it has bytes.
+# An XML file with compressed arrays holds at most this many numbers per byte.
 MOST_COMPRESSED = 1100
 
 
 def read_dataset(path: Path) -> Any:
-    """What a file of VTK's, .stl, .ply or .obj holds, as a dataset of PyVista; ValueError where it is damaged."""
+    """Read a VTK, .stl, .ply or .obj file as a PyVista dataset; raise ValueError if it is damaged."""
     content, suffix = path.read_bytes(), path.suffix.lower()
     try:
         return READERS[suffix](content) if suffix in READERS else _read_by_vtk(path, content)
@@ -131,7 +131,10 @@ def read_dataset(path: Path) -> Any:
 
 
 def _read_by_vtk(path: Path, content: bytes) -> Any:
-    """Read XML or STL, by VTK; these readers survive a wrong size, but not all that they make of it is sound."""
+    """Read XML or STL by VTK, and check the result.
+
+    These readers survive a wrong size in the file, but can return invalid cells.
+    """
     import pyvista
     from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkIOGeometry import vtkSTLReader
@@ -145,7 +148,7 @@ def _read_by_vtk(path: Path, content: bytes) -> Any:
     reader.SetFileName(str(path))
     reader.AddObserver("ErrorEvent", lambda *_: errors.append(path))
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    # What else it says of the file, to the terminal and to PyVista's log, is no help.
+    # VTK's other messages, in the terminal and in PyVista's log, do not help the user.
     with pyvista.VtkErrorCatcher(send_to_logging=False):
         reader.Update()
     vtkLogger.SetStderrVerbosity(verbosity)
@@ -166,13 +169,13 @@ def _read_by_vtk(path: Path, content: bytes) -> Any:
 
 
 def save_dataset(dataset: Any, path: Path) -> None:
-    """Write a dataset of PyVista; OSError where that fails."""
+    """Write a PyVista dataset; raise OSError if that fails."""
     import pyvista
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
     xml = {".vtu": vtkXMLUnstructuredGridWriter, ".vtp": vtkXMLPolyDataWriter}.get(path.suffix.lower())
     if xml is not None:
-        # Not into the file: where the disk is full, VTK ends the process.
+        # VTK writes to memory, since it ends the process if the disk is full.
         writer = xml()
         writer.SetInputData(dataset)
         writer.SetDataModeToBinary()
@@ -190,18 +193,19 @@ def save_dataset(dataset: Any, path: Path) -> None:
 def write_surface(
     path: str | Path, surface: SurfaceFile, points: Float[np.ndarray, "k 3"], values: Mapping[str, AnyArray]
 ) -> None:
-    """Write a surface with its points elsewhere and values at the points, all of it or nothing.
+    """Write a surface with moved points and values at the points, in one step.
 
     Parameters
     ----------
     path : path
-        Ends as the file that the surface was read from; .stl, .ply and .obj keep no values.
+        Has the suffix of the file from which the surface was read; .stl, .ply and .obj keep no values.
     surface : SurfaceFile
-        Its space is kept, and the file says which it is. Normals are left out: they turn, and programs find them anew.
+        The surface before the move. The file keeps its space and states it. Normals are removed, since they are no
+        longer valid and programs compute them again.
     points : (k, 3) array
-        World RAS, mm.
+        The moved points in world RAS, mm.
     values : mapping
-        Arrays (k, …) by name.
+        Arrays of shape (k, …) by name.
     """
     moved, path = surface.content.copy(), Path(path)
     moved.points = points * TO_RAS[surface.space]
@@ -219,7 +223,7 @@ def write_surface(
 def save_outline(
     path: str | Path, values: Float[np.ndarray, "X Y Z"], affine: Float[np.ndarray, "4 4"], level: float
 ) -> None:
-    """Write the surface about all voxels above a level as a .vtk file, world RAS mm.
+    """Write the surface around all voxels above a level as a .vtk file, world RAS, mm.
 
     Raises
     ------
@@ -228,7 +232,7 @@ def save_outline(
     """
     if not (values > level).any():
         raise InputError(f"{path}: no voxel is above {level:g}, so that there is no surface")
-    # A rim of zeros closes the surface where it meets the end of the grid.
+    # A margin of zeros closes the surface at the end of the grid.
     points, faces, _, _ = measure.marching_cubes(np.pad(values, 1), level)
     save_surface(path, (points - 1) @ affine[:3, :3].T + affine[:3, 3], faces)
 
@@ -239,7 +243,7 @@ def save_ellipsoids(
     half_axes: Float[np.ndarray, "k 3"],
     directions: Float[np.ndarray, "k 3 3"],
 ) -> None:
-    """Write ellipsoids, world RAS mm, each direction a row, as one surface in a .vtk file."""
+    """Write ellipsoids as one surface in a .vtk file, world RAS, mm; the rows of `directions` are unit vectors."""
     import pyvista
 
     ball = pyvista.Icosphere(radius=1.0, nsub=2)
@@ -256,7 +260,7 @@ def save_surface(
     faces: Int[np.ndarray, "t 3"],
     values: Mapping[str, AnyArray] = MappingProxyType({}),
 ) -> None:
-    """Write triangles, world RAS mm, with values at the points as a .vtk file, all of it or nothing."""
+    """Write triangles with values at their points as a .vtk file in one step, world RAS, mm."""
     import pyvista
 
     surface = pyvista.PolyData(points, np.insert(faces, 0, 3, axis=1).ravel())
@@ -268,7 +272,7 @@ def save_surface(
 
 
 def _named_space(path: Path, surface: Any) -> Space | None:
-    """The space that the head of a file names, or a field of it."""
+    """Read the space of the coordinates from the dataset's field SPACE or the head of a file."""
     with path.open("rb") as file:
         found = re.search(rb"SPACE\s*=\s*(RAS|LPS)", file.read(512))
     named = str(surface.field_data["SPACE"][0]) if "SPACE" in surface.field_data else found and found[1].decode()
@@ -276,15 +280,15 @@ def _named_space(path: Path, surface: Any) -> Space | None:
 
 
 def _say_space(path: Path, space: Space) -> None:
-    """In the head of a file, as 3D Slicer does; those in XML have it as a field."""
+    """Write the space into the head of a file, as 3D Slicer does; XML files already have it as a field."""
     content, said = path.read_bytes(), f"bayesreg SPACE={space}".encode()
     suffix = path.suffix.lower()
     if suffix == ".vtk":
-        # The second line is a title.
+        # The second line is a title, whose text is free.
         first, _, rest = content.split(b"\n", 2)
         content = b"\n".join([first, said, rest])
     elif suffix == ".stl":
-        # VTK writes it in binary form, of which 80 bytes are free.
+        # VTK writes binary STL, whose first 80 bytes are free.
         content = said.ljust(80) + content[80:]
     elif suffix == ".ply":
         first, kind, rest = content.split(b"\n", 2)

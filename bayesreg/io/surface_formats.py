@@ -1,7 +1,7 @@
-"""Readers of VTK's legacy format, PLY and OBJ in NumPy: VTK's own end the process where a file has a wrong size.
+"""Readers of VTK's legacy format, PLY and OBJ in NumPy; VTK's own readers end the process if a file has a wrong size.
 
-What they make is a dataset of PyVista. PyVista takes seconds to import, which nothing else needs: hence inside the
-functions.
+The readers return PyVista datasets. The functions import PyVista themselves, since its import takes seconds and other
+code does not need it.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ _PLY_TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-# Components of an attribute; the others say it themselves.
+# Number of components of an attribute; other attributes state it in the file.
 _COMPONENTS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "SCALARS": 1}
 _CELLS = {"VERTICES": "verts", "LINES": "lines", "POLYGONS": "faces", "TRIANGLE_STRIPS": "strips", "CELLS": "cells"}
 
 
 class _Cursor:
-    """A place in the content of a file, which moves on with what is read; ValueError where the content ends."""
+    """An offset in the content of a file, which every read advances; ValueError if the content ends too early."""
 
     def __init__(self, content: bytes, at: int, is_text: bool, order: Literal["<", ">"]) -> None:
         self.content, self.at, self.is_text, self.order = content, at, is_text, order
 
     def line(self) -> list[str]:
-        """The words of the next line that has any; none at the end."""
+        """Read the words of the next line that is not empty; return an empty list at the end."""
         while self.at < len(self.content):
             end = self.content.find(b"\n", self.at)
             end = len(self.content) if end < 0 else end
@@ -66,7 +66,11 @@ class _Cursor:
         return np.frombuffer(self.content, stored, count, start).astype(kind)
 
     def texts(self, count: int) -> list[str]:
-        """Words: one a line, or each after its length, whose first two bits tell in how many bytes that stands."""
+        """Read texts.
+
+        A text file has one text per line. In a binary file the length precedes each text; the first two bits of the
+        length give the number of bytes of the length itself.
+        """
         if self.is_text:
             return [unquote(" ".join(self.line())) for _ in range(count)]
         found = []
@@ -78,7 +82,7 @@ class _Cursor:
         return found
 
     def cells(self, first: int, second: int, has_offsets: bool) -> Int[np.ndarray, "n"]:
-        """The points of every cell in a row, each time after their number."""
+        """Read cells as one array in which the number of points of each cell precedes their indices."""
         if not has_offsets:
             return self.values("i4", second)
         offsets = self.values(_legacy_type(self.line()[1]), first).astype(np.int64)
@@ -90,7 +94,10 @@ class _Cursor:
 
 
 def join_cells(offsets: Int[np.ndarray, "c"], points: Int[np.ndarray, "k"]) -> Int[np.ndarray, "n"]:
-    """The points of every cell in a row, each time after their number; `offsets` say where each begins and ends."""
+    """Join cells to one array in which the number of points of each cell precedes their indices.
+
+    `offsets` are the indices into `points` at which the cells begin, and the end of the last cell.
+    """
     if not len(offsets):
         return np.zeros(0, np.int64)
     counts = np.diff(offsets)
@@ -100,7 +107,10 @@ def join_cells(offsets: Int[np.ndarray, "c"], points: Int[np.ndarray, "k"]) -> I
 
 
 def split_cells(cells: Int[np.ndarray, "n"], count: int) -> list[np.ndarray]:
-    """The points of each cell; ValueError where a cell has points beyond the count, or ends too late."""
+    """Split joined cells into the point indices of each cell.
+
+    Raise ValueError if a cell has an index of `count` or more, or does not end within the array.
+    """
     found, start = [], 0
     while start < len(cells):
         end = start + 1 + int(cells[start])
@@ -115,7 +125,7 @@ def split_cells(cells: Int[np.ndarray, "n"], count: int) -> list[np.ndarray]:
 
 
 def read_legacy(content: bytes) -> Any:
-    """Read a surface or grid in VTK's legacy format; ValueError, KeyError or IndexError where it is damaged."""
+    """Read a surface or grid in VTK's legacy format; raise ValueError, KeyError or IndexError if it is damaged."""
     head = _HEAD.match(content)
     if head is None:
         raise ValueError("it does not begin as a surface or grid of VTK's legacy format")
@@ -152,7 +162,7 @@ def read_legacy(content: bytes) -> Any:
             arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
         elif key == "COLOR_SCALARS":
             values = cursor.values("f4" if cursor.is_text else "u1", int(words[2]) * rows)
-            # As text they are shares of the brightest.
+            # In text files colours are in [0, 1].
             values = np.rint(255 * values).astype(np.uint8) if cursor.is_text else values
             arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
         elif key == "LOOKUP_TABLE":
@@ -165,7 +175,7 @@ def read_legacy(content: bytes) -> Any:
 
 
 def read_ply(content: bytes) -> Any:
-    """Read the points and faces of a PLY file; errors as of `read_legacy`."""
+    """Read the points and faces of a PLY file; raise the errors of `read_legacy`."""
     head = re.match(rb"ply\s(.*?)end_header[ \r]*\n", content, re.DOTALL)
     if head is None:
         raise ValueError("it does not begin as PLY")
@@ -203,7 +213,7 @@ def _ply_value(cursor: _Cursor, words: Sequence[str]) -> Any:
 
 
 def read_obj(content: bytes) -> Any:
-    """Read the points, faces and lines of a Wavefront OBJ file; errors as of `read_legacy`."""
+    """Read the points, faces and lines of a Wavefront OBJ file; raise the errors of `read_legacy`."""
     points: list[list[str]] = []
     cells: dict[str, list[list[int]]] = {"f": [], "l": []}
     for line in content.decode("utf-8", "replace").splitlines():
@@ -211,7 +221,7 @@ def read_obj(content: bytes) -> Any:
         if key == "v":
             points.append(words[:3])
         elif key in cells:
-            # Numbers count from 1, or back from the last point.
+            # Positive numbers count from 1, negative ones back from the last point.
             numbers = [int(word.split("/")[0]) for word in words]
             cells[key].append([number - 1 if number > 0 else len(points) + number for number in numbers])
     return _dataset({
@@ -232,7 +242,7 @@ def _join(cells: Iterable[Any]) -> Int[np.ndarray, "n"]:
 
 
 def _dataset(parts: dict[str, np.ndarray], arrays: dict[str, dict[str, Any]] | None = None) -> Any:
-    """A dataset of PyVista, whose cells have no other points than it has."""
+    """Create a PyVista dataset after a check that its cells only use existing points."""
     import pyvista
 
     points, types = parts.pop("points", np.zeros((0, 3))), parts.pop("types", None)

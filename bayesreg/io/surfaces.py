@@ -1,4 +1,4 @@
-"""Triangulated surfaces of Ω and of the tissues in it, and how fine to mesh where."""
+"""Triangulated surfaces of Ω and of its tissues, and the target edge length at each point."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from bayesreg.io.domain import main_part
 from bayesreg.mesh import signed_volumes
 from bayesreg.tissues import BRAIN, is_fluid
 
-# In units of the edge length: detail that the mesh cannot show is smoothed away (standard deviation), and the
-# triangles that describe the rest need not be finer than the stride.
+# All three are in units of the edge length. Smoothing (standard deviation) removes detail that the mesh cannot show;
+# the triangles of the remaining surface need not be finer than the stride.
 SMOOTHING = 0.22
 FLUID_SMOOTHING = 0.12
 STRIDE = 0.25
-# Millimetres of edge length per millimetre of depth: neighbours stay alike in size.
+# Millimetres of edge length per millimetre of depth, so that neighbouring tetrahedra have similar sizes.
 GROWTH = 0.7
 
 
 class Surface(NamedTuple):
-    """A triangulated surface.
+    """A closed triangulated surface.
 
     Attributes
     ----------
     points : (n, 3) array
-        World RAS, mm.
+        Vertices in world RAS, mm.
     faces : (m, 3) array
-        Indices into points, normals outwards.
+        Indices into points, with outward normals.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -42,22 +42,22 @@ class Surface(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Enclosed volume, mm³; negative where the normals point inwards."""
+        """The enclosed volume, mm³; negative if the normals point inwards."""
         a, b, c = np.moveaxis(self.points[self.faces], 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 class Sizing(NamedTuple):
-    """Wanted edge length on a background mesh.
+    """The target edge length on a background mesh.
 
     Attributes
     ----------
     points : (n, 3) array
-        World RAS, mm.
+        Nodes in world RAS, mm.
     cells : (m, 4) array
         Positively oriented tetrahedra.
     values : (n,) array
-        Edge length at each point, mm.
+        Target edge length at each point, mm.
     """
 
     points: Float[np.ndarray, "nodes 3"]
@@ -66,35 +66,36 @@ class Sizing(NamedTuple):
 
 
 def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BRAIN) -> list[Surface]:
-    """Surfaces of Ω and of the tissues in it, one inside the other, as far as a mesh can show them.
+    """Extract nested surfaces of Ω and of its tissues, at the detail that a mesh can show.
 
-    Tissues are ordered from the one that lies most along the surface of Ω, which gets none of its own, over the other
-    solid ones, the largest first, to the fluids. Every further surface encloses a tissue and all that follow it, lest a
-    wall between two of them be there twice, a little apart: in a brain that of white matter with the fluid deep
-    inside, and that of this fluid.
+    The tissues are ordered: first the solid tissue with the largest part of the surface of Ω, then the other solid
+    tissues from the largest to the smallest, then the fluids. The first surface encloses Ω, and so no surface belongs
+    to the first tissue. Every further surface encloses one tissue and all tissues after it in this order; otherwise the
+    interface between two tissues would exist twice, slightly apart. In a brain these are the surface of white matter
+    with the fluid deep inside it, and the surface of this fluid.
 
-    Fluid nearer to the outer surface than half an edge length (sulci, the film under the skull) gets no surface
-    of its own, nor do parts and holes of a tissue smaller than a cube of half an edge length.
+    Fluid nearer to the outer surface than half an edge length (sulci, the film under the skull) gets no surface of its
+    own. Parts and holes of a tissue that are smaller than a cube of half an edge length are removed.
 
     Parameters
     ----------
     labels : Image
-        As `domain_labels` makes it.
+        The labels of `domain_labels`.
     edge_length : float
-        mm.
+        Target edge length of the mesh, mm.
     names : sequence of str
         Names of the tissues.
 
     Returns
     -------
     list of Surface
-        The outer one first. All have their normals outwards: for fTetWild, which goes by winding numbers, an
-        inner surface of opposite orientation would be the wall of a cavity.
+        The surfaces, the outer one first. All normals point outwards, since fTetWild uses winding numbers and would
+        treat an inner surface of opposite orientation as the boundary of a cavity.
 
     Raises
     ------
     MeshError
-        If Ω vanishes or falls apart at this resolution.
+        If Ω vanishes or splits into large parts at this resolution.
     """
     grid = _CoarseGrid.around(labels, STRIDE * edge_length, margin=edge_length)
     smallest = (edge_length / 2) ** 3 / grid.voxel_volume
@@ -115,11 +116,11 @@ def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BR
 
 
 def _from_outside_in(labels: Int[np.ndarray, "X Y Z"], names: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Labels of the solid tissues, the one that lies most along the surface first, and those of the fluids."""
+    """List the labels of the solid tissues, in the order of `tissue_surfaces`, and those of the fluids."""
     fluids = [index for index, name in enumerate(names, start=1) if is_fluid(name)]
     solids = [index for index in range(1, len(names) + 1) if index not in fluids]
     solid = np.isin(labels, solids)
-    # A fluid may lie all around.
+    # A fluid may surround all solid tissues, so that their surface is used instead of that of Ω.
     rim = labels[solid & ~ndimage.binary_erosion(ndimage.binary_fill_holes(solid))]
     counts = np.bincount(rim.ravel(), minlength=len(names) + 1)
     sizes = np.bincount(labels.ravel(), minlength=len(names) + 1)
@@ -128,18 +129,18 @@ def _from_outside_in(labels: Int[np.ndarray, "X Y Z"], names: Sequence[str]) -> 
 
 
 def depth_sizing(labels: Image, edge_length: float, inner_edge_length: float) -> Sizing:
-    """Edge length that grows with the depth below the surface of Ω.
+    """Compute a target edge length that grows with the depth below the surface of Ω.
 
     Parameters
     ----------
     labels : Image
         Nonzero inside Ω.
     edge_length, inner_edge_length : float
-        At the surface and beyond, and at most, mm.
+        The edge length at the surface and outside Ω, and the largest edge length, mm.
     """
     grid = _CoarseGrid.around(labels, 0.6 * edge_length, margin=2 * edge_length)
     inside = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length) > 0.5
-    # The distance is to the next voxel outside; the surface runs half-way.
+    # The distance is to the centre of the next voxel outside; the surface lies half a voxel before it.
     depth = np.maximum(edt.edt(inside, anisotropy=tuple(grid.spacing)) - grid.spacing.mean() / 2, 0)
     indices = np.stack(np.meshgrid(*map(np.arange, depth.shape), indexing="ij"), axis=-1).reshape(-1, 3)
     points = grid.to_world(indices)
@@ -148,7 +149,7 @@ def depth_sizing(labels: Image, edge_length: float, inner_edge_length: float) ->
 
 
 class _CoarseGrid(NamedTuple):
-    """Every stride-th voxel of an image's padded grid, along each axis."""
+    """The grid of every n-th voxel (n the stride of each axis) of an image's padded grid."""
 
     stride: tuple[int, int, int]
     padding: tuple[int, int, int]
@@ -170,11 +171,11 @@ class _CoarseGrid(NamedTuple):
         return float(abs(np.linalg.det(self.affine[:3, :3])) * np.prod(self.stride))
 
     def smoothed(self, mask: Bool[np.ndarray, "X Y Z"], sigma: float) -> Float[np.ndarray, "A B C"]:
-        """The mask (0 beyond the grid) smoothed by a Gaussian of standard deviation sigma, mm."""
+        """Smooth a mask (0 beyond its grid) by a Gaussian of standard deviation sigma, mm; sample it on this grid."""
         padded = np.pad(mask.astype(np.float32), [(n, n) for n in self.padding])
         smooth = ndimage.gaussian_filter(padded, sigma / self.voxel_sizes, mode="constant")
         coarse = smooth[tuple(slice(None, None, step) for step in self.stride)]
-        # The last plane may have been skipped; marching cubes closes a surface only inside its grid.
+        # The stride may skip the last plane, and marching cubes closes a surface only inside its grid.
         return np.pad(coarse, [(0, 1)] * 3)
 
     def to_world(self, indices: np.ndarray) -> Float[np.ndarray, "n 3"]:
@@ -183,7 +184,7 @@ class _CoarseGrid(NamedTuple):
 
 
 def _without_specks(field: Float[np.ndarray, "A B C"], smallest: float) -> Float[np.ndarray, "A B C"]:
-    """The field, flattened where parts above 0.5 or holes in them have fewer voxels than `smallest`."""
+    """Remove parts of a field above 0.5, and holes in them, that have fewer voxels than `smallest`."""
     for inside, level in ((field > 0.5, 0.0), (field <= 0.5, 1.0)):
         parts, _ = ndimage.label(inside)
         small = np.bincount(parts.ravel()) < smallest
@@ -199,7 +200,7 @@ def _surface(field: Float[np.ndarray, "A B C"], grid: _CoarseGrid) -> Surface:
 
 
 def _kuhn_cells(shape: tuple[int, ...], points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 4"]:
-    """Six tetrahedra per cube of a grid, all along one diagonal, positively oriented."""
+    """Divide each cube of a grid into six positively oriented tetrahedra that share one diagonal."""
     node = np.arange(np.prod(shape)).reshape(shape)
     cells = []
     for axes in permutations(range(3)):
@@ -214,5 +215,5 @@ def _kuhn_cells(shape: tuple[int, ...], points: Float[np.ndarray, "n 3"]) -> Int
 
 
 def _shift_nodes(node: Int[np.ndarray, "A B C"], offset: Int[np.ndarray, "3"]) -> Int[np.ndarray, "a b c"]:
-    """Nodes at an offset (0 or 1 per axis) from the first corner of every cube."""
+    """Select the nodes at an offset (0 or 1 per axis) from the first corner of every cube."""
     return node[tuple(slice(o, n - 1 + o) for o, n in zip(offset, node.shape, strict=True))]

@@ -1,7 +1,7 @@
-"""fTetWild in a process of its own.
+"""A wrapper that runs fTetWild in a separate process.
 
-It writes a file into the working directory and prints from native code, can neither be interrupted nor caught
-when it crashes, and none of that may reach the caller.
+fTetWild writes a file into the working directory, prints from native code, cannot be interrupted, and can crash without
+an exception. The separate process protects the caller from this.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ def tetrahedralize(
     threads: int = 0,
     quiet: bool = True,
 ) -> tuple[Float[np.ndarray, "nodes 3"], Int[np.ndarray, "cells 4"]]:
-    """Points and positively oriented cells of a tetrahedral mesh that follows the surfaces.
+    """Mesh the inside of surfaces by fTetWild; return points and positively oriented cells.
 
-    fTetWild (Hu, Schneider, Wang, Zorin, Panozzo, "Fast Tetrahedral Meshing in the Wild", 2020). Not
-    deterministic, even with one thread.
+    fTetWild (Hu, Schneider, Wang, Zorin, Panozzo, "Fast Tetrahedral Meshing in the Wild", 2020) is not deterministic,
+    even with one thread.
 
     Parameters
     ----------
     surfaces : list of Surface
-        The mesh fills what the first encloses, and has faces along all of them.
+        The mesh fills the first surface and has faces along all surfaces.
     sizing : Sizing
-        Wanted edge length.
+        Target edge length.
     envelope : float
-        How far the mesh's faces may lie from the surfaces, mm.
+        Largest distance of the mesh's faces from the surfaces, mm.
     stop_energy : float
         Quality (AMIPS energy, 3 at best) at which the optimisation may stop.
     threads : int
-        0 for all cores.
+        Number of threads; 0 for all cores.
     quiet : bool
-        Whether to keep fTetWild's own output to itself.
+        Whether to suppress fTetWild's own output.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Transforms as ITK composites in HDF5 (.h5): a displacement field on a grid and a pose, LPS inside, RAS outside."""
+"""Writer of transforms as ITK composites in HDF5 (.h5): a displacement field on a grid and a pose, in LPS."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from bayesreg.io.spaces import LPS, convert_affine, convert_motion
 from bayesreg.pose import Pose
 from bayesreg.types import AnyArray
 
-# Fields are rounded to this, mm: smaller files, and an error of an eighth of a micrometre.
+# Fields are rounded to multiples of this, mm: files become smaller, and the error is an eighth of a micrometre.
 QUANTUM = 2.0**-12
 
 
 def save_transform(
     path: str | Path, field: Float[AnyArray, "X Y Z 3"], grid: Image, pose: Pose, pose_first: bool = False
 ) -> None:
-    """Write y = pose(x + u(x)), or with the pose first y = x′ + u(x′), x′ = pose(x), as ITK's programs read it.
+    """Write the transform y = pose(x + u(x)), or y = x′ + u(x′) with x′ = pose(x) if the pose comes first, for ITK.
 
     Parameters
     ----------
     path : path
         Ends in .h5.
     field : (X, Y, Z, 3) array
-        u at the voxel centres of the grid, mm, world RAS. ITK interpolates it linearly, and beyond the grid it is zero.
+        u at the voxel centres of the grid, mm, world RAS. ITK interpolates it linearly and sets it to zero beyond the
+        grid.
     grid : Image
-        Its axes are at right angles (`Image.is_orthogonal`).
+        The grid of the field; its axes must be orthogonal (`Image.is_orthogonal`).
     pose : Pose
     pose_first : bool
 
     Notes
     -----
     The layout is that of `itk::HDF5TransformIO`: transforms in a queue, of which the last is applied first. The field
-    is stored in single precision and compressed, which ITK reads and does not write itself.
+    is stored as compressed float32, which ITK can read but does not write itself.
     """
     if not grid.is_orthogonal:
         raise ValueError("ITK's grids have axes at right angles; use Image.on_orthogonal_grid")
@@ -61,13 +62,16 @@ def _write_text(file: h5py.File, name: str, text: str) -> None:
 
 
 def _affine(pose: Pose) -> tuple[str, np.ndarray, np.ndarray]:
-    """Its matrix row by row, its translation; about the origin."""
+    """Convert a pose to ITK's affine transform: name, centre (the origin), matrix by rows and translation."""
     matrix = convert_motion(pose.matrix)
     return "AffineTransform", np.zeros(3), np.concatenate([matrix[:3, :3].ravel(), matrix[:3, 3]])
 
 
 def _displacement_field(field: Float[AnyArray, "X Y Z 3"], grid: Image) -> tuple[str, np.ndarray, np.ndarray]:
-    """Size, origin, spacing and directions of its grid; vectors, the first voxel axis running fastest."""
+    """Convert a field to ITK's transform: name; size, origin, spacing and directions of the grid; vectors.
+
+    The first voxel axis of the vectors varies fastest.
+    """
     affine = convert_affine(grid.affine)
     directions = affine[:3, :3] / grid.voxel_sizes
     known = np.concatenate([grid.shape, affine[:3, 3], grid.voxel_sizes, directions.ravel()])

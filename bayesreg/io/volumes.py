@@ -1,4 +1,4 @@
-"""Images, masks and tissue labels in files, world RAS mm throughout."""
+"""Readers and writers of images, masks and tissue labels; world RAS, mm."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from bayesreg.types import AnyArray, InputError
 
 LabelTable = Mapping[str, int | Sequence[int]]
 
-# Labels that are stored as floating-point numbers lie this near to integers.
+# The largest distance from an integer of a label that is stored as a floating-point number.
 ROUNDING = 0.05
-# Probabilities that were interpolated by splines overshoot by no more.
+# The largest overshoot of probabilities that were interpolated by splines.
 OVERSHOOT = 0.5
 
-# Of gzip, from 1 to 9: fields are a fifth smaller than at 1, and take as long; from 6 on they take three times as long.
+# Level of gzip, from 1 to 9. At 4, fields are a fifth smaller than at 1 and take as long to write; from 6 on they take
+# three times as long.
 COMPRESSION = 4
 
 _log = logging.getLogger(__name__)
 
 
 def load_image(path: str | Path) -> Image:
-    """Read a 3D image: NIfTI, MGZ, NRRD, MetaImage, a folder with one DICOM series, or what else nibabel reads.
+    """Read a 3D image: NIfTI, MGZ, NRRD, MetaImage, a folder with one DICOM series, or another format of nibabel.
 
     Parameters
     ----------
@@ -41,29 +42,32 @@ def load_image(path: str | Path) -> Image:
     Returns
     -------
     Image
-        Orientation and number type as in the file; trailing axes of length one are dropped.
+        The image, with orientation and number type as in the file. Trailing axes of length one are removed.
 
     Raises
     ------
     InputError
-        If there is no such file, it is not an image or damaged, has more or fewer than three axes, holds
-        values that are not real and finite, or its affine is singular.
+        If the file does not exist, is not an image, is damaged, has more or fewer than three axes, holds values that
+        are not real and finite, or has a singular affine.
     """
     return _as_image(read_volume(path), path)
 
 
 def load_mask(path: str | Path) -> Image:
-    """Read a mask: of two values the greater is inside; of probabilities what is at least 0.5, and the log says so.
+    """Read a mask.
+
+    If the file has two values, the greater is inside. If it has probabilities, those of at least 0.5 are inside, and
+    the log reports it.
 
     Returns
     -------
     Image
-        uint8, 1 inside.
+        The mask, uint8, 1 inside.
 
     Raises
     ------
     InputError
-        As in `load_image`; also if the file holds one value, or neither two values nor probabilities.
+        As in `load_image`; also if the file holds a single value, or neither two values nor probabilities.
     """
     image = load_image(path)
     voxels = np.asarray(image.voxels)
@@ -83,9 +87,9 @@ def load_mask(path: str | Path) -> Image:
 
 
 def load_ignored(path: str | Path) -> Image:
-    """Read a mask of what is ignored: uint8, 1 where the file is not zero, or a probability of 0.5 or more.
+    """Read a mask of ignored voxels: uint8, 1 where the file is not zero, or where a probability is at least 0.5.
 
-    A mask that is zero everywhere ignores nothing, and the log says so.
+    If the mask is zero everywhere, nothing is ignored, and the log reports it.
 
     Raises
     ------
@@ -110,7 +114,7 @@ def load_ignored(path: str | Path) -> Image:
 
 
 def save_image(image: Image, path: str | Path) -> None:
-    """Write an image as NIfTI, all of it or nothing.
+    """Write an image as NIfTI in one step.
 
     Parameters
     ----------
@@ -122,43 +126,43 @@ def save_image(image: Image, path: str | Path) -> None:
     Raises
     ------
     InputError
-        If the path ends otherwise, or its folder does not exist.
+        If the path has another suffix, or its folder does not exist.
     """
     write_nifti(_storable(np.asarray(image.voxels)), image.affine, Path(path))
 
 
 def load_labels(path: str | Path, table: LabelTable, unlisted: Literal["outside", "refused"] = "outside") -> Image:
-    """Read a label file as tissue indices: `load_whole_numbers`, then `tissues_of`, whose errors it has."""
+    """Read a label file as tissue indices, by `load_whole_numbers` and `tissues_of`, and raise their errors."""
     return tissues_of(load_whole_numbers(path), table, path, unlisted)
 
 
 def tissues_of(
     image: Image, table: LabelTable, path: str | Path, unlisted: Literal["outside", "refused"] = "outside"
 ) -> Image:
-    """Make tissue indices of labels.
+    """Convert labels to tissue indices.
 
     Parameters
     ----------
     image : Image
-        Whole numbers.
+        Labels, which are whole numbers.
     table : mapping
-        Tissue name to the value, or values, that stand for it in the file; the order gives the indices. What stands for
-        `BACKGROUND` is no tissue.
+        Label value or values of each tissue by its name; the order gives the indices. Values of `BACKGROUND` belong to
+        no tissue.
     path : path
-        Of the labels, for a message.
+        The path of the labels, for a message.
     unlisted : {"outside", "refused"}
-        Labels that are neither zero nor in the table are no tissue, or refused.
+        Whether labels that are neither zero nor in the table belong to no tissue, or raise InputError.
 
     Returns
     -------
     Image
-        int8: 0 outside, 1 + the position of the tissue in the table inside.
+        int8: 0 outside, 1 + the index of the tissue in the table inside.
 
     Raises
     ------
     InputError
-        If there are no labels of any tissue (or of one, where what is not listed is outside), or one that is not listed
-        and is refused, or if a value belongs to two tissues.
+        If no tissue has a label (with "outside", if any tissue has none), a label is refused because it is not listed,
+        or a value belongs to two tissues.
     """
     values = {name: np.atleast_1d(np.asarray(entry, int)).tolist() for name, entry in table.items()}
     present, counts = np.unique(image.voxels, return_counts=True)
@@ -182,16 +186,16 @@ def tissues_of(
 
 
 def load_whole_numbers(path: str | Path) -> Image:
-    """Read a label file as int32; values up to `ROUNDING` from an integer are rounded, and the log says so.
+    """Read a label file as int32; values up to `ROUNDING` from an integer are rounded, and the log reports it.
 
-    Of a file of several volumes, the probabilities of one tissue each, the most probable one is the label, counted from
-    1; it is 0 where they sum to less than a half.
+    If the file has several volumes, each must hold the probabilities of one tissue. Then the label is the number of the
+    most probable tissue, counted from 1, or 0 where the probabilities sum to less than 0.5.
 
     Raises
     ------
     InputError
-        As in `load_image`; also if it holds values further from integers, or beyond 32 bits, or several volumes that
-        are no probabilities.
+        As in `load_image`; also if the file holds values further from integers or beyond 32 bits, or several volumes
+        that are not probabilities.
     """
     volume = read_volume(path)
     if volume.voxels.ndim == 4 and volume.voxels.shape[3] > 1:
@@ -234,7 +238,7 @@ def _most_probable(volume: Volume, path: str | Path) -> Image:
 
 
 def shorten(values: Iterable[object], most: int = 30) -> str:
-    """The first of some values, as text."""
+    """Join the first `most` values to a text, with an ellipsis if there are more."""
     listed = [str(value) for value in values]
     return ", ".join(listed[:most]) + (", …" if len(listed) > most else "")
 
@@ -246,9 +250,9 @@ def write_nifti(
     intent: int | None = None,
     scaling: tuple[float, float] | None = None,
 ) -> None:
-    """Write voxels as NIfTI, mm, all of it or nothing; InputError as in `save_image`.
+    """Write voxels as NIfTI, mm, in one step; raise InputError as in `save_image`.
 
-    With a scaling (a, b) a voxel v stands for a v + b.
+    If a scaling (a, b) is given, a stored value v represents a v + b.
     """
     if not path.name.endswith((".nii", ".nii.gz")):
         raise InputError(f"{path} must end in .nii or .nii.gz")
@@ -266,7 +270,10 @@ def write_nifti(
 
 
 def _one_real(voxels: np.ndarray) -> np.ndarray:
-    """Three axes of native numbers; InputError where there are others."""
+    """Remove trailing axes of length one and convert to native byte order.
+
+    Raise InputError unless three axes of real numbers result.
+    """
     shape = voxels.shape
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
@@ -282,7 +289,7 @@ def _storable(voxels: np.ndarray) -> np.ndarray:
         return voxels.astype(np.uint8)
     if voxels.dtype.kind == "f":
         return voxels.astype(np.float32)
-    # 64-bit integers, NumPy's default, are read by few programs.
+    # Few programs read 64-bit integers, which are NumPy's default.
     if voxels.dtype.itemsize == 8 and voxels.min() >= -(2**31) and voxels.max() < 2**31:
         return voxels.astype(np.int32)
     return voxels

@@ -1,1 +1,1 @@
-"""What a finished run is used for: transforms, maps, scenes."""
+"""Code that uses the results of a finished run: transforms, maps, scenes."""

@@ -1,4 +1,4 @@
-"""Carry points, surfaces, images and labels from the fixed image's world to the moving one's, or back."""
+"""Transformation of points, surfaces, images and labels from the fixed image's world to the moving one's, or back."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ _log = logging.getLogger(__name__)
 
 Around = Literal["harmonic", "missing"]
 
-# Draws of all chains together: of points, and of labels, which take longer.
+# Default number of draws of all chains together for labels, which take longer than points (`POINT_DRAWS`).
 LABEL_DRAWS = 200
+# Fewer draws than this cause a warning.
 FEW_DRAWS = 30
-# The probability with which a margin holds a label, point by point.
+# A point outside the margin of a label has this label with at most 1 minus this probability.
 MARGIN = 0.95
 
 
@@ -52,41 +53,45 @@ def apply(
     space: Space | None = None,
     margins: Sequence[int] = (),
 ) -> list[Path]:
-    """Carry what lies in the world of the fixed image to that of the moving one, over the posterior.
+    """Transform points, an image, labels or a surface from the fixed to the moving image's world by the posterior.
 
     Parameters
     ----------
     folder : path
-        Of a run.
+        The folder of a run.
     out : path
-        A folder; files of the same names are replaced.
+        The output folder; files of the same names are replaced.
     points : path, optional
-        CSV with columns x, y, z (world RAS, mm), .fcsv, .mrk.json or .tag. Writes points.csv: places by the posterior
-        mean, covariance (mm²), the radius within which a point lies with 95 % and half-axes and axes of the ellipsoid
-        that holds as many, mm, and P(further from there than so many mm). Around the mesh, where nothing is known, all
-        but the places is NaN.
+        CSV with columns x, y, z (world RAS, mm), .fcsv, .mrk.json or .tag. The output points.csv has the transformed
+        points by the posterior mean (mm), their covariance (mm²), the radius of the ball that holds a point with 95 %
+        probability (mm), the half-axes (mm) and axes of the ellipsoid that does so, and P(distance from the posterior
+        mean > d) for each distance d. Around the mesh, where nothing is observed, all columns except the coordinates
+        are NaN.
     image : path, optional
-        Carried by the posterior mean and interpolated linearly, on the grid of the image that shows the other world.
+        An image. The posterior mean transforms it with linear interpolation to the grid of the image of the other
+        world.
     labels : path, optional
-        Whole numbers. Writes the most probable label of each voxel, and a folder with the probability of every label.
+        Whole numbers. The output is the most probable label of each voxel, and a folder with the probability of every
+        label.
     mesh : path, optional
-        A surface or lines (.vtk, .vtp, .vtu, .stl, .ply, .obj). Writes it where the posterior mean takes it, with the
-        same values at its points as points.csv has.
+        A surface or lines (.vtk, .vtp, .vtu, .stl, .ply, .obj). The output is the surface moved by the posterior mean,
+        with the values of points.csv at its points.
     inverse : bool
-        From the world of the moving image to that of the fixed one.
+        Whether to transform from the moving image's world to the fixed one's.
     around : "harmonic" or "missing"
-        What becomes of all that lies around the mesh: carried on (`bayesreg.fem.surroundings`), or NaN (a label of 0;
-        points of a surface are left out).
+        Treatment of the region around the mesh: the displacement continues harmonically
+        (`bayesreg.fem.surroundings`), or values are missing (NaN; label 0; points of a surface are removed).
     like : path, optional
-        An image on whose grid images and labels are written.
+        An image whose grid the output images and labels have.
     far : sequence of float
-        Distances, mm.
+        The distances d, mm.
     draws : int, optional
-        How many at most; the default is 1,000, for labels 200.
+        Largest number of draws; the default is 1,000, for labels 200.
     space : "RAS" or "LPS", optional
-        Of the coordinates in `points` and `mesh`, where a file does not say it.
+        The space of the coordinates in `points` and `mesh`, if a file does not state it.
     margins : sequence of int
-        Labels; of each a surface is written (.vtk, RAS) beyond which every point has it with less than 5 %.
+        Labels. For each a surface (.vtk, RAS) is written; every point outside it has the label with less than 5 %
+        probability.
 
     Returns
     -------
@@ -96,14 +101,14 @@ def apply(
     Raises
     ------
     InputError
-        If nothing is given to carry, or a file is wrong.
+        If nothing is given to transform, or a file is invalid.
     """
     given = {"points": points, "image": image, "labels": labels, "mesh": mesh}
     _require_sense(given, around, far, draws, margins)
     result, out = load_result(folder), require_folder(out)
     how = _How(out, "fixed" if inverse else "moving", around, tuple(far))
     _require_own_names(how, given, like)
-    # All input is read before anything long begins.
+    # All input is read before the long computation, so that errors appear early.
     tasks: list[Callable[[Transform], list[Path]]] = []
     if points is not None:
         side: Literal["fixed", "moving"] = "moving" if inverse else "fixed"
@@ -132,7 +137,7 @@ def apply(
 def _require_sense(
     given: Mapping[str, Any], around: str, far: Sequence[float], draws: int | None, margins: Sequence[int]
 ) -> None:
-    """Raise InputError where what is asked for makes none."""
+    """Raise InputError if the options contradict each other."""
     if all(path is None for path in given.values()):
         raise InputError("there is nothing to carry: give points, an image, labels or a mesh")
     if around not in get_args(Around):
@@ -147,13 +152,13 @@ def _require_sense(
 
 
 def require_distances(far: Sequence[float]) -> None:
-    """Raise InputError where one is not above zero."""
+    """Raise InputError if a distance is not above zero."""
     if any(not distance > 0 for distance in far):
         raise InputError(f"expected distances above zero, mm, got {', '.join(map(str, far))}")
 
 
 def require_folder(out: str | Path) -> Path:
-    """The path of a folder to write to; InputError where there is a file, or none can be made."""
+    """Return the path of an output folder; raise InputError if it is a file or is not writable."""
     out = Path(out)
     nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
@@ -162,7 +167,7 @@ def require_folder(out: str | Path) -> Path:
 
 
 def _require_own_names(how: _How, given: Mapping[str, str | Path | None], like: str | Path | None) -> None:
-    """Raise InputError where one file would be replaced by another."""
+    """Raise InputError if an output would replace an input or another output."""
     targets: dict[Path, str] = {}
     known = {Path(path).resolve() for path in (*given.values(), like) if path is not None}
     for kind, path in given.items():
@@ -177,7 +182,7 @@ def _require_own_names(how: _How, given: Mapping[str, str | Path | None], like: 
 
 
 class _How(NamedTuple):
-    """What all kinds have in common."""
+    """The options that points, surfaces, images and labels share."""
 
     out: Path
     where: str
@@ -185,18 +190,18 @@ class _How(NamedTuple):
     far: tuple[float, ...]
 
     def target(self, kind: str, source: Path) -> Path:
-        """The file for what is carried of another."""
+        """Build the path of the output for a source file."""
         if kind == "points":
             return self.out / "points.csv"
         return self.name(source, source.suffix if kind == "mesh" else ".nii.gz")
 
     def name(self, source: Path, end: str) -> Path:
-        """A file named after another."""
+        """Build the path of a file that is named after a source file."""
         stem = Path(source.name.removesuffix(".gz")).stem
         return self.out / f"{stem or 'image'}_in-{self.where}{end}"
 
     def tell_of_outside(self, inside: Bool[np.ndarray, "k"], what: str) -> None:
-        """Say how much lies around the mesh, where nothing was observed."""
+        """Log how many points lie around the mesh, where nothing was observed."""
         if inside.all():
             return
         then = "the displacement goes on harmonically" if self.around == "harmonic" else "no place is given"
@@ -207,7 +212,7 @@ class _How(NamedTuple):
 
 
 def _describe(transform: Transform) -> str:
-    """Where things are carried, and by what."""
+    """Describe the direction of a transform and its draws in words."""
     ways = (
         "the moving image to that of the fixed one" if transform.turned else "the fixed image to that of the moving one"
     )
@@ -218,14 +223,14 @@ def _describe(transform: Transform) -> str:
 
 
 def _grid(result: Result, like: str | Path | None, inverse: bool) -> Image:
-    """The grid that images and labels are carried to."""
+    """Choose the grid on which images and labels are written."""
     if like is not None:
         return load_image(like)
     run = result.run
     if inverse:
         return run.background
     if run.moving is None:
-        # No image shows where the organ has gone.
+        # Without a moving image the grid must hold the displaced organ.
         return around_displaced(run.background, run.matching.pose.place(run.mesh.points + run.u_mean))
     return run.matching.pose.inverse.aligned(run.moving)
 
@@ -255,7 +260,7 @@ def _carry_surface(surface: SurfaceFile, path: Path, how: _How, transform: Trans
     return [target]
 
 
-# What stands behind the name of a column, for what has several.
+# The suffixes of columns of quantities that have several components.
 ENDS = {
     "": ("x", "y", "z"),
     "cov_": ("xx", "xy", "xz", "yy", "yz", "zz"),
@@ -265,7 +270,7 @@ ENDS = {
 
 
 def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
-    """What is told of every point: its place, and how sure that is."""
+    """Collect the coordinates of every point and the measures of its uncertainty, by column name."""
     lengths, directions = found.ellipsoids()
     one, other = np.triu_indices(3)
     places = found.places if how.around == "harmonic" else np.where(found.inside[:, None], found.places, np.nan)
@@ -276,12 +281,12 @@ def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
 
 
 def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Transform) -> list[Path]:
-    """By the posterior mean, linearly interpolated; zero where the image ends."""
+    """Transform an image by the posterior mean with linear interpolation; voxels from beyond its grid are zero."""
     back, voxels = transform.inverse, np.empty(int(np.prod(grid.shape)), np.float32)
     inside, given = np.empty(len(voxels), bool), np.asarray(image.voxels, float)
     for some, places in grid.blocks():
         source, location = back.place(places)
-        # As ITK: nearest to the outermost voxels, and zero beyond these.
+        # As in ITK, the outermost half voxel takes the nearest value; beyond it the result is zero.
         index = image.world_to_voxel(source).T
         values = ndimage.map_coordinates(given, index, order=1, mode="nearest")
         voxels[some] = np.where(image.contains(source), values, 0.0)
@@ -309,7 +314,7 @@ def _carry_labels(
     save_image(found.most_probable, target := how.target("labels", path))
     folder = how.name(path, "_probability")
     folder.mkdir(exist_ok=True)
-    # Of labels that another file of this name had.
+    # An earlier call with a file of this name may have left probabilities of other labels.
     for stale in folder.glob("label-*.nii.gz"):
         stale.unlink()
     written = [target]

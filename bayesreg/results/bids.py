@@ -1,4 +1,4 @@
-"""A run under the names of BIDS derivatives, each file with a sidecar."""
+"""Export of a run under the names of BIDS derivatives, each file with a sidecar."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ FOLDER = "bids"
 
 
 def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
-    """Write a derivative dataset, bids/, into the folder of a run; files are linked where the disk can do that.
+    """Write a derivative dataset, bids/, into the folder of a run; files are hard links if the file system allows it.
 
     Parameters
     ----------
     folder : path
-        Of a finished run.
+        The folder of a finished run.
     names : BidsConfig
-        Subject and session, and what the spaces of both images are called.
+        Subject, session, and the names of the spaces of both images.
     place : callable
-        As of `bayesreg.io.ledger.writing`.
+        The callable from `bayesreg.io.ledger.writing`.
 
     Notes
     -----
-    A transform from-A_to-B resamples an image of A on the grid of B, as BIDS has it for mode-image.
+    A transform from-A_to-B resamples an image of A on the grid of B, as BIDS defines it for mode-image.
     """
     entities = f"sub-{names.subject}" + ("" if names.session is None else f"_ses-{names.session}")
     within = f"{FOLDER}/{entities.replace('_', '/')}/anat"

@@ -1,4 +1,4 @@
-"""A label map carried to another grid: how probable each label is in every voxel, over draws of the displacement."""
+"""Transformation of a label map to another grid: the probability of each label in every voxel, from draws."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from bayesreg.fem.location import Location
 from bayesreg.image import Image, slices
 from bayesreg.results.transform import Transform
 
-# Counts of labels in one go over the draws.
+# The largest number of counts (labels times voxels) in one pass over the draws.
 MOST_COUNTS = 100_000_000
-# What a draw changes is bounded by its largest change at the nodes about, times this.
+# The change of a source point by a draw is at most the largest change at the nodes of its tetrahedron times this.
 MARGIN = 1.25
-# And what the mesh does not resolve of it by so many standard deviations.
+# The part of the change that the mesh does not resolve is at most this number of standard deviations.
 FURTHEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class CarriedLabels:
-    """Labels in the voxels of a grid.
+    """Labels in the voxels of a grid, with their probabilities.
 
     Attributes
     ----------
@@ -31,12 +31,14 @@ class CarriedLabels:
     values : (L,) int array
         The labels, zero first.
     certain : (V,) int array
-        For every voxel, in the order of memory, its index into `values` by the posterior mean; −1 where none is known.
+        For every voxel, in the order of memory, the index into `values` of its label by the posterior mean; −1 if the
+        label is unknown.
     open : (k,) int array
-        The voxels of which draws may tell more than one label.
+        The voxels whose label may differ between draws.
     counts : (L, k) int array
-        Of so many draws each such voxel has each label.
+        Number of draws in which each of these voxels has each label.
     draws : int
+        Number of all draws.
     """
 
     grid: Image
@@ -48,14 +50,14 @@ class CarriedLabels:
 
     @property
     def most_probable(self) -> Image:
-        """The label that most draws give each voxel; zero where none is known."""
+        """The most frequent label of each voxel over the draws; zero if it is unknown."""
         found = np.where(self.certain < 0, 0, self.values[self.certain])
         known = self.certain[self.open] >= 0
         found[self.open[known]] = self.values[self.counts[:, known].argmax(axis=0)]
         return self.grid.with_voxels(found.reshape(self.grid.shape).astype(np.int32))
 
     def probabilities(self) -> Iterator[tuple[int, Float[np.ndarray, "X Y Z"]]]:
-        """Every label but zero, and how probable it is in each voxel; NaN where none is known."""
+        """Yield every label except zero with its probability in each voxel; NaN where the label is unknown."""
         for index, value in enumerate(self.values):
             if value:
                 found = (self.certain == index).astype(np.float32)
@@ -65,23 +67,23 @@ class CarriedLabels:
 
 
 def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: bool = True) -> CarriedLabels:
-    """Carry labels by every draw of a transform.
+    """Transform labels by every draw of a transform.
 
     Parameters
     ----------
     transform : Transform
-        From the world of the labels to that of the grid.
+        The transform from the labels' world to the grid's world.
     labels : Image
-        Whole numbers; zero beyond its grid.
+        Whole numbers; zero beyond their grid.
     grid : Image
-        Its voxels get labels.
+        The grid of the result.
     keep_around : bool
-        Whether what comes from around the mesh is carried, too; where not, no label is known there.
+        Whether labels from around the mesh are transformed, too; otherwise they are unknown.
 
     Notes
     -----
-    A voxel gets the label of the place that a draw leads back to. Where that of the posterior mean is further from
-    any other label than a draw can lead, all draws agree, and none is asked.
+    For each draw, a voxel gets the label of its source, the point that the draw maps to the voxel centre. If the source
+    by the posterior mean is further from any other label than draws can move it, all draws agree and none is computed.
     """
     labels = labels.on_orthogonal_grid(order=0)
     values, index = np.unique(np.append(labels.voxels, 0), return_inverse=True)
@@ -130,7 +132,7 @@ def _count(
     unresolved_sd: Float[np.ndarray, "k 3"],
     counts: UInt[np.ndarray, "L k"],
 ) -> None:
-    """Add the labels that every draw gives to places."""
+    """Count the labels that every draw gives to points, in place."""
 
     def labels_of(draw: int) -> Int[np.ndarray, "k"]:
         sources = back.place_by(draw, places, near, unresolved_sd)
@@ -142,15 +144,15 @@ def _count(
 
 
 def _distance_to_others(numbers: Image) -> Image:
-    """How far every point of a voxel is at least from other labels, mm."""
-    # Zero is a label as others are, also beyond the grid.
+    """Compute a lower bound, mm, of the distance of any point in a voxel from other labels."""
+    # Zero counts as a label, also beyond the grid.
     shifted = np.pad(np.asarray(numbers.voxels).astype(np.uint32) + 1, 1, constant_values=1)
     found = edt.edt(shifted, anisotropy=tuple(numbers.voxel_sizes), black_border=False, parallel=0)[1:-1, 1:-1, 1:-1]
     return numbers.with_voxels(np.maximum(found - np.linalg.norm(numbers.voxel_sizes), 0))
 
 
 def _box(numbers: Image) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The corners of what has a label, as voxel indices; far away where nothing has one."""
+    """Compute the corners, as voxel indices, of the box of all labelled voxels; infinite if there are none."""
     labelled = np.argwhere(np.asarray(numbers.voxels) != 0)
     if not len(labelled):
         return np.full(3, np.inf), np.full(3, np.inf)
@@ -160,14 +162,17 @@ def _box(numbers: Image) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]
 def _distance_to_box(
     numbers: Image, box: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]], points: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k"]:
-    """How far points are from a box of voxels, mm."""
+    """Compute the distance of points from a box of voxels, mm."""
     index = numbers.world_to_voxel(points)
     outside = np.maximum(np.maximum(box[0] - index, index - box[1]), 0)
     return np.linalg.norm(outside * numbers.voxel_sizes, axis=1)
 
 
 def _reach(back: Transform) -> Float[np.ndarray, "cells"]:
-    """How far a source by a draw may be from that by the posterior mean, mm, by tetrahedron; last beyond the sphere."""
+    """Bound the distance, mm, between the sources of a point by a draw and by the posterior mean.
+
+    There is one bound for each tetrahedron of the mesh and its surroundings; the last one holds beyond these.
+    """
     around = back.deformer.surroundings
     mean = around.extend(back.u_mean)
     away = np.zeros(len(mean))
@@ -176,7 +181,7 @@ def _reach(back: Transform) -> Float[np.ndarray, "cells"]:
     corners = around.points[around.cells]
     moved = corners + mean[around.cells]
     edges, moved_edges = (x[:, 1:] - x[:, :1] for x in (corners, moved))
-    # Back through (I + ∇u)⁻¹.
+    # A displacement changes the source by up to the norm of (I + ∇u)⁻¹ times its length.
     stretch = np.linalg.norm(np.linalg.solve(moved_edges, edges), ord=2, axis=(1, 2))
     reach = MARGIN * stretch * away[around.cells].max(axis=1)
     return np.append(reach, away.max())

@@ -1,4 +1,4 @@
-"""Displacement fields on grids, there and back, and the transforms that a run leaves for other programs."""
+"""Displacement fields on grids, forward and inverse, and the transform files of a run for other programs."""
 
 from __future__ import annotations
 
@@ -20,29 +20,31 @@ from bayesreg.pose import Pose
 from bayesreg.results.transform import Transform
 
 MEAN, MEAN_INVERSE, ENSEMBLE = "transform_mean.h5", "transform_mean_inverse.h5", "transforms"
-# Between the voxels of an ensemble's fields, in mean edges of the mesh: linear interpolation then errs by 0.02 mm in
-# the median, and by 0.2 mm at most where a draw bends by some mm from node to node.
+# Voxel size of the draws' fields, in mean edges of the mesh. The error of linear interpolation then has a median of
+# 0.02 mm, and is at most 0.2 mm where the displacement of a draw varies by some mm between nodes.
 ENSEMBLE_SPACING = 0.2
-# Between the voxels of the mean's transforms, in mean edges of the mesh, rounded down to whole voxels of the image.
+# Voxel size of the mean's transforms, in mean edges of the mesh, rounded down to whole voxels of the image.
 MEAN_SPACING = 0.15
-# What is written is a multiple of this, mm: the mean in the mesh, around it, where nothing is observed, and the sd.
+# Written values are multiples of these, mm: the mean in the mesh, the mean around it, where nothing is observed, and
+# the standard deviation.
 MEAN_STEP, STEP_AROUND, SD_STEP = 2.0**-8, 2.0**-4, 2.0**-9
-# What the grid of an inverse reaches beyond the displaced mesh, mm.
+# The grid of an inverse extends this far beyond the displaced mesh, mm.
 MARGIN = 10.0
 
 
 class Moments(NamedTuple):
-    """The displacement from one world to the other at the voxel centres of an image, world RAS, single precision.
+    """Mean and standard deviation of the displacement at the voxel centres of an image, world RAS, float32.
 
     Attributes
     ----------
     mean : (X, Y, Z, 3) array
-        mm, the pose included, in the mesh and around it.
+        Posterior mean in the mesh and around it, mm, including the pose.
     sd : (X, Y, Z, 3) array
-        mm. Its variance is that of the nodes, interpolated as a standard deviation, and what the mesh cannot follow of
-        a smooth displacement (`bayesreg.model.submesh`). Zero around the mesh.
+        Standard deviation, mm. Its square is the sum of two variances: that of the nodes, interpolated as a standard
+        deviation, and that of a smooth displacement which the mesh cannot resolve (`bayesreg.model.submesh`). Zero
+        around the mesh.
     rms_sd : dict
-        Root mean square over the voxels in the mesh and the axes of both parts of it: "nodes", "mesh".
+        Root mean squares of the two parts over the axes and the voxels in the mesh, mm: "nodes", "mesh".
     """
 
     mean: Float[np.ndarray, "X Y Z 3"]
@@ -51,7 +53,7 @@ class Moments(NamedTuple):
 
     @property
     def rounded(self) -> tuple[Float[np.ndarray, "X Y Z 3"], Float[np.ndarray, "X Y Z 3"]]:
-        """Mean and standard deviation as they are written: rounded, so that files are small."""
+        """The mean and the standard deviation, rounded so that compressed files are small."""
         inside = (self.sd > 0).any(axis=-1, keepdims=True)
         step = np.where(inside, np.float32(MEAN_STEP), np.float32(STEP_AROUND))
         sd = np.maximum(np.rint(self.sd / np.float32(SD_STEP)), inside) * np.float32(SD_STEP)
@@ -59,19 +61,19 @@ class Moments(NamedTuple):
 
 
 def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], grid: Image) -> Moments:
-    """The displacement by the posterior mean, and its standard deviation, at the voxel centres of an image.
+    """Compute the posterior mean and standard deviation of the displacement at the voxel centres of an image.
 
     Parameters
     ----------
     transform : Transform
-        From the fixed image's world.
+        The transform from the fixed image's world.
     nodal_sd : (n, 3) array
         Posterior standard deviation at the nodes, mm, along the axes of the moving image's world.
     grid : Image
     """
     mesh, pose = transform.mesh, transform.pose
     step = _step(mesh, grid)
-    # Around the mesh, where the displacement is smooth and nothing is observed, that of every n-th voxel will do.
+    # Around the mesh the displacement is smooth and nothing is observed, so that every n-th voxel is enough.
     mean = _between(displacement_on(transform.mean, _every(grid, step)).field, step, grid.shape)
     covered = covered_voxels(grid, mesh)
     at = np.ravel_multi_index(tuple(covered.voxel.T), grid.shape)
@@ -91,7 +93,7 @@ def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], gri
 def _between(
     field: Float[np.ndarray, "x y z 3"], step: Int[np.ndarray, "3"], shape: tuple[int, ...]
 ) -> Float[np.ndarray, "voxels 3"]:
-    """A field of every n-th voxel, linearly interpolated at all of them, in the order of memory."""
+    """Interpolate a field of every n-th voxel linearly at all voxels, in the order of memory."""
     for axis, (every, length) in enumerate(zip(step, shape, strict=True)):
         before, share = np.divmod(np.arange(length), every)
         after = np.minimum(before + 1, field.shape[axis] - 1)
@@ -102,14 +104,14 @@ def _between(
 
 
 class OnGrid(NamedTuple):
-    """A displacement at the voxel centres of a grid, and where in the mesh or around it these lie.
+    """A displacement at the voxel centres of a grid, and the locations of these points in the mesh or around it.
 
     Attributes
     ----------
     field : (X, Y, Z, 3) array
-        mm, world RAS of the fixed image, single precision.
+        Displacement, mm, in the fixed image's world RAS, float32.
     locations : list of Location
-        Of some voxels at a time, in the order of memory.
+        Locations of blocks of voxels, in the order of memory.
     """
 
     field: Float[np.ndarray, "X Y Z 3"]
@@ -117,7 +119,7 @@ class OnGrid(NamedTuple):
 
 
 def displacement_on(displaced: Displaced, grid: Image, known: list[Location] | None = None) -> OnGrid:
-    """u at the voxel centres of a grid; with their locations, if these are known from another u, it is faster."""
+    """Compute u at the voxel centres of a grid; known locations of these, from another u, save time."""
     field, found = np.empty((int(np.prod(grid.shape)), 3), np.float32), []
     for index, (some, points) in enumerate(grid.blocks()):
         location = displaced.deformer.locate(points) if known is None else known[index]
@@ -127,7 +129,7 @@ def displacement_on(displaced: Displaced, grid: Image, known: list[Location] | N
 
 
 def return_on(displaced: Displaced, grid: Image, near: list[Location] | None = None) -> OnGrid:
-    """x − z at the voxel centres z = x + u(x) of a grid; with locations of sources near by it is faster."""
+    """Compute x − z at the voxel centres z = x + u(x) of a grid; locations near the sources x save time."""
     field, found = np.empty((int(np.prod(grid.shape)), 3), np.float32), []
     for index, (some, places) in enumerate(grid.blocks()):
         sources, location = displaced.sources(places, None if near is None else near[index])
@@ -137,19 +139,19 @@ def return_on(displaced: Displaced, grid: Image, near: list[Location] | None = N
 
 
 def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
-    """Write the transforms of the posterior mean, there and back, and those of the draws of a transform.
+    """Write the transforms of the posterior mean and of the draws, each with its inverse.
 
     Parameters
     ----------
     place : callable
-        As of `bayesreg.io.ledger.writing`. Each draw gets three files in transforms/: draw-01.h5 and
-        draw-01_inverse.h5 as `bayesreg.io.transforms.save_transform` writes them, and draw-01.nii.gz, the whole
-        displacement.
+        The callable from `bayesreg.io.ledger.writing`. Each draw gets three files in transforms/: draw-01.h5 and
+        draw-01_inverse.h5 from `bayesreg.io.transforms.save_transform`, and draw-01.nii.gz, the displacement including
+        the pose.
     transform : Transform
-        From the fixed image's world.
+        The transform from the fixed image's world.
     grid : Image
-        Of the fixed image. The mean's field stands at every voxel centre, or where voxels are much smaller than
-        tetrahedra, in which the field is linear, at every second, third, …
+        The grid of the fixed image. The mean's field has a value at every voxel centre. If voxels are much smaller than
+        the tetrahedra, in which the field is linear, it has values only at every second, third, … voxel centre.
     """
     pose, upright = transform.pose, grid.on_orthogonal_grid(order=0)
     there = _every(upright, _step(transform.mesh, upright))
@@ -161,12 +163,12 @@ def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
 
 
 def _step(mesh: TetMesh, grid: Image) -> Int[np.ndarray, "3"]:
-    """How many voxels lie between those at which the mean is written, by axis."""
+    """Compute the step n of each axis if the mean is written at every n-th voxel."""
     return np.maximum(np.floor(MEAN_SPACING * mesh.boundary_edge / grid.voxel_sizes), 1).astype(int)
 
 
 def _every(grid: Image, step: Int[np.ndarray, "3"]) -> Image:
-    """A grid of every n-th voxel centre along each axis, which reaches as far as the whole does."""
+    """Build the grid of every n-th voxel centre along each axis that extends at least as far as the full grid."""
     shape = -(-(np.array(grid.shape) - 1) // step) + 1
     return Image(np.zeros(shape, np.int8), np.array(grid.affine) * np.append(step, 1))
 
@@ -189,12 +191,12 @@ def _write_ensemble(place: Place, transform: Transform, grid: Image) -> None:
 def total_displacement(
     pose: Pose, points: Float[np.ndarray, "X Y Z 3"], field: Float[np.ndarray, "X Y Z 3"]
 ) -> Float[np.ndarray, "X Y Z 3"]:
-    """From points to where they lie in the moving image's world, mm, single precision."""
+    """Compute the displacement of points to the moving image's world, including the pose, mm, float32."""
     return np.asarray(pose.displacement(points, field), np.float32)
 
 
 def around_displaced(grid: Image, points: Float[np.ndarray, "k 3"]) -> Image:
-    """A grid, enlarged by whole voxels so that it holds points and a margin about them."""
+    """Enlarge a grid by whole voxels so that it holds points and a margin of `MARGIN` around them."""
     index, margin = grid.world_to_voxel(points), MARGIN / grid.voxel_sizes
     low = np.minimum(np.floor(index.min(axis=0) - margin), 0).astype(int)
     high = np.maximum(np.ceil(index.max(axis=0) + margin), np.array(grid.shape) - 1).astype(int)

@@ -1,4 +1,4 @@
-"""Maps of the posterior on a grid: how sure the displacement is, how volume changes, how stiff the tissue is."""
+"""Maps of the posterior on a grid: uncertainty of the displacement, change of volume, stiffness."""
 
 from __future__ import annotations
 
@@ -33,34 +33,36 @@ def maps(
     like: str | Path | None = None,
     draws: int = POINT_DRAWS,
 ) -> list[Path]:
-    """Write maps of a run on the grid of its fixed image; NaN where the mesh does not reach, and nothing is known.
+    """Write maps of a run on the grid of its fixed image; NaN outside the mesh, where nothing is observed.
 
     Parameters
     ----------
     folder : path
-        Of a run.
+        The folder of a run.
     out : path
-        A folder; files of the same names are replaced.
+        The output folder; files of the same names are replaced.
     far : sequence of float
-        Distances, mm.
+        Distances d, mm, for the maps of P(distance > d).
     like : path, optional
-        An image in the fixed image's world on whose grid the maps are written instead.
+        An image in the fixed image's world whose grid is used instead.
     draws : int
-        How many at most.
+        Largest number of draws.
 
     Returns
     -------
     list of Path
         radius95.nii.gz
-            mm, within which a point lies about its mean place with a probability of 95 %.
+            Radius of the ball around the posterior mean that holds a displaced point with 95 % probability, mm.
         p_over_2mm.nii.gz and so on
-            P(a point lies further from there than so many mm).
+            P(distance of a displaced point from the posterior mean > d), here with d = 2 mm.
         jacobian_mean.nii.gz, jacobian_sd.nii.gz
-            Of det F of the tetrahedron of each voxel: its volume after the deformation over that before.
+            Mean and standard deviation of det F in the tetrahedron of each voxel: the ratio of the volumes after and
+            before the deformation.
         p_inverted.nii.gz
             P(det F < 0).
         stiffness_mean.nii.gz, stiffness_sd.nii.gz
-            Over that of the tissue, where the model has a field of stiffness.
+            Mean and standard deviation of the ratio of the stiffness to that of the tissue, if the model has a field of
+            stiffness.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def maps(
 
 
 def jacobians(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> dict[str, Float[np.ndarray, "cells"]]:
-    """Mean and standard deviation of det F of every tetrahedron, and how many draws turn it inside out."""
+    """Compute the mean and standard deviation of det F of every tetrahedron, and the share of draws that invert it."""
     count, total, square, inverted = len(draws), *np.zeros((3, len(mesh.cells)))
     for u in draws:
         ratio = signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes

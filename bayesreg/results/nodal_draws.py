@@ -1,4 +1,4 @@
-"""Draws of the displacement of every node of a run, and the transform that they make."""
+"""Draws of the displacement of every node of a run, and the transform from these draws."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from bayesreg.results.result import Result
 from bayesreg.results.transform import Transform
 from bayesreg.types import AnyArray
 
-# Draws of all chains together.
+# Default number of draws of all chains together for points.
 POINT_DRAWS = 1000
 
 
 def transform_of(result: Result, draws: int = POINT_DRAWS) -> Transform:
-    """The transform of a run from the fixed image's world to the moving one's, with up to so many of its draws."""
+    """Build the transform of a run from the fixed image's world to the moving one's, with at most `draws` draws."""
     run = result.run
-    # The files that the configuration names need not be there any more.
+    # `model_of` does not open the files that the configuration names, since they may no longer exist.
     u = nodal_draws(model_of(run.config), run, dataset(result.idata, "posterior"), draws)
     return Transform(Deformer(run.mesh), run.matching.pose, run.u_mean, u, seed=int(run.manifest["seed"]))
 
@@ -36,15 +36,15 @@ def transform_of(result: Result, draws: int = POINT_DRAWS) -> Transform:
 def nodal_draws(
     model: ModelConfig, inputs: Inputs | Run, draws: xr.Dataset, most: int
 ) -> Float[np.ndarray, "draws nodes 3"]:
-    """The displacement of every node, mm, of up to so many evenly spaced draws of a run, of all chains in turn.
+    """Compute the displacement of every node, mm, for at most `most` evenly spaced draws, from all chains in turn.
 
-    Nodes that are not sampled follow from those that are, and from λ and μ.
+    Displacements of nodes that are not sampled are computed from the sampled ones and from λ and μ.
     """
     if not most:
         return np.empty((0, *inputs.mesh.points.shape))
     chains = draws.sizes["chain"]
     some = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], chains * -(-most // chains))
-    # As few of each chain as there may be are still too many where the number is no multiple of theirs.
+    # Every chain gave the same number of draws, so that there are too many if `most` is no multiple of the chains.
     count = some["u_boundary"].shape[1]
     draw, chain = np.divmod(evenly_spaced(chains * count, most), chains)
     some = {name: values[chain, draw][None] for name, values in some.items()}
@@ -63,7 +63,7 @@ def nodal_draws(
 
 
 def with_known_boundary(model: ModelConfig, inputs: Inputs | Run) -> ModelConfig:
-    """The model of a run, whose boundary nodes are held if their displacement is known."""
+    """Return the model of a run; hold the boundary nodes fixed if their displacement is known."""
     if inputs.boundary is None:
         return model
     held = dict(zip(inputs.mesh.boundary.tolist(), map(tuple, np.asarray(inputs.boundary).tolist()), strict=True))

@@ -1,4 +1,4 @@
-"""A finished run, as its folder holds it."""
+"""Access to a finished run in its folder."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ POSTERIOR, REPORT = "posterior.nc", "report.html"
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A finished run.
+    """A finished run with its draws and its convergence.
 
     Attributes
     ----------
@@ -36,12 +36,12 @@ class Result:
 
     @cached_property
     def idata(self) -> Any:
-        """The draws, as ArviZ opens them."""
+        """The draws as ArviZ's inference data."""
         return open_posterior(require_file(self.folder, POSTERIOR))
 
     @cached_property
     def convergence(self) -> Convergence:
-        """R̂ and effective sample sizes of every estimand."""
+        """The R̂ and the effective sample sizes of every estimand."""
         return convergence(self.idata)
 
     @property
@@ -51,20 +51,20 @@ class Result:
 
     @property
     def u_mean(self) -> np.ndarray:
-        """Posterior mean displacement of every node, (n, 3), mm."""
+        """The posterior mean displacement of every node, (n, 3), mm."""
         return np.asarray(self.run.u_mean)
 
     @property
     def u_sd(self) -> np.ndarray:
-        """Posterior standard deviation of the displacement of every node, (n, 3), mm."""
+        """The posterior standard deviation of the displacement of every node, (n, 3), mm."""
         return np.asarray(self.run.u_sd)
 
     @property
     def pose(self) -> Motion | None:
-        """The rigid part of the displacement, the pose that was found first included, of some draws of every chain.
+        """The rigid part of the displacement, including the pose from before sampling, for some draws of every chain.
 
-        Translation of the mesh's centre, mm, and rotation about it, degrees, each (chains, draws, 3); None for runs of
-        versions that did not keep it.
+        It has the translation of the mesh's centre, mm, and the rotation vector about the centre, degrees, each
+        (chains, draws, 3). None for a run of a version that did not store it.
         """
         if self.run.predicted is None:
             return None
@@ -72,22 +72,22 @@ class Result:
 
     @property
     def metrics(self) -> dict[str, Any] | None:
-        """The paper's Tables 1 and 2 and the coverage of intervals, where the truth is known."""
+        """The values of the paper's Tables 1 and 2 and the coverage of intervals; None if the truth is unknown."""
         return self.run.metrics
 
     @property
     def converged(self) -> bool | None:
-        """Whether the stop rule held and the report's rank-normalised R̂ agrees; None where no rule was set."""
+        """True if the stop rule and the report's rank-normalised R̂ both show convergence; None if no rule was set."""
         return self.run.manifest["stopped"]["converged"]
 
     @property
     def report(self) -> Path:
-        """The HTML report."""
+        """The path of the HTML report."""
         return self.folder / REPORT
 
 
 def load_result(folder: str | Path) -> Result:
-    """Open a finished run; InputError where the folder holds none, or a file of it is damaged."""
+    """Open a finished run; raise InputError if the folder holds none or a file of it is damaged."""
     run = store.read_run(folder)
     require_file(folder, POSTERIOR)
     require_unchanged(folder, but=REPORT)

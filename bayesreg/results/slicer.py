@@ -1,4 +1,4 @@
-"""A run as a scene of 3D Slicer, in the world of the moving image: where surgery takes place."""
+"""Export of a run as a scene of 3D Slicer, in the world of the moving image, in which surgery takes place."""
 
 from __future__ import annotations
 
@@ -22,26 +22,27 @@ SCENE, BACK = "scene.mrml", "moving to fixed"
 
 
 def slicer(folder: str | Path, out: str | Path) -> Path:
-    """Write a folder that 3D Slicer opens: images, transform, uncertainty, mesh, and places with their ellipsoids.
+    """Write a folder that 3D Slicer opens: images, transform, uncertainty, mesh, and points with their ellipsoids.
 
     Parameters
     ----------
     folder : path
-        Of a run.
+        The folder of a run.
     out : path
-        A folder; files of the same names are replaced.
+        The output folder; files of the same names are replaced.
 
     Returns
     -------
     Path
-        The scene. Fixed image and uncertainty are carried into the moving image's world by the inverse of the posterior
-        mean; the mesh is where that takes it, its points with their 95 % radius, mm; places and landmarks are where it
-        takes them, each within the ellipsoid that holds it with 95 %.
+        The path of the scene. In the scene, the inverse of the posterior mean resamples the fixed image and the maps of
+        uncertainty in the moving image's world. The mesh's surface is moved by the posterior mean, with the 95 % radius
+        of its points, mm. The report's points and the landmarks are moved likewise, each with the ellipsoid that holds
+        it with 95 % probability.
 
     Raises
     ------
     InputError
-        If the folder holds no run, or one that left no transforms.
+        If the folder holds no run, or a run without transforms.
     """
     result, out = load_result(folder), require_folder(out)
     if not (result.folder / MEAN_INVERSE).is_file():
@@ -75,7 +76,7 @@ def _write_images(result: Result, out: Path) -> list[Item]:
 
 
 def _write_mesh(transform: Transform, out: Path) -> list[Item]:
-    """The surface of the organ."""
+    """Write the surface of the organ, moved by the posterior mean."""
     mesh = transform.mesh
     found = spread(transform, mesh.points[mesh.boundary])
     faces = np.searchsorted(mesh.boundary, mesh.boundary_faces)
@@ -84,7 +85,7 @@ def _write_mesh(transform: Transform, out: Path) -> list[Item]:
 
 
 def _write_places(result: Result, transform: Transform, out: Path) -> list[Item]:
-    """The report's places, and the landmarks that were observed or held out."""
+    """Write the report's points, and the observed and held-out landmarks, with their ellipsoids."""
     predicted, items = result.run.predicted, []
     if predicted is None:
         return []

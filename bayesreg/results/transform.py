@@ -1,4 +1,4 @@
-"""The posterior of the map from the world of the fixed image to that of the moving one, and of its inverse."""
+"""The posterior of the map from the fixed image's world to the moving image's world, and of its inverse."""
 
 from __future__ import annotations
 
@@ -25,32 +25,33 @@ from bayesreg.pose import Pose
 
 @dataclass(frozen=True, eq=False)
 class Transform:
-    """y = pose(x + u(x)) with draws of u, or, where it is turned round, x as a function of y.
+    """The map y = pose(x + u(x)) with draws of u or, if it is inverted (`turned`), x as a function of y.
 
     Attributes
     ----------
     deformer : Deformer
-        The mesh, at rest in the fixed image's world.
+        The mesh, undeformed in the fixed image's world.
     pose : Pose
-        Between the two worlds; known, for what is unknown of it is part of u.
+        The rigid map between the two worlds. It has no uncertainty, since u includes the error of the pose.
     u_mean : (n, 3) array
         Posterior mean of u at the nodes, mm.
     draws : (S, n, 3) array
-        Draws of it.
+        Draws of u at the nodes, mm.
     turned : bool
-        Whether it leads from the moving image's world to that of the fixed one.
+        Whether the map leads from the moving image's world to the fixed image's world.
     seed : int
-        Of what the mesh cannot follow.
+        Seed of the Normal numbers for the part of u that the mesh cannot resolve.
 
     Notes
     -----
-    A draw of u is linear between the nodes, and there it averages what these err by on their own: in the middle of a
-    tetrahedron it varies by half as much as at its corners. The truth is not linear, and is not known any better there.
-    A draw at a point is therefore that of the mesh and a Normal number, so that its variance is that of the nodes,
-    interpolated as a standard deviation, and what the mesh cannot follow of a smooth displacement
-    (`bayesreg.model.submesh`): the standard deviation that a run writes on the grid of its image. All points have the
-    same Normal numbers, three to a draw, so that what is told of a point does not depend on which others there are;
-    how points vary together is not told by them.
+    A draw of u is linear between the nodes, which averages independent errors of the nodes: in the middle of a
+    tetrahedron the standard deviation of u is half of that at the corners. The true displacement is not linear, and is
+    no better known in the middle than at the corners. Therefore a draw at a point is the draw of the mesh plus a Normal
+    number. The variance of their sum is the variance of the nodes, interpolated as a standard deviation, plus the
+    variance of a smooth displacement that the mesh cannot resolve (`bayesreg.model.submesh`). A run writes the same
+    standard deviation on the grid of its image. All points share the same Normal numbers, three for each draw, so that
+    the result for a point does not depend on the other points. The draws do not show how the displacements of several
+    points vary together.
     """
 
     deformer: Deformer
@@ -67,28 +68,28 @@ class Transform:
 
     @property
     def inverse(self) -> Transform:
-        """The map that leads back."""
+        """The inverse map between the two worlds."""
         return replace(self, turned=not self.turned)
 
     @cached_property
     def mean(self) -> Displaced:
-        """The mesh, displaced by the posterior mean."""
+        """The mesh after displacement by the posterior mean."""
         return self.deformer.displaced(self.u_mean)
 
     @cached_property
     def _normal_numbers(self) -> Float[np.ndarray, "draws 3"]:
-        """One for each draw and axis, of mean zero and of variance one over the draws."""
+        """Normal numbers for each draw and axis, with mean zero and variance one over the draws."""
         numbers = np.random.default_rng(self.seed).standard_normal((len(self.draws), 3))
         numbers -= numbers.mean(axis=0)
         return numbers / np.maximum(numbers.std(axis=0, ddof=1), 1e-12) if len(numbers) > 1 else numbers
 
     @cached_property
     def folded(self) -> float:
-        """The share of the draws that turn a tetrahedron of the mesh inside out."""
+        """The share of the draws that invert a tetrahedron of the mesh."""
         return float(np.mean([self.deformer.displaced(u).folded > 0 for u in self.draws]))
 
     def place(self, points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "k 3"], Location]:
-        """Where the posterior mean of u takes points, mm, and where in the fixed image's world what moves them lies."""
+        """Map points by the posterior mean of u, mm; also locate them in the mesh in the fixed image's world."""
         if self.turned:
             return self.mean.sources(self.pose.inverse.place(points))
         location = self.deformer.locate(points)
@@ -97,16 +98,18 @@ class Transform:
     def place_by(
         self, draw: int, points: Float[np.ndarray, "k 3"], near: Location, unresolved_sd: Float[np.ndarray, "k 3"]
     ) -> Float[np.ndarray, "k 3"]:
-        """Where one of the draws takes points, mm.
+        """Map points by one of the draws, mm.
 
         Parameters
         ----------
         draw : int
+            The number of the draw.
         points : (k, 3) array
+            The points before the map, mm.
         near : Location
-            As `place` gives it.
+            The locations of the points from `place`.
         unresolved_sd : (k, 3) array
-            As `unresolved_sd` gives it there.
+            The standard deviations at these locations from `Transform.unresolved_sd`, mm.
         """
         displaced = self.deformer.displaced(self.draws[draw])
         beside = unresolved_sd * self._normal_numbers[draw]
@@ -115,20 +118,23 @@ class Transform:
         return self.pose.place(points + displaced.displacement(points, near) + beside)
 
     def for_each_draw(self, function: Callable[[int], Any]) -> Iterator[Any]:
-        """Call a function with the number of each draw, some side by side, and yield what it returns, in order."""
+        """Call a function with the number of each draw, in parallel threads, and yield its results in order."""
         side_by_side = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         with ThreadPoolExecutor(side_by_side) as pool:
             for first in range(0, len(self.draws), side_by_side):
                 yield from pool.map(function, range(first, min(first + side_by_side, len(self.draws))))
 
     def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
-        """What draws of u lack of its standard deviation at points, mm (see above); zero around the mesh."""
+        """Compute the standard deviation of the Normal number that is added to draws of u at points, mm.
+
+        The notes of `Transform` define it. It is zero around the mesh.
+        """
         return np.sqrt(self._unresolved_variance(near, self._drawn_covariance(near)))
 
     def covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
-        """The posterior covariance of u at points, mm² (see above), along the axes of the fixed image's world.
+        """Compute the posterior covariance of u at points, mm², along the axes of the fixed image's world.
 
-        Around the mesh, where no draw is asked, it is NaN.
+        The notes of `Transform` define it. It is NaN around the mesh, where nothing is observed.
         """
         drawn = self._drawn_covariance(near)
         found = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
@@ -136,7 +142,10 @@ class Transform:
         return found
 
     def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
-        """The posterior covariance of u at the nodes, mm², and of what the mesh cannot follow about them."""
+        """Compute the posterior covariance of u at the nodes, mm², plus the variance that the mesh cannot resolve.
+
+        The latter is the mean over the tetrahedra at a node, weighted by their volumes.
+        """
         away = self.draws - self.draws.mean(axis=0)
         found = np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
         total, volume = np.zeros((len(found), 3)), np.zeros(len(found))
@@ -146,7 +155,10 @@ class Transform:
         return found + (total / volume[:, None])[:, :, None] * np.eye(3)
 
     def _drawn_covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
-        """The covariance of the draws, which are linear in every tetrahedron; zero around the mesh."""
+        """Compute the covariance of the draws at points, mm²; zero around the mesh.
+
+        The draws are linear in every tetrahedron.
+        """
         found = np.zeros((len(near.cell), 3, 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
@@ -157,7 +169,10 @@ class Transform:
         return found
 
     def _unresolved_variance(self, near: Location, drawn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 3"]:
-        """The variance of u (the nodes', interpolated, and what the mesh cannot follow) less that of the draws."""
+        """Compute the variance of u minus the variance of the draws at points, mm²; zero around the mesh.
+
+        The variance of u is that of the nodes, interpolated, plus the variance that the mesh cannot resolve.
+        """
         found = np.zeros((len(near.cell), 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
@@ -175,10 +190,10 @@ class Transform:
 
     @cached_property
     def _cell_covariance(self) -> Float[np.ndarray, "cells 4 4 3 3"]:
-        """The covariance of u between the corners of every tetrahedron."""
+        """The covariance of u between the corners of every tetrahedron, mm²."""
         away, cells = self.draws - self.draws.mean(axis=0), self.mesh.cells
         found = np.empty((len(cells), 4, 4, 3, 3))
-        # A few tetrahedra at a time: all draws of their corners are in memory.
+        # Blocks of tetrahedra limit the memory for all draws of their corners.
         for some in slices(len(cells), 500):
             corners = np.moveaxis(away[:, cells[some]], 0, 2)
             for a, b in combinations_with_replacement(range(4), 2):
@@ -188,19 +203,19 @@ class Transform:
 
 
 class Spread(NamedTuple):
-    """Where points may lie.
+    """The posterior of the coordinates of mapped points.
 
     Attributes
     ----------
     places : (k, 3) array
-        By the posterior mean of the displacement, mm.
+        The points mapped by the posterior mean of the displacement, mm.
     covariance : (k, 3, 3) array
-        Of the draws about that, mm²; NaN around the mesh, where nothing is observed and draws agree with one another
-        because the displacement goes on in one way.
+        Covariance of the draws about `places`, mm². NaN around the mesh: nothing is observed there, and the draws agree
+        too well because the displacement continues in one way only.
     far : (x, k) array
-        P(a point lies further from there than so many mm), for each such distance; NaN there, too.
+        P(distance from `places` > d) for each of x distances d; NaN around the mesh.
     inside : (k,) bool array
-        Whether what moves the point lies in the mesh: outside nothing is observed.
+        Whether the point, in the fixed image's world, lies in the mesh; outside nothing is observed.
     """
 
     places: Float[np.ndarray, "k 3"]
@@ -209,11 +224,14 @@ class Spread(NamedTuple):
     inside: Bool[np.ndarray, "k"]
 
     def part(self, chosen: Bool[np.ndarray, "k"]) -> Spread:
-        """Take some of the points."""
+        """Select some of the points."""
         return Spread(self.places[chosen], self.covariance[chosen], self.far[:, chosen], self.inside[chosen])
 
     def ellipsoids(self, probability: float = 0.95) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3 3"]]:
-        """Half-axes, mm, the longest first, and their directions (rows) of the regions that hold a Normal point."""
+        """Compute the ellipsoids that hold Normal points of these covariances with a probability.
+
+        The results are the half-axes, mm, the longest first, and their directions (rows).
+        """
         lengths, axes = np.full((len(self.places), 3), np.nan), np.full((len(self.places), 3, 3), np.nan)
         known = np.isfinite(self.covariance).all(axis=(1, 2))
         variance, directions = np.linalg.eigh(self.covariance[known])
@@ -223,15 +241,17 @@ class Spread(NamedTuple):
 
 
 def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence[float] = ()) -> Spread:
-    """Where a transform may take points; a few draws of all points are in memory at a time.
+    """Compute the posterior of points mapped by a transform.
+
+    Only a few draws of all points are in memory at a time.
 
     Parameters
     ----------
     transform : Transform
     points : (k, 3) array
-        mm.
+        The points before the map, mm.
     far : sequence of float
-        Distances, mm.
+        The distances d of `Spread.far`, mm.
     """
     places, near = transform.place(points)
     inside = transform.deformer.is_inside(near)
@@ -251,14 +271,14 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
 
 
 class Distances(NamedTuple):
-    """How far Normal vectors about zero lie from it.
+    """The distribution of the length of Normal vectors of mean zero.
 
     Attributes
     ----------
     radius : (k,) array
-        Within which 95 % of them lie, mm.
+        The radius that 95 % of the vectors do not exceed, mm (or another share, see `distances_of`).
     far : (x, k) array
-        P(further than so many mm), for each such distance.
+        P(length > d) for each of x distances d.
     """
 
     radius: Float[np.ndarray, "k"]
@@ -266,10 +286,10 @@ class Distances(NamedTuple):
 
 
 def distances_of(covariance: Float[np.ndarray, "k 3 3"], far: Sequence[float] = (), level: float = 0.95) -> Distances:
-    """How far Normal vectors of these covariances, mm², lie from zero; NaN where a covariance is.
+    """Compute the distribution of the length of Normal vectors of given covariances, mm²; NaN if a covariance is NaN.
 
-    |x|² is Σ λ_i z_i² by the eigenvalues λ and independent Normal numbers z, here 1,024 quasi-random ones that all
-    share: probabilities are right to 0.01.
+    The squared length is Σ λ_i z_i² with the eigenvalues λ of the covariance and independent Normal numbers z. All
+    covariances share 1,024 quasi-random z, which give probabilities with an error of 0.01.
     """
     squares = MultivariateNormalQMC(np.zeros(3), rng=np.random.default_rng(0)).random(1024) ** 2
     radius, probability = np.full(len(covariance), np.nan), np.full((len(far), len(covariance)), np.nan)
