@@ -1,4 +1,4 @@
-"""The sections of a configuration that say which images there are: files, datasets, and pairs made of them."""
+"""The sections of a configuration that describe the images: files, datasets, and synthetic pairs made of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Mni152Data(Section):
 
     @property
     def tissues(self) -> tuple[str, ...]:
-        """Names of the tissues."""
+        """The names of the tissues."""
         return BRAIN
 
 
@@ -37,12 +37,12 @@ class BrainWebData(Section):
 
     @property
     def tissues(self) -> tuple[str, ...]:
-        """Names of the tissues."""
+        """The names of the tissues."""
         return BRAIN
 
 
 class FilesData(Section):
-    """An organ of one's own."""
+    """The user's own images and labels, from files."""
 
     source: Literal["files"]
     fixed: FoundImage | None = None
@@ -72,7 +72,7 @@ class FilesData(Section):
 
     @property
     def tissues(self) -> tuple[str, ...] | None:
-        """Names of the tissues; None where only the mesh knows them."""
+        """The names of the tissues; None if only the mesh defines them."""
         if self.label_table is None:
             return (ORGAN,) if self.fixed is not None else None
         return tissue_names(self.label_table)
@@ -111,7 +111,7 @@ class FilesData(Section):
 
 
 class Scan(Section):
-    """How the moving image of a synthetic pair is stored as a hospital would have it, beside the pair itself."""
+    """Options of the two scans, as from a hospital, that are stored beside a synthetic pair."""
 
     millimetres: NotNegative = 8.0
     """How far the organ has shifted between the scans, mm."""

@@ -22,7 +22,7 @@ from bayesreg.tissues import BRAIN_EDGE
 
 
 class MeshConfig(Section):
-    """How the mesh is made, or which one is taken."""
+    """How the mesh is made, or the file of an existing mesh."""
 
     edge_length: Positive | None = None
     """Wanted length of an edge on the boundary, mm; null is 15.5 for a human brain, which gives a mesh of the paper's
@@ -36,7 +36,7 @@ class MeshConfig(Section):
 
 
 class StartConfig(Section):
-    """Where the chains start."""
+    """The start of the chains."""
 
     field: Annotated[Literal["identity", "truth", "demons"] | Path, BeforeValidator(find_field)] = "identity"
     """identity, truth (of a synthetic pair), demons (of the pair of images, which must be of one contrast), or a file
@@ -51,13 +51,13 @@ class StartConfig(Section):
     """Sd, between chains, of the logarithm of the Lamé parameters that they start with."""
 
     def entries(self, name: Literal["lam", "mu"], names: Iterable[str]) -> dict[str, float] | None:
-        """Start value of every named entry of λ or μ; None where the model is to choose."""
+        """Return the start value of every named entry of λ or μ; None if the model chooses them."""
         given = getattr(self, name)
         return dict.fromkeys(names, given) if isinstance(given, float) else given
 
 
 class StopConfig(Section):
-    """When to stop: as soon as every estimand's R-hat is low enough, or when a budget is spent."""
+    """The stop rule: sampling stops when the R-hat of every estimand is low enough, or a budget is spent."""
 
     rhat: Annotated[float, Field(strict=True, gt=1)] | None = 1.01
     """Largest R-hat of all estimands; null runs until a budget is spent."""
@@ -80,7 +80,7 @@ BidsLabel = Annotated[str, Field(strict=True), AfterValidator(_require_letters_a
 
 
 class BidsConfig(Section):
-    """Names of BIDS: letters and digits."""
+    """BIDS labels of the results; each has only letters and digits."""
 
     subject: BidsLabel
     session: BidsLabel | None = None
@@ -99,7 +99,7 @@ class BidsConfig(Section):
 
 
 class ResultsConfig(Section):
-    """What a run leaves for other programs, besides what it always does."""
+    """Optional result files for other programs."""
 
     draws: Annotated[int, Field(strict=True, ge=0)] = 0
     """How many draws, evenly spaced, are written as transforms and displacement fields of their own."""
@@ -108,7 +108,7 @@ class ResultsConfig(Section):
 
 
 class EvaluationConfig(Section):
-    """What the result is held against, and the sampler never sees."""
+    """Held-out landmarks for the evaluation of the result; the sampler does not use them."""
 
     landmarks: FoundFile
     """Pairs of points: both of each in one file (.csv, or .tag of two volumes), or those of the fixed image."""
@@ -133,7 +133,7 @@ class ReportConfig(Section):
 
 
 def _require_tissues(key: str, given: object, names: Sequence[str] | None, whole: bool = False) -> None:
-    """Refuse names that no tissue has, and where it must be `whole`, tissues that are left out."""
+    """Raise an error for unknown names of tissues and, if the mapping must be `whole`, for missing tissues."""
     if not isinstance(given, Mapping) or names is None:
         return
     for tissue in sorted(set(given) - set(names)):
@@ -147,7 +147,7 @@ def _has_images(data: Mni152Data | BrainWebData | FilesData) -> bool:
 
 
 def _require_nothing_else(model: ModelConfig) -> None:
-    """Refuse what known_boundary leaves no room for."""
+    """Raise an error for options of the elastic prior that contradict known_boundary."""
     elastic = model.elastic_prior
     if elastic.nodes != "boundary" or elastic.held:
         key = "held" if elastic.held else "nodes"
@@ -160,10 +160,10 @@ def _require_nothing_else(model: ModelConfig) -> None:
 
 
 def complete(given: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration, before it is checked, with the preset of its model and the observations that it leaves out.
+    """Add the default preset of the model and the default observations to an unchecked configuration.
 
-    The default is `preset: registration` where data come from files, and `preset: paper` where the pair is made here or
-    the boundary is known. Images that are there are compared, unless the observations are listed.
+    The default preset is `registration` for data from files, and `paper` for a synthetic pair or a known boundary. The
+    default observation is the pair of images, if there is one.
     """
     data, found = given.get("data"), dict(given)
     if not isinstance(data, Mapping):
@@ -179,7 +179,7 @@ def complete(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """A completed configuration in which every pair of images has the options of the preset that it does not give."""
+    """Add the preset's options to every pair of images in a completed configuration; given options stay."""
     model, observations = given.get("model"), given.get("observations")
     preset = model.get("preset") if isinstance(model, Mapping) else getattr(model, "preset", None)
     if preset not in ("paper", "registration") or not isinstance(observations, list):
@@ -195,7 +195,7 @@ def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Config(Section):
-    """Everything that a run needs to know."""
+    """The complete configuration of a run."""
 
     description: str = ""
     """The purpose of the run, in words."""
@@ -230,7 +230,7 @@ class Config(Section):
     def _complete(cls, given: Any) -> Any:
         return _with_image_options(complete(given)) if isinstance(given, Mapping) else given
 
-    # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
+    # Checks between sections are validators of fields: pydantic skips validators of the model if a field is wrong.
 
     @field_validator("simulate")
     @classmethod
@@ -284,13 +284,13 @@ class Config(Section):
 
     @property
     def pairs_of_images(self) -> list[ImagesSection]:
-        """The pairs of images among the observations, that of the section data first."""
+        """The pairs of images among the observations; the pair of the section data comes first."""
         pairs = [one for one in self.observations if isinstance(one, ImagesSection)]
         return sorted(pairs, key=lambda pair: pair.fixed is not None)
 
     @property
     def image_options(self) -> ImageOptions:
-        """How the pair of the section data is compared; the defaults where it is not."""
+        """The options for the comparison of the pair in the section data; the defaults if it is not compared."""
         return next(iter(self.pairs_of_images), ImageOptions())
 
     @field_validator("known_boundary")
