@@ -9,8 +9,8 @@ from pathlib import Path
 from bayesreg.tissues import BACKGROUND, ORGAN
 
 # FreeSurfer's aseg, aparc+aseg, aparc.a2009s+aseg and wmparc (FreeSurferColorLUT.txt), and SynthSeg, which takes its
-# values from there. Brainstem, optic chiasm and ventral diencephalon are mixtures of tissues: the first two count as WM,
-# the last as GM.
+# values from there. Brainstem, optic chiasm and ventral diencephalon are mixtures of tissues: the first two count as
+# WM, the last as GM.
 _FREESURFER = {
     "csf": (4, 5, 14, 15, 24, 31, 43, 44, 63, 72),
     "gm": (
