@@ -91,7 +91,7 @@ def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices
 
 
 def _together() -> int:
-    """Lookups, those of all chains, whose taps are held at once: what stays in a processor's cache, or fills a GPU."""
+    """Return the number of points, over all chains, in one batch: their taps fit into a CPU's cache, or fill a GPU."""
     return 2**13 if jax.default_backend() == "cpu" else 2**20
 
 

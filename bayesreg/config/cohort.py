@@ -38,9 +38,9 @@ class ClusterConfig(Section):
     """The workers that share the runs of a cohort."""
 
     workers: Count = 1
-    """How many subjects at a time, each in a process of its own, which a fair share of the cores is for."""
+    """The number of subjects that run at the same time. Each has its own process, with an equal share of the cores."""
     slurm: dict[str, Any] | None = None
-    """What dask_jobqueue.SLURMCluster is given (queue, cores, memory, walltime …): workers are then jobs of SLURM."""
+    """Arguments of dask_jobqueue.SLURMCluster (queue, cores, memory, walltime …); the workers are then SLURM jobs."""
 
 
 class CohortConfig(Section):
@@ -53,7 +53,7 @@ class CohortConfig(Section):
     such as data.fixed (an empty cell leaves what all share); or a pattern for each of such keys, such as
     "bids/sub-{subject}/ses-pre/anat/*_T1w.nii.gz"."""
     sweep: dict[str, list[Any]] = Field(default_factory=dict)
-    """Values of further keys; every subject is run with each combination of them."""
+    """Values of further keys; every subject runs with each combination of these values."""
     cluster: ClusterConfig = ClusterConfig()
 
 

@@ -91,7 +91,7 @@ def _path(details: ErrorDetails, data: Any, model: type[BaseModel]) -> Keys:
         try:
             data, path = data[key], (*path, key)
         except (KeyError, IndexError, TypeError):
-            path = path or (key,)  # A section that was left out may be wrong, too.
+            path = path or (key,)  # An omitted section may have errors, too.
     left_out = details["type"] == "missing" or last in _fields_at(tuple(parents), model)
     if left_out and path[-1] != last:
         path = (*path, last)

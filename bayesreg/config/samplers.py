@@ -17,10 +17,10 @@ class _Chains(BaseModel):
 
     chains: Chains = 4
     thin: Count = 1
-    """Every how many transitions a draw is kept."""
+    """The number of transitions per kept draw."""
     block: Count | None = None
-    """Kept draws between two looks at the stop rule; null is 100, and fewer where many quadrature points make steps
-    slow."""
+    """The number of kept draws between two checks of the stop rule; null is 100, or fewer if many quadrature points
+    make steps slow."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -34,7 +34,7 @@ class RandomWalk(settings.RandomWalk, _Chains):
     name: Literal["rwmh"]
     chains: Chains = 3
     thin: Count = 10
-    """Every how many transitions a draw is kept."""
+    """The number of transitions per kept draw."""
 
 
 class Hmc(settings.Hmc, _Chains):

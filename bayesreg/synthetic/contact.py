@@ -56,7 +56,7 @@ class _State(NamedTuple):
     u: np.ndarray  # (n, 3)
     force: np.ndarray  # (o,) multipliers of the nodes that may touch
     penalty: np.ndarray  # (o,) weights of the ℓ1 penalty, at least the multipliers
-    direction: np.ndarray  # (n, 3) of the last step, and zero where that step was stretched
+    direction: np.ndarray  # (n, 3) direction of the last step; zero if its length was not one
 
 
 class ContactProblem:
