@@ -211,7 +211,7 @@ class Config(Section):
     """The synthetic pair that is made from the anatomy; null for data from files."""
     known_boundary: Annotated[Literal["truth"] | Path | None, BeforeValidator(find_boundary)] = None
     """Elastography: the displacement of the boundary is known, and only λ and μ are sampled. The value is truth (of a
-    synthetic pair) or a file (.vtu or .npz of this mesh, or a displacement field .nii, .nii.gz); null samples it too."""
+    synthetic pair) or a file (.vtu or .npz of this mesh, or a displacement field .nii, .nii.gz). null samples both."""
     observations: Observations = Field(default=[])
     """The data of the run; null is only the pair of images, if there is one."""
     model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
