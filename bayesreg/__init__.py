@@ -5,7 +5,7 @@ import os
 import sys
 from typing import Any
 
-# Float64 without paying for the import of JAX here: it reads the variable when it is first imported.
+# JAX reads this variable at its first import, so that float64 is enabled without importing JAX here.
 os.environ["JAX_ENABLE_X64"] = "true"
 if "jax" in sys.modules:
     sys.modules["jax"].config.update("jax_enable_x64", True)

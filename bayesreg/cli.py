@@ -1,4 +1,4 @@
-"""The command line. Heavy imports stand inside the commands, so that help comes at once."""
+"""Define the command line. The commands import large modules themselves, so that help appears at once."""
 
 import errno
 import logging
@@ -18,9 +18,10 @@ STORAGE_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno
 
 
 class _Commands(TyperGroup):
-    """A mistake of the user gives one message and status 2, a failing disk status 1; any other exception is a bug.
+    """The group of commands, which converts expected exceptions into a message and an exit status.
 
-    A signal gives a message, too, and the status that shells know it by.
+    The status is 2 for an error of the user, 1 for a failing disk, and 128 plus its number for a signal. Any other
+    exception is a bug.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -139,7 +140,7 @@ Space = Annotated[
 
 def _quieten(wanted: bool) -> bool:
     if wanted:
-        # Until the block of `show_messages` about the command ends.
+        # The block of `show_messages` around the command restores the level.
         logging.getLogger("bayesreg").setLevel(logging.WARNING)
     return wanted
 
@@ -362,12 +363,12 @@ def schema() -> None:
 
 
 def main() -> None:
-    """Entry point of the `bayesreg` command."""
+    """Run the `bayesreg` command; this is its entry point."""
     app()
 
 
 def _sample(config: Any, out: Path, resume: bool, quiet: bool) -> None:
-    """Run a configuration, name the report, and end with the status of its convergence."""
+    """Run a configuration, print the path of the report, and exit with `NOT_CONVERGED` if it has not converged."""
     from bayesreg.workflow.run import run
 
     result = run(config, out, resume=resume, progress=not quiet)

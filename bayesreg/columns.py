@@ -1,4 +1,4 @@
-"""Chains side by side as the last axis of arrays, where `vmap` would give each its own place."""
+"""Put chains on the last axis of arrays under `vmap`, which would put them on the first axis."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from bayesreg.types import AnyArray
 
 
 def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate f(shared, *arrays) whose arrays, as what it returns, end in an axis of chains: `vmap` makes it longer.
+    """Decorate f(shared, *arrays) so that `vmap` makes the last axis (chains) of its arrays and results longer.
 
-    `shared` is a pytree that all chains have in common. What is decorated has no derivative.
+    `shared` is a pytree that all chains have in common. The decorated function has no derivative.
     """
     decorated = custom_vmap(function)
 

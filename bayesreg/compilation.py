@@ -1,4 +1,4 @@
-"""How JAX compiles programs and where it keeps them, said by variables that it reads when it starts."""
+"""Set the environment variables that control how JAX compiles programs and where it stores them."""
 
 import os
 import platform
@@ -11,29 +11,29 @@ from pathlib import Path
 
 import platformdirs
 
-# For so long are compiled programs kept, some 5 MB of them for a mesh.
+# Older compiled programs are removed; one mesh has about 5 MB of programs.
 MOST_DAYS = 30
-# Half the time for compiling, and programs that are no slower (docs/speed.md#compiling).
+# These flags halve the compilation time and do not slow the programs (docs/speed.md#compiling).
 QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
-# XLA ends a process that names a flag which it does not know, and drops flags as it goes.
+# XLA ends a process that uses an unknown flag, and new versions of XLA remove flags.
 KNOWN_TO = "0.10."
 
 
 def compile_quickly(flags: str = QUICK) -> None:
-    """Have XLA spend less on compiling, unless its own variable is set.
+    """Reduce the compilation time of XLA, unless the variable XLA_FLAGS is set.
 
-    Only with the version of jaxlib that this was measured with, and where JAX has no devices but the processor: for
-    others one of the flags means something else.
+    The flags are set only for the measured version of jaxlib, and only if the processor is JAX's only device: for other
+    devices one of the flags has another meaning.
     """
     if version("jaxlib").startswith(KNOWN_TO) and find_spec("jax_plugins") is None:
         os.environ.setdefault("XLA_FLAGS", flags)
 
 
 def keep_compiled_programs() -> None:
-    """Have JAX keep compiled programs in the user's cache for later runs, unless its own variable names a folder.
+    """Let JAX store compiled programs in the user's cache, unless the variable JAX_COMPILATION_CACHE_DIR is set.
 
-    Each kind of processor has a folder of its own there: homes are shared on clusters, and what is compiled for one
-    kind may not run on another. Where there is no home, or none that can be written to, nothing is kept.
+    Each kind of processor has its own folder: clusters share home folders, and a program that was compiled for one kind
+    may not run on another. Without a writable home folder no program is stored.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
@@ -52,14 +52,14 @@ def keep_compiled_programs() -> None:
 def _remove_old(folder: Path) -> None:
     oldest = time.time() - MOST_DAYS * 24 * 3600
     for program in folder.iterdir():
-        # Another run may be doing the same.
+        # Another run may remove the same files at the same time.
         with suppress(FileNotFoundError):
             if program.stat().st_mtime < oldest:
                 program.unlink()
 
 
 def _processor() -> str:
-    """A text that tells kinds of processors apart."""
+    """Describe the kind of this machine's processor in a text that differs between kinds."""
     information = Path("/proc/cpuinfo")
     if not information.exists():
         return platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""Signed distance to a forbidden region."""
+"""Compute the signed distance to a forbidden region."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from scipy import ndimage
 from bayesreg.image import Image
 from bayesreg.types import InputError
 
-# Wide enough to lead back a body that has strayed from what is allowed, mm.
+# The distance has a gradient up to this depth in the forbidden region, which leads a node there back out, mm.
 MARGIN = 16.0
-# The smoothing: its standard deviation and its reach, voxels, and the least distance, voxels, of a voxel centre from
-# the surface.
+# The standard deviation and the reach of the smoothing, and the least distance of a voxel centre from the surface; all
+# in voxels.
 _SMOOTHING, _END, _KEPT = 1.0, 4, 0.02
 
 
 def forbidden(intracranial: Image) -> Image:
-    """Ω_SK, nonzero = forbidden: everything outside the intracranial mask."""
+    """Make the image of Ω_SK, nonzero = forbidden: everything outside the intracranial mask."""
     return intracranial.with_voxels((np.asarray(intracranial.voxels) == 0).astype(np.uint8))
 
 
 def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
-    """Distance to the forbidden region Ω_SK, positive outside it.
+    """Compute the distance to the forbidden region Ω_SK, positive outside this region.
 
     Parameters
     ----------
     skull : Image
-        Nonzero = forbidden. All that lies off its grid is forbidden too.
+        Nonzero = forbidden. Everything outside its grid is forbidden, too.
     margin : float
-        How far from all that is allowed the distance is told at least, mm.
+        The least distance from the allowed region to the border of the result's grid, mm.
 
     Returns
     -------
     Image
-        mm, negative where forbidden, on the skull's grid with one voxel more on each side, or as many as the margin
-        asks for; for affines whose axes are orthogonal.
+        The distance, mm, negative in the forbidden region. Its grid is the skull's grid, extended on each side by at
+        least one voxel, or by as many as the margin needs. The axes of the affine must be orthogonal.
 
     Raises
     ------
@@ -46,10 +46,10 @@ def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
 
     Notes
     -----
-    The surface of a voxel mask is a staircase, in whose corners a node that slides along it is caught. The distance
-    is therefore smoothed by one voxel, but so that every voxel centre stays on its own side (Whitaker 2000, "Reducing
-    aliasing artifacts in iso-surfaces of binary volumes"): sheets and ridges of one voxel remain. Where the surface is
-    flat and along the grid, its trilinear zero level runs half-way between allowed and forbidden voxel centres.
+    The surface of a voxel mask has steps, whose corners stop a node that slides along it. The distance is therefore
+    smoothed by one voxel, but every voxel centre stays on its own side (Whitaker 2000, "Reducing aliasing artifacts in
+    iso-surfaces of binary volumes"), so that sheets and ridges of one voxel remain. If the surface is flat and parallel
+    to the grid, its trilinear zero level lies half-way between allowed and forbidden voxel centres.
     """
     allowed = np.asarray(skull.voxels) == 0
     if not allowed.any():
@@ -73,5 +73,5 @@ def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
     return Image(distance, affine)
 
 
-# For a synthetic pair and its posterior, which ask for the same one.
+# A synthetic pair and its posterior need the same distance.
 shared_distance = lru_cache(maxsize=1)(signed_distance)

@@ -1,4 +1,4 @@
-"""What a mask says of an image to ignore: on the grid of the image, whatever grid the mask lies on."""
+"""Find the voxels of an image that a mask ignores; the grids of mask and image may differ."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from bayesreg.image import Image
 
 
 def ignored_voxels(image: Image, ignore: Image) -> Bool[np.ndarray, "X Y Z"]:
-    """Tell which voxels of an image a mask ignores: by its nearest voxel, and none beyond its grid."""
+    """Mark the voxels of an image whose nearest voxel in the mask is not zero; the mask is zero outside its grid."""
     return np.asarray(ignore.nearest(image.grid_points()) != 0)
 
 
 def fill_ignored(image: Image, ignore: Image | None) -> Image:
-    """The image with the intensity of the nearest voxel that is looked at wherever one is ignored.
+    """Replace the intensity of every ignored voxel by that of the nearest voxel that is not ignored.
 
-    Smoothing, gradients and interpolation near the mask then know nothing of what lies in it. An image of which all is
-    ignored stays as it is.
+    Smoothing, gradients and interpolation near the mask then do not depend on the ignored intensities. An image that is
+    ignored as a whole does not change.
     """
     if ignore is None:
         return image

@@ -1,4 +1,4 @@
-"""Images in world RAS millimetres."""
+"""Represent 3D images in world space (RAS, mm)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scipy import ndimage
 from bayesreg.interpolation import Interpolation, Interpolator
 from bayesreg.types import AnyArray, InputError
 
-# Cosine of an angle between two axes that passes for a right one.
+# Two axes are orthogonal if the absolute cosine of their angle is smaller.
 RIGHT_ANGLE = 1e-4
 
 
@@ -29,7 +29,8 @@ class Image:
     voxels : (X, Y, Z) array
         Finite values; any real or integer type.
     affine : (4, 4) array
-        Voxel index to world RAS, mm. Any orientation, anisotropic or left-handed, but invertible.
+        Maps voxel indices to world RAS, mm. It must be invertible; any orientation is allowed, also anisotropic or
+        left-handed.
 
     Raises
     ------
@@ -58,51 +59,51 @@ class Image:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Number of voxels along each axis."""
+        """The number of voxels along each axis."""
         return self.voxels.shape
 
     @cached_property
     def to_voxel(self) -> Float[np.ndarray, "4 4"]:
-        """World RAS mm to voxel index."""
+        """The affine from world RAS, mm, to voxel indices."""
         return np.linalg.inv(self.affine)
 
     @cached_property
     def voxel_sizes(self) -> Float[np.ndarray, "3"]:
-        """Edge lengths of a voxel, mm."""
+        """The edge lengths of a voxel, mm."""
         return np.linalg.norm(self.affine[:3, :3], axis=0)
 
     @property
     def voxel_volume(self) -> float:
-        """Volume of a voxel, mm³."""
+        """The volume of a voxel, mm³."""
         return float(abs(np.linalg.det(self.affine[:3, :3])))
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of voxels (as float64) and affine."""
+        """The SHA-256 digest of the voxels (as float64) and the affine."""
         arrays = (np.asarray(self.voxels, "<f8"), np.asarray(self.affine, "<f8"))
         return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
     @cached_property
     def axes(self) -> Float[np.ndarray, "3 3"]:
-        """Directions of the voxel axes, columns: those of an orthogonal grid; of a sheared one the nearest such."""
+        """The directions of the voxel axes, as columns; for a sheared grid, the nearest orthogonal directions."""
         left, _, right = np.linalg.svd(self.affine[:3, :3] / self.voxel_sizes)
         return left @ right
 
     @property
     def is_orthogonal(self) -> bool:
-        """Whether the voxel axes are at right angles, as most programs want them."""
+        """Whether the voxel axes are orthogonal, as most programs require."""
         directions = self.affine[:3, :3] / self.voxel_sizes
         return bool(np.abs(directions.T @ directions - np.eye(3)).max() < RIGHT_ANGLE)
 
     def on_orthogonal_grid(self, voxel_sizes: AnyArray | None = None, order: int = 1) -> Image:
-        """The image on a grid whose axes are at right angles, and which covers its own; itself where that is its own.
+        """Resample the image on an orthogonal grid that covers its grid; an orthogonal image is returned unchanged.
 
         Parameters
         ----------
         voxel_sizes : (3,) array, optional
-            mm; the default is its own.
+            Voxel sizes of the new grid, mm; the default is those of the image. If given, the image is always resampled.
         order : int
-            Of the splines that interpolate it; 0 takes the nearest voxel, and zero beyond its grid.
+            Order of the interpolating splines; 0 takes the nearest voxel, and zero outside the grid.
         """
         if self.is_orthogonal and voxel_sizes is None:
             return self
@@ -120,46 +121,46 @@ class Image:
         return Image(ndimage.affine_transform(voxels, matrix, offset, tuple(count), order=order, mode=mode), affine)
 
     def with_voxels(self, voxels: AnyArray) -> Image:
-        """Another image on the same grid."""
+        """Return an image with other voxels on the same grid."""
         if np.shape(voxels) != self.shape:
             raise InputError(f"expected voxels of shape {self.shape}, got {np.shape(voxels)}")
         return Image(voxels, self.affine)
 
     def part(self, box: Sequence[slice]) -> Image:
-        """The part of the image in a box of voxels, its place in the world kept."""
+        """Crop the image to a box of voxels; they keep their coordinates in the world."""
         affine = np.array(self.affine, float)
         affine[:3, 3] = self.voxel_to_world(np.array([float(along.start) for along in box]))
         return Image(np.asarray(self.voxels)[tuple(box)], affine)
 
     def world_to_voxel(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3"]:
-        """Continuous voxel indices of world points (mm)."""
+        """Convert world points (mm) to continuous voxel indices."""
         return points @ self.to_voxel[:3, :3].T + self.to_voxel[:3, 3]
 
     def voxel_to_world(self, indices: AnyArray) -> Float[AnyArray, "*batch 3"]:
-        """World points (mm) of (continuous) voxel indices."""
+        """Convert (continuous) voxel indices to world points (mm)."""
         return indices @ self.affine[:3, :3].T + self.affine[:3, 3]
 
     def grid_points(self) -> Float[np.ndarray, "X Y Z 3"]:
-        """World position of every voxel centre, mm."""
+        """Compute the world coordinates of every voxel centre, mm."""
         x, y, z = (np.arange(n)[:, None] * self.affine[:3, axis] for axis, n in enumerate(self.shape))
         return x[:, None, None] + y[:, None] + (z + self.affine[:3, 3])
 
     def centres(self, numbers: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k 3"]:
-        """World position of voxels by their number in the order of memory, mm."""
+        """Compute the world coordinates of voxel centres, mm, from the voxels' numbers in the order of memory."""
         return self.voxel_to_world(np.stack(np.unravel_index(numbers, self.shape), axis=1).astype(float))
 
     def blocks(self, length: int = 500_000) -> Iterator[tuple[slice, Float[np.ndarray, "k 3"]]]:
-        """Some voxels at a time, in the order of memory, and their world positions, mm."""
+        """Yield blocks of up to `length` voxels, in the order of memory, with their world coordinates, mm."""
         for some in slices(int(np.prod(self.shape)), length):
             yield some, self.centres(np.arange(some.start, some.stop))
 
     def contains(self, points: Float[AnyArray, "*batch 3"]) -> Bool[AnyArray, "*batch"]:
-        """Tell which world points (mm) lie on the grid (its voxels' extent included)."""
+        """Decide which world points (mm) lie on the grid, the extent of its voxels included."""
         indices = self.world_to_voxel(points)
         return ((indices >= -0.5) & (indices <= np.array(self.shape) - 0.5)).all(axis=-1)
 
     def nearest(self, points: Float[AnyArray, "*batch 3"]) -> np.ndarray:
-        """The value of the nearest voxel at world points (mm), zero beyond the grid."""
+        """Return the value of the nearest voxel at world points (mm), and zero outside the grid."""
         indices = np.rint(np.asarray(self.world_to_voxel(points))).astype(int)
         on_grid = ((indices >= 0) & (indices < np.array(self.shape))).all(axis=-1)
         i, j, k = np.moveaxis(np.where(on_grid[..., None], indices, 0), -1, 0)
@@ -167,15 +168,15 @@ class Image:
         return np.where(on_grid, values, np.zeros_like(values))
 
     def smoothed(self, sd: float) -> Image:
-        """The image smoothed by a Gaussian of some standard deviation, mm."""
+        """Smooth the image by a Gaussian with the standard deviation `sd`, mm."""
         voxels = ndimage.gaussian_filter(np.asarray(self.voxels, float), sd / self.voxel_sizes, mode="nearest")
         return self.with_voxels(voxels)
 
     def interpolator(self, method: Interpolation = "linear") -> Interpolator:
-        """The image as a differentiable function of world position; see `Interpolator`."""
+        """Make a differentiable function of world coordinates from the image; see `Interpolator`."""
         voxels = np.asarray(self.voxels, float)
         if method == "cubic":
-            # Samples to B-spline coefficients, mirrored at the faces; the padding holds the outer taps.
+            # The padding holds the outer taps of points near the faces.
             coefficients = ndimage.spline_filter(voxels, order=3, mode="mirror", output=float)
             coefficients = _mirror(coefficients, before=1, after=2)
         elif method == "linear":
@@ -187,12 +188,12 @@ class Image:
     def interpolate(
         self, points: Float[AnyArray, "*batch 3"], method: Interpolation = "linear"
     ) -> Float[AnyArray, "*batch"]:
-        """Values at world points (mm); nearest value outside the grid. Differentiable in `points`."""
+        """Interpolate at world points (mm), with the nearest value outside the grid; differentiable in `points`."""
         return self.interpolator(method)(jnp.asarray(points, float))
 
 
 def slices(count: int, length: int) -> Iterator[slice]:
-    """Stretches of a length that follow one another, up to a count."""
+    """Yield consecutive slices of at most `length` numbers that cover 0 to `count`."""
     for first in range(0, count, length):
         yield slice(first, min(first + length, count))
 
@@ -207,28 +208,28 @@ def _mirror(array: np.ndarray, before: int, after: int) -> np.ndarray:
 
 
 class IntensityScale(NamedTuple):
-    """The affine map of intensities that sends `low` to 0 and `high` to 1."""
+    """The affine map of intensities that maps `low` to 0 and `high` to 1."""
 
     low: float
     high: float
 
     def __call__(self, image: Image) -> Image:
-        """The image with rescaled intensities; values outside [low, high] leave [0, 1] and are kept."""
+        """Rescale the intensities of an image; values outside [low, high] are not clipped to [0, 1]."""
         return image.with_voxels((np.asarray(image.voxels, float) - self.low) / (self.high - self.low))
 
     def undo(self, image: Image) -> Image:
-        """The image with the intensities that it had."""
+        """Restore the original intensities of a rescaled image."""
         return image.with_voxels(np.asarray(image.voxels, float) * (self.high - self.low) + self.low)
 
 
 def robust_scale(image: Image, mask: Bool[np.ndarray, "X Y Z"] | None = None) -> IntensityScale:
-    """Scale of the 0.5 % to 99.5 % quantiles of the intensities inside a mask.
+    """Compute the intensity scale that maps the 0.5 % and 99.5 % quantiles inside a mask to 0 and 1.
 
     Parameters
     ----------
     image : Image
     mask : (X, Y, Z) bool array, optional
-        Where to look; the default is everywhere.
+        The voxels that count; the default is all voxels.
 
     Raises
     ------

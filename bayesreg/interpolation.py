@@ -1,4 +1,4 @@
-"""Interpolation of images, differentiable in the places: trilinear, or by cubic B-splines."""
+"""Interpolate images, trilinearly or by cubic B-splines, with derivatives in the points."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ Interpolation = Literal["linear", "cubic"]
 )
 @dataclass(frozen=True)
 class Interpolator:
-    """An image as a function of world position, for use inside jitted code (it is a pytree).
+    """An image as a function of world coordinates; it is a pytree, for use in jitted code.
 
-    Differentiable in the points, not in the coefficients. All that `vmap` runs side by side share it.
-    Trilinear (continuous, its gradient jumps between voxels) or cubic B-spline (twice continuously
-    differentiable; `scipy.ndimage.map_coordinates` with order 3 and mode "mirror"). Outside the grid the
-    image continues with its nearest value.
+    It is differentiable in the points, but not in the coefficients, which all lanes of a `vmap` share. The method is
+    trilinear (continuous, with jumps of the gradient between voxels) or cubic B-spline (twice continuously
+    differentiable; `scipy.ndimage.map_coordinates` with order 3 and mode "mirror"). Outside the grid the image has the
+    nearest value on the grid.
 
     Attributes
     ----------
     coefficients : padded (X, Y, Z) array
-        Voxels, or B-spline coefficients.
+        Voxel values, or B-spline coefficients.
     to_voxel : (4, 4) array
-        World RAS mm to voxel index.
+        The affine from world RAS, mm, to voxel indices.
     method : {"linear", "cubic"}
     """
 
@@ -46,7 +46,7 @@ class Interpolator:
 
     @jax.jit
     def __call__(self, points: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch"]:
-        """Values at world points, mm."""
+        """Interpolate at world points, mm."""
         along = [points[..., axis] for axis in range(3)]
         indices = [sum(self.to_voxel[i, j] * along[j] for j in range(3)) + self.to_voxel[i, 3] for i in range(3)]
         return _interpolate(self.method, self.coefficients, *indices)
@@ -54,7 +54,7 @@ class Interpolator:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _interpolate(method: Interpolation, coefficients: AnyArray, *indices: AnyArray) -> AnyArray:
-    """Sum of B-splines at voxel indices, given by axis; its derivative is in these alone."""
+    """Sum B-splines at voxel indices, given by axis; the sum is differentiable in the indices only."""
     return _of_one_chain(_VALUES[method], coefficients, *indices)
 
 
@@ -62,7 +62,7 @@ def _interpolate(method: Interpolation, coefficients: AnyArray, *indices: AnyArr
 def _interpolated_jvp(
     method: Interpolation, primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]
 ) -> tuple[AnyArray, AnyArray]:
-    # Value and gradient from one look at the taps: they are what costs.
+    # Value and gradient share one reading of the taps, which is the costly part.
     value, gradient = _with_gradient(method, *primals)
     return value, sum(slope * change for slope, change in zip(gradient, tangents[1:], strict=True))
 
@@ -71,7 +71,7 @@ def _interpolated_jvp(
 def _with_gradient(
     method: Interpolation, coefficients: AnyArray, *indices: AnyArray
 ) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-    """Value, and its gradient in the indices, by axis."""
+    """Compute the value and its gradient in the indices, by axis."""
     return _of_one_chain(_VALUES_AND_GRADIENTS[method], coefficients, *indices)
 
 
@@ -79,19 +79,19 @@ def _with_gradient(
 def _with_gradient_jvp(
     method: Interpolation, primals: tuple[AnyArray, ...], tangents: tuple[AnyArray, ...]
 ) -> tuple[Any, Any]:
-    # This serves second derivatives: functions with chains as columns have none of their own.
+    # Second derivatives need this rule, because functions with chains as columns have no derivative.
     looked = _in_batches(partial(_value_and_gradient_at, _SPLINES[method]))
     return jax.jvp(partial(_of_one_chain, looked, primals[0]), primals[1:], tangents[1:])
 
 
 def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices: AnyArray) -> Any:
-    """Call a function of indices (points, chains) by axis with those of one chain, of any shape."""
+    """Call a function of indices (points, chains) by axis with the indices of one chain, of any shape."""
     found = function(coefficients, *(index.reshape(-1, 1) for index in indices))
     return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
 
 
 def _together() -> int:
-    """Lookups, those of all chains, whose taps are held at once: what stays in a processor's cache, or fills a GPU."""
+    """Return the number of points, over all chains, in one batch: their taps fit into a CPU's cache, or fill a GPU."""
     return 2**13 if jax.default_backend() == "cpu" else 2**20
 
 
@@ -99,8 +99,8 @@ def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
     """Turn a function of single points into one of indices (points, chains) by axis."""
 
     def interpolation(coefficients: AnyArray, *indices: AnyArray) -> Any:
-        # The taps of all points at once leave the cache, which costs three times as much. The batches are of one size,
-        # filled up with zeros: a smaller last one would be compiled as well.
+        # The taps of all points together exceed the cache, which takes three times as long. All batches have one size,
+        # filled up with zeros, because a smaller last batch would need another compilation.
         count, chains = indices[0].shape
         batches = max(-(-count * chains // _together()), 1)
         size = -(-count // batches)
@@ -112,7 +112,15 @@ def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Spline(NamedTuple):
-    """The B-splines that reach between two voxels, by the place in between: their values, and their slopes there."""
+    """The B-splines that overlap an interval between two voxels, as functions of the coordinate in this interval.
+
+    Attributes
+    ----------
+    width : int
+        The number of these B-splines.
+    weights, slopes : callable
+        Map the coordinate to the values and the derivatives of the B-splines.
+    """
 
     width: int
     weights: Callable[[AnyArray], tuple[AnyArray, ...]]
@@ -120,7 +128,7 @@ class _Spline(NamedTuple):
 
 
 def _value_at(spline: _Spline, coefficients: AnyArray, *index: AnyArray) -> AnyArray:
-    """Value at one point: the sum over its taps, one axis after the other."""
+    """Compute the value at one point, by sums over its taps, one axis after the other."""
     taps, weights, _ = _taps(spline, coefficients, index)
     for weight in weights:
         taps = jax.lax.optimization_barrier(_sum_taps(taps, weight))
@@ -130,7 +138,7 @@ def _value_at(spline: _Spline, coefficients: AnyArray, *index: AnyArray) -> AnyA
 def _value_and_gradient_at(
     spline: _Spline, coefficients: AnyArray, *index: AnyArray
 ) -> tuple[AnyArray, tuple[AnyArray, ...]]:
-    """Value and gradient at one point."""
+    """Compute the value and its gradient at one point."""
     taps, (wx, wy, wz), (sx, sy, sz) = _taps(spline, coefficients, index)
     x, dx = jax.lax.optimization_barrier((_sum_taps(taps, wx), _sum_taps(taps, sx)))
     y, dy, y_dx = jax.lax.optimization_barrier((_sum_taps(x, wy), _sum_taps(x, sy), _sum_taps(dx, wy)))
@@ -138,9 +146,9 @@ def _value_and_gradient_at(
 
 
 def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) -> Any:
-    """Coefficients about a point, and by axis what the spline makes of them, for the value and for the slope.
+    """Return the coefficients around a point, and the weights and the slopes of the spline by axis.
 
-    Off the grid the point is the nearest on it, and the slope across the border zero.
+    A point outside the grid is replaced by the nearest point on the grid, and its slope across the border is zero.
     """
     last = [length - spline.width for length in coefficients.shape]
     nearest = [jnp.clip(i, 0.0, end) for i, end in zip(index, last, strict=True)]
@@ -156,29 +164,29 @@ def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) 
 
 
 def _sum_taps(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:
-    """Over the first axis; what is left lies together, and is summed side by side."""
+    """Sum the weighted taps over the first axis; the other axes are contiguous, which allows vector instructions."""
     return sum(taps[k] * weight for k, weight in enumerate(weights))
 
 
 def _cubic_weights(t: AnyArray) -> tuple[AnyArray, ...]:
-    """Uniform cubic B-spline at distances t + 1, t, 1 − t, 2 − t from its centre, 0 ≤ t ≤ 1."""
+    """Evaluate the uniform cubic B-spline at distances t + 1, t, 1 − t, 2 − t from its centre, 0 ≤ t ≤ 1."""
     s = 1 - t
     return s**3 / 6, 2 / 3 - t**2 * (2 - t) / 2, 2 / 3 - s**2 * (2 - s) / 2, t**3 / 6
 
 
 def _cubic_slopes(t: AnyArray) -> tuple[AnyArray, ...]:
-    """Derivatives of `_cubic_weights` in t."""
+    """Compute the derivatives of `_cubic_weights` in t."""
     s = 1 - t
     return -(s**2) / 2, t * (3 * t / 2 - 2), s * (2 - 3 * s / 2), t**2 / 2
 
 
 def _linear_weights(t: AnyArray) -> tuple[AnyArray, ...]:
-    """Hat functions of the two voxels that a point lies between, 0 ≤ t ≤ 1."""
+    """Evaluate the hat functions of the two voxels on both sides of a point, 0 ≤ t ≤ 1."""
     return 1 - t, t
 
 
 def _linear_slopes(t: AnyArray) -> tuple[AnyArray, ...]:
-    """Derivatives of `_linear_weights` in t."""
+    """Compute the derivatives of `_linear_weights` in t."""
     return -jnp.ones_like(t), jnp.ones_like(t)
 
 
@@ -186,7 +194,7 @@ _SPLINES: dict[Interpolation, _Spline] = {
     "linear": _Spline(2, _linear_weights, _linear_slopes),
     "cubic": _Spline(4, _cubic_weights, _cubic_slopes),
 }
-# Chains come one after the other at each point: they look at the same voxels.
+# The chains of one point are adjacent in memory, because they read the same voxels.
 _VALUES = {name: with_chains_as_columns(_in_batches(partial(_value_at, spline))) for name, spline in _SPLINES.items()}
 _VALUES_AND_GRADIENTS = {
     name: with_chains_as_columns(_in_batches(partial(_value_and_gradient_at, spline)))

@@ -1,4 +1,4 @@
-"""Label tables: the values in label files by tissue, of programs that many use, by ranges, or by the labels' names."""
+"""Define label tables: the values in label files by tissue, for common programs, as ranges, or by label names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 from bayesreg.tissues import BACKGROUND, ORGAN
 
 # FreeSurfer's aseg, aparc+aseg, aparc.a2009s+aseg and wmparc (FreeSurferColorLUT.txt), and SynthSeg, which takes its
-# values from there. Brainstem, ventral diencephalon and optic chiasm are mixtures: the first and the last count as WM.
+# values from there. Brainstem, optic chiasm and ventral diencephalon are mixtures of tissues: the first two count as
+# WM, the last as GM.
 _FREESURFER = {
     "csf": (4, 5, 14, 15, 24, 31, 43, 44, 63, 72),
     "gm": (
@@ -33,41 +34,41 @@ _FREESURFER = {
     ),
 }
 
-# The label of what has none: in a table it is a tissue, the rest of the intracranial mask.
+# The value of unlabelled voxels. A table may give it to a tissue, which is then the rest of the intracranial mask.
 REST = 0
 
 TABLES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
     "fast": {"csf": (1,), "gm": (2,), "wm": (3,)},
     "freesurfer": _FREESURFER,
-    # Collins 1998. Glial matter (8) counts as GM; fat, muscle, skin, skull and connective tissue are not of the brain.
+    # Collins 1998. Glial matter (8) counts as GM; fat, muscle, skin, skull and connective tissue are no brain tissue.
     "brainweb": {"csf": (1,), "gm": (2, 8), "wm": (3,), BACKGROUND: (4, 5, 6, 7, 9)},
-    # Tumour labels: necrotic core, oedema and what enhances, which had the label 4 until 2021 and has 3 since 2023.
+    # Tumour labels: necrotic core, oedema and enhancing tumour, whose label was 4 until 2021 and is 3 since 2023.
     "brats": {"brain": (REST,), "oedema": (2,), "tumour_core": (1, 4)},
     "brats2023": {"brain": (REST,), "oedema": (2,), "tumour_core": (1, 3)},
-    # A mask of the organ is a label file of one label.
+    # A mask of the organ is a label file with one label.
     "mask": {ORGAN: (1,)},
 }
 
 
-# The longest range of labels that is no slip.
+# A longer range of labels is taken for a typing error.
 LONGEST_RANGE = 100_000
 
-# Labels by which a table is known: others have some of its values, too.
+# The labels that must occur for a table to be recognised, because several tables share values.
 _MARKS = {
     "fast": {1, 2, 3},
     "freesurfer": {2, 3, 41, 42},
     "brainweb": {1, 2, 3, 8},
     "brats": {1, 2, 4},
-    # Of the same values as fast, which is likelier: it has to be named.
+    # This table has the same values as fast, which is likelier; therefore a user must name it.
     "brats2023": {1, 2, 3},
     "mask": {1},
 }
 
 
 def recognise_tables(values: Iterable[int]) -> list[str]:
-    """The tables that list all of some values of a label file, zero aside, and whose marks are among them.
+    """Return the tables that list all values of a label file except zero, and whose marks are among the values.
 
-    The likeliest comes first.
+    The likeliest table comes first.
     """
     found = set(values) - {0}
     listed = {name: {value for entry in table.values() for value in entry} for name, table in TABLES.items()}
@@ -75,7 +76,7 @@ def recognise_tables(values: Iterable[int]) -> list[str]:
 
 
 def as_range(text: str) -> list[int]:
-    """The labels of a text such as 7 or 1000-1035, its ends included; ValueError for anything else."""
+    """Parse the labels in a text such as 7 or 1000-1035, its ends included; ValueError for any other text."""
     ends = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
     if ends is None:
         raise ValueError(f"{text!r} is no label; expected a whole number, a range such as 1000-1035, or a name with "
@@ -89,12 +90,12 @@ def as_range(text: str) -> list[int]:
 
 
 def read_label_names(path: str | Path) -> dict[str, int]:
-    """The labels by name in a lookup table: FreeSurfer's, 3D Slicer's (.ctbl) or ITK-SNAP's.
+    """Read the labels by name from a lookup table of FreeSurfer, 3D Slicer (.ctbl) or ITK-SNAP.
 
     Raises
     ------
     ValueError
-        If the file is no such table.
+        If the file has no label names.
     """
     found: dict[str, int] = {}
     for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
@@ -110,6 +111,6 @@ def read_label_names(path: str | Path) -> dict[str, int]:
 
 
 def name_values(entry: object, known: Mapping[str, int]) -> object:
-    """An entry of a table with names in place of values, where it holds some."""
+    """Replace the names of labels in an entry of a table by their values."""
     several = entry if isinstance(entry, list | tuple) else [entry]
     return [known.get(one, one) if isinstance(one, str) else one for one in several]

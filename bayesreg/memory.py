@@ -1,4 +1,4 @@
-"""The machine's memory, which bounds what is begun."""
+"""Measure the memory of the machine, which limits the size of a run."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import os
 
 
 def memory_of_machine() -> int:
-    """Bytes; 64 GiB where the system does not say."""
+    """Return the memory of the machine in bytes; 64 GiB if the system does not report it."""
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 2**36

@@ -1,4 +1,4 @@
-"""Tetrahedral meshes with one tissue per tetrahedron."""
+"""Represent tetrahedral meshes with one tissue per tetrahedron."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from bayesreg.printable import require_printable
 from bayesreg.tissues import BRAIN
 from bayesreg.types import AnyArray, InputError
 
-# The faces of a positively oriented tetrahedron, their normals pointing outwards.
+# The faces of a positively oriented tetrahedron; their normals point outwards.
 FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 
 
 @dataclass(frozen=True, eq=False)
 class TetMesh:
-    """A tetrahedral mesh in world space. Make one with `from_arrays`, which validates.
+    """A tetrahedral mesh in world space. Make a mesh with `from_arrays`, which checks the arrays.
 
     Attributes
     ----------
     points : (n, 3) float array
-        Node positions, world RAS mm.
+        Coordinates of the nodes, world RAS, mm.
     cells : (m, 4) int array
         Node indices of each tetrahedron, positively oriented.
     tissue : (m,) int array
@@ -41,13 +41,13 @@ class TetMesh:
 
     @classmethod
     def from_arrays(cls, points: AnyArray, cells: AnyArray, tissue: AnyArray, names: Sequence[str] = BRAIN) -> TetMesh:
-        """Validate arrays and make a mesh of them.
+        """Check arrays and make a mesh of them.
 
         Raises
         ------
         ValueError
-            If shapes or indices are off, a coordinate is not finite, a tetrahedron has no positive volume,
-            a node belongs to no tetrahedron, or a name cannot be printed. The topology is not looked at.
+            If a shape or an index is wrong, a coordinate is not finite, a tetrahedron has no positive volume, a node
+            belongs to no tetrahedron, or a name cannot be printed. The topology is not checked.
         """
         points, cells, tissue = np.array(points, float), np.array(cells), np.array(tissue)
         _require_shapes(points, cells, tissue)
@@ -70,67 +70,67 @@ class TetMesh:
 
     @cached_property
     def volumes(self) -> Float[np.ndarray, "cells"]:
-        """Signed volume of every tetrahedron, mm³."""
+        """The signed volume of every tetrahedron, mm³."""
         return signed_volumes(self.points, self.cells)
 
     @cached_property
     def nodal_volumes(self) -> Float[np.ndarray, "nodes"]:
-        """A quarter of the tetrahedra about every node, mm³."""
+        """The volume of every node, mm³: a quarter of the volumes of its tetrahedra."""
         return np.bincount(self.cells.ravel(), np.repeat(self.volumes / 4, 4), len(self.points))
 
     @cached_property
     def boundary_faces(self) -> Int[np.ndarray, "faces 3"]:
-        """Triangles that belong to exactly one tetrahedron, normals outwards."""
+        """The triangles that belong to exactly one tetrahedron, with normals outwards."""
         return boundary_faces_of(self.cells)
 
     @cached_property
     def boundary_edge(self) -> float:
-        """Mean length of the edges of the boundary's triangles, mm."""
+        """The mean length of the edges of the boundary's triangles, mm."""
         corner = self.points[self.boundary_faces]
         return float(np.linalg.norm(corner - np.roll(corner, -1, axis=1), axis=2).mean())
 
     @cached_property
     def neighbours(self) -> Int[np.ndarray, "pairs 2"]:
-        """Pairs of tetrahedra that share a face."""
+        """The pairs of tetrahedra that share a face."""
         return _shared_faces(self.cells) // 4
 
     @cached_property
     def boundary(self) -> Int[np.ndarray, "boundary"]:
-        """Sorted indices of the nodes on the boundary."""
+        """The sorted indices of the nodes on the boundary."""
         return np.unique(self.boundary_faces)
 
     @cached_property
     def interior(self) -> Int[np.ndarray, "interior"]:
-        """Sorted indices of the nodes that are not on the boundary."""
+        """The sorted indices of the nodes that are not on the boundary."""
         return np.setdiff1d(np.arange(len(self.points)), self.boundary)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the mesh's content: the same for the same mesh on any machine."""
+        """The SHA-256 digest of the mesh's content; it does not depend on the machine."""
         arrays = (self.points.astype("<f8"), self.cells.astype("<i8"), self.tissue.astype("<i8"))
         content = b"".join(np.ascontiguousarray(a).tobytes() for a in arrays) + "\0".join(self.names).encode()
         return hashlib.sha256(content).hexdigest()
 
     def moved(self, u: Float[AnyArray, "nodes 3"]) -> TetMesh:
-        """The mesh with every node displaced by u (mm); raises ValueError if a tetrahedron inverts."""
+        """Displace every node by u (mm) and return the new mesh; ValueError if a tetrahedron inverts."""
         return TetMesh.from_arrays(self.points + np.asarray(u), self.cells, self.tissue, self.names)
 
 
 def signed_volumes(points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"]) -> np.ndarray:
-    """Volume of every tetrahedron, mm³; negative where it is inverted."""
+    """Compute the volume of every tetrahedron, mm³; an inverted tetrahedron has a negative volume."""
     corner = points[cells]
     return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6
 
 
 def boundary_faces_of(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "faces 3"]:
-    """Triangles that belong to exactly one tetrahedron, normals outwards."""
+    """Find the triangles that belong to exactly one tetrahedron; their normals point outwards."""
     faces = cells[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[count == 1]]
 
 
 def faces_across(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "cells 4"]:
-    """The tetrahedron beyond the face opposite to each corner; −1 where there is none."""
+    """Find the neighbour of each tetrahedron across the face opposite to each corner; −1 if there is none."""
     one, other = _shared_faces(cells).T
     across = np.full(4 * len(cells), -1)
     across[one], across[other] = other // 4, one // 4
@@ -138,7 +138,7 @@ def faces_across(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "cells 4"
 
 
 def _shared_faces(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs of faces that are one; face 4 c + a is that of cell c opposite to its corner a."""
+    """Find the pairs of identical faces; the face 4 c + a of cell c lies opposite to its corner a."""
     faces = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
     shared = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))

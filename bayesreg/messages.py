@@ -1,4 +1,4 @@
-"""What bayesreg says while it works: records of `logging` under the name bayesreg, shown on the terminal by Rich."""
+"""Show the messages of bayesreg on the terminal: Rich prints the `logging` records of the logger bayesreg."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _log = logging.getLogger("bayesreg")
 
 
 class TerminalHandler(logging.Handler):
-    """Prints messages as they are, above a progress bar where there is one; a warning begins with "beware"."""
+    """Handler that prints messages without markup, above any progress bar; a warning begins with "beware"."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one message."""
+        """Print one message on the terminal."""
         beware = "beware: " if record.levelno >= logging.WARNING else ""
         rich.get_console().print(beware + self.format(record), markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
 def show_messages() -> Iterator[None]:
-    """Show messages in this block, unless they are shown already."""
+    """Show messages in this block, unless an outer block shows them already."""
     if any(isinstance(handler, TerminalHandler) for handler in _log.handlers):
         yield
         return

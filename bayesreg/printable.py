@@ -1,4 +1,4 @@
-"""Names and texts that can be written to every file and shown on every page."""
+"""Check that names and texts can be written to every file and shown on every page, and format numbers."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from collections.abc import Iterable
 
 from bayesreg.types import InputError
 
-# Controls but for tabs and ends of lines, line separators that read back as others, and halves of characters.
+# Control characters except tabs and ends of lines, line separators that programs read back as other characters, and
+# halves of surrogate pairs.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufffe\uffff]")
 
-# What stands where there is no number.
+# The text for a missing number.
 NONE = "–"
 
 
 def find_unprintable(text: str) -> str | None:
-    """The first character that cannot be printed, as U+0085; None where there is none."""
+    """Find the first character that cannot be printed, such as U+0085; None if all can be printed."""
     found = _UNPRINTABLE.search(text)
     return None if found is None else f"U+{ord(found[0]):04X}"
 
 
 def require_printable(names: Iterable[str], where: str) -> None:
-    """Raise InputError, which begins with `where`, for a name that cannot be printed or has several lines."""
+    """Raise InputError if a name cannot be printed or has several lines; its message begins with `where`."""
     for name in names:
         if (odd := find_unprintable(name)) is not None or "\n" in name:
             raise InputError(f"{where}: the name {name!r:.80} holds {odd or 'an end of line'}; give it another one")
 
 
 def number(value: float | int | None, digits: int = 3) -> str:
-    """A number to so many significant digits; a dash where there is none."""
+    """Format a number with `digits` significant digits; a missing or non-finite number becomes a dash."""
     if value is None or not math.isfinite(value):
         return NONE
     if value == 0:

@@ -1,4 +1,4 @@
-"""Checked records of settings: their base, and the kinds of values that they hold."""
+"""Define the base class of checked settings, and the types of their values."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from bayesreg.types import DATA_FOLDER
 
 
 class Section(BaseModel):
-    """A record of settings, such as a part of a configuration: no unknown keys, no changes after the making."""
+    """A record of settings, such as a section of a configuration. It refuses unknown keys and cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 def is_stored(info: ValidationInfo) -> bool:
-    """Whether a configuration is that of a run folder, which holds what was made of the files that it names."""
+    """Report whether a configuration is stored in a run folder; the files that it names may then be missing."""
     return bool((info.context or {}).get("stored"))
 
 
 def find_file(value: object, info: ValidationInfo) -> Path:
-    """The path of a file that exists; ValueError says where it was looked for."""
+    """Find the path of an existing file; the ValueError for a missing file names the searched places."""
     return _find(value, info, Path.is_file)
 
 
 def _find_image(value: object, info: ValidationInfo) -> Path:
-    """A file, or a folder with a DICOM series."""
+    """Find the path of an existing file, or of a folder with a DICOM series."""
     return _find(value, info, Path.exists)
 
 
@@ -52,18 +52,18 @@ def _find(value: object, info: ValidationInfo, serves: Callable[[Path], bool]) -
 
 
 def search_folders(*beside: Path) -> list[Path]:
-    """Where relative paths are looked for, the first place first."""
+    """List the folders in which relative paths are searched, in this order."""
     data = os.environ.get(DATA_FOLDER)
     return [*beside, Path.cwd(), *([Path(data)] if data else [])]
 
 
 def by_kind(value: object) -> object:
-    """A record that is given by the name of its kind alone, such as `similarity: lncc`, as a mapping."""
+    """Convert the name of a kind, such as `similarity: lncc`, to a mapping with this kind."""
     return {"kind": value} if isinstance(value, str) else value
 
 
 def wrong(key: str, message: str) -> PydanticCustomError:
-    """An error that belongs to one key, given by its dotted path, of the section whose validator raises it."""
+    """Make an error for one key, given by its dotted path in the section whose validator raises the error."""
     return PydanticCustomError("wrong", "{message}", {"message": message, "key": key})
 
 
@@ -82,19 +82,20 @@ class ScalePrior(Section):
     Attributes
     ----------
     median : float
-        In the unit of the number, positive.
+        The median in the unit of the number, positive.
     log_sd : float
-        Standard deviation of its natural logarithm, positive; 1 spans a factor of 50 with 95 %.
+        Standard deviation of the natural logarithm of the number, positive. With 1, the ends of the 95 % interval
+        differ by a factor of 50.
     """
 
     median: Positive
     log_sd: Positive = 1.0
 
 
-# A positive number that is known, or the prior of one that is inferred.
+# A known positive number, or the prior of an inferred number.
 KnownOrInferred = Positive | ScalePrior
 
 
 def is_inferred(scale: Any) -> bool:
-    """Whether a scale has a prior, and is not a known number."""
+    """Report whether a scale has a prior, rather than a known value."""
     return isinstance(scale, ScalePrior)

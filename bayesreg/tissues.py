@@ -1,7 +1,6 @@
-"""Facts about tissues that a name tells: the presets of brains, and neutral ones of all other names.
+"""Define the properties of tissues by their names: presets for brains, and defaults for all other names.
 
-Besides the datasets (`bayesreg.io.datasets`) and label tables (`bayesreg.label_tables`) the only place where tissues
-are named.
+Only this module, the datasets (`bayesreg.io.datasets`) and the label tables (`bayesreg.label_tables`) name tissues.
 """
 
 from __future__ import annotations
@@ -12,19 +11,19 @@ from typing import NamedTuple
 
 
 class Tissue(NamedTuple):
-    """Facts about a tissue.
+    """The properties of a tissue.
 
     Attributes
     ----------
     label : str
-        Its name for people.
+        The name of the tissue in reports.
     colour : str
-        In figures.
+        The colour of the tissue in figures.
     is_fluid : bool
-        Whether it hardly resists: it starts at λ = μ = 0.01, fills the space that others leave, and its stiffness is
-        not worth looking for.
+        Whether the tissue has almost no stiffness. A fluid starts at λ = μ = 0.01 and fills the space that other
+        tissues leave; its stiffness is not of interest.
     has_unit_mu : bool
-        Whether its μ is the one that is fixed at 1 where nothing else is said.
+        Whether the default fixes the μ of this tissue at 1.
     """
 
     label: str
@@ -33,7 +32,8 @@ class Tissue(NamedTuple):
     has_unit_mu: bool = False
 
 
-# By name in small letters. Colours are distinct in hue and in lightness, also for colour-blind eyes and in grey.
+# The presets by name, in small letters. The colours differ in hue and in lightness, so that colour-blind readers and
+# grey prints distinguish them.
 PRESETS: Mapping[str, Tissue] = {
     "csf": Tissue("CSF", "#3a6ea5", is_fluid=True),
     "gm": Tissue("GM", "#c26a6f", has_unit_mu=True),
@@ -42,55 +42,55 @@ PRESETS: Mapping[str, Tissue] = {
 }
 COLOURS = ("#5c9a86", "#7d6aa8", "#b07c46", "#8aa34f", "#a3597f", "#4f8fa3")
 
-# The tissues of the brains that the package ships or reads, in the order of the paper, and the paper's true values.
+# The tissues of brains in the datasets, in the order of the paper, and the paper's true values.
 BRAIN = ("csf", "gm", "wm")
 PAPER_LAM: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 10.0, 30.0), strict=True))
 PAPER_MU: Mapping[str, float] = dict(zip(BRAIN, (1e-6, 1.0, 1.0), strict=True))
 
-# Lengths that suit a human brain, mm: of an edge on the boundary of its mesh, the radius of the closing that makes its
+# Default lengths for a human brain, mm: the edges on the boundary of its mesh, the radius of the closing that makes its
 # hull, and the gap between mesh and skull.
 BRAIN_EDGE, BRAIN_CLOSING, BRAIN_GAP = 15.5, 8.0, 0.5
 
-# Solid tissue of Colin27, mm³: lengths that suit a brain of this size suit others in proportion.
+# The volume of solid tissue in Colin27, mm³. The lengths for other organs are proportional to their size.
 BRAIN_VOLUME = 1.583e6
 
-# λ and μ where nothing is said (the literature's λ/μ is about 24), and those of a fluid.
+# The default λ and μ of a solid (the literature's λ/μ is about 24), and the default value of both for a fluid.
 SOLID = {"lam": 10.0, "mu": 1.0}
 FLUID = 0.01
-# In a label table, what is no part of the organ.
+# The name in a label table of everything outside the organ.
 BACKGROUND = "background"
-# The one tissue of an organ without labels.
+# The name of the only tissue of an organ without labels.
 ORGAN = "organ"
 
 
 def is_fluid(name: str) -> bool:
-    """Whether a tissue of this name hardly resists."""
+    """Report whether a tissue of this name is a fluid, which has almost no stiffness."""
     return name.lower() in PRESETS and PRESETS[name.lower()].is_fluid
 
 
 def label_of(name: str) -> str:
-    """A tissue's name for people."""
+    """Return the name of a tissue in reports."""
     preset = PRESETS.get(name.lower())
     return preset.label if preset else name
 
 
 def colours_of(names: Sequence[str]) -> list[str]:
-    """A colour for each tissue, the same in every figure."""
+    """Choose a colour for each tissue; the colours are the same in every figure."""
     others = itertools.cycle(COLOURS)
     return [PRESETS[name.lower()].colour if name.lower() in PRESETS else next(others) for name in names]
 
 
 def tissue_of_unit_mu(names: Sequence[str]) -> str:
-    """The tissue whose μ is 1 where nothing else is said: the preset's, else the first that is no fluid."""
+    """Return the tissue whose μ is fixed at 1 by default: the tissue of the preset, else the first solid tissue."""
     preset = (name for name in names if name.lower() in PRESETS and PRESETS[name.lower()].has_unit_mu)
     return next(preset, next((name for name in names if not is_fluid(name)), names[0]))
 
 
 def usual_value(parameter: str, name: str) -> float:
-    """λ ("lam") or μ ("mu") of a tissue where nothing is said."""
+    """Return the default λ ("lam") or μ ("mu") of a tissue."""
     return FLUID if is_fluid(name) else SOLID[parameter]
 
 
 def tissue_names(table: Iterable[str]) -> tuple[str, ...]:
-    """The names of a label table that are those of tissues, in its order."""
+    """Return the names of the tissues in a label table, in its order, without the background."""
     return tuple(name for name in table if name != BACKGROUND)

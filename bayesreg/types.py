@@ -1,4 +1,4 @@
-"""Array aliases, and the small containers and names that two floors share."""
+"""Define the aliases of arrays, and small containers and names that several packages share."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 else:
     AnyArray = jax.Array | np.ndarray
 
-# The environment variable that names a folder in which files are looked for.
+# The environment variable that names a folder in which files are searched.
 DATA_FOLDER = "BAYESREG_DATA"
 
-# On the host, dense or sparse.
+# A matrix in NumPy's or SciPy's format, dense or sparse.
 Matrix = np.ndarray | scipy.sparse.spmatrix
 
 Scalar = Float[AnyArray, ""]
@@ -28,7 +28,7 @@ Tissue = Int[AnyArray, "cells"]
 
 
 class Equilibrium(NamedTuple):
-    """Displacement of every node, and how well the elastic solve converged.
+    """The displacement of every node, and the convergence of the elastic solve.
 
     Attributes
     ----------
@@ -37,9 +37,9 @@ class Equilibrium(NamedTuple):
     residual : scalar
         Relative residual ‖f − K_II u_I‖ / ‖f‖ of the interior solve.
     iterations : scalar integer
-        Conjugate-gradient iterations.
+        The number of conjugate-gradient iterations.
     converged : scalar bool
-        Whether everything is finite and the residual is below the tolerance.
+        Whether all numbers are finite and the residual is below the tolerance.
     """
 
     u: Float[AnyArray, "nodes 3"]
@@ -49,8 +49,8 @@ class Equilibrium(NamedTuple):
 
 
 class InputError(ValueError):
-    """Something that a user gave is wrong; the message says what, where, and what to do.
+    """An input of the user is wrong; the message names the error, its place, and the remedy.
 
-    The command line shows the message alone and ends with status 2. Any other exception is a bug, and
-    shows its traceback.
+    The command line prints only the message and exits with status 2. Any other exception is a bug, and its traceback is
+    printed.
     """

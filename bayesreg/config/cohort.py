@@ -1,4 +1,4 @@
-"""A cohort: a table of subjects, or patterns of their files, times a sweep of settings."""
+"""Read a cohort: a table of subjects, or patterns of their files, combined with a sweep of settings."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from bayesreg.settings import Count, Section
 SUBJECT = "subject"
 MOST_TASKS = 100_000
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
-# What a batch itself writes beside the folders of its subjects.
+# Files that a batch writes beside the folders of its subjects.
 RESERVED = ("cohort.csv", "cohort.parquet", "cohort.html")
-# Keys of a configuration that name files, by their last part.
+# The last parts of those keys of a configuration that name files.
 FILES = (
     "fixed", "moving", "labels", "intracranial", "fixed_ignore", "moving_ignore", "label_names", "t1", "file",
     "moving_file", "field", "known_boundary", "landmarks", "moving_landmarks",
 )  # fmt: skip
-# Folders named after longer values get a digest in their place.
+# Longer names of folders are cut here, and a digest is added.
 LONGEST_NAME = 100
 
 
 class ClusterConfig(Section):
-    """The workers that share the runs among them."""
+    """The workers that share the runs of a cohort."""
 
     workers: Count = 1
-    """How many subjects at a time, each in a process of its own, which a fair share of the cores is for."""
+    """The number of subjects that run at the same time. Each has its own process, with an equal share of the cores."""
     slurm: dict[str, Any] | None = None
-    """What dask_jobqueue.SLURMCluster is given (queue, cores, memory, walltime …): workers are then jobs of SLURM."""
+    """Arguments of dask_jobqueue.SLURMCluster (queue, cores, memory, walltime …); the workers are then SLURM jobs."""
 
 
 class CohortConfig(Section):
@@ -53,7 +53,7 @@ class CohortConfig(Section):
     such as data.fixed (an empty cell leaves what all share); or a pattern for each of such keys, such as
     "bids/sub-{subject}/ses-pre/anat/*_T1w.nii.gz"."""
     sweep: dict[str, list[Any]] = Field(default_factory=dict)
-    """Values of further keys; every subject is run with each combination of them."""
+    """Values of further keys; every subject runs with each combination of these values."""
     cluster: ClusterConfig = ClusterConfig()
 
 
@@ -63,12 +63,12 @@ class Task(NamedTuple):
     Attributes
     ----------
     name : str
-        Its folder, relative to that of the cohort.
+        The folder of the run, relative to the folder of the cohort.
     subject : str
     settings : dict
-        Of the sweep.
+        The values of the sweep, by key.
     overrides : tuple of str
-        Of the configuration, as `bayesreg.config.load_config` takes them.
+        Overrides of the configuration, as for `bayesreg.config.load_config`.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Task(NamedTuple):
 
 
 class Cohort(NamedTuple):
-    """A cohort as it was read: the configuration that all share, the tasks, and who does the work."""
+    """A cohort as read from its file: the shared configuration, the tasks, and the workers."""
 
     config: Path
     tasks: list[Task]
@@ -91,7 +91,7 @@ def load_cohort(path: str | Path) -> Cohort:
     Raises
     ------
     ConfigError
-        If the file, its table or a pattern is wrong. What is wrong with one subject alone shows when it is run.
+        If the file, its table or a pattern is wrong. Errors of a single subject appear when this subject is run.
     """
     path = Path(path).absolute()
     data = read_mapping(path)
@@ -160,7 +160,7 @@ def _names_file(key: str) -> bool:
 
 
 def _beside(folder: Path, value: str) -> str:
-    """A path relative to the table as an absolute one; anything else as it is."""
+    """Make a path relative to the table absolute if it exists; return any other value unchanged."""
     try:
         place = folder / value
         return str(place) if place.exists() else value
@@ -169,7 +169,7 @@ def _beside(folder: Path, value: str) -> str:
 
 
 def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[str, str]]:
-    """The files of every subject for which one of the patterns names one."""
+    """Find the files of every subject that matches at least one of the patterns."""
     found: dict[str, dict[str, str]] = {}
     for key, pattern in patterns.items():
         if "{subject}" not in pattern:
@@ -178,7 +178,8 @@ def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[st
             if key in found.setdefault(subject, {}):
                 raise ConfigError(f"subjects: {key}: {found[subject][key]} and {path} are both of subject {subject}")
             found[subject][key] = str(path)
-    # Where a subject lacks a file it is told of the pattern, and takes none of the configuration that all share.
+    # A subject that lacks a file gets the path of the pattern: the run then reports this path as missing, and does not
+    # use a file of the shared configuration.
     return {
         subject: {key: str(folder / pattern.replace("{subject}", subject)) for key, pattern in patterns.items()}
         | found[subject]
@@ -189,7 +190,7 @@ def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[st
 def _matches(pattern: str, folder: Path) -> Iterator[tuple[str, Path]]:
     whole = folder / Path(pattern).expanduser()
     root, pattern = Path(whole.anchor), whole.relative_to(whole.anchor).as_posix()
-    # As a glob, and as an expression that tells which part of a path is the subject.
+    # The glob finds the paths; the regular expression extracts the subject from each path.
     own = re.escape(pattern).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
     own = own.replace(re.escape("{subject}"), "(?P<subject>[A-Za-z0-9]+)", 1)
     expression = re.compile(own.replace(re.escape("{subject}"), "(?P=subject)"))
@@ -202,7 +203,7 @@ def _matches(pattern: str, folder: Path) -> Iterator[tuple[str, Path]]:
 def _tasks(subject: str, given: Mapping[str, str], sweep: Mapping[str, list[Any]]) -> Iterator[Task]:
     for values in product(*sweep.values()):
         settings = dict(zip(sweep, values, strict=True))
-        # JSON is YAML: a value of the sweep comes back as what it was. A cell of a table is read as YAML.
+        # JSON is valid YAML, so that a value of the sweep keeps its type. A cell of a table is read as YAML.
         values_of = {**{key: _quoted(cell) for key, cell in given.items()},
                      **{key: json.dumps(value, default=str) for key, value in settings.items()}}  # fmt: skip
         overrides = tuple(f"{key}={value}" for key, value in values_of.items())
@@ -211,7 +212,7 @@ def _tasks(subject: str, given: Mapping[str, str], sweep: Mapping[str, list[Any]
 
 
 def _folder_of(settings: Mapping[str, Any]) -> str:
-    """The name of a folder, by the values; with a digest of them where it does not hold them as they are."""
+    """Make the name of a folder from settings; add a digest if characters had to be replaced or cut."""
     plain = "_".join(f"{key}-{value}" for key, value in settings.items())
     name = re.sub(r"[^A-Za-z0-9._-]+", "-", plain)
     if name == plain and len(name) <= LONGEST_NAME:
@@ -221,7 +222,7 @@ def _folder_of(settings: Mapping[str, Any]) -> str:
 
 
 def _quoted(cell: str) -> str:
-    """A cell in quotes, where YAML would take a part of it for something else; lists stay lists."""
+    """Quote a cell if YAML might interpret a part of it; lists stay lists."""
     try:
         is_list = cell.startswith("[") and isinstance(parse(cell, "a cell")[0], list)
     except ConfigError:

@@ -1,4 +1,4 @@
-"""The sections of a configuration that say which images there are: files, datasets, and pairs made of them."""
+"""The sections of a configuration that describe the images: files, datasets, and synthetic pairs made of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Mni152Data(Section):
 
     @property
     def tissues(self) -> tuple[str, ...]:
-        """Names of the tissues."""
+        """The names of the tissues."""
         return BRAIN
 
 
@@ -33,46 +33,47 @@ class BrainWebData(Section):
     t1: FoundFile
     """T1 image on the same grid."""
     intracranial_labels: Labels = (1, 2, 3, 8)
-    """Labels inside the skull; of their union the largest connected part is taken."""
+    """Labels inside the skull; the largest connected part of their union is used."""
 
     @property
     def tissues(self) -> tuple[str, ...]:
-        """Names of the tissues."""
+        """The names of the tissues."""
         return BRAIN
 
 
 class FilesData(Section):
-    """An organ of one's own."""
+    """The user's own images and labels, from files."""
 
     source: Literal["files"]
     fixed: FoundImage | None = None
-    """Pre-operative image, a file or a DICOM folder; null where only other observations are to be used."""
+    """Pre-operative image, a file or a DICOM folder; null if only other observations are used."""
     moving: Annotated[FoundImage | None, Field(validate_default=True)] = None
     """Intra-operative image."""
     labels: Annotated[FoundImage | None, Field(validate_default=True)] = None
-    """Tissue labels of the fixed image; null takes the tissues of mesh.file, or one for all of the organ."""
+    """Tissue labels of the fixed image; null takes the tissues of mesh.file, or one tissue for the whole organ."""
     label_names: FoundFile | None = None
-    """Lookup table of FreeSurfer, 3D Slicer or ITK-SNAP, by which label_table may hold names in place of values."""
+    """Lookup table of FreeSurfer, 3D Slicer or ITK-SNAP; label_table may then have names in place of values."""
     label_table: Annotated[LabelTable | None, Field(validate_default=True)] = None
-    """Values of the label file by tissue, or ranges of them (1000-1035), background being what belongs to none, and 0
-    the rest of the intracranial mask; or fast, freesurfer, brainweb, brats, brats2023 or mask."""
+    """Values of the label file by tissue, or ranges of values (1000-1035). The entry background has the values that
+    belong to no tissue; the value 0 is the rest of the intracranial mask. Or a name: fast, freesurfer, brainweb, brats,
+    brats2023 or mask."""
     intracranial: Annotated[FoundImage | None, Field(validate_default=True)] = None
-    """Mask of where the organ may go, of two values or probabilities; without it nothing bounds the motion. Without
-    labels it is the organ, too."""
+    """Mask of where the organ may go, with two values or probabilities; without it nothing bounds the motion. Without
+    labels this mask is also the organ."""
     fixed_ignore: FoundImage | None = None
-    """Mask of where the fixed image says nothing, such as a tumour; not zero = ignored. On any grid, in its world."""
+    """Mask of the ignored part of the fixed image, such as a tumour; not zero = ignored. On any grid, in its world."""
     moving_ignore: FoundImage | None = None
-    """Mask of where the moving image says nothing, such as a cavity; not zero = ignored. On any grid, in its world."""
+    """Mask of the ignored part of the moving image, such as a cavity; not zero = ignored. On any grid, in its world."""
     pose: Literal["auto", "fixed"] = "auto"
-    """auto: where the images do not lie on one another by their headers, a rigid motion is found first; fixed: as the
-    headers say. The rigid part of the displacement is sampled in either case."""
+    """auto: if the headers do not align the images, a rigid motion is found first; fixed: the headers are used as they
+    are. The rigid part of the displacement is sampled in both cases."""
     same_contrast: StrictBool | None = None
-    """true: one contrast on one scale of intensities; false: the fixed image is compared through a map of its
-    intensities; null finds out."""
+    """true: both images have one contrast and one scale of intensities; false: the fixed image is compared through a
+    map of its intensities; null: the program decides from the images."""
 
     @property
     def tissues(self) -> tuple[str, ...] | None:
-        """Names of the tissues; None where only the mesh knows them."""
+        """The names of the tissues; None if only the mesh defines them."""
         if self.label_table is None:
             return (ORGAN,) if self.fixed is not None else None
         return tissue_names(self.label_table)
@@ -111,33 +112,33 @@ class FilesData(Section):
 
 
 class Scan(Section):
-    """How the moving image of a synthetic pair is stored as a hospital would have it, beside the pair itself."""
+    """Options of the two scans, as from a hospital, that are stored beside a synthetic pair."""
 
     millimetres: NotNegative = 8.0
-    """How far the organ has shifted between the scans, mm."""
+    """Translation of the organ between the scans, mm."""
     degrees: NotNegative = 8.0
-    """By how much it is turned."""
+    """Rotation of the organ between the scans, degrees."""
     inverted: StrictBool = False
-    """Whether dark and bright change places in the organ, as between T1 and T2."""
+    """Whether the intensities in the organ are inverted (dark and bright), as between T1 and T2."""
     cavity: NotNegative = 0.0
-    """Radius of a cavity at the place that moves most, mm; 0: there is none."""
+    """Radius of a cavity where the surface moves most, mm; 0: no cavity."""
 
 
 class _Pair(Section):
     displacement: Positive = 15.0
-    """How far the patch moves towards the centre of gravity, mm."""
+    """Displacement of the patch towards the centre of gravity, mm."""
     patch_nodes: Annotated[int, Field(strict=True, ge=3)] = 20
     """Number of boundary nodes in the patch."""
     direction: Direction | None = None
-    """From the centre of gravity to the patch, world RAS; null takes the first of several that inverts no element."""
+    """Direction from the centre of gravity to the patch, world RAS; null: the first of several without inversions."""
     lam: ByTissue = Field(default=dict(PAPER_LAM))
     """True first Lamé parameter of every tissue."""
     mu: ByTissue = Field(default=dict(PAPER_MU))
     """True second Lamé parameter of every tissue."""
     smoothing_mm: NotNegative | None = None
-    """Width (sd, mm) of the smoothing of the anatomy beforehand; null lets the kind of pair choose."""
+    """Standard deviation of the Gaussian that smooths the anatomy first, mm; null: the default of the kind of pair."""
     scan: Scan | None = None
-    """What `bayesreg simulate` also writes under scans/: the files of two scans, of which all else is to be found."""
+    """Options of the two scans that `bayesreg simulate` also writes under scans/; null writes none."""
 
 
 class PaperPair(_Pair):
@@ -155,4 +156,4 @@ class CalibratedPair(_Pair):
     noise_sd: NotNegative = 0.01
     """Noise on each image; intensities run from 0 to 1."""
     making_edge_length: Positive = 10.0
-    """Edge length of the making mesh, mm."""
+    """Edge length of the mesh on which the pair is made, mm."""

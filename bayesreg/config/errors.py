@@ -1,4 +1,4 @@
-"""pydantic's errors as messages for a person: where, what was found, what was expected."""
+"""Translate pydantic's errors into messages for users: the place, the value, and the expected value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesreg.types import InputError
 
 Keys = tuple[str | int, ...]
 
-# More are counted, and not told.
+# Further errors are counted but not described.
 MOST_ERRORS = 100
 
 _KEYS, _NUMBER, _WHOLE, _LIST, _TRUTH = "keys with values", "a number", "a whole number", "a list", "true or false"
@@ -39,11 +39,11 @@ _EXPECTED = {
 
 
 class ConfigError(InputError):
-    """A configuration that cannot be run; the message lists everything that is wrong with it."""
+    """A configuration that cannot be run; the message lists all its errors."""
 
 
 def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any], origins: dict[Keys, str]) -> str:
-    """All of the errors, one a line.
+    """Describe all errors, one per line.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
     model : type
         The pydantic model that `data` should fit.
     data : dict
-        What was validated.
+        The validated data.
     origins : dict
-        Where each key was written ("run.yaml:3"), by its path.
+        The file and line of each key ("run.yaml:3"), by the key's path.
     """
     errors = error.errors(include_url=False)
     found = [(_path(details, data, model), details) for details in errors[:MOST_ERRORS]]
@@ -67,9 +67,11 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
 
 
 def _explains(other: Keys, by: ErrorDetails, path: Keys, kind: str) -> bool:
-    """Is an error but another member of a union complaining, where `by` says what is wrong?
+    """Decide whether the error `by` at the path `other` makes an error of type `kind` at `path` superfluous.
 
-    A value that is wrong as a whole is right in its parts; one that is wrong in a part was meant to have parts.
+    Every member of a union reports its own errors. If a value is wrong as a whole, its parts are right, and errors of
+    its parts are dropped. If a part of a value is wrong, the value was meant to have parts, and errors of the whole are
+    dropped.
     """
     if len(other) < len(path):
         return path[: len(other)] == other and by["type"] in ("value_error", "wrong")
@@ -82,14 +84,14 @@ def _join(messages: list[str]) -> str:
 
 
 def _path(details: ErrorDetails, data: Any, model: type[BaseModel]) -> Keys:
-    """pydantic's location less the names of union members, which no user has written."""
+    """Return pydantic's location without the names of union members, which no user has written."""
     *parents, last = details["loc"] or ("",)
     path: Keys = ()
     for key in (*parents, last):
         try:
             data, path = data[key], (*path, key)
         except (KeyError, IndexError, TypeError):
-            path = path or (key,)  # A section that was left out may be wrong, too.
+            path = path or (key,)  # An omitted section may have errors, too.
     left_out = details["type"] == "missing" or last in _fields_at(tuple(parents), model)
     if left_out and path[-1] != last:
         path = (*path, last)
@@ -102,7 +104,7 @@ def _custom_key(details: ErrorDetails) -> Keys:
 
 
 def _head(path: Keys, data: Any, origins: dict[Keys, str]) -> str:
-    """Origin, dotted path, and the value where it is short."""
+    """Write the origin, the dotted path and, if it is short, the value."""
     present, value = 0, data
     while present < len(path) and isinstance(value, dict | list):
         try:
@@ -141,7 +143,7 @@ def _unknown(key: str, fields: dict[str, FieldInfo]) -> str:
 
 
 def _fields_at(location: Keys, model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Fields of the model (of all members, where it is a union) that a location leads to."""
+    """Return the fields of the model at a location; for a union, the fields of all its members."""
     models = [model]
     for key in location:
         inner = [m for parent in models if key in parent.model_fields for m in _models(parent.model_fields[str(key)])]
@@ -155,7 +157,7 @@ def _models(field: FieldInfo) -> list[type[BaseModel]]:
 
 
 def _tags(model: type[BaseModel]) -> set[object]:
-    """The names that pydantic may give a member of a union: its class, or a value of its discriminator."""
+    """List the names that pydantic may give to a member of a union: its class, or a value of its discriminator."""
     return {model.__name__, *(leaf for field in model.model_fields.values() for leaf in _leaves(field.annotation))}
 
 

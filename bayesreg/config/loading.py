@@ -1,4 +1,4 @@
-"""YAML files to configurations and back."""
+"""Read configurations from YAML files, and write them back."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from bayesreg.model.observations.registry import kinds
 from bayesreg.model.options import ModelConfig
 from bayesreg.settings import search_folders
 
-# A section of another kind replaces the one that it extends: their keys have nothing in common.
+# If one of these keys changes, a section replaces the section that it extends, because the two have different keys.
 _KINDS = ("source", "kind", "name")
 
 
 @dataclass(frozen=True)
 class _Document:
-    """The content of YAML files, where each key was written, and the folders that they lie in."""
+    """The content of YAML files, the file and line of each key, and the folders of the files."""
 
     data: dict[str, Any]
     origins: dict[Keys, str]
@@ -41,37 +41,37 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     Parameters
     ----------
     path : path
-        A YAML 1.2 file. ``extends: other.yaml`` takes over another file, looked for beside it: sections are
-        merged key by key, and the value of a key replaces the other's as a whole.
+        A YAML 1.2 file. ``extends: other.yaml`` includes another file in the same folder: sections are merged key by
+        key, and the value of a key replaces the whole value in the other file.
     overrides : sequence of str
         ``"sampler.chains=4"``: a dotted path and a YAML value, applied last.
 
     Returns
     -------
     Config
-        Its relative paths, looked for beside the file, in the current folder and in the folder that the
-        environment variable BAYESREG_DATA names, are made absolute.
+        The configuration with absolute paths. Relative paths are searched beside the file, in the current folder and in
+        the folder of the environment variable BAYESREG_DATA.
 
     Raises
     ------
     ConfigError
-        Naming every error with its place, the value and what was expected.
+        If the configuration is wrong. The message names the place, the value and the expected value of every error.
     """
     return _validated(_override(_read(Path(path), ()), overrides), f"the configuration {path}")
 
 
 def load_stored_config(path: str | Path) -> Config:
-    """Read a configuration as `resolved_yaml` wrote it into a run folder; the files that it names may be gone."""
+    """Read a configuration that `resolved_yaml` wrote into a run folder; the files that it names may be missing."""
     return _validated(_read(Path(path), ()), f"the configuration {path}", stored=True)
 
 
 def make_config(sections: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
-    """Complete and check a configuration that is in no file.
+    """Complete and check a configuration that is given as a mapping.
 
     Parameters
     ----------
     sections : mapping
-        What a file would hold.
+        The content that a file would have.
     overrides : sequence of str
         As in `load_config`.
 
@@ -84,7 +84,7 @@ def make_config(sections: Mapping[str, Any], overrides: Sequence[str] = ()) -> C
 
 
 def read_mapping(path: str | Path) -> dict[str, Any]:
-    """The keys and values of a YAML file; ConfigError if it holds none."""
+    """Read the keys and values of a YAML file; ConfigError if it has none."""
     return _read(Path(path), ()).data
 
 
@@ -98,7 +98,7 @@ def _validated(document: _Document, title: str, *, stored: bool = False) -> Conf
 
 
 def resolved_yaml(config: Config) -> str:
-    """The configuration as YAML, every default spelled out; `load_config` and `load_stored_config` read it back."""
+    """Write a configuration as YAML with all defaults; `load_config` and `load_stored_config` read it back."""
     yaml, text = YAML(), io.StringIO()
     yaml.Representer = _Representer
     yaml.width = 120
@@ -107,12 +107,12 @@ def resolved_yaml(config: Config) -> str:
 
 
 def model_of(text: str) -> ModelConfig:
-    """The model of a configuration as `resolved_yaml` writes it; the files that it names need not be there any more."""
+    """Read the section model of a configuration that `resolved_yaml` wrote; the files that it names may be missing."""
     return ModelConfig.model_validate(parse(text, "config.yaml")[0]["model"])
 
 
 def schema() -> dict[str, Any]:
-    """JSON schema of a configuration file, for editors."""
+    """Make the JSON schema of a configuration file, for editors."""
     result = Config.model_json_schema()
     any_kind: Any = reduce(or_, kinds().values())
     observed = TypeAdapter(any_kind).json_schema()
@@ -123,7 +123,7 @@ def schema() -> dict[str, Any]:
 
 
 class _Representer(RoundTripRepresenter):
-    """Writes null, where the base class writes nothing."""
+    """YAML representer that writes None as null; the base class writes nothing."""
 
 
 _Representer.add_representer(
@@ -164,7 +164,7 @@ def _text(path: Path) -> str:
 
 
 def _lines(node: Node, path: Keys = ()) -> Iterator[tuple[Keys, int]]:
-    """Path and line number of everything under a node."""
+    """Yield the path and the line number of every entry under a node."""
     if isinstance(node, MappingNode):
         children = [(key.value, key, value) for key, value in node.value]
     elif isinstance(node, SequenceNode):
@@ -188,7 +188,7 @@ def _merge(base: _Document, top: _Document) -> _Document:
 
 
 def _override(document: _Document, overrides: Sequence[str]) -> _Document:
-    # So that an override may name the first of the observations where the file lists none.
+    # The defaults are filled in first: an override may then name the first observation of a file that lists none.
     data, origins = complete(document.data) if overrides else document.data, dict(document.origins)
     for text in overrides:
         path, equals, value = text.partition("=")

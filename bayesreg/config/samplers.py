@@ -1,4 +1,4 @@
-"""The samplers' sections of a configuration: their settings, and how many chains and draws there are."""
+"""The samplers' sections of a configuration: their settings, and the numbers of chains and draws."""
 
 from __future__ import annotations
 
@@ -17,46 +17,46 @@ class _Chains(BaseModel):
 
     chains: Chains = 4
     thin: Count = 1
-    """Every how many transitions a draw is kept."""
+    """The number of transitions per kept draw."""
     block: Count | None = None
-    """Kept draws between two looks at the stop rule; null is 100, and fewer where many quadrature points make steps
-    slow."""
+    """The number of kept draws between two checks of the stop rule; null is 100, or fewer if many quadrature points
+    make steps slow."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The sampler's own settings."""
+        """The settings of the sampler itself, without the options that all samplers share."""
         return self.model_dump(exclude={"name", *_Chains.model_fields})
 
 
 class RandomWalk(settings.RandomWalk, _Chains):
-    """The kernel of the paper, random-walk Metropolis."""
+    """Random-walk Metropolis, the sampler of the paper."""
 
     name: Literal["rwmh"]
     chains: Chains = 3
     thin: Count = 10
-    """Every how many transitions a draw is kept."""
+    """The number of transitions per kept draw."""
 
 
 class Hmc(settings.Hmc, _Chains):
-    """Hamiltonian Monte Carlo; the default."""
+    """Hamiltonian Monte Carlo, the default sampler."""
 
     name: Literal["hmc"] = "hmc"
 
 
 class Nuts(settings.Nuts, _Chains):
-    """The No-U-Turn sampler."""
+    """The No-U-Turn sampler (NUTS)."""
 
     name: Literal["nuts"]
 
 
 class Smc(settings.Smc, _Chains):
-    """Sequential Monte Carlo."""
+    """The sequential Monte Carlo sampler."""
 
     name: Literal["smc"]
 
 
 class Laplace(settings.Laplace, _Chains):
-    """Laplace's approximation."""
+    """Laplace's approximation of the posterior."""
 
     name: Literal["laplace"]
 
@@ -65,10 +65,10 @@ SamplerConfig = Hmc | Nuts | Smc | Laplace | RandomWalk
 
 
 def sampler_section(name: str) -> SamplerConfig:
-    """The section of a sampler by its name, with default settings."""
+    """Make the section of a sampler with default settings, from the sampler's name."""
     return TypeAdapter(Annotated[SamplerConfig, Field(discriminator="name")]).validate_python({"name": name})
 
 
 def name_hmc_where_unnamed(value: object) -> object:
-    """A section without a name is one of hmc."""
+    """Add the name hmc to a section without a name."""
     return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value

@@ -22,52 +22,55 @@ from bayesreg.tissues import BRAIN_EDGE
 
 
 class MeshConfig(Section):
-    """How the mesh is made, or which one is taken."""
+    """How the mesh is made, or the file of an existing mesh."""
 
     edge_length: Positive | None = None
-    """Wanted length of an edge on the boundary, mm; null is 15.5 for a human brain, which gives a mesh of the paper's
-    size, and for the organ in a file as much more or less as it is larger or smaller."""
+    """Desired length of the edges on the boundary, mm. null is 15.5 for a human brain, which gives a mesh of the
+    paper's size; for the organ in a file, null is proportional to the size of this organ."""
     envelope: Positive | None = None
-    """How far the mesh's surfaces may lie from those of the labels, mm; null is 0.32 edge lengths."""
+    """Largest distance of the mesh's surfaces from the surfaces of the labels, mm; null is 0.32 edge lengths."""
     skull_gap: NotNegative | None = None
-    """Least distance of the boundary nodes from the skull, mm; null is 0.5 for a human brain, and in proportion."""
+    """Least distance of the boundary nodes from the skull, mm. null is 0.5 for a human brain; for the organ in a file,
+    null is proportional to the size of this organ."""
     file: FoundFile | None = None
-    """A mesh (.vtu) made earlier; the other entries are then left alone."""
+    """An existing mesh (.vtu); the other entries are then ignored."""
 
 
 class StartConfig(Section):
-    """Where the chains start."""
+    """The start of the chains."""
 
     field: Annotated[Literal["identity", "truth", "demons"] | Path, BeforeValidator(find_field)] = "identity"
     """identity, truth (of a synthetic pair), demons (of the pair of images, which must be of one contrast), or a file
     with a displacement of every node (.npz, .vtu) or a field on a grid (NIfTI, NRRD, MetaImage, ITK's transforms)."""
     fraction: Range = (0.0, 1.0)
-    """Every chain starts at its own fraction of the field, evenly spread from the first to the second."""
+    """The chains start at fractions of the field that are evenly spaced from the first to the second value."""
     lam: Positive | ByTissue | None = None
-    """First Lamé parameter, for all or by tissue; null is 10, in a fluid 0.01. Fixed ones keep their value."""
+    """First Lamé parameter, for all tissues or by tissue; null is 10, in a fluid 0.01. Fixed parameters keep their
+    value."""
     mu: Positive | ByTissue | None = None
-    """Second Lamé parameter, for all or by tissue; null is 1, in a fluid 0.01. Fixed ones keep their value."""
+    """Second Lamé parameter, for all tissues or by tissue; null is 1, in a fluid 0.01. Fixed parameters keep their
+    value."""
     spread: NotNegative = 0.1
-    """Sd, between chains, of the logarithm of the Lamé parameters that they start with."""
+    """Standard deviation, between chains, of the logarithm of the Lamé parameters at the start."""
 
     def entries(self, name: Literal["lam", "mu"], names: Iterable[str]) -> dict[str, float] | None:
-        """Start value of every named entry of λ or μ; None where the model is to choose."""
+        """Return the start value of every named entry of λ or μ; None if the model chooses them."""
         given = getattr(self, name)
         return dict.fromkeys(names, given) if isinstance(given, float) else given
 
 
 class StopConfig(Section):
-    """When to stop: as soon as every estimand's R-hat is low enough, or when a budget is spent."""
+    """The stop rule: sampling stops when the R-hat of every estimand is low enough, or a budget is spent."""
 
     rhat: Annotated[float, Field(strict=True, gt=1)] | None = 1.01
-    """Largest R-hat of all estimands; null runs until a budget is spent."""
+    """The largest R-hat of any estimand at which sampling stops; null runs until a budget is spent."""
     ess: Positive | None = 400.0
-    """Least effective sample size, bulk and tail, of all estimands, R-hat then being rank-normalised and split;
-    null leaves it out, and R-hat is the unsplit one of the paper."""
+    """The least effective sample size (bulk and tail) of any estimand at which sampling stops; R-hat is then
+    rank-normalised and split. null omits this rule and uses the unsplit R-hat of the paper."""
     max_steps: Count = 10_000
-    """Steps per chain, thinned ones included."""
+    """Largest number of steps per chain, thinned steps included."""
     max_minutes: Positive | None = None
-    """Minutes of sampling, the search for the mode and the warm-up included."""
+    """Largest number of minutes for sampling, the search for the mode and the warm-up included."""
 
 
 def _require_letters_and_digits(label: str) -> str:
@@ -80,16 +83,16 @@ BidsLabel = Annotated[str, Field(strict=True), AfterValidator(_require_letters_a
 
 
 class BidsConfig(Section):
-    """Names of BIDS: letters and digits."""
+    """BIDS labels of the results; each has only letters and digits."""
 
     subject: BidsLabel
     session: BidsLabel | None = None
     fixed: BidsLabel = "preop"
-    """What the space of the fixed image is called."""
+    """The label of the fixed image's space."""
     moving: BidsLabel = "intraop"
-    """What the space of the moving image is called."""
+    """The label of the moving image's space."""
     suffix: BidsLabel = "T1w"
-    """Of the moving image."""
+    """The suffix of the moving image."""
 
     @model_validator(mode="after")
     def _two_spaces(self) -> BidsConfig:
@@ -99,30 +102,30 @@ class BidsConfig(Section):
 
 
 class ResultsConfig(Section):
-    """What a run leaves for other programs, besides what it always does."""
+    """Optional result files for other programs."""
 
     draws: Annotated[int, Field(strict=True, ge=0)] = 0
-    """How many draws, evenly spaced, are written as transforms and displacement fields of their own."""
+    """The number of evenly spaced draws that are written as separate transforms and displacement fields."""
     bids: BidsConfig | None = None
-    """Write the results under the names of BIDS derivatives, too."""
+    """BIDS labels; if given, the results are also written under the names of BIDS derivatives."""
 
 
 class EvaluationConfig(Section):
-    """What the result is held against, and the sampler never sees."""
+    """Held-out landmarks for the evaluation of the result; the sampler does not use them."""
 
     landmarks: FoundFile
     """Pairs of points: both of each in one file (.csv, or .tag of two volumes), or those of the fixed image."""
     moving_landmarks: FoundFile | None = None
-    """The points in the moving image, where they stand in a file of their own."""
+    """The points in the moving image, if they are in a separate file."""
     sd: Positive | None = None
-    """Sd of the error of each coordinate with which they were found, mm; null takes the file's column sd, else zero."""
+    """Standard deviation of the localisation error of each coordinate, mm; null: the file's column sd, else zero."""
 
 
 class ReportConfig(Section):
     """The content of the report."""
 
     places: dict[str, Vector] = Field(default={})
-    """Places (x, y, z) in the fixed image, world RAS mm, by name; empty lets the program choose some."""
+    """Places (x, y, z) in the fixed image, world RAS, mm, by name; if empty, the program chooses some."""
 
     @model_validator(mode="before")
     @classmethod
@@ -133,7 +136,7 @@ class ReportConfig(Section):
 
 
 def _require_tissues(key: str, given: object, names: Sequence[str] | None, whole: bool = False) -> None:
-    """Refuse names that no tissue has, and where it must be `whole`, tissues that are left out."""
+    """Raise an error for unknown names of tissues and, if the mapping must be `whole`, for missing tissues."""
     if not isinstance(given, Mapping) or names is None:
         return
     for tissue in sorted(set(given) - set(names)):
@@ -147,7 +150,7 @@ def _has_images(data: Mni152Data | BrainWebData | FilesData) -> bool:
 
 
 def _require_nothing_else(model: ModelConfig) -> None:
-    """Refuse what known_boundary leaves no room for."""
+    """Raise an error for options of the elastic prior that contradict known_boundary."""
     elastic = model.elastic_prior
     if elastic.nodes != "boundary" or elastic.held:
         key = "held" if elastic.held else "nodes"
@@ -160,10 +163,10 @@ def _require_nothing_else(model: ModelConfig) -> None:
 
 
 def complete(given: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration, before it is checked, with the preset of its model and the observations that it leaves out.
+    """Add the default preset of the model and the default observations to an unchecked configuration.
 
-    The default is `preset: registration` where data come from files, and `preset: paper` where the pair is made here or
-    the boundary is known. Images that are there are compared, unless the observations are listed.
+    The default preset is `registration` for data from files, and `paper` for a synthetic pair or a known boundary. The
+    default observation is the pair of images, if there is one.
     """
     data, found = given.get("data"), dict(given)
     if not isinstance(data, Mapping):
@@ -179,7 +182,7 @@ def complete(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """A completed configuration in which every pair of images has the options of the preset that it does not give."""
+    """Add the preset's options to every pair of images in a completed configuration; given options stay."""
     model, observations = given.get("model"), given.get("observations")
     preset = model.get("preset") if isinstance(model, Mapping) else getattr(model, "preset", None)
     if preset not in ("paper", "registration") or not isinstance(observations, list):
@@ -195,7 +198,7 @@ def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Config(Section):
-    """Everything that a run needs to know."""
+    """The complete configuration of a run."""
 
     description: str = ""
     """The purpose of the run, in words."""
@@ -205,14 +208,14 @@ class Config(Section):
     simulate: Annotated[
         Annotated[PaperPair | CalibratedPair, Field(discriminator="kind")] | None, Field(validate_default=True)
     ] = None
-    """The synthetic pair to be made of the anatomy; not for a pair of one's own."""
+    """The synthetic pair that is made from the anatomy; null for data from files."""
     known_boundary: Annotated[Literal["truth"] | Path | None, BeforeValidator(find_boundary)] = None
-    """Elastography: the displacement of the boundary is known, truth (of a synthetic pair) or a file (.vtu or .npz of
-    this mesh, or a displacement field .nii, .nii.gz), and λ, μ alone are sampled; null samples both."""
+    """Elastography: the displacement of the boundary is known, and only λ and μ are sampled. The value is truth (of a
+    synthetic pair) or a file (.vtu or .npz of this mesh, or a displacement field .nii, .nii.gz). null samples both."""
     observations: Observations = Field(default=[])
-    """The data of the run; null is the pair of images alone, where there is one."""
+    """The data of the run; null is only the pair of images, if there is one."""
     model: Annotated[ModelConfig, Field(validate_default=True)] = ModelConfig()
-    """preset: registration is the default of all that comes from files, and preset: paper of what is made here."""
+    """The model; preset: registration is the default for data from files, preset: paper for synthetic pairs."""
     sampler: Annotated[
         SamplerConfig,
         Field(discriminator="name"),
@@ -223,14 +226,14 @@ class Config(Section):
     report: ReportConfig = ReportConfig()
     results: ResultsConfig = ResultsConfig()
     evaluation: EvaluationConfig | None = None
-    """Landmarks that are held out."""
+    """The held-out landmarks for the evaluation."""
 
     @model_validator(mode="before")
     @classmethod
     def _complete(cls, given: Any) -> Any:
         return _with_image_options(complete(given)) if isinstance(given, Mapping) else given
 
-    # Checks between sections hang on fields, since pydantic skips those of the whole when a field is wrong.
+    # Checks between sections are validators of fields: pydantic skips validators of the model if a field is wrong.
 
     @field_validator("simulate")
     @classmethod
@@ -284,13 +287,13 @@ class Config(Section):
 
     @property
     def pairs_of_images(self) -> list[ImagesSection]:
-        """The pairs of images among the observations, that of the section data first."""
+        """The pairs of images among the observations; the pair of the section data comes first."""
         pairs = [one for one in self.observations if isinstance(one, ImagesSection)]
         return sorted(pairs, key=lambda pair: pair.fixed is not None)
 
     @property
     def image_options(self) -> ImageOptions:
-        """How the pair of the section data is compared; the defaults where it is not."""
+        """The options for the comparison of the pair in the section data; the defaults if it is not compared."""
         return next(iter(self.pairs_of_images), ImageOptions())
 
     @field_validator("known_boundary")

@@ -1,4 +1,4 @@
-"""Kinds of values in a configuration: tables of labels, ranges, directions."""
+"""Types of values in a configuration: tables of labels, ranges, directions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bayesreg.tissues import BACKGROUND, tissue_names
 
 
 def find_field(value: object, info: ValidationInfo) -> object:
-    """A word for a displacement field as it is, anything else as a file."""
+    """Return the keywords of a displacement field unchanged; find the file of any other value."""
     return value if value in ("identity", "truth", "demons") else find_file(value, info)
 
 
 def find_boundary(value: object, info: ValidationInfo) -> object:
-    """The word truth and null as they are, anything else as a file."""
+    """Return the keyword truth and null unchanged; find the file of any other value."""
     return value if value in (None, "truth") else find_file(value, info)
 
 
@@ -28,7 +28,7 @@ def _as_pair(value: object) -> object:
 
 
 def _as_list(value: object) -> object:
-    """One label or several; a text such as 1000-1035 is a range, its ends included."""
+    """Convert one label or several to a tuple; a text such as 1000-1035 is a range that includes its ends."""
     several = (value,) if isinstance(value, int | str) and not isinstance(value, bool) else value
     if not isinstance(several, Sequence):
         return value
@@ -49,7 +49,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if length == 0:
         raise ValueError("expected a direction that is not zero")
     if math.isclose(length, 1, rel_tol=1e-12):
-        return vector  # A resolved configuration reads back unchanged.
+        return vector  # Another division could change the last bit of a stored configuration.
     x, y, z = (component / length for component in vector)
     return x, y, z
 
@@ -62,7 +62,7 @@ Direction = Annotated[Vector, AfterValidator(_unit)]
 
 
 def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Refuse names that are none, the background, and a label of two tissues."""
+    """Raise ValueError for an unsuitable table: a wrong name, no tissue or too many, or a label of two tissues."""
     if not table:
         raise ValueError("expected at least one tissue with its labels, such as liver: 1")
     if not 0 < len(tissue_names(table)) < 128:
@@ -84,9 +84,9 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
 
 
 def _named_table(value: object, info: ValidationInfo) -> object:
-    """The table of a program by its name; in others, names of labels that a lookup table lists become their values."""
+    """Replace the name of a program by its label table, and names of labels by their values in the lookup table."""
     known = info.data.get("label_names")
-    # A stored table has numbers alone.
+    # A stored table holds only numbers.
     if isinstance(value, dict) and known is not None and not is_stored(info):
         names = read_label_names(known)
         return {tissue: name_values(entry, names) for tissue, entry in value.items()}

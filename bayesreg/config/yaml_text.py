@@ -1,4 +1,4 @@
-"""YAML from anywhere: read within bounds of size, depth and number, and without tags; errors name the line."""
+"""Read YAML from untrusted sources: size, depth and number of entries are limited, and tags are refused."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from bayesreg.config.errors import ConfigError
 from bayesreg.printable import find_unprintable
 
-# A configuration spelled out has some 150 lines, three levels below a list, and a label table a thousand entries.
+# A configuration with all defaults has about 150 lines and three levels below a list; a label table has up to 1,000
+# entries.
 MOST_CHARACTERS, MOST_ENTRIES, DEEPEST, LONGEST_PLAIN = 1_000_000, 20_000, 20, 4_000
 
 
 def parse(text: str, name: str) -> tuple[Any, Node | None]:
-    """The content of a YAML text, and its nodes, which know their lines.
+    """Parse a YAML text into its content and its nodes; the nodes hold line numbers.
 
     Parameters
     ----------
     text : str
     name : str
-        Of the text, for messages.
+        The name of the text in messages.
 
     Raises
     ------
     ConfigError
-        If it is no YAML, or too long, too deep or too many.
+        If the text is not YAML, is too long or too deep, or has too many entries. The message names the line.
     """
     if len(text) > MOST_CHARACTERS:
         raise ConfigError(f"{name}: {len(text):,} characters are more than the {MOST_CHARACTERS:,} that are read")
@@ -44,13 +45,13 @@ def parse(text: str, name: str) -> tuple[Any, Node | None]:
     except ConfigError:
         raise
     except Exception as error:
-        # The reader raises what its parts do, such as ValueError for a date like 2026-13-01.
+        # The YAML reader also raises the exceptions of its parts, such as ValueError for a date like 2026-13-01.
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise ConfigError(f"{name}: not valid YAML: {first:.200}") from None
 
 
 def _require_bounds(text: str, name: str) -> None:
-    """Raise ConfigError for what would take the next steps too long, or too deep for them."""
+    """Raise ConfigError if the text exceeds the limits of the next steps."""
     depth = entries = 0
     for event in YAML(typ="safe", pure=True).parse(text):
         if not isinstance(event, NodeEvent | CollectionEndEvent):
@@ -72,9 +73,9 @@ def _require_bounds(text: str, name: str) -> None:
 
 
 def _require_tree(node: Node | None, name: str) -> None:
-    """Raise ConfigError where anchors lead round, or make more of a text than it holds."""
+    """Raise ConfigError if anchors form a cycle, or aliases expand the text to too many entries."""
     count = 0
-    # The nodes on the way to each, of which none may come again.
+    # Each waiting node has the identities of its ancestors; a node among them forms a cycle.
     waiting: list[tuple[Node, frozenset[int]]] = [] if node is None else [(node, frozenset())]
     while waiting:
         one, above = waiting.pop()

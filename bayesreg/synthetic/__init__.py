@@ -1,1 +1,1 @@
-"""Pairs of images with a known truth, and what a mesh does to stiffness."""
+"""Synthetic pairs of images with a known deformation and stiffness."""

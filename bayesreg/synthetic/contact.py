@@ -1,6 +1,6 @@
-"""The elastic body of least energy that touches an obstacle: held nodes, and nodes that must not enter it.
+"""Minimise the elastic energy of a body beside an obstacle, which its boundary nodes must not enter.
 
-minimise ½ uᵀKu over u, with u given at the held nodes and gap(p + u) ≥ floor at the others on the boundary.
+Minimise ½ uᵀKu over u, with u given at the held nodes and gap(p + u) ≥ floor at the other boundary nodes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from bayesreg.mesh import TetMesh
 
-# How far to take the steps of the load before the last: mm, and quadratic programs.
+# Load steps before the last end at this accuracy, mm, or after this number of quadratic programs.
 _ROUGHLY = 0.1
 _ITERATIONS_OF_A_PARTIAL_LOAD = 10
 
@@ -25,24 +25,23 @@ Gap = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class EnergyMinimum(NamedTuple):
-    """A displacement of least energy, and how well it satisfies the conditions of optimality.
+    """A displacement of least energy, and its errors in the conditions of optimality.
 
     Attributes
     ----------
     u : (n, 3) array
         Displacement of every node, mm.
     force : (n,) array
-        Contact force along the gradient of the gap (the multiplier), zero or positive; zero where a node is
-        not in contact.
+        Contact force along the gradient of the gap (the multiplier): positive, or zero at a node without contact.
     violation : float
-        Largest depth below the floor of the gap, or height above it of a node with a contact force, mm.
+        The largest depth of a node below the floor of its gap, or height of a node with a contact force above it, mm.
     stationarity : float
-        Largest force out of balance at a node that is not held, K u less the contact forces, each component
-        over its diagonal entry of K: mm.
+        The largest unbalanced force at a node that is not held: K u minus the contact forces, each component divided
+        by its diagonal entry of K, mm.
     iterations : int
-        Quadratic programs solved.
+        The number of solved quadratic programs.
     converged : bool
-        Whether both are below the tolerance.
+        Whether violation and stationarity are below the tolerance.
     """
 
     u: Float[np.ndarray, "nodes 3"]
@@ -57,16 +56,16 @@ class _State(NamedTuple):
     u: np.ndarray  # (n, 3)
     force: np.ndarray  # (o,) multipliers of the nodes that may touch
     penalty: np.ndarray  # (o,) weights of the ℓ1 penalty, at least the multipliers
-    direction: np.ndarray  # (n, 3) of the last step, and zero where that step was stretched
+    direction: np.ndarray  # (n, 3) direction of the last step; zero if its length was not one
 
 
 class ContactProblem:
-    """Least elastic energy with some nodes held and the rest of the boundary outside an obstacle.
+    """The problem of least elastic energy with some nodes held and the other boundary nodes outside an obstacle.
 
-    Sequential quadratic programming. The energy is quadratic already, so that each step replaces the gap by
-    its tangent planes and solves for the contact forces through the compliance of the boundary nodes; a line
-    search on the exact ℓ1 penalty makes it safe. The held nodes are moved to their places in several steps,
-    so that contact is met gradually: where there is more than one minimum, it is the one so reached.
+    The method is sequential quadratic programming. The energy is quadratic, so that each step only replaces the gap by
+    its tangent planes, and solves for the contact forces by the compliance of the boundary nodes. A line search on the
+    exact ℓ1 penalty ensures descent. The held nodes are moved to their given displacements in several steps, so that
+    contact begins gradually. If there are several minima, the result is the one that these steps reach.
 
     Parameters
     ----------
@@ -74,11 +73,11 @@ class ContactProblem:
     stiffness : (3n, 3n) sparse matrix
         See `bayesreg.fem.elasticity.stiffness`.
     held : (h,) int array
-        At least three nodes that are not in line, or the body is free to turn.
+        At least three nodes that do not lie on one line; otherwise the body could rotate.
     held_u : (h, 3) array
-        Their displacements, mm.
+        The displacements of the held nodes, mm.
     gap : callable
-        Positions (k, 3) to distances (k,) from the obstacle, mm, and their gradients (k, 3).
+        Maps points (k, 3) to their distances (k,) from the obstacle, mm, and the gradients (k, 3) of the distances.
     """
 
     def __init__(
@@ -97,7 +96,7 @@ class ContactProblem:
         pushed[held] = held_u
         self._free = pushed - self._compliance.solve(stiffness @ pushed.ravel())
 
-    # Beside other work a second thread made factors of a hundred rows two hundred times as slow.
+    # On a busy machine a second thread slowed the factorisation of matrices of 100 rows by a factor of 200.
     @threadpool_limits.wrap(limits=1, user_api="blas")
     def solve(
         self,
@@ -112,15 +111,15 @@ class ContactProblem:
         Parameters
         ----------
         floor : (n,) array
-            The least gap of each node on the boundary, mm; entries of other nodes are not looked at.
+            The least gap of each boundary node, mm; entries of other nodes are ignored.
         start : EnergyMinimum, optional
-            Solution for other floors.
+            A solution for other floors, from which the search begins.
         tolerance : float, default 1e-6
-            mm, for violation and stationarity.
+            The tolerance for violation and stationarity, mm.
         load_steps : int, default 5
-            Ignored with a `start`.
+            The number of steps that move the held nodes; ignored with a `start`.
         max_iterations : int, default 400
-            Quadratic programs in all.
+            The largest number of quadratic programs in all load steps together.
         """
         floor, used = floor[self.nodes], 0
         if start is None:
@@ -142,7 +141,7 @@ class ContactProblem:
     def _iterate(
         self, state: _State, floor: np.ndarray, load: float, tolerance: float, limit: int
     ) -> tuple[_State, int]:
-        """Steps until one is shorter than the tolerance (mm) or longer than the body; also their number."""
+        """Step until a step is shorter than the tolerance (mm) or longer than the body; also return the step count."""
         for count in range(1, limit + 1):
             after, moved = self._step(state, floor, load)
             if not moved < self._size:
@@ -153,7 +152,7 @@ class ContactProblem:
         return state, limit
 
     def _step(self, state: _State, floor: np.ndarray, load: float) -> tuple[_State, float]:
-        """One quadratic program and line search; also the largest distance to its solution, mm."""
+        """Solve one quadratic program and do a line search; also return the largest distance to its solution, mm."""
         gap, normal = self.gap((self.points + state.u)[self.nodes])
         force = self._contact_forces(state, gap - floor, normal, load)
         direction = load * self._free + self._compliance.solve(self._spread(force, normal)) - state.u
@@ -180,10 +179,10 @@ class ContactProblem:
         return nodal.ravel()
 
     def _contact_forces(self, state: _State, slack: np.ndarray, normal: np.ndarray, load: float) -> np.ndarray:
-        """Multipliers of the quadratic program; its working set grows until no tangent plane is crossed."""
+        """Solve for the multipliers of the quadratic program; its working set grows until no node crosses its plane."""
         offset = slack + (normal * (load * self._free - state.u)[self.nodes]).sum(axis=1)
         force = np.zeros(len(self.nodes))
-        # A node that has fled to where the gap is flat has no tangent plane to be held by.
+        # A node in a region where the gap has no gradient has no tangent plane.
         steep = np.abs(normal).max(axis=1) > 1e-6
         working = steep & ((state.force > 0) | (offset < 0))
         while True:
@@ -205,7 +204,7 @@ class ContactProblem:
         gap: np.ndarray,
         first: float,
     ) -> float:
-        """Step length at which energy and penalised violation fall (Armijo)."""
+        """Find a step length that decreases the energy plus the penalised violation (Armijo)."""
         slope = float(direction.ravel() @ (self.stiffness @ u.ravel()))
         curvature = float(direction.ravel() @ (self.stiffness @ direction.ravel()))
         below = float(penalty @ np.maximum(floor - gap, 0))
@@ -222,9 +221,9 @@ class ContactProblem:
 
 
 def _stretch(direction: np.ndarray, previous: np.ndarray) -> float:
-    """Aitken's step length, where two steps in line say that the rest is a geometric series; otherwise 1.
+    """Return Aitken's step length if two steps are nearly parallel, as terms of a geometric series; otherwise 1.
 
-    The tangent planes leave the curvature of the obstacle out, which makes convergence linear.
+    Convergence is linear, because the tangent planes ignore the curvature of the obstacle.
     """
     dot, square, last = (float((a * b).sum()) for a, b in ((direction, previous), (direction,) * 2, (previous,) * 2))
     in_line = dot**2 > 0.95 * square * last > 0
@@ -232,13 +231,13 @@ def _stretch(direction: np.ndarray, previous: np.ndarray) -> float:
 
 
 class _Compliance:
-    """K⁻¹ with the held nodes fixed: one factorisation, and the columns of nodes in contact as they come up."""
+    """K⁻¹ with the held nodes fixed: one factorisation; the column of a node is computed when the node has contact."""
 
     def __init__(self, stiffness: scipy.sparse.csr_matrix, held: np.ndarray, nodes: np.ndarray) -> None:
         degrees = np.arange(stiffness.shape[0]).reshape(-1, 3)
         self.free = np.delete(degrees, held, axis=0).ravel()
         self.rows = degrees[nodes].ravel()
-        # Stiffness spans seven decades between a fluid and a solid; a unit diagonal lets the factor see both alike.
+        # The stiffness of a fluid and a solid differ by seven decades; scaling to a unit diagonal balances the factor.
         self.scale = 1 / np.sqrt(stiffness.diagonal()[self.free])
         scaled = scipy.sparse.diags(self.scale) @ stiffness[self.free][:, self.free] @ scipy.sparse.diags(self.scale)
         self.factor = splu(
@@ -248,25 +247,25 @@ class _Compliance:
         self.columns = np.zeros((len(self.rows), 0))
 
     def solve(self, force: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) under nodal forces (3n,); the held nodes stay."""
+        """Compute the displacement (n, 3) by nodal forces (3n,); the held nodes do not move."""
         result = np.zeros_like(force)
         result[self.free] = self._solve_free(force[self.free, None])[:, 0]
         return result.reshape(-1, 3)
 
     def among(self, index: np.ndarray) -> np.ndarray:
-        """(k, 3, k, 3): displacement of the nodes of `index` by unit forces on them."""
+        """Compute the displacements (k, 3, k, 3) of the nodes of `index` by unit forces on these nodes."""
         self._add(index[self.position[index] < 0])
         rows, columns = (3 * i[:, None] + np.arange(3) for i in (index, self.position[index]))
         return self.columns[rows[:, :, None, None], columns]
 
     def response(self, index: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """(o, 3): displacement of every node that may touch, by forces (k, 3) on those of `index`."""
+        """Compute the displacement (o, 3) of every node that may touch, by forces (k, 3) on the nodes of `index`."""
         every = np.zeros((self.columns.shape[1] // 3, 3))
         every[self.position[index]] = force
         return (self.columns @ every.ravel()).reshape(-1, 3)
 
     def _add(self, index: np.ndarray) -> None:
-        """Columns of the compliance for forces on the nodes of `index`."""
+        """Compute the columns of the compliance for forces on the nodes of `index`."""
         if not len(index):
             return
         degrees = self.rows.reshape(-1, 3)[index].ravel()
@@ -285,8 +284,8 @@ def complementarity(
 ) -> Float[np.ndarray, "k"]:
     """Solve x ≥ 0, A x ≥ b, xᵀ(A x − b) = 0 for a symmetric positive definite A.
 
-    Block principal pivoting (Júdice and Pires, 1994): guess the support, solve, exchange all entries of the
-    wrong sign; where that stops paying, exchange the last one only (Murty), which always ends.
+    The method is block principal pivoting (Júdice and Pires, 1994): guess the support, solve, and exchange all entries
+    of the wrong sign. If their number does not decrease, exchange only the last one (Murty); this rule always ends.
 
     Parameters
     ----------

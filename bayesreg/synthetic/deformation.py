@@ -1,4 +1,4 @@
-"""A patch of the boundary pushed in, after section 4.1 of the paper: the true deformation of a synthetic pair."""
+"""Push a patch of the boundary inwards, as in section 4.1 of the paper: the true deformation of a synthetic pair."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from bayesreg.types import InputError
 
 Direction = tuple[float, float, float]
 
-# Frontal (right, left, right and lower), lateral (right, left) and parietal: all where the hull of a brain is free.
+# Frontal (right, left, right and lower), lateral (right, left) and parietal directions, in which the hull of a brain is
+# free to move.
 DIRECTIONS: tuple[Direction, ...] = (
     (0.6, 0.3, 0.75),
     (-0.6, 0.3, 0.75),
@@ -34,14 +35,14 @@ DIRECTIONS: tuple[Direction, ...] = (
 
 _log = logging.getLogger(__name__)
 
-# How often to raise the floors of nodes that ended nearer to the skull than the margin, and by what share of
-# the margin they may.
+# The largest number of rounds that raise the floors of nodes nearer to the skull than the margin, and the share of the
+# margin by which a node may be nearer.
 _ROUNDS_OF_FLOORS = 20
 _SLIP = 0.01
 
 
 class Deformation(NamedTuple):
-    """A patch of the boundary pushed in, and the least elastic energy of the rest.
+    """The deformation by a patch of the boundary that is pushed inwards; the other nodes minimise the elastic energy.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class Deformation(NamedTuple):
     contact : (c,) int array
         Nodes that press against the skull.
     minimum : EnergyMinimum
-        Contact forces and how well the minimum converged.
+        The contact forces and the convergence of the minimum.
     volume_ratio : (m,) array
         det F of every tetrahedron, all positive.
     """
@@ -76,10 +77,10 @@ def push_patch(
     margin: float = 0.1,
     skull_smoothing_mm: float = 2.0,
 ) -> Deformation:
-    """Push a patch of the boundary towards the centre of gravity, and let the rest find its least energy.
+    """Push a patch of the boundary towards the centre of gravity; the other nodes minimise the elastic energy.
 
-    Every other node on the boundary keeps at least `margin` from the skull, which it may slide along: along
-    a smoothed skull, that is, drawn in at each node as far as the margin from the exact one asks for.
+    Every other boundary node keeps at least the distance `margin` from the skull and may slide along it. It slides
+    along a smoothed skull, which is moved inwards at each node until the exact skull is at least the margin away.
 
     Parameters
     ----------
@@ -91,9 +92,10 @@ def push_patch(
     displacement : float, default 15.0
         The displacement of each node of the patch, mm.
     patch_nodes : int, default 20
-        The boundary node farthest out along `direction`, and those nearest to it over the surface.
+        The number of nodes of the patch: the boundary node whose bearing is closest to `direction`, and the nodes
+        nearest to it along the surface.
     direction : (x, y, z), optional
-        From the centre of gravity towards the patch, RAS; any length. The default is the first of `DIRECTIONS`
+        Direction from the centre of gravity to the patch, RAS; any length. The default is the first of `DIRECTIONS`
         along which no tetrahedron inverts.
     margin : float, default 0.1
         Least distance of a boundary node from the skull after the deformation, mm.
@@ -103,8 +105,8 @@ def push_patch(
     Raises
     ------
     InputError
-        If an argument is out of range, nodes lie in the skull before or patch nodes after the push, a
-        tetrahedron inverts, or the minimum is not found.
+        If an argument is out of range, a boundary node lies in the skull before the push, a patch node lies in it
+        after the push, a tetrahedron inverts, or the minimum is not found.
     """
     if not (np.asarray(mu) > 0).all() or not (np.asarray(lam) >= 0).all():
         raise InputError(f"the truth needs mu > 0 and lam >= 0 everywhere, got mu = {mu}, lam = {lam}")
@@ -138,12 +140,12 @@ def _push(
 
 
 def centre_of_gravity(mesh: TetMesh) -> Float[np.ndarray, "3"]:
-    """Centre of the meshed volume, mm."""
+    """Compute the centre of the meshed volume, mm."""
     return mesh.volumes @ mesh.points[mesh.cells].mean(axis=1) / mesh.volumes.sum()
 
 
 def surface_patch(mesh: TetMesh, count: int, direction: Float[np.ndarray, "3"]) -> Int[np.ndarray, "patch"]:
-    """A connected patch of the boundary: a node, and those nearest to it along the edges of the surface.
+    """Choose a connected patch of the boundary: a node, and the nodes nearest to it along the edges of the surface.
 
     Parameters
     ----------
@@ -151,12 +153,12 @@ def surface_patch(mesh: TetMesh, count: int, direction: Float[np.ndarray, "3"]) 
     count : int
         Number of nodes, at least three.
     direction : (3,) array
-        The first node is the one whose bearing from the centre of gravity is closest to it.
+        The first node has the bearing from the centre of gravity that is closest to this direction.
 
     Returns
     -------
     (count,) int array
-        Nearest first.
+        The nodes, sorted by their distance from the first node.
 
     Raises
     ------
@@ -175,7 +177,7 @@ def surface_patch(mesh: TetMesh, count: int, direction: Float[np.ndarray, "3"]) 
 
 
 def _surface_edges(mesh: TetMesh) -> scipy.sparse.csr_matrix:
-    """Lengths of the edges of the boundary."""
+    """Compute the lengths of the boundary's edges, as a sparse matrix of nodes by nodes."""
     faces = mesh.boundary_faces
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
     length = np.linalg.norm(mesh.points[edges[:, 0]] - mesh.points[edges[:, 1]], axis=1)
@@ -183,7 +185,7 @@ def _surface_edges(mesh: TetMesh) -> scipy.sparse.csr_matrix:
 
 
 def _settle(problem: ContactProblem, obstacle: SmoothObstacle, margin: float) -> EnergyMinimum:
-    """The minimum with floors on the smoothed distance that keep the exact distance above the margin."""
+    """Find the minimum with floors of the smoothed distance that keep the exact distance above the margin."""
     floor = np.full(len(problem.points), margin)
     minimum = problem.solve(floor, tolerance=1e-3)
     for _ in range(_ROUNDS_OF_FLOORS):

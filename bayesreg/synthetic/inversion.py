@@ -1,4 +1,4 @@
-"""The image that a known deformation makes of another, by inverting the deformation exactly."""
+"""Deform an image by a known deformation, which is inverted exactly."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ from bayesreg.model.warp import covered_voxels
 def deformed_image(
     fixed: Image, tissue: Image, skull: Image, mesh: TetMesh, u: Float[np.ndarray, "nodes 3"], filling: float
 ) -> Image:
-    """The image m with m(x + u(x)) = f(x).
+    """Make the image m with m(x + u(x)) = f(x).
 
-    A voxel centre y inside the deformed mesh lies in one deformed tetrahedron; its barycentric coordinates
-    there give x in the tetrahedron at rest, and m(y) = f(x) by cubic interpolation. No iteration, no
-    approximation but the interpolation.
+    A voxel centre y inside the deformed mesh lies in one deformed tetrahedron. Its barycentric coordinates give x in
+    the tetrahedron at rest, and m(y) = f(x) by cubic interpolation. The interpolation is the only approximation.
 
-    Outside the deformed mesh y is one of these, in this order: a voxel next to it, which the interpolation of
-    m inside the mesh reads too: m(y) = f(y − u), u being the displacement of the nearest point of the surface;
-    skull, which stays where it is: m(y) = f(y); tissue that the mesh left out and that rides on its surface:
-    m(y) = f(y − u) again; space that tissue has left: `filling`; nothing labelled before or after: m(y) = f(y).
+    Outside the deformed mesh the first of these rules that applies gives m(y):
+
+    - y lies next to the mesh, where the interpolation of m inside the mesh reads it: m(y) = f(y − u), with the
+      displacement u of the nearest point of the surface;
+    - y lies in the skull, which does not move: m(y) = f(y);
+    - y lies in tissue outside the mesh, which moves with the surface: m(y) = f(y − u);
+    - y lies in space that tissue has left: `filling`;
+    - y has no label before and after the deformation: m(y) = f(y).
 
     Parameters
     ----------
@@ -37,11 +40,11 @@ def deformed_image(
     skull : Image
         Nonzero = forbidden, on the same grid.
     mesh : TetMesh
-        At rest, in the space of `fixed`.
+        The mesh at rest, in the space of `fixed`.
     u : (n, 3) array
-        Displacement of every node, mm; no tetrahedron inverted.
+        Displacement of every node, mm, without inverted tetrahedra.
     filling : float
-        Fills the space that tissue has left.
+        The intensity of space that tissue has left.
     """
     deformed = mesh.moved(u)
     values = np.array(fixed.voxels, float)
@@ -69,7 +72,7 @@ def residuals(
     rule: str = "gauss4",
     interpolation: Interpolation = "linear",
 ) -> Float[np.ndarray, "points"]:
-    """f(x) − m(x + u(x)) at the quadrature points of a mesh; at the truth, what noise and interpolation leave."""
+    """Compute f(x) − m(x + u(x)) at quadrature points; for the true u it is noise and interpolation error."""
     quadrature = gauss_quadrature(mesh, rule)
     nodal = u[mesh.cells[np.asarray(quadrature.cells)]]
     rest = quadrature.positions(mesh)
@@ -80,14 +83,14 @@ def residuals(
 def _surface_displacement(
     mesh: TetMesh, deformed: TetMesh, positions: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Displacement of the nearest point of the deformed surface."""
+    """Compute the displacement of the nearest point of the deformed surface."""
     triangles = mesh.boundary_faces
     face, weight = nearest_on_surface(deformed.points, triangles, positions)
     return np.einsum("ka,kai->ki", weight, (deformed.points - mesh.points)[triangles[face]])
 
 
 def _cubic(image: Image, positions: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k"]:
-    """`Image.interpolate(positions, "cubic")`, by SciPy: four times faster for a million points without a compiler."""
+    """Interpolate as `Image.interpolate` with "cubic", but by SciPy: for a million points it is four times faster."""
     index = np.clip(image.world_to_voxel(positions), 0, np.array(image.shape) - 1.0)
     return ndimage.map_coordinates(np.asarray(image.voxels, float), index.T, order=3, mode="mirror")
 

@@ -1,4 +1,4 @@
-"""Synthetic pairs with a known truth, after section 4.1 of the paper."""
+"""Make synthetic pairs with a known truth, as in section 4.1 of the paper."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bayesreg.types import InputError
 
 
 class SyntheticPair(NamedTuple):
-    """Two images, and the deformation between them that made the second.
+    """Two images, and the known deformation that made the second from the first.
 
     Attributes
     ----------
     fixed, moving : Image
-        f and m on one grid, noise included; m(x + u(x)) = f(x) but for noise and interpolation.
+        f and m on one grid, noise included; m(x + u(x)) = f(x) except for noise and interpolation.
     mesh : TetMesh
-        The mesh that made the pair. Where the registration uses another one, its truth is
+        The mesh on which the pair was made. If the registration uses another mesh, the truth there is
         `transfer(pair.u, pair.mesh, other.points)`.
     u : (n, 3) array
         True displacement of every node of `mesh`, mm.
@@ -31,12 +31,12 @@ class SyntheticPair(NamedTuple):
         True Lamé parameters.
     deformation : Deformation
     residual_sd : float
-        Standard deviation of f(x) − m(x + u(x)) at the four-point quadrature points, linear interpolation:
-        noise and interpolation together.
+        Standard deviation of f(x) − m(x + u(x)) at the four-point quadrature points, with linear interpolation. It
+        includes noise and interpolation.
     interpolation_sd : float
         `residual_sd` without the noise.
     smoothing_mm, noise_sd : float
-        As given.
+        The arguments of `make_pair`.
     """
 
     fixed: Image
@@ -68,30 +68,30 @@ def make_pair(
     noise_sd: float = 0.003,
     seed: int = 0,
 ) -> SyntheticPair:
-    """A pair of images with a known deformation and stiffness.
+    """Make a pair of images with a known deformation and stiffness.
 
-    The *paper pair*: the defaults, and the same mesh for making and for registering, as the paper did (an
-    inverse crime). The *calibrated pair*: `noise_sd` 0.01, and a finer mesh here than in the registration; the
-    same number of patch nodes is then a smaller patch.
+    The *paper pair* has the defaults, and the registration uses the same mesh, as in the paper (an inverse crime). The
+    *calibrated pair* has `noise_sd` 0.01 and a finer mesh than the registration; the same number of patch nodes is then
+    a smaller patch.
 
     Parameters
     ----------
     fixed : Image
-        Intensities of about [0, 1]: the noise is added as it stands.
+        The fixed image with intensities in about [0, 1]; the noise is not scaled to the intensities.
     tissue : Image
         0 = outside, then 1 + index into `mesh.names`; on the grid of `fixed`.
     skull : Image
         Nonzero = forbidden; on the same grid.
     mesh : TetMesh
-        Space that its tissues leave is filled with its fluid (`bayesreg.tissues`), or with what lies outside the
-        tissues where none is a fluid.
+        The mesh on which the pair is made. Space that its tissues leave gets the median intensity of the fluid
+        (`bayesreg.tissues`), or of the voxels outside all tissues if no tissue is a fluid.
     lam, mu : (T,) array
         Lamé parameters by tissue.
     displacement, patch_nodes, direction, margin
         See `push_patch`.
     smoothing_mm : float, default 0.75
-        Standard deviation of the Gaussian that f is smoothed by beforehand, 0 for none. Linear interpolation
-        of Colin27 leaves a residual of sd 0.010 at the truth unsmoothed, 0.005 with the default, 0.003 with 1 mm.
+        Standard deviation of the Gaussian that smooths f first; 0 for no smoothing. Linear interpolation of Colin27
+        gives a residual sd at the truth of 0.010 without smoothing, 0.005 with the default, and 0.003 with 1 mm.
     noise_sd : float, default 0.003
         Standard deviation of the independent Normal noise on each image.
     seed : int, default 0
@@ -100,8 +100,8 @@ def make_pair(
     Raises
     ------
     InputError
-        If the images are on different grids or do not cover the mesh, the image has no voxel
-        to fill free space with, or as `push_patch` says.
+        If the images are on different grids or do not cover the mesh, or no voxel has an intensity for free space; and
+        as `push_patch`.
     """
     _require_one_grid(fixed, tissue, skull, mesh)
     if smoothing_mm < 0 or noise_sd < 0:
@@ -136,7 +136,7 @@ def make_pair(
 
 
 def _filling_intensity(fixed: Image, tissue: Image, mesh: TetMesh) -> float:
-    """The median of the fluid, or of what is no tissue where there is no fluid."""
+    """Compute the median intensity of the fluid, or of the voxels without tissue if there is no fluid."""
     fluids = [index for index, name in enumerate(mesh.names, start=1) if is_fluid(name)]
     values = np.asarray(fixed.voxels)[np.isin(np.asarray(tissue.voxels), fluids or [0])]
     if values.size == 0:

@@ -1,1 +1,1 @@
-"""The verbs of the command line, from a configuration to a folder of results."""
+"""The commands of the command line, each from a configuration to a folder of results."""

@@ -1,4 +1,4 @@
-"""What can be said of a pair of images and its labels before any search: overlap, likeness, scale, millilitres."""
+"""Measure a pair of images and its labels before any search: overlap, likeness, scale, volumes of the tissues."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from bayesreg.image import Image
 from bayesreg.model.observations.images.contrast import explained_shares
 from bayesreg.tissues import is_fluid, label_of
 
-# Voxels that are looked at; bins of each image in the joint histogram.
+# The largest number of voxels that are compared, and the number of bins of each image in the joint histogram.
 VOXELS, BINS = 200_000, 32
-# Aligned images of one contrast correlate by more: by 0.53 where tissue has moved by 4 mm in the mean and 10 at most.
+# Aligned images of one contrast have a greater correlation: 0.53 if tissue moved by 4 mm in the mean, at most 10 mm.
 ALIKE = 0.5
-# Scales of intensities that differ by a greater factor are no accident.
+# Two images have different scales if the ranges of their intensities differ by a greater factor.
 SCALES = 2.0
-# Nor is a difference of the medians by more than this share of the range.
+# They also have different scales if their medians differ by a greater share of the range.
 OFFSET = 0.5
-# Images are of one contrast where a straight line explains this share of what any map of intensities does.
+# Images have one contrast if a straight line explains this share of the variance that any map of intensities explains.
 STRAIGHT = 0.8
-# Of a smaller share nothing can be told.
+# A map that explains a smaller share of the variance does not show whether the contrasts are the same.
 UNLIKE = 0.02
-# Shares that are worth a sentence: of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
+# Greater shares are reported: the share of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
-# Labels that fill less of the mask of the organ are of a part of it.
+# Labels that fill a smaller share of the mask seem to show only a part of the organ.
 FILLED = 0.4
 
 
 class Appraisal(NamedTuple):
-    """What is known of a pair before any search.
+    """Measurements of a pair of images and its labels before any search.
 
     Attributes
     ----------
     millilitres : mapping
-        By tissue, inside and outside of Ω.
+        The volumes inside and outside Ω of each tissue, ml.
     likeness : Likeness or None
-        None without a pair of images from files.
+        None if there is no pair of images from files.
     beware : tuple of str
-        What a user should know, a sentence each.
+        Warnings for the user, one sentence each.
     notes : tuple of str
-        What was found and chosen, a sentence each.
+        Findings and choices, one sentence each.
     """
 
     millilitres: Mapping[str, tuple[float, float]]
@@ -51,30 +51,31 @@ class Appraisal(NamedTuple):
     notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """As mappings and lists, for files."""
+        """Convert the appraisal to mappings and lists, for files."""
         likeness = None if self.likeness is None else self.likeness._asdict()
         told = {"beware": list(self.beware), "notes": list(self.notes)}
         return {"millilitres": dict(self.millilitres), "likeness": likeness, **told}
 
 
 class Likeness(NamedTuple):
-    """How alike two images are in Ω as they lie.
+    """Measures of the likeness of two images in Ω before the registration.
 
     Attributes
     ----------
     correlation : float
-        Pearson's.
+        Pearson's correlation.
     mutual_information : float
         2 I / (H_fixed + H_moving), from 0 to 1.
     scale_ratio : float
-        Range of the moving image over that of the fixed one, between the 0.5 and 99.5 % quantiles.
+        The range of the moving image divided by the range of the fixed image. A range is the difference of the 0.5 and
+        99.5 % quantiles.
     offset : float
-        Median of the moving image less that of the fixed one, over the range of the fixed one.
+        The median of the moving image minus the median of the fixed image, divided by the range of the fixed image.
     on_grid : float
         The share of Ω that lies on the grid of the moving image.
     line_share, map_share : float
-        Shares of the variance of the moving image that a straight line of the fixed one's intensities explains,
-        negative where it falls, and that the best map of them explains.
+        The shares of the variance of the moving image that functions of the fixed image's intensities explain: a
+        straight line (a negative share if the line falls), and the best map.
     """
 
     correlation: float
@@ -87,23 +88,23 @@ class Likeness(NamedTuple):
 
     @property
     def is_one_contrast(self) -> bool:
-        """Whether a rising line explains nearly what any map does, or no map explains anything."""
+        """Whether a rising line explains nearly as much as any map does, or no map explains anything."""
         return self.map_share < UNLIKE or self.line_share >= STRAIGHT * self.map_share
 
     @property
     def is_one_scale(self) -> bool:
-        """Whether the intensities of both run over nearly one range."""
+        """Whether the intensities of both images have nearly the same range."""
         return 1 / SCALES < self.scale_ratio < SCALES and abs(self.offset) <= OFFSET
 
     def sentences(self, one_contrast: bool, one_scale: bool) -> list[str]:
-        """What a user should know; nothing where all is well.
+        """Write the warnings for a user; the list is empty if the images are alike.
 
         Parameters
         ----------
         one_contrast : bool
-            Whether the similarity takes both images to be of one contrast.
+            Whether the similarity assumes that both images have one contrast.
         one_scale : bool
-            Whether both images are on one scale of intensities.
+            Whether both images share one scale of intensities.
         """
         found = []
         if self.on_grid < 1 - BEYOND:
@@ -139,7 +140,7 @@ def appraise(
     one_scale: bool = True,
     intracranial: Image | None = None,
 ) -> Appraisal:
-    """Appraise labels and, where there is a pair of images, how alike they are; see `Likeness.sentences`."""
+    """Appraise the labels and, if there is a pair of images, their likeness; see `Likeness.sentences`."""
     millilitres = measure_tissues(tissue, domain, names)
     told = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
     return Appraisal(
@@ -148,7 +149,7 @@ def appraise(
 
 
 def explain_mask(tissue: Image, intracranial: Image | None) -> list[str]:
-    """A sentence where labels fill little of the mask that the organ may move in, both on one grid."""
+    """Warn if the labels fill a small share of the mask of where the organ may go; both lie on one grid."""
     if intracranial is None:
         return []
     labelled, inside = np.asarray(tissue.voxels) != 0, np.asarray(intracranial.voxels) != 0
@@ -162,14 +163,14 @@ def explain_mask(tissue: Image, intracranial: Image | None) -> list[str]:
 
 
 def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
-    """Compare two images in Ω, at up to `VOXELS` of its voxels evenly spread.
+    """Compare two images in Ω, at up to `VOXELS` evenly spread voxels of Ω.
 
     Parameters
     ----------
     fixed, moving : Image
-        On grids of their own in one world space.
+        Images in one world space; each may have its own grid.
     domain : Image
-        Not zero in Ω, on a grid of its own.
+        Not zero in Ω, on any grid.
     """
     inside = np.argwhere(np.asarray(domain.voxels) != 0)
     inside = inside[:: max(1, len(inside) // VOXELS)]
@@ -189,7 +190,7 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
 
 
 def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Millilitres of every tissue inside and outside of Ω, both on one grid."""
+    """Measure the volume of every tissue inside and outside Ω, ml; `tissue` and `domain` share one grid."""
     voxels, inside = np.asarray(tissue.voxels), np.asarray(domain.voxels) != 0
     millilitre = tissue.voxel_volume / 1e3
     counted = ((voxels == index) for index in range(1, len(names) + 1))
@@ -200,7 +201,7 @@ def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dic
 
 
 def explain_left_out(millilitres: Mapping[str, tuple[float, float]]) -> list[str]:
-    """A sentence on every solid tissue of which Ω leaves out more than `LEFT_OUT`."""
+    """Warn of every solid tissue of which Ω leaves out a greater share than `LEFT_OUT`."""
     return [
         f"{outside:.3g} of {inside + outside:.3g} ml of {label_of(name)} lie outside the region to mesh, which leaves "
         "them out."

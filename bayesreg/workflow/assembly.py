@@ -1,4 +1,4 @@
-"""From a configuration and its inputs to the posterior and to where its chains begin."""
+"""Build the posterior and the start of its chains from a configuration and its inputs."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def posterior_of(
     observations: Sequence[Any] = (),
     independent_points: Mapping[str, float] | None = None,
 ) -> Posterior:
-    """The posterior of a run, with observations besides those of its configuration.
+    """Build the posterior of a run, with observations besides those of its configuration.
 
-    Solves are preconditioned at the start parameters. Where a run has found how many points are independent, its
-    likelihood is tempered by that.
+    Solves are preconditioned at the start parameters. If the numbers of independent points are given, they temper the
+    likelihood.
     """
     model, reference = with_known_boundary(config.model, inputs), _references(config, inputs.mesh)
     observed = [one for section in config.observations for one in section.observe(inputs)]
@@ -47,7 +47,7 @@ def _references(config: Config, mesh: TetMesh) -> dict[str, AnyArray]:
 
 
 def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
-    """All entries of λ or μ at the start: as the configuration gives them, else as the model chooses."""
+    """Return all entries of λ or μ at the start: the configuration's values, else those that the model chooses."""
     values = np.array(lame_parameter(name, mesh, config.model, None).reference())
     given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
     for index, tissue in enumerate(mesh.names):
@@ -57,7 +57,7 @@ def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "
 
 
 def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
-    """Where a configuration's chains begin."""
+    """Build the start of a configuration's chains."""
     field = _start_field(config, inputs)
     return Start(
         field=None if field is None else field[posterior.sampled],
@@ -69,7 +69,7 @@ def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
 
 
 def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
-    """Displacement of every node at fraction one, mm."""
+    """Return the displacement of every node at fraction one, mm; None for the identity."""
     wanted = config.start.field
     if wanted == "identity":
         return None
@@ -87,12 +87,12 @@ def _start_field(config: Config, inputs: Inputs) -> np.ndarray | None:
 
 @lru_cache(maxsize=1)
 def _demons(fixed: Image, moving: Image, mesh: TetMesh) -> np.ndarray:
-    """The field of Demons at the nodes, mm."""
+    """Compute the displacement field of the Demons registration at the nodes, mm."""
     return np.stack([component.interpolate(mesh.points) for component in find_demons(fixed, moving)], axis=-1)
 
 
 def with_initial(inputs: Inputs, config: Config) -> Inputs:
-    """The truth with the centre of the chains' starts, for the paper's Table 1."""
+    """Add the mean start of the chains to the truth, for the paper's Table 1."""
     field = _start_field(config, inputs)
     if inputs.truth is None or field is None:
         return inputs

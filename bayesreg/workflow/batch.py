@@ -1,6 +1,6 @@
-"""Many subjects in one command, on workers of Dask: one task, one run folder.
+"""Run many subjects in one command on Dask workers. Each task has one run folder.
 
-Dask is optional, and imported where it is used.
+Dask is optional; the functions that use it import it.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from bayesreg.workflow.run import run
 
 TOPIC = "bayesreg"
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-# Workers that may die under one subject before it is given up.
+# The number of workers that may die while they run one subject, before that subject counts as failed.
 DEATHS = 5
-# How long a scheduler is waited for.
+# The longest wait for the answer of a scheduler.
 PATIENCE = "20s"
 
 
@@ -47,25 +47,25 @@ def batch(
     scheduler: str | None = None,
     progress: bool = True,
 ) -> pd.DataFrame:
-    """Run all subjects of a cohort; those that have ended are left as they are, others go on where they stand.
+    """Run all subjects of a cohort. Finished runs stay as they are; interrupted runs continue.
 
     Parameters
     ----------
     cohort : path
-        Of its file (`bayesreg.config.cohort.CohortConfig`).
+        The file of the cohort (`bayesreg.config.cohort.CohortConfig`).
     out : path
-        A folder. Each run has its own within, named after the subject and its settings; all workers must see it.
+        A folder that all workers can access. Each run has a subfolder, named after the subject and its settings.
     scheduler : str, optional
-        Address of a Dask scheduler that exists, such as tcp://host:8786; else workers are started as the section
-        cluster says.
+        Address of an existing Dask scheduler, such as tcp://host:8786. The default starts workers as the section
+        cluster describes.
     progress : bool
-        Show how far the subjects are.
+        Show the progress of the subjects.
 
     Returns
     -------
     DataFrame
-        A row for each run: its state ("finished" or "failed", with a message), convergence, displacement, uncertainty
-        and stiffness by tissue. Written as cohort.csv and cohort.parquet, and as a page, cohort.html.
+        One row per run: its state ("finished" or "failed", with a message), convergence, displacement, uncertainty
+        and stiffness by tissue. The table is also written as cohort.csv, cohort.parquet and the page cohort.html.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def batch(
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{out} cannot be a folder: {error.strerror}; name another one") from None
     rows: dict[str, dict[str, Any]] = {}
-    # Workers of this machine alone share its cores.
+    # Only workers that run on this machine share its cores.
     shares = given.cluster.workers if scheduler is None and given.cluster.slurm is None else None
     with _client(given.cluster, scheduler) as client, _Board(given, progress) as board:
         client.subscribe_topic(TOPIC, board.show)
@@ -93,12 +93,12 @@ def batch(
 
 
 def run_task(config: str, task: Task, folder: str, cores: int | None) -> dict[str, Any]:
-    """Run one task in a worker, and tell what came of it; no error leaves it but that of a process that ends."""
+    """Run one task in a worker and return its row; only an exception that ends the process is raised."""
     if cores is not None:
         _take_share(cores)
     try:
         settings = load_config(config, task.overrides)
-        # Of many runs side by side nobody would know which one a message is about; warnings stand in its report, too.
+        # Messages of many simultaneous runs do not name their run. The report of each run holds its warnings.
         with from_level(logging.ERROR):
             result = run(settings, folder, resume=True, progress=lambda *budget: _Reporter(task.name, *budget))
         return {"state": "finished", **summarise(result)}
@@ -106,14 +106,14 @@ def run_task(config: str, task: Task, folder: str, cores: int | None) -> dict[st
         begun = (Path(folder) / STATUS).exists()
         return {"state": "failed", "message": f"{error} (to begin it anew, remove {folder})" if begun else str(error)}
     except Exception as error:
-        # Whatever it is that ends one subject, it must not end the others.
+        # No error of one subject may end the others.
         Path(folder).mkdir(parents=True, exist_ok=True)
         (Path(folder) / "failed.txt").write_text(traceback.format_exc(), encoding="utf-8")
         return {"state": "failed", "message": f"{type(error).__name__}: {error} (see failed.txt in its folder)"}
 
 
 def summarise(result: Result) -> dict[str, Any]:
-    """What a cohort's table tells of a run; stiffness as median and 95 % interval, displacement and radius in mm."""
+    """Make a run's row of the cohort's table: stiffness as median and 95 % interval, displacement and radius in mm."""
     manifest, mesh = result.run.manifest, result.mesh
     share = mesh.nodal_volumes / mesh.nodal_volumes.sum()
     length = np.linalg.norm(result.u_mean, axis=1)
@@ -135,13 +135,13 @@ def summarise(result: Result) -> dict[str, Any]:
 
 
 class _Reporter(NoProgress):
-    """Tells the scheduler how far a run is."""
+    """Progress of a run that is reported to the Dask scheduler."""
 
     def __init__(self, name: str, draws: int, max_seconds: float | None, threshold: float | None) -> None:
         self.name, self.draws, self.max_seconds = name, draws, max_seconds
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
-        """Draws, the greatest R̂, and the share of the budget that is spent."""
+        """Report the greatest R̂, the spent share of the budget and the minutes that are left."""
         from distributed import get_worker
 
         draws, seconds = int(checkpoint.draws), float(checkpoint.seconds)
@@ -152,7 +152,7 @@ class _Reporter(NoProgress):
 
 
 def _take_share(count: int) -> None:
-    """Keep to a fair share of the cores, and to one of the devices, before JAX counts them."""
+    """Restrict the worker to its share of the cores and to one device, before JAX counts them."""
     from distributed import get_worker
 
     name = get_worker().name
@@ -163,13 +163,13 @@ def _take_share(count: int) -> None:
         os.sched_setaffinity(0, set(cores[number % count :: count]) or set(cores))
 
 
-# Those of the process before it took a share.
+# The cores of the process before `_take_share` restricted it.
 _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 
 
 @cache
 def _devices() -> tuple[str, ...]:
-    """Names of NVIDIA's devices that the process might use before it took a share, as CUDA_VISIBLE_DEVICES has them."""
+    """List the NVIDIA devices that were available before `_take_share`, by their names in CUDA_VISIBLE_DEVICES."""
     given = os.environ.get(VISIBLE)
     if given is not None:
         return tuple(name for name in given.split(",") if name)
@@ -181,16 +181,16 @@ def _devices() -> tuple[str, ...]:
 
 
 def share_of_devices(number: int, workers: int, devices: Sequence[str]) -> dict[str, str]:
-    """The environment in which a worker of so many sees one device alone, and takes a share of its memory."""
+    """Return the environment variables that give a worker one device and a share of the memory of this device."""
     if not devices:
         return {}
-    # JAX takes three quarters of a device at once where nothing is said.
+    # By default JAX reserves three quarters of the memory of a device.
     beside = -(-workers // len(devices))
     return {VISIBLE: devices[number % len(devices)], "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.75 / beside:.3f}"}
 
 
 def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Iterator[tuple[Task, dict[str, Any]]]:
-    """Tasks with what came of them, as they end; those that were begun first come first."""
+    """Submit all tasks and yield each with its row when it ends; tasks that were begun before are submitted first."""
     from distributed import as_completed
 
     begun = sorted(cohort.tasks, key=lambda task: _stage_of(out / task.name) != "prepared")
@@ -203,15 +203,15 @@ def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Itera
         try:
             found = future.result()
         except Exception as error:
-            # Workers have died under it again and again, or could not be reached.
+            # Its workers died more than `DEATHS` times, or were not reachable.
             found = {"state": "failed", "message": f"{type(error).__name__}: {error}"}
-        # What is known here is not done again where the worker that did it dies.
+        # A released result is not computed again if its worker dies.
         future.release()
         yield task, found
 
 
 def _stage_of(folder: Path) -> str | None:
-    """The stage of a run; None where there is none, or its status is damaged, which the run itself tells of."""
+    """Return the stage of a run; None if there is no run or its status is damaged, which the run itself reports."""
     try:
         return stage_of(folder)
     except (InputError, OSError):
@@ -220,7 +220,7 @@ def _stage_of(folder: Path) -> str | None:
 
 @contextmanager
 def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
-    """A client of the workers: those of a scheduler that exists, of SLURM, or processes of this machine."""
+    """Connect to workers: those of an existing scheduler, SLURM jobs, or processes on this machine."""
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -241,7 +241,7 @@ def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
         workers: Any = SLURMCluster(**cluster.slurm)
         workers.scale(cluster.workers)
     else:
-        # A run needs what it needs: no worker is ended for its memory.
+        # Dask must not end a worker because of its memory: a restarted run would need as much.
         own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": "127.0.0.1:0",
                "silence_logs": logging.CRITICAL}  # fmt: skip
         workers = LocalCluster(n_workers=cluster.workers, **own)
@@ -252,7 +252,7 @@ def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
 
 
 def _deaf_to_interrupts() -> Any:
-    """A plugin of workers that leaves Ctrl-C, which a terminal sends to them, too, to the process that began them."""
+    """Make a plugin by which workers ignore Ctrl-C: a terminal sends it to them too, and the parent process acts."""
     from distributed import WorkerPlugin
 
     class Deaf(WorkerPlugin):
@@ -266,7 +266,7 @@ def _deaf_to_interrupts() -> Any:
 
 
 class _Board:
-    """What is shown while a cohort runs: how many have ended, and a line for each that has not."""
+    """The progress display of a cohort: the number of runs that ended, and one line for each active run."""
 
     def __init__(self, cohort: Cohort, shown: bool) -> None:
         self._bar = Progress(
@@ -285,7 +285,7 @@ class _Board:
         self._bar.stop()
 
     def show(self, event: tuple[float, dict[str, Any]]) -> None:
-        """Show how far a run is."""
+        """Update the line of a run from its progress report."""
         _, said = event
         if said["name"] not in self._lines:
             self._lines[said["name"]] = self._bar.add_task(said["name"], total=100, figures="")
@@ -294,7 +294,7 @@ class _Board:
         self._bar.update(self._lines[said["name"]], completed=round(100 * min(said["spent"], 1)), figures=rhat + left)
 
     def end(self, task: Task, found: dict[str, Any]) -> None:
-        """Count a run that has ended, and say what is wrong with one that failed."""
+        """Count a run that ended, and print the message of a failed run."""
         if (line := self._lines.pop(task.name, None)) is not None:
             self._bar.remove_task(line)
         if found["state"] == "failed":

@@ -1,4 +1,4 @@
-"""Everything but sampling, and what sampling would cost."""
+"""Do every step of a run except sampling, and estimate the cost of sampling."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 
 def check(config: str | Path | Config) -> Check:
-    """Everything but sampling, with an estimate of time and memory.
+    """Do every step of a run except sampling, and estimate time and memory.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def check(config: str | Path | Config) -> Check:
     def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
         reached.append(float(checkpoint.seconds))
 
-    # Two blocks: the first holds the compilation.
+    # Two blocks, because the time of the first includes the compilation.
     sample(posterior, options.name, options.chains, 2 * trial, config.seed, block=trial, start=start,
            progress=False, on_block=keep, **options.settings)  # fmt: skip
     seconds_per_step = (reached[1] - reached[0]) / trial
@@ -61,7 +61,7 @@ def check(config: str | Path | Config) -> Check:
 
 @dataclass(frozen=True)
 class Check:
-    """The cost of a configuration; `text` puts it in words."""
+    """The cost of a configuration; `text` describes it in words."""
 
     nodes: int
     cells: int
@@ -75,12 +75,12 @@ class Check:
 
     @property
     def text(self) -> str:
-        """What was found, and the estimate, in words."""
+        """The findings on the inputs and the estimated cost, in words."""
         return f"{describe_inputs(self.appraisal)}\n{self.cost}"
 
     @property
     def cost(self) -> str:
-        """The estimate in words."""
+        """The estimated cost in words."""
         preparation = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.preparation.items())
         return "\n".join(
             [
@@ -95,14 +95,14 @@ class Check:
 
 
 def describe_inputs(appraisal: Mapping[str, Any]) -> str:
-    """What was found of labels and images, in words."""
+    """Describe the labels and images in words."""
     beware = appraisal.get("beware", [])
     verdict = "The configuration can be run, but beware:" if beware else "The configuration is sound."
     return "\n".join([verdict, *(f"  - {sentence}" for sentence in beware), *_describe(appraisal)])
 
 
 def _describe(appraisal: Mapping[str, Any]) -> list[str]:
-    """The labels and the images in two lines."""
+    """Describe the notes, the volumes of the tissues and the likeness of the images, one line each."""
     lines = [f"  {note}" for note in appraisal.get("notes", ())]
     if appraisal.get("millilitres"):
         parts = (

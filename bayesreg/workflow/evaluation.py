@@ -1,4 +1,4 @@
-"""Landmarks that the sampler never saw: how far they are from where the posterior takes them, and should be."""
+"""Compare held-out landmarks with their predicted positions: the actual and the expected distances."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from bayesreg.io.points import PointPairs
 from bayesreg.results.transform import Transform, spread
 from bayesreg.types import AnyArray, InputError
 
-# Among the points of a run's inputs; no observation has this name.
+# The name of the held-out landmarks among the points of a run's inputs; no observation has this name.
 NAME = "evaluation"
-# Landmarks that lie no further from each other are one, mm.
+# Landmarks with a smaller distance are the same landmark, mm.
 SAME = 1e-3
 
 
 def require_unseen(held_out: PointPairs, seen: Mapping[str, tuple[AnyArray, AnyArray]]) -> None:
-    """Raise InputError where a landmark that is to be held out is one of those observed, (fixed, moving) by name."""
+    """Raise InputError if a held-out landmark is also observed; `seen` holds the observed (fixed, moving) by name."""
     for name, (fixed, moving) in seen.items():
         away = np.linalg.norm(held_out.fixed[:, None] - np.asarray(fixed), axis=2)
         away += np.linalg.norm(held_out.moving[:, None] - np.asarray(moving), axis=2)
@@ -29,16 +29,16 @@ def require_unseen(held_out: PointPairs, seen: Mapping[str, tuple[AnyArray, AnyA
 
 
 def evaluate_landmarks(pairs: PointPairs, transform: Transform, sd: float | None) -> dict[str, AnyArray]:
-    """What `Predicted` keeps of landmarks that were held out.
+    """Compute the entries of `Predicted` for held-out landmarks.
 
     Parameters
     ----------
     pairs : PointPairs
-        As they were given, each side in the world of its own image.
+        The landmarks as given, the points of each image in the world of this image.
     transform : Transform
-        From the fixed image's world.
+        The transform from the fixed image's world.
     sd : float or None
-        Of the error of each coordinate with which a landmark is found, mm; None takes that of the file, else zero.
+        Standard deviation of the localisation error of each coordinate, mm; None takes the file's value, else zero.
     """
     found = spread(transform, pairs.fixed)
     own = pairs.sd if sd is None else np.full(len(pairs.fixed), sd)

@@ -1,4 +1,4 @@
-"""What a run leaves when its last draw is made: the files of its folder, and the report."""
+"""Write the results of a run after its last draw: the files of its folder, and the report."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def finish(
     out: Path,
     began: float,
 ) -> Result:
-    """Write everything that comes after the last draw into the folder of the run."""
+    """Write all results of the draws, and the report, into the folder of the run."""
     from bayesreg.report.html import write_report
 
     idata = _store_draws(posterior, samples, out, config.seed)
@@ -73,7 +73,7 @@ def finish(
         predicted=predicted,
         **inputs._asdict(),
     )
-    # An earlier end of this run may have left more files.
+    # The run may have finished before, with other files in these folders.
     for folder in (ENSEMBLE, FOLDER):
         drop(out, folder)
     with writing(out) as place:
@@ -88,11 +88,11 @@ def finish(
 
 
 def _store_draws(posterior: Posterior, samples: Samples, out: Path, seed: int) -> Any:
-    """Write posterior.nc, with what ArviZ wants to know of the observations, and open it."""
+    """Write posterior.nc with the draws and ArviZ's groups of the observations, and open it."""
     with writing(out) as place:
         path = place(POSTERIOR)
         save_posterior(posterior, samples.blocks, path)
-        # A file that is open is not added to.
+        # Groups cannot be appended to an open file.
         with xr.open_dataset(path, group="posterior") as draws:
             groups = predictive_groups(posterior, draws, seed)
         append_groups(path, groups)
@@ -100,8 +100,8 @@ def _store_draws(posterior: Posterior, samples: Samples, out: Path, seed: int) -
 
 
 def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
-    """The moving image on the fixed grid by the mean of the displacement, the pose included."""
+    """Resample the moving image on the fixed grid by the mean displacement and the pose."""
     if inputs.moving is None or inputs.fixed is None:
         return None
-    # Where the voxels lie in the moving image's own world.
+    # The stored moving image is aligned; its own world is that of its file.
     return warp_image(inputs.matching.pose.inverse.aligned(inputs.moving), mean_field, inputs.fixed)

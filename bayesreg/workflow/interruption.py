@@ -1,4 +1,4 @@
-"""A run that is asked to end, by Ctrl-C or by a queue's SIGTERM, ends after the block of draws in hand."""
+"""End a run after its current block of draws if Ctrl-C or a queue's SIGTERM asks for it."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Any
 
 _log = logging.getLogger(__name__)
 
-# Seconds after which a signal comes again.
+# Seconds after which a signal is sent again.
 AGAIN = 0.5
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal has ended the program, and what is stored can be gone on with.
+    """A signal ended the program; the stored run can be resumed.
 
     Parameters
     ----------
     number : int
-        Of the signal.
+        The number of the signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -32,18 +32,18 @@ class Interrupted(KeyboardInterrupt):
 
     @property
     def status(self) -> int:
-        """The status that the program ends with: 128 and the signal's number, as shells have it."""
+        """The exit status of the program: 128 plus the signal's number, the convention of shells."""
         return 128 + self.number
 
 
 @contextmanager
 def ending_between_blocks() -> Iterator[Callable[[], None]]:
-    """Put signals off while blocks of draws are made; another one ends the program at once.
+    """Delay the first signal until a block of draws is stored; a second signal ends the program at once.
 
     Yields
     ------
     callable
-        To be called where a block is stored; it raises `Interrupted` where a signal has come.
+        Call it after a block is stored; it raises `Interrupted` if a signal came.
     """
     came: list[int] = []
 
@@ -63,10 +63,10 @@ def ending_between_blocks() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def ending_at_once() -> Iterator[None]:
-    """Let signals raise `Interrupted`, where that is not lost.
+    """Let signals raise `Interrupted` at once.
 
-    Python drops what is raised in a callback of its garbage collector (JAX has one) or in a `__del__`: the signal comes
-    again, until this block has ended.
+    Python drops an exception that is raised in a callback of its garbage collector (JAX has one) or in a `__del__`.
+    Therefore the signal is sent again until this block ends.
     """
     again: list[threading.Timer] = []
     show = sys.unraisablehook
@@ -93,7 +93,7 @@ def ending_at_once() -> Iterator[None]:
 
 @contextmanager
 def _handling(handler: Callable[[int, object], None]) -> Iterator[None]:
-    # Only there can a program say what signals do.
+    # Python allows signal handlers in the main thread only.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

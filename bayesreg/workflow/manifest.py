@@ -1,4 +1,4 @@
-"""The content of run.json."""
+"""Collect the content of run.json."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.blocks import Scale, Values
 from bayesreg.model.posterior import Posterior
 
-# A sampled node counts as in contact where its mean position lies this near to the skull, mm.
+# A sampled node is in contact if the distance from its mean position to the skull is smaller, mm.
 CONTACT = 0.5
 
 
@@ -42,7 +42,7 @@ def manifest(
     provenance: dict[str, Any],
     began: float,
 ) -> dict[str, Any]:
-    """The content of run.json: versions, digests, timings, and how well the sampling went.
+    """Collect the content of run.json: versions, digests, timings, and the quality of the sampling.
 
     Parameters
     ----------
@@ -56,16 +56,16 @@ def manifest(
         Values of all blocks at the mean of the draws.
     judged : Convergence
     provenance : dict
-        "timings" (s) of the preparation, what is known of a synthetic "pair", and the "appraisal" of labels and images.
+        "timings" (s) of the preparation, properties of a synthetic "pair", and the "appraisal" of labels and images.
     began : float
-        `time.perf_counter()` when the run began, put back by what processes that were cut off have spent.
+        `time.perf_counter()` at the beginning of the run, minus the seconds that interrupted processes spent on it.
     """
     tally = samples.tally
     steps, outside = float(tally.steps.sum()), float(tally.outside_support.sum())
     accepted = float(tally.acceptance.sum())
     greatest = _extreme(judged.rhat, np.nanmax)
     observations = describe_observations(posterior, mean)
-    # Of the first pair of images, where there is one.
+    # Only pairs of images have these figures; the first pair stands for the run.
     of_images = next((one for one in observations.values() if "noise_sd" in one), {})
     return {
         "name": config.description,
@@ -127,7 +127,7 @@ def manifest(
 
 
 def _has_converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:
-    """The stop rule and the figures of the report, rank-normalised and split, must both agree."""
+    """Decide whether both the stop rule and the report's rank-normalised, split figures show convergence."""
     if stop.rhat is None:
         return None
     greatest = _extreme(judged.rhat, np.nanmax)
@@ -152,7 +152,7 @@ def _inverted_elements(posterior: Posterior, samples: Samples) -> int:
 
 
 def inverted_share(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> float:
-    """The share of tetrahedra that are inside out, over draws of the displacement of every node, mm."""
+    """Compute the mean share of inverted tetrahedra, from draws of the displacement of every node, mm."""
     return float(np.mean([(signed_volumes(mesh.points + u, mesh.cells) <= 0).mean() for u in draws]))
 
 

@@ -1,4 +1,4 @@
-"""How the moving image is brought beside the fixed one before the model sees it: pose, contrast and scale."""
+"""Match the moving image to the fixed image before the registration: pose, contrast and scale of intensities."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from bayesreg.pose import Pose
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Likeness, compare_images
 
-# A pose is taken where the images share so many times as much information as where the headers place them.
+# A pose is used if it multiplies the mutual information of the headers' placement by more than this factor.
 GAIN = 1.05
-# A mask that ignores a greater share of the organ may be meant the other way round.
+# A mask that ignores a greater share of the organ may have zero and nonzero interchanged.
 MOST_IGNORED = 0.5
 
 
 class Matched(NamedTuple):
-    """Two images side by side.
+    """Two images in one world, with scaled intensities.
 
     Attributes
     ----------
     matching : Matching
     fixed, moving : Image
-        In one world and scaled.
+        The scaled images in the world of the fixed image.
     moving_ignore : Image or None
-        In that world.
+        The mask of the moving image, in the same world.
     likeness : Likeness
-        How alike they are.
+        Measures of the likeness of the two images.
     notes : tuple of str
-        What was found, a sentence each.
+        Findings, one sentence each.
     beware : tuple of str
-        What a user should know of the masks, a sentence each.
+        Warnings about the masks, one sentence each.
     """
 
     matching: Matching
@@ -60,18 +60,18 @@ def match_images(
     fixed_ignore: Image | None = None,
     moving_ignore: Image | None = None,
 ) -> Matched:
-    """Find what `data` leaves to be found: the pose, whether both are of one contrast, and their scales.
+    """Find the pose, decide whether both images have one contrast, and scale them, as far as `data` leaves this open.
 
     Parameters
     ----------
     data : FilesData
     similarity : settings of a similarity
-        How the model compares them.
+        The similarity by which the model compares the images.
     domain : Image
         Not zero in Ω, on the grid of the fixed image.
     fixed, moving : Image
     fixed_ignore, moving_ignore : Image, optional
-        Not zero where the image of that name says nothing, on any grid in its world.
+        Not zero where the fixed or the moving image is ignored, on any grid in the world of this image.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def match_images(
     moving_ignore = None if moving_ignore is None else pose.aligned(moving_ignore)
     ignored = {"fixed": fixed_ignore, "moving": moving_ignore}
     seen = _seen(domain, ignored.values())
-    # A constant image is told by its name, before it is compared.
+    # The scales come before the comparison, because their error names an image that is constant in Ω.
     scales = _scale_of("fixed", fixed, seen.voxels != 0), _scale_of("moving", moving, within(seen, moving))
     likeness = compare_images(fixed, moving, seen)
     alike = likeness.is_one_contrast if data.same_contrast is None else data.same_contrast
@@ -108,7 +108,7 @@ def match_channel(
     moving: Image,
     fixed_ignore: Image | None = None,
 ) -> Channel:
-    """A further pair of images in the pose of the first, each image on a scale of its own.
+    """Match a further pair of images in the pose of the first pair; each image has its own scale.
 
     Raises
     ------
@@ -124,12 +124,12 @@ def match_channel(
 
 
 def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
-    """The part of Ω that no mask ignores.
+    """Return the part of Ω that no mask ignores.
 
     Raises
     ------
     InputError
-        If none is left.
+        If the masks ignore all of Ω.
     """
     seen = np.asarray(domain.voxels) != 0
     for mask in masks:
@@ -141,7 +141,7 @@ def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
 
 
 def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple[list[str], list[str]]:
-    """How much of Ω each mask ignores, and what is odd about that."""
+    """Describe how much of Ω each mask ignores (notes), and warn of unusual shares."""
     notes, beware = [], []
     inside = np.asarray(domain.voxels) != 0
     for name, mask in masks.items():
@@ -172,7 +172,7 @@ def _find_pose(
     fixed_ignore: Image | None,
     moving_ignore: Image | None,
 ) -> tuple[Pose, str]:
-    """The pose, and what is said of it."""
+    """Find the pose, and describe it in a sentence."""
     if data.pose == "fixed":
         check_same_space(fixed, moving, ("fixed", "moving"))
         return Pose.identity(), "Pose: as the headers say (data.pose: fixed)."
@@ -208,5 +208,5 @@ def _scale_of(name: str, image: Image, mask: np.ndarray) -> IntensityScale:
 
 
 def within(domain: Image, image: Image) -> np.ndarray:
-    """Tell which voxels of an image on another grid lie in the domain."""
+    """Mark the voxels of an image that lie in the domain; the two grids may differ."""
     return np.asarray(domain.interpolate(image.grid_points())) > 0.5

@@ -1,4 +1,4 @@
-"""Predictions that need the posterior itself, computed once after sampling and stored for the report."""
+"""Compute the predictions that need the posterior itself, once after sampling; the report reads them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STIFFER = 1.5
 
 
 def mean_values(posterior: Posterior, draws: xr.Dataset, u_mean: Float[np.ndarray, "nodes 3"]) -> dict[str, AnyArray]:
-    """Values of all blocks, known ones included, at the mean of the draws."""
+    """Compute the values of all blocks, known ones included, at the mean of the draws."""
     names = [name for name in posterior.reference() if name in draws and name != "u_boundary"]
     means = {name: draws[name].mean(("chain", "draw")).to_numpy() for name in names}
     return posterior.fill({**means, "u_boundary": u_mean[posterior.sampled]})
@@ -50,7 +50,7 @@ def predict(
     seed: int,
     pose: Pose,
 ) -> Predicted:
-    """Push at most 400 evenly spaced draws forward: u at nodes and places, stiffness, residuals and replications.
+    """Compute predictions of at most 400 evenly spaced draws: u at nodes and places, stiffness, residuals, replicates.
 
     Parameters
     ----------
@@ -62,11 +62,11 @@ def predict(
     u_mean, u_sd : (n, 3) arrays
         Posterior mean and standard deviation at every node over all draws, mm.
     places : mapping
-        Name to place (world mm, in the fixed image); where it is empty some are chosen.
+        Places by name (world RAS of the fixed image, mm); if it is empty, `default_places` chooses some.
     seed : int
         The seed of the replicated noise.
     pose : Pose
-        What lies between the posterior's world and that of the moving image.
+        The rigid motion from the posterior's world to the world of the moving image.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def predict(
 
 
 def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, np.ndarray]:
-    """What the observations leave for the report, by "<observation>/<array>"."""
+    """Collect the arrays that the observations compute for the report, by "<observation>/<array>"."""
     state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(mean))
     summarised = {name: one for name, one in posterior.observations.items() if isinstance(one, Summarised)}
     return {
@@ -132,11 +132,11 @@ def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, 
 
 
 def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
-    """The predictions, allowing for what the mesh cannot follow (`bayesreg.results.transform.Transform`)."""
+    """Add to the predictions the displacement that the mesh cannot resolve (`bayesreg.results.transform.Transform`)."""
     places = np.asarray(predicted.place_points)
     sd = transform.unresolved_sd(transform.deformer.locate(places))
     draws = np.asarray(predicted.place_draws)
-    # A stream of its own: those of draws have their number.
+    # The stream number len(draws) is free: the draws use the numbers below it.
     rng = np.random.default_rng((transform.seed, len(transform.draws)))
     about = distances_of(transform.nodal_covariance(), (float(predicted.far_mm),), REACH)
     return predicted._replace(
@@ -154,7 +154,7 @@ def _stiffness(found: Summary) -> dict[str, np.ndarray]:
 
 
 def _keep_aside(blocks: Iterator[dict[str, Any]], kept: dict[str, list[np.ndarray]]) -> Iterator[dict[str, Any]]:
-    """The blocks less the entries that are small and kept whole: places, the motion, and checks of observations."""
+    """Move the small entries of blocks (places, the motion, checks of observations) to `kept`; yield the others."""
     for block in blocks:
         for name in [name for name in block if name in ("places", "motion") or "/" in name]:
             kept.setdefault(name, []).append(block.pop(name))
@@ -162,12 +162,12 @@ def _keep_aside(blocks: Iterator[dict[str, Any]], kept: dict[str, list[np.ndarra
 
 
 def require_inside(mesh: TetMesh, places: Places) -> None:
-    """Raise InputError if a place lies outside the mesh, where no displacement is estimated."""
+    """Raise InputError if a place lies outside the mesh; no displacement is estimated there."""
     _interpolation(mesh, places)
 
 
 def _interpolation(mesh: TetMesh, places: Places) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (place, 4) and barycentric weights (place, 4) of places in the mesh."""
+    """Return the nodes (place, 4) and the barycentric weights (place, 4) of places in the mesh."""
     points = np.array(list(places.values()), float).reshape(-1, 3)
     return interpolation_at(mesh, points, [f"place {name!r}" for name in places])
 
@@ -175,9 +175,9 @@ def _interpolation(mesh: TetMesh, places: Places) -> tuple[np.ndarray, np.ndarra
 def default_places(
     mesh: TetMesh, u_mean: Float[np.ndarray, "nodes 3"], u_sd: Float[np.ndarray, "nodes 3"]
 ) -> dict[str, tuple[float, float, float]]:
-    """The nodes of the largest shift, the least certainty and the greatest depth, and the middle of each tissue.
+    """Choose the nodes of the largest shift, the largest sd and the greatest depth, and the middle of each tissue.
 
-    A tissue's middle is the centre of the one of its tetrahedra that lies nearest to its centroid.
+    The middle of a tissue is the centre of its tetrahedron nearest to its centroid.
     """
     depth, _ = cKDTree(mesh.points[mesh.boundary]).query(mesh.points)
     centres = mesh.points[mesh.cells].mean(axis=1)

@@ -1,4 +1,4 @@
-"""What ArviZ wants to know of the observations: groups observed_data, posterior_predictive and log_likelihood."""
+"""Compute ArviZ's groups of the observations: observed_data, posterior_predictive and log_likelihood."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import State, state_of
 from bayesreg.types import AnyArray
 
-# Draws of all chains together of which observations are replicated.
+# The largest number of draws, of all chains together, that have replicated observations.
 MOST_DRAWS = 400
 
 Groups = dict[str, xr.Dataset]
@@ -25,7 +25,7 @@ Variables = dict[str, xr.DataArray]
 
 
 def predictive_groups(posterior: Posterior, draws: xr.Dataset, seed: int) -> Groups:
-    """Observations, and what the model would have observed by the draws, as ArviZ names them.
+    """Compute the observations and their replicates by the draws, in the groups that ArviZ names.
 
     Parameters
     ----------
@@ -33,16 +33,16 @@ def predictive_groups(posterior: Posterior, draws: xr.Dataset, seed: int) -> Gro
     draws : xarray.Dataset
         The group `posterior` of the run.
     seed : int
-        Of the replicated noise.
+        The seed of the replicated noise.
 
     Returns
     -------
     dict
-        A Dataset by group, each with a variable by observation. Landmarks: displacements (…, point, axis), mm. Images:
+        One Dataset per group, with one variable per observation. Landmarks: displacements (…, point, axis), mm. Images:
         intensities, as they are compared, at up to 1,000 evenly spaced quadrature points. `posterior_predictive` has up
-        to 400 evenly spaced draws. `log_likelihood` (chain, draw, point) has all draws of landmarks alone, with its
-        normaliser, as leave-one-out needs it: voxels of an image depend on one another, and one that is left out is
-        told by those beside it.
+        to 400 evenly spaced draws. `log_likelihood` (chain, draw, point) has all draws and only landmarks, with its
+        normaliser, as leave-one-out needs it. It has no images, because their voxels depend on one another: the
+        neighbours of a voxel that is left out predict it.
     """
     recorded = {
         name: one.recorded(posterior.data.terms[name])
@@ -69,7 +69,7 @@ def predictive_groups(posterior: Posterior, draws: xr.Dataset, seed: int) -> Gro
 def _replicate(
     posterior: Posterior, draws: xr.Dataset, recorded: Mapping[str, Recorded], seed: int
 ) -> dict[str, np.ndarray]:
-    """What each draw would have observed, (chain, draw, …) by observation."""
+    """Replicate the observations by each draw, (chain, draw, …) by observation."""
     key = jax.random.key(seed)
 
     def forward(draw: dict[str, AnyArray], data: Any) -> dict[str, AnyArray]:
@@ -89,7 +89,7 @@ def _replicate(
 
 
 def _log_likelihood(posterior: Posterior, draws: xr.Dataset, recorded: Mapping[str, Recorded]) -> Variables:
-    """The log likelihood of every value by every draw, of observations whose values are independent."""
+    """Compute the log likelihood of every value by every draw, for observations with independent values."""
     terms = posterior.data.terms
     names = [name for name in recorded if hasattr(terms[name], "pointwise_log_likelihood")]
     if not names:

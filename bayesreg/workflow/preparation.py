@@ -1,4 +1,4 @@
-"""From a configuration to the inputs of a run: anatomy, mesh, image pair, and the truth where it is made."""
+"""Prepare the inputs of a run from its configuration: anatomy, mesh, image pair, and the truth of a synthetic pair."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PROVENANCE = "inputs/provenance.json"
 
 
 class Prepared(NamedTuple):
-    """The inputs of a run, and how they came about.
+    """The inputs of a run, with the timings and findings of their preparation.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class Prepared(NamedTuple):
     timings : dict
         Seconds for "anatomy", "mesh" and "pair".
     pair : dict
-        What is known of a synthetic pair besides its truth; empty for files.
+        Properties of a synthetic pair besides its truth; empty for files.
     appraisal : Appraisal or None
-        What labels and images are like; None without labels.
+        The appraisal of labels and images; None without labels.
     """
 
     inputs: Inputs
@@ -68,7 +68,7 @@ def prepare(config: Config) -> Prepared:
     Raises
     ------
     InputError
-        If a file, a label, the mesh or the pair is not what the configuration promises.
+        If a file, a label, the mesh or the pair contradicts the configuration.
     """
     clock = _Clock()
     _require_start(config)
@@ -130,7 +130,7 @@ def prepare(config: Config) -> Prepared:
 
 
 def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Image | None) -> dict[str, Channel]:
-    """The pairs of images besides the first."""
+    """Match the pairs of images after the first, by their names."""
     assert isinstance(config.data, FilesData)
     found = {}
     for section in config.pairs_of_images:
@@ -143,7 +143,7 @@ def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Ima
 
 
 def _ignored(config: Config, which: Literal["fixed", "moving"], image: Image) -> Image | None:
-    """The mask of what an image says nothing of, as the file has it."""
+    """Read the mask of the ignored part of an image; None without one."""
     if not isinstance(config.data, FilesData):
         return None
     mask_path, path = getattr(config.data, f"{which}_ignore"), getattr(config.data, which)
@@ -155,7 +155,7 @@ def _ignored(config: Config, which: Literal["fixed", "moving"], image: Image) ->
 
 
 def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image | None) -> Matched | None:
-    """The moving image of a pair from files, brought beside the fixed one."""
+    """Match the moving image of a pair from files to the fixed image; None without such a pair."""
     data = config.data
     if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
         return None
@@ -165,14 +165,14 @@ def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image 
 
 
 def _skull(intracranial: Path | None) -> Image | None:
-    """Where no sampled node may go, from a mask of where the organ may be."""
+    """Compute the region that sampled nodes may not enter, from a mask of where the organ may go."""
     if intracranial is None:
         return None
     return _as_stored(forbidden(without_ridges(load_mask(intracranial))))
 
 
 def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, Arrays]:
-    """What is observed, and the landmarks of the section evaluation; InputError where one is both."""
+    """Add the landmarks of the section evaluation to the observed arrays; InputError if one is observed too."""
     found = {name: arrays for name, arrays in observed.items() if name != NAME and arrays}
     if config.evaluation is None:
         return found
@@ -187,7 +187,7 @@ def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, A
 
 
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
-    """What is told of labels and images before the mesh is built."""
+    """Appraise labels and images before the mesh is built."""
     if matched is None or not isinstance(config.data, FilesData):
         return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
     one_contrast = matched.matching.one_contrast and not config.image_options.similarity.serves_any_contrast
@@ -199,12 +199,12 @@ def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched 
 
 
 def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:
-    """The images, mesh and truth of a configuration, and where they come from.
+    """Prepare the inputs of a configuration, and return them with their provenance.
 
     Raises
     ------
     InputError
-        As `prepare`; if neither the configuration nor `observations` holds anything observed.
+        As `prepare`, and if neither the configuration nor `observations` has an observation.
     """
     if not (config.observations or observations):
         raise InputError(
@@ -219,7 +219,7 @@ def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[I
 
 
 def require_all_unseen(inputs: Inputs, observations: Sequence[Any]) -> None:
-    """Raise InputError where a landmark that is held out is among observations that no configuration names."""
+    """Raise InputError if a held-out landmark is also among observations from Python."""
     if NAME in inputs.observed:
         points = {
             one.name: (one.fixed_points, one.moving_points) for one in observations if hasattr(one, "fixed_points")
@@ -228,19 +228,19 @@ def require_all_unseen(inputs: Inputs, observations: Sequence[Any]) -> None:
 
 
 def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:
-    """With the seconds spent on all but sampling, which a resumed run adds to its own."""
+    """Add the seconds spent on everything except sampling; a resumed run adds them to its own time."""
     return provenance | {"unsampled": time.perf_counter() - began}
 
 
 def store_inputs(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
-    """Write the inputs of a run, and where they come from."""
+    """Write the inputs of a run and their provenance into its folder."""
     with writing(out, "prepared") as place:
         store.write_json(place(PROVENANCE), provenance)
         store.write_inputs(place, inputs)
 
 
 def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
-    """Raise InputError where a file with displacements cannot serve, as far as can be told by now."""
+    """Raise InputError if a file with displacements is unsuitable; without the mesh only its form is checked."""
     if isinstance(config.start.field, Path):
         require_displacement(config.start.field, mesh)
     if isinstance(config.known_boundary, Path) and mesh is None:
@@ -250,7 +250,7 @@ def _require_start(config: Config, mesh: TetMesh | None = None) -> None:
 def _known_boundary(
     config: Config, mesh: TetMesh, truth: Truth | None = None, pose: Pose = IDENTITY
 ) -> Float[np.ndarray, "boundary 3"] | None:
-    """u_B where the configuration gives it, mm; see `read_boundary`."""
+    """Return the known u_B, mm, or None if the configuration gives none; see `read_boundary`."""
     if config.known_boundary is None:
         return None
     if config.known_boundary == "truth":
@@ -260,7 +260,7 @@ def _known_boundary(
 
 
 class _Clock:
-    """Seconds since the lap before."""
+    """Stopwatch that records the seconds of each step of the preparation."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
@@ -272,7 +272,7 @@ class _Clock:
 
 
 def _anatomy(config: Config) -> Anatomy:
-    """The fixed side."""
+    """Read the anatomy of the fixed image."""
     data = config.data
     if isinstance(data, FilesData):
         if data.labels is None:
@@ -286,12 +286,12 @@ def _anatomy(config: Config) -> Anatomy:
 
 
 def _size(config: Config, anatomy: Anatomy) -> float:
-    """The size of the organ beside a human brain, which those that ship are."""
+    """Return the size of the organ relative to a human brain; it is one for the data that ship, which are brains."""
     return size_of_solid(anatomy.tissue, anatomy.names) if isinstance(config.data, FilesData) else 1.0
 
 
 def _sized(settings: MeshConfig, size: float) -> MeshConfig:
-    """The settings with every length given."""
+    """Complete the settings of the mesh with the default lengths for an organ of this size."""
     usual = {"edge_length": size * BRAIN_EDGE, "skull_gap": size * BRAIN_GAP}
     return settings.model_copy(update={name: x for name, x in usual.items() if getattr(settings, name) is None})
 
@@ -310,7 +310,7 @@ def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: fl
 
 
 def _load_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
-    """A mesh from a file; InputError where its tissues are not those of the labels."""
+    """Load a mesh from a file; InputError if its tissues differ from those of the labels."""
     mesh = load_mesh(path, names)
     if mesh.names != names:
         raise InputError(
@@ -321,7 +321,7 @@ def _load_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
 
 
 def _as_stored(image: Image) -> Image:
-    """Round to the precision of a NIfTI file: a resumed run then sees the same numbers to the last bit."""
+    """Round an image to the precision of a NIfTI file, so that a resumed run reads exactly the same numbers."""
     stored = in_levels(image) if np.asarray(image.voxels).dtype.kind == "f" else image
     return Image(stored.voxels, image.affine.astype(np.float32))
 

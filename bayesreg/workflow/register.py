@@ -1,4 +1,4 @@
-"""From the paths of a pair to its configuration, and what was understood of them."""
+"""Make the configuration of a pair from the paths of its files, and describe it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from bayesreg.types import InputError
 
 
 class Understood(NamedTuple):
-    """A configuration that was made of paths.
+    """A configuration that was made from paths, with its description.
 
     Attributes
     ----------
     config : Config
     lines : tuple of str
-        What was understood: grids, labels, mask and choices, to be read before anything long begins.
+        A description of grids, labels, mask and choices, which the user can read before the long steps begin.
     """
 
     config: Config
@@ -50,17 +50,17 @@ def understand(
     fixed, moving : path
         Two images.
     labels : path, optional
-        Tissue labels of the fixed image, or a mask of the organ; without them `intracranial` is the organ, or what is
-        bright in the fixed image.
+        Tissue labels of the fixed image, or a mask of the organ. Without them, the organ is `intracranial`, or the
+        bright part of the fixed image.
     table : str, optional
-        The name of a label table (`bayesreg.label_tables`), or a YAML file with labels by tissue; where it is left out,
-        the values of the labels tell.
+        The name of a label table (`bayesreg.label_tables`), or a YAML file with labels by tissue. The default is
+        recognised from the values of the labels.
     intracranial : path, optional
         Mask of where the organ may go.
     fixed_ignore, moving_ignore : path, optional
-        Masks of where the image of that name says nothing; not zero = ignored.
+        Masks of the ignored part of the fixed and the moving image; not zero = ignored.
     channels : sequence of str
-        Further images of the same two visits: the paths of a fixed and a moving one, with a comma between them.
+        Further images of the same two visits: the paths of a fixed and a moving image, with a comma between them.
     overrides : sequence of str
         As in `bayesreg.load_config`.
 
@@ -86,7 +86,7 @@ def understand(
 
 
 def _describe(config: Config, how: str) -> Iterator[str]:
-    """What a configuration, overrides included, says of its files; `how` its table was found."""
+    """Describe the files and choices of a configuration, one line each; `how` is the source of its label table."""
     data = config.data
     assert isinstance(data, FilesData)
     for name in ("fixed", "moving", "labels"):
@@ -112,7 +112,7 @@ def _describe(config: Config, how: str) -> Iterator[str]:
 
 def _channel(number: int, pair: str) -> dict[str, str]:
     parts = pair.split(",")
-    # A path may hold a comma, too.
+    # A path may also contain a comma.
     ways = [(Path(",".join(parts[:k])), Path(",".join(parts[k:]))) for k in range(1, len(parts))]
     if not ways:
         raise InputError(f"--channel {pair}: expected two paths with a comma between them, FIXED,MOVING")
@@ -126,7 +126,7 @@ def _describe_organ(data: FilesData) -> str:
 
 
 def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], str]:
-    """A table, and where it is from."""
+    """Choose the label table, and return it with a description of its source."""
     if table not in (None, "mask"):
         if table in TABLES:
             return TABLES[table], table

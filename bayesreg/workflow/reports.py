@@ -1,4 +1,4 @@
-"""Write the report of a finished run anew, and put several runs side by side."""
+"""Write the report of a finished run again, and write one page that compares several runs."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from bayesreg.types import InputError
 
 
 def report(folder: str | Path) -> Path:
-    """Write the report of a finished run anew, and return its path."""
+    """Write the report of a finished run again, and return its path."""
     from bayesreg.report.html import write_report
 
-    # A folder that is none of a run is not locked, and so not made.
+    # `locked` creates a missing folder; the check before it prevents this.
     store.require_finished(folder)
     with locked(folder):
         result = load_result(folder)
@@ -25,7 +25,7 @@ def report(folder: str | Path) -> Path:
 
 
 def compare(folders: Sequence[str | Path], out: str | Path) -> Path:
-    """Put runs side by side on one page, and return its path."""
+    """Write one page that compares runs, and return its path."""
     from bayesreg.report.compare import write_comparison
 
     if not Path(out).absolute().parent.is_dir():

@@ -1,4 +1,4 @@
-"""A run once more, from what its folder holds, and whether it comes to the same bits."""
+"""Repeat a run from the content of its folder, and compare the draws bit by bit."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from bayesreg.workflow.run import run
 
 _log = logging.getLogger(__name__)
 
-# What stands in run.json of where a run was made; the same of all of these makes the same bits.
+# Entries of run.json that describe the software and the machine of a run; if all are equal, the draws are identical.
 WHERE = ("versions", "devices", "xla_flags", "machine", "cores")
 GROUPS = ("posterior", "sample_stats")
 
 
 class Comparison(NamedTuple):
-    """How a run and its repetition compare.
+    """The comparison of a run with its repetition.
 
     Attributes
     ----------
@@ -35,9 +35,10 @@ class Comparison(NamedTuple):
     same : bool
         Whether all draws have the same bits.
     apart : dict
-        Variable to the greatest difference of a draw, in units of its standard deviation, where there is one.
+        The greatest difference of a draw, in units of the variable's standard deviation, by variable; only variables
+        that differ.
     moved : dict
-        What of `WHERE` is another now: (then, now) by name.
+        The entries of `WHERE` that changed: (then, now) by name.
     """
 
     result: Result
@@ -47,7 +48,7 @@ class Comparison(NamedTuple):
 
     @property
     def lines(self) -> list[str]:
-        """In words."""
+        """The comparison in words, one line per difference."""
         found = [f"{name} was {then or 'none'}, and is {now or 'none'}" for name, (then, now) in self.moved.items()]
         if self.same:
             return ["the draws are the same, bit for bit", *found]
@@ -56,13 +57,13 @@ class Comparison(NamedTuple):
 
 
 def reproduce(folder: str | Path, out: str | Path, progress: bool = True) -> Comparison:
-    """Run again what the folder of a run holds, with its seed and as many draws, and compare.
+    """Repeat the run in a folder, with its seed and its number of draws, and compare the draws.
 
     Parameters
     ----------
     folder : path
-        Of a finished run; the files that it was made of may be gone. Preparation is not repeated: mesh, images and
-        pose are those of the folder.
+        The folder of a finished run. The preparation is not repeated: mesh, images and pose are read from this folder,
+        and the original files may be missing.
     out : path
         Folder of the repetition, new or empty.
     progress : bool
@@ -85,7 +86,7 @@ def reproduce(folder: str | Path, out: str | Path, progress: bool = True) -> Com
     config = _as_many(config, int(first.run.manifest["steps_per_chain"]))
     inputs = store.read_inputs(folder)._replace(config=resolved_yaml(config))
     with locked(out):
-        # Those files may have changed, or be gone.
+        # No digests of sources: the original files may have changed or be missing.
         store_inputs(out, inputs, provenance | {"sources": {}})
     steps, chains = first.run.manifest["steps_per_chain"], config.sampler.chains
     _log.info(f"{steps:,} steps of {chains} chains, with seed {config.seed}")
@@ -93,7 +94,7 @@ def reproduce(folder: str | Path, out: str | Path, progress: bool = True) -> Com
 
 
 def _as_many(config: Config, steps: int) -> Config:
-    """The configuration with a budget in steps alone: where a clock ends a run is not repeated."""
+    """Set the budget to a number of steps only: the steps that fit into a time limit differ between runs."""
     stop = StopConfig(rhat=None, ess=None, max_steps=steps, max_minutes=None)
     return config.model_copy(update={"stop": stop})
 

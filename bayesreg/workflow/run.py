@@ -1,6 +1,6 @@
-"""From a configuration to a run folder: the only place that wires everything together.
+"""Run a configuration and write its run folder; this module connects all steps of a run.
 
-Reports are imported where they are written: no run waits at its start for what draws them at its end.
+The modules of the report are imported when the report is written, because their import would delay the start of a run.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ from bayesreg.workflow.sources import digests_of_sources, require_same_sources
 
 _log = logging.getLogger(__name__)
 
-# Draws between two looks at the stop rule with up to so many quadrature points, and the fewest: for each block the
-# whole state is written.
+# BLOCK is the number of draws between two checks of the stop rule, for up to POINTS quadrature points. More points give
+# smaller blocks, of at least FEWEST draws, because each block writes the whole state.
 BLOCK, POINTS, FEWEST = 100, 20_000, 10
 # Sections of the configuration that do not change what is drawn.
 MAY_CHANGE = ("stop", "results", "report", "evaluation")
@@ -69,22 +69,23 @@ def run(
     progress: Showing = True,
     observations: Sequence[Any] = (),
 ) -> Result:
-    """Run a configuration from end to end.
+    """Run a configuration: prepare its inputs, sample the posterior and write the results.
 
     Parameters
     ----------
     config : path or Config
     out : path
-        The run folder, new or empty; with `resume`, that of a run that was cut off, or of a finished one.
+        The run folder, new or empty; with `resume`, the folder of an interrupted or a finished run.
     resume : bool
-        Continue after the last draws that were stored. Where the sections `stop`, `results`, `report` and
-        `evaluation` differ from those that the run was begun with, the new ones hold: a finished run is given more
-        draws so, leaves other files, or is held against landmarks that were found later.
+        Continue after the last stored draws. If the sections `stop`, `results`, `report` and `evaluation` differ from
+        those at the beginning of the run, the new sections apply. They can give a finished run more draws or other
+        files, or compare it with landmarks that were found later.
     progress : bool or callable
-        Say what is being done, and show a progress bar; or what makes one, as of `bayesreg.sample`.
+        Whether to show messages and a progress bar; or a callable that makes the progress display, as in
+        `bayesreg.sample`.
     observations : sequence
-        What was observed besides the two images, such as `bayesreg.Landmarks`; see `bayesreg.build_posterior`. A run
-        that began with some is resumed with the same.
+        Observations besides those of the configuration, such as `bayesreg.Landmarks`; see `bayesreg.build_posterior`.
+        A run that began with such observations must be resumed with the same.
 
     Returns
     -------
@@ -106,20 +107,20 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
     if resume and stage_of(out) is not None:
         with locked(out):
             return _resume(config, out, progress, observations, began)
-    # What a run has left that was cut off before its inputs stood is worth nothing.
+    # A run that was interrupted before it stored its inputs begins again in the same folder.
     if not (resume and read_status(out) is not None):
         store.require_fresh(out)
     _log.info("reading the files, meshing")
     if config.has_images and not config.pairs_of_images:
         _log.info("the images are shown and not compared: observations does not name them ({kind: images})")
-    # Before they are read: what changes meanwhile is told when the run goes on.
+    # The digests precede the reading, so that a resumed run detects a file that changed during the reading.
     sources = digests_of_sources(config, MAY_CHANGE)
     inputs, provenance = prepared_inputs(config, observations)
     for line in provenance["appraisal"].get("notes", ()):
         _log.info("%s", line)
     for sentence in provenance["appraisal"].get("beware", ()):
         _log.warning("%s", sentence)
-    # Nothing is written before all input has proved sound, and all of it before the first step is taken.
+    # The folder is written after all inputs are checked, and before the first step.
     posterior = posterior_of(config, inputs, observations)
     _require_memory(config, posterior)
     provenance["observations"] = _fingerprint(posterior, observations)
@@ -156,7 +157,7 @@ def _resume(
     inputs = store.read_inputs(out)
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(out, provenance, posterior, observations)
-    # What `simulate` has made is not tempered yet.
+    # A pair that `simulate` stored is not tempered yet.
     posterior = temper(config, inputs, posterior)
     provenance["independent_points"] = posterior.independent_points
     if finished:
@@ -185,7 +186,7 @@ def _go_on(
     began: float,
     progress: Showing,
 ) -> Result:
-    """Sample from where the chains stand, and write the results."""
+    """Sample from the current state of the chains, and write the results."""
     _save_state(out, *reached)
     _log.info("%s", _describe_mesh(inputs))
     with ending_between_blocks() as require_no_signal:
@@ -198,7 +199,7 @@ def _go_on(
 
 
 def _warn(config: Config, result: Result) -> None:
-    """Say what the report says first of a model that real images seldom fit."""
+    """Log the report's warning about a model that real images seldom fit."""
     from bayesreg.report.verdict import doubt_of_equilibrium
 
     doubt = doubt_of_equilibrium(result.run.manifest["model"], simulated=config.simulate is not None)
@@ -207,7 +208,7 @@ def _warn(config: Config, result: Result) -> None:
 
 
 def _resumed_config(out: Path, config: Config) -> Config:
-    """The configuration that a run was begun with; InputError if it differs in more than `MAY_CHANGE`."""
+    """Load the configuration of a begun run; InputError if it differs outside the sections `MAY_CHANGE`."""
     known = load_stored_config(require_file(out, "config.yaml"))
     given = {name: getattr(config, name) for name in MAY_CHANGE}
     if resolved_yaml(known.model_copy(update=given)) != resolved_yaml(config):
@@ -219,7 +220,7 @@ def _resumed_config(out: Path, config: Config) -> Config:
 
 
 def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, float | None]:
-    """The log of each of these observations at one displacement of up to a millimetre, by name; None if not finite."""
+    """Compute the log likelihood of each observation at one displacement of up to 1 mm; None if it is not finite."""
     if not observations:
         return {}
     rest = posterior.reference()
@@ -230,7 +231,7 @@ def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, flo
 
 
 def _require_same_observations(out: Path, provenance: dict[str, Any], posterior: Posterior, given: list[Any]) -> None:
-    """Raise InputError where a run would go on with other observations than it began with."""
+    """Raise InputError if a run is resumed with other observations than it began with."""
     begun, now = provenance.get("observations", {}), _fingerprint(posterior, given)
     advice = "give the same to bayesreg.run(..., observations=[...])"
     if list(begun) != list(now):
@@ -253,7 +254,7 @@ def _describe_mesh(inputs: Inputs) -> str:
 
 
 def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
-    """The posterior that the chains are to draw from."""
+    """Temper the posterior by its numbers of independent points, unless it is tempered already."""
     if posterior.tempered:
         return posterior
     _log.info("how many points are independent: where the images first lead to")
@@ -267,9 +268,9 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
 def _first(
     config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing, seconds: float = 0.0
 ) -> Reached:
-    """The chains before their first step; InputError where one cannot start.
+    """Make the state of the chains before their first step; InputError if a chain cannot start.
 
-    What was spent on the way there before, `seconds`, counts as sampling.
+    The `seconds` that were spent before count as sampling.
     """
     options, start = config.sampler, start_of(config, inputs, posterior)
     found = first_checkpoint(posterior, options.name, options.chains, config.seed, start, **options.settings)
@@ -278,7 +279,7 @@ def _first(
 
 
 def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing) -> Reached:
-    """The chains as the run that was cut off stored them last."""
+    """Load the state of the chains that the interrupted run stored last."""
     state = checkpoints.load_state(out)
     if state is None:
         return _first(config, inputs, posterior, out, progress)
@@ -321,11 +322,11 @@ def _sample(
 
 
 def _require_memory(config: Config, posterior: Posterior) -> None:
-    """Raise InputError where a block of draws, or the chains' moments alone, are more than the machine could hold."""
+    """Raise InputError if one block of draws and the moments of the chains exceed the memory of the machine."""
     options = config.sampler
     estimands = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values())
     block = min(options.block or _block(posterior), config.stop.max_steps // options.thin)
-    # Moments are two numbers for each, and are made anew beside the old ones.
+    # Two moments per number; the new moments are made while the old ones still exist.
     needed = 8 * options.chains * (block * estimands + 4 * (estimands + posterior.mesh.points.size))
     if needed > (held := memory_of_machine()):
         raise InputError(
@@ -336,9 +337,9 @@ def _require_memory(config: Config, posterior: Posterior) -> None:
 
 
 def _block(posterior: Posterior) -> int:
-    """Fewer draws where a step costs more, or no look would come before a time limit is long over.
+    """Choose the number of draws per block: costly steps get small blocks, so that time limits are checked in time.
 
-    By the size of the problem and not by the clock: where a run ends is part of what a seed repeats.
+    The number depends on the size of the problem and not on measured time, so that a seed always gives the same draws.
     """
     points = sum(len(getattr(term, "positions", ())) for term in posterior.data.terms.values())
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)

@@ -1,7 +1,7 @@
-"""The posterior over HTTP on loopback, for clients of UM-Bridge in any language.
+"""Serve the posterior over HTTP on loopback, for clients of UM-Bridge in any language.
 
 Seelinger et al., "UM-Bridge: Uncertainty quantification and modeling bridge", Journal of Open Source Software 8(83),
-2023. The package umbridge is optional, and imported where it is used.
+2023. The package umbridge is optional; `serve` imports it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 LOG_POSTERIOR = "log_posterior"
 LOOPBACK, PORT = "127.0.0.1", 4242
-# JSON has no infinity, nor what is no number: both have the least number that there is, which no sampler accepts.
+# JSON has neither infinity nor NaN. The least finite number replaces both; no sampler accepts it.
 IMPOSSIBLE = float(np.finfo(float).min)
 
 Vectors = Sequence[Sequence[float]]
@@ -46,10 +46,10 @@ class Served:
     ----------
     name : str
     function : callable
-        From data and a flat position to the outputs, a list of vectors.
+        Maps data and a flat position to the outputs, a list of vectors.
     data : Problem
     inputs : sequence of int
-        Sizes of the parts that a position comes in; none of a model that has no input.
+        Sizes of the parts of a position; empty for a model without input.
     """
 
     def __init__(
@@ -64,36 +64,36 @@ class Served:
         self._value, self._pulled = jax.jit(function), jax.jit(pull)
 
     def get_input_sizes(self, config: Any = None) -> list[int]:
-        """How long each input is."""
+        """Return the length of each input."""
         return self.inputs
 
     def get_output_sizes(self, config: Any = None) -> list[int]:
-        """How long each output is."""
+        """Return the length of each output."""
         return self.outputs
 
     def supports_evaluate(self) -> bool:
-        """Values are given."""
+        """Report that the model gives values."""
         return True
 
     def supports_gradient(self) -> bool:
-        """So are gradients, where there is an input."""
+        """Report whether the model gives gradients: it does if it has an input."""
         return bool(self.inputs)
 
     def supports_apply_jacobian(self) -> bool:
-        """Not given."""
+        """Report that the model does not apply its Jacobian."""
         return False
 
     def supports_apply_hessian(self) -> bool:
-        """Not given."""
+        """Report that the model does not apply its Hessian."""
         return False
 
     def __call__(self, parameters: Vectors, config: Any = None) -> list[list[float]]:
-        """The outputs at a position.
+        """Compute the outputs at a position.
 
         Raises
         ------
         InputError
-            If there are none there, as where λ is not a number; but the log posterior has its least number there.
+            If an output is not finite. The log posterior is then `IMPOSSIBLE` and raises nothing.
         """
         found = [np.asarray(one, float).ravel() for one in self._value(self.data, self._position(parameters))]
         if self.name == LOG_POSTERIOR:
@@ -103,12 +103,12 @@ class Served:
     def gradient(
         self, out_wrt: int, in_wrt: int, parameters: Vectors, sens: Sequence[float], config: Any = None
     ) -> list[float]:
-        """Sensitivity to an output, as one to an input: sensᵀ ∂output/∂input.
+        """Compute the gradient of a weighted output with respect to an input: sensᵀ ∂output/∂input.
 
         Raises
         ------
         InputError
-            If there is none there; but that of the log posterior is zero there.
+            If the gradient is not finite. The gradient of the log posterior is then zero.
         """
         sensitivities = [jnp.zeros(size) for size in self.outputs]
         sensitivities[out_wrt] = jnp.asarray(sens, float)
@@ -124,20 +124,21 @@ class Served:
 
 
 def models_of(posterior: Posterior) -> list[Served]:
-    """What is served of a posterior.
+    """Make the models that are served for a posterior.
 
     Returns
     -------
     list of Served
-        "log_posterior", of a position, whose parts are the inputs: u_boundary and the parameters, mapped to the real
-        line, the logarithm of the Jacobian included. "forward", of the same: the displacement of every node, mm, node
-        by node, and the intensities that the moving image has at the quadrature points, where there are images.
-        "start", of nothing: the parts of the position at rest, to begin from.
+        "log_posterior" is a function of a position; its inputs are the parts of the position (u_boundary and the
+        parameters, mapped to the real line), and it includes the logarithm of the Jacobian. "forward" has the same
+        inputs; its outputs are the displacement of every node, mm, node by node, and, if there are images, the
+        intensities of the moving image at the quadrature points. "start" has no input; its outputs are the parts of the
+        position at rest, where a sampler can begin.
     """
     back, parts = unravel(posterior), slices(posterior)
     sizes = [part.stop - part.start for part in parts.values()]
 
-    # Data are handed in: in a closure they would be constants of what is compiled.
+    # The data are an argument, because JAX would compile data of a closure as constants.
     def log_posterior(data: Any, position: Any) -> list[Any]:
         return [replace(posterior, data=data).logdensity(back(position))[None]]
 
@@ -145,7 +146,7 @@ def models_of(posterior: Posterior) -> list[Served]:
         here = replace(posterior, data=data)
         estimands, images = here.constrain(back(position)), images_of(data)
         evaluation = here.evaluate(estimands)
-        # A solve that has failed leaves numbers, too, and so does one that was not begun, outside the support.
+        # The displacement is invalid if the solve failed, or was skipped outside the support.
         u = jnp.where(evaluation.solver_failed | evaluation.outside_support, jnp.nan, evaluation.u)
         return [u.ravel(), *([] if images is None else [images.predicted(u, here.fill(estimands))])]
 
@@ -163,9 +164,9 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
     Parameters
     ----------
     config : path or Config
-        A configuration, or the folder of a run, whose inputs are taken.
+        A configuration, or the folder of a run with stored inputs.
     port : int
-        On loopback alone: other machines do not reach it.
+        The port on loopback; other machines cannot reach it.
 
     Raises
     ------
@@ -181,7 +182,7 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
     names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior).items())
     served = ", ".join(one.name for one in models)
     _log.info("inputs: %s; serving %s at http://%s:%d", names, served, LOOPBACK, port)
-    # umbridge would listen to every machine.
+    # By default umbridge accepts connections from every machine.
     run_app = um.web.run_app
     um.web.run_app = partial(run_app, host=LOOPBACK, print=None)
     try:
@@ -193,7 +194,7 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
 
 
 def posterior_of_run(config: str | Path | Config) -> Posterior:
-    """What a run of a configuration would sample, or that of a folder samples."""
+    """Build the posterior that a run samples, from a configuration or from the folder of a run."""
     if not isinstance(config, Config) and Path(config).is_dir():
         if stage_of(config) is None:
             raise InputError(f"{config} holds no run of bayesreg, and is no configuration")

@@ -1,4 +1,4 @@
-"""The synthetic pair of a configuration, in a folder."""
+"""Make the synthetic pair of a configuration, and write it into a folder."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ SCANS = "scans"
 def simulate(config: str | Path | Config, out: str | Path) -> Path:
     """Make the synthetic pair of a configuration: images, tissue, skull, mesh and truth in a folder.
 
-    With `simulate.scan` also the files of two scans, in its subfolder scans: fixed, moving, labels, intracranial and,
-    of the moving scan, cavity, each .nii.gz.
+    With `simulate.scan` the subfolder scans holds the files of two scans, too: fixed, moving, labels, intracranial and,
+    if the moving scan has one, cavity, each as .nii.gz.
     """
     config = config if isinstance(config, Config) else load_config(config)
     if config.simulate is None:
@@ -51,7 +51,7 @@ def _write_scans(folder: Path, inputs: Inputs, scan: Scan, seed: int) -> None:
     voxels[cavity] = np.median(np.asarray(inputs.fixed.voxels)[np.isin(np.asarray(inputs.tissue.voxels), fluid)])
     if scan.inverted:
         voxels[inside] = voxels[inside].max() + voxels[inside].min() - voxels[inside]
-    # The organ lies elsewhere, and so do the voxels that show it.
+    # The pose changes the affine and no voxel: the grid moves with the organ.
     pose = _pose(inputs.mesh.points.mean(axis=0), scan, seed)
     moving = pose.inverse.aligned(inputs.moving.with_voxels(voxels))
     written = {
@@ -68,7 +68,7 @@ def _write_scans(folder: Path, inputs: Inputs, scan: Scan, seed: int) -> None:
 
 
 def _cavity(inputs: Inputs, radius: float) -> np.ndarray:
-    """A ball that touches the surface where it has moved most, as it lies in the moved organ; (X, Y, Z) booleans."""
+    """Mark a ball inside the moved organ that touches its surface where it moved most; (X, Y, Z) booleans."""
     assert inputs.truth is not None
     u, points = np.asarray(inputs.truth.u), inputs.mesh.points
     most = np.linalg.norm(u, axis=1).argmax()
@@ -78,6 +78,6 @@ def _cavity(inputs: Inputs, radius: float) -> np.ndarray:
 
 
 def _pose(centre: np.ndarray, scan: Scan, seed: int) -> Pose:
-    """A rigid motion about a centre, in a random direction."""
+    """Make a rigid motion about a centre, with random directions of its shift and its axis."""
     shift, axis = (way / np.linalg.norm(way) for way in np.random.default_rng(seed).normal(size=(2, 3)))
     return Motion(scan.millimetres * shift, scan.degrees * axis).pose(centre)

@@ -1,4 +1,4 @@
-"""The files that a configuration names, which a run that goes on must find as they were, or not at all."""
+"""Check that the files of a configuration are unchanged or missing when a run is resumed."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bayesreg.types import InputError
 
 
 def digests_of_sources(config: Config, but: tuple[str, ...]) -> dict[str, str]:
-    """SHA-256 of every file or folder that the configuration names, by its key; some sections are left out."""
+    """Compute the SHA-256 of every file or folder that the configuration names, by key, without the sections `but`."""
     named = _paths(config.model_dump(exclude=set(but)))
     return {key: digest for key, path in named if (digest := _digest_of(path)) is not None}
 
 
 def require_same_sources(config: Config, known: Mapping[str, str], but: tuple[str, ...], folder: Path) -> None:
-    """Raise InputError where a file has another content than when the run in a folder was begun.
+    """Raise InputError if the content of a file changed since the run in a folder was begun.
 
-    One that is gone does not matter: the folder holds what was made of it.
+    A missing file is no error: the folder holds the inputs that were made from it.
     """
     now = digests_of_sources(config, but)
     if changed := [key for key, digest in known.items() if now.get(key, digest) != digest]:
@@ -34,7 +34,7 @@ def require_same_sources(config: Config, known: Mapping[str, str], but: tuple[st
 
 
 def _digest_of(path: Path) -> str | None:
-    """That of a file, or of all files of a folder, such as a DICOM series; None where there is neither."""
+    """Compute the digest of a file, or of all files in a folder, such as a DICOM series; None if neither exists."""
     if not path.is_dir():
         return digest_of(path)
     content = [f"{file.relative_to(path)}\0{digest_of(file)}" for file in sorted(path.rglob("*")) if file.is_file()]
