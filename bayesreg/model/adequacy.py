@@ -1,4 +1,4 @@
-"""How well every observation fits."""
+"""The fit of every observation to the posterior."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayesreg.settings import Section
 
 
 def describe_observations(posterior: Posterior, values: Values) -> dict[str, dict[str, Any]]:
-    """How every observation fits at some values.
+    """Describe how well every observation fits at some values.
 
     Returns
     -------
@@ -37,7 +37,7 @@ def _describe(observation: Any, term: Any, state: State) -> dict[str, Any]:
     found: dict[str, Any] = {"kind": kind, "title": title, "log": float(term.log(state))}
     if isinstance(options := getattr(observation, "options", None), Section):
         found["options"] = options.model_dump(mode="json")
-    # The term of an observation from outside knows its log alone.
+    # An observation from outside the package may provide nothing but its log.
     standardised = next((one for one in (term, observation) if isinstance(one, Standardised)), None)
     if standardised is not None:
         z = np.asarray(standardised.standardised_residual(state))

@@ -15,7 +15,7 @@ from bayesreg.model.field import FieldConfig
 from bayesreg.settings import NotNegative, Positive, Section, by_kind, is_inferred, wrong
 from bayesreg.tissues import tissue_of_unit_mu
 
-# Names of blocks and of the other sites of the program, which no observation may have.
+# Names of blocks and other sites of the program. No observation may use them.
 TAKEN = (
     "u_boundary", "lam", "mu", "t_elastic", "body_load", "surface_load", "field", "field_sd", "elastic", "rigid",
     "skull", "barrier", "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations",
@@ -53,7 +53,7 @@ class PriorConfig(Section):
         return self
 
 
-# Options by the name of a preset; what else is given replaces them.
+# The options of each preset by its name. Options that the user gives replace them.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     "registration": {
@@ -65,13 +65,13 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def _require_tagged(value: object) -> object:
-    """The prior with its kind: that of the paper where none is given."""
+    """Return the prior with its kind; without a given kind, it is the paper's."""
     value = by_kind(value)
     return {"kind": "boltzmann", **value} if isinstance(value, Mapping) else value
 
 
 class ModelConfig(Section):
-    """The posterior to sample, but for what belongs to an observation; the defaults are the paper's.
+    """The options of the posterior, except those of an observation; the defaults are the paper's.
 
     Attributes
     ----------
@@ -147,14 +147,16 @@ class ModelConfig(Section):
                 "sampled nodes with their strain, and the normaliser knows the elastic prior alone",
             )
         if elastic.normalised or elastic.samples_no_node:
-            # Where the options name no tissue, the mesh has one at least, which is free or known as `known` says.
+            # If the options name no tissue, the mesh still has at least one. It is free or known by the rule of
+            # `known`.
             self.require_proper_priors(self._named_tissues or ("the tissue",))
         return self
 
     def require_proper_priors(self, tissues: Sequence[str]) -> None:
-        """Refuse flat priors on [low, ∞) of free parameters where the density is normalised, or u_B given.
+        """Refuse flat priors on [low, ∞) of free parameters if the density is normalised or u_B is given.
 
-        With them the images tell ratios alone, and have a limit where one goes to infinity.
+        With flat priors, the images determine only ratios, and the density has a positive limit where a parameter goes
+        to infinity.
 
         Raises
         ------
@@ -174,7 +176,7 @@ class ModelConfig(Section):
                 )
 
     def known(self, tissues: Sequence[str]) -> Mapping[Lame, Any]:
-        """`fixed`, or its default for these tissues."""
+        """Return `fixed`, or its default for these tissues."""
         if self.fixed is not None:
             return self.fixed
         return {"mu": 1.0 if self.elasticity == "uniform" else {tissue_of_unit_mu(tissues): 1.0}}
@@ -186,12 +188,12 @@ class ModelConfig(Section):
 
 
 def is_taken(name: str) -> bool:
-    """Whether no observation may have this name, nor bring an unknown of this name."""
+    """Check whether a name is reserved: no observation, and no unknown that it brings, may use it."""
     return name in TAKEN or name.startswith("prior_")
 
 
 def of_tissue(model: ModelConfig, given: Any, tissue: str) -> Any:
-    """The option of one tissue, given for all or in a mapping by tissue; None where it is not given."""
+    """Return the option of one tissue, from one value for all or a mapping by tissue; None if it is not given."""
     if not isinstance(given, Mapping):
         return given
     return next(iter(given.values()), None) if model.elasticity == "uniform" else given.get(tissue)

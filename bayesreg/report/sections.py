@@ -1,4 +1,4 @@
-"""The sections of a report: what a clinician asks first, then the statistics."""
+"""The sections of a report: first the questions of a clinician, then the statistics."""
 
 from __future__ import annotations
 

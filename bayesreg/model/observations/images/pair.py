@@ -1,4 +1,4 @@
-"""A pair of images as a user gives it."""
+"""A pair of images in the form that a user gives."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bayesreg.types import InputError
 
 
 class ImagePair:
-    """A pair of images of which one shows the organ before and the other after it has deformed.
+    """A pair of images: one shows the organ before, the other after its deformation.
 
     Parameters
     ----------
@@ -77,9 +77,9 @@ class ImagePair:
         _require_options(name, self.options)
 
     def prepared(self, mesh: TetMesh, preset: str = "paper") -> PreparedPair:
-        """The pair as it is compared: f in the contrast of m, as far as a map tells at rest, or descriptors.
+        """Prepare the pair for comparison: convert f to the contrast of m by a map at rest, or compute descriptors.
 
-        What is ignored is filled with what lies beside it.
+        Ignored voxels are filled with the values beside them.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class ImagePair:
         return MappedPair(mapped, moving, self.name, self.fixed_ignore, self.moving_ignore, options, fixed, self.tissue)
 
     def on(self, mesh: TetMesh, preset: str = "paper") -> Placed:
-        """The pair on a mesh, with a T_s of its own.
+        """Place the pair on a mesh, with its own T_s.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class ImagePair:
 
 
 def _require_options(name: str, given: dict[str, Any]) -> None:
-    """Raise InputError where options are wrong whatever the preset of the model, which is not known yet."""
+    """Raise InputError if options are wrong for every preset; the preset of the model is not known yet."""
     errors = []
     for preset in PRESETS:
         try:
