@@ -166,8 +166,8 @@ class LameParameter(NamedTuple):
     free : FreeEntries
         The entries that are sampled.
     at_rest : (entries,) array
-        The known value, or the one at which the interior solve is preconditioned and chains may start, and which is
-        the scale of the coordinate where there is no upper bound.
+        The known value, or the value at which the interior solve is preconditioned and chains may start. Without an
+        upper bound, it is also the scale of the coordinate.
     """
 
     alpha: Float[AnyArray, "entries"]
@@ -264,7 +264,7 @@ class Scale(_Positive):
     log_sd : scalar, optional
         Standard deviation of the logarithm; None means that the value is known.
     factor : scalar
-        The value is the estimand times this, which is one but on the way to a mode.
+        The value is the estimand times this factor; it is one except in the search for a mode.
     """
 
     arrays = ("median", "log_sd", "factor")
@@ -355,5 +355,5 @@ class Coefficients(_Arrays):
         return jnp.zeros_like(self.sd)
 
 
-# Blocks by name; what is particular to one kind is asked of it by those who know that it is there.
+# Blocks by name. Only code that expects one kind of block uses the members that are particular to it.
 Blocks = dict[str, Any]

@@ -19,7 +19,7 @@ from bayesreg.model.state import StaticMesh
 # acceptance.
 CHAIN_TOLERANCE = 1e-6
 
-# Tolerance of the solves for gradients. A small error of the gradient that is always the same at one position leaves
+# Tolerance of the solves for gradients. A small error of the gradient that is always the same in one state leaves
 # the sampled density unchanged, because the gradient only proposes.
 CHAIN_ADJOINT_TOLERANCE = 1e-3
 

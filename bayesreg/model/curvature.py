@@ -25,7 +25,7 @@ from bayesreg.types import AnyArray, Equilibrium, Matrix
 # With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
 FEW_ENTRIES = 20
 
-# Number of random positions at which the dependence of a term from outside is tested, and the sd of their
+# Number of random displacements at which the dependence of a term from outside is tested, and the sd of their
 # displacements, mm.
 NEARBY, NEARBY_SD = 3, 0.1
 
@@ -39,7 +39,7 @@ class Curvature:
     gauss_newton : (r, r) array
         Positive semidefinite.
     second_derivatives : callable
-        () → `remainder`, which not everybody needs.
+        () → `remainder`; it is computed only on demand.
     """
 
     gauss_newton: Float[np.ndarray, "rows rows"]
@@ -100,7 +100,7 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     values, near : mapping
         Values of all blocks.
     u : (n, 3) array
-        The equilibrium at the latter, mm.
+        The equilibrium at `near`, mm.
     """
     response = _Response.at(problem, near, u)
     K = _stiffness(problem.body, values)
@@ -257,7 +257,7 @@ def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]
 
 
 def _find_touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
-    """Find the unknowns on which a term depends: its gradient is not zero there at some random position near u."""
+    """Find the unknowns on which a term depends: its gradient is not zero there at some random displacement near u."""
     steps = NEARBY_SD * np.random.default_rng(0).normal(size=(NEARBY, *u.shape))
     slopes = [np.asarray(_slope(term, seen, (u + step).ravel())) for step in steps]
     return np.flatnonzero((np.stack(slopes) != 0).any(axis=0))

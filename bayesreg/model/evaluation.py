@@ -14,7 +14,7 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Evaluation(NamedTuple):
-    """The log density at one position, with intermediate results of its computation.
+    """The log density of one state, with intermediate results of its computation.
 
     Attributes
     ----------

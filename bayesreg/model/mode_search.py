@@ -35,9 +35,9 @@ class ModeSearch:
     observations : mapping
         By name.
     approached : mapping or None
-        Estimands near the mode, that a search has led to already.
+        Estimands near the mode, found by an earlier search.
     tempering : callable or None
-        From estimands near the mode to the posterior that is tempered by its residuals there; None where it is.
+        Maps estimands near the mode to the posterior tempered by its residuals there; None if it is tempered already.
     """
 
     data: Problem
@@ -69,8 +69,8 @@ class ModeSearch:
         Returns
         -------
         Curvature
-            First the k components of the field, then row k + 3 · node + axis, 1/mm². The elastic energy counts by its
-            curvature in the displacements alone.
+            First the k components of the field, then row k + 3 · node + axis, 1/mm². The elastic energy contributes
+            only its curvature in the displacements.
         """
         values = complete(data.blocks, estimands)
         return displacement_curvature(data, values, _equilibrium(data, values))

@@ -27,7 +27,7 @@ class Normaliser:
     Attributes
     ----------
     is_costly : bool
-        Whether it costs much more than the rest of the density.
+        Whether the normaliser costs much more than the rest of the density.
     """
 
     is_costly: bool

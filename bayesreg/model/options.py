@@ -76,12 +76,12 @@ class ModelConfig(Section):
     Attributes
     ----------
     preset : {"paper", "registration"}
-        What is not given, here and in observations: as in the paper, or as suits data that no model made.
+        Defaults of options, here and in observations: those of the paper, or those that suit real data.
     elasticity : {"tissue", "uniform", "element", "field"}
         One pair (λ, μ) for each tissue, one for all, one for each tetrahedron; or one for each tissue, times the
         exponential of a smooth random field over its tetrahedra.
     field : FieldConfig, optional
-        Prior of that field; for "field" alone.
+        Prior of that field; only for "field".
     fixed : mapping, optional
         Parameters that are known: ``{"mu": {"liver": 1.0}}`` by tissue name (by element it fixes every
         element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of one tissue
@@ -94,11 +94,11 @@ class ModelConfig(Section):
         random loads, K u = q in place of eq. (7), of all nodes, which depends much less on the mesh.
     skull_width : float
         Depth inside the skull, in voxels of its mask, that counts as one standard deviation: masks are no better known
-        than half a voxel. 0: no sampled node lies in the skull, as in the paper; for the sampler rwmh alone, since no
-        gradient tells of such a wall.
+        than half a voxel. 0: no sampled node lies in the skull, as in the paper; only for the sampler rwmh, since a
+        gradient does not show a hard constraint.
     least_volume : float
-        0: tetrahedra may be inverted. Else a barrier, which begins where a tetrahedron is left with less than this
-        share of its volume (`bayesreg.model.elastic.barrier`). Like the skull it has no part in the normaliser.
+        0: tetrahedra may be inverted. Otherwise a barrier acts on every tetrahedron that keeps less than this
+        share of its volume (`bayesreg.model.elastic.barrier`). Like the skull, it is not part of the normaliser.
     rigid_sd : float, optional
         Standard deviation, mm, of the root-mean-square displacement of each of the six rigid motions of
         the sampled nodes under a Gaussian prior; None is flat.

@@ -47,23 +47,23 @@ class Posterior:
     Attributes
     ----------
     data : Problem
-        All arrays; an argument of every jitted function, so that none is baked into compiled code.
+        All arrays. It is an argument of every jitted function, so that no array becomes a constant of compiled code.
     mesh : TetMesh
     options : ModelConfig
     sampled : (b,) int array
         The nodes whose displacements are sampled, sorted.
     observations : mapping
-        The observations by name, prepared for this mesh.
+        The observations, prepared for this mesh, by name.
     approached : mapping, optional
-        Estimands near the mode, where a search for it begins.
+        Estimands near the mode, at which a search for it begins.
     tempered : bool
-        False where residuals have yet to tell how many quadrature points are independent (`independent_points:
-        residual`): all count until then.
+        False if residuals must still determine how many quadrature points are independent (`independent_points:
+        residual`); until then, all points count.
 
     Notes
     -----
-    Two are equal if they differ in the values of their arrays alone: what is compiled for one pair of images then
-    serves all others on the mesh.
+    Two posteriors are equal if they differ only in the values of their arrays: code compiled for one pair of images
+    then serves all other pairs on the mesh.
     """
 
     data: Problem
@@ -211,7 +211,7 @@ class Posterior:
     ) -> Evaluation:
         """Evaluate the density as a pure function of the data; see `evaluate`.
 
-        A `guess` is the displacement of every node at a position near by. It makes the evaluation faster and removes
+        A `guess` is the displacement of every node in a state near by. It makes the evaluation faster and removes
         the gradient.
         """
         return evaluation.evaluate(data, coordinates.complete(data.blocks, estimands), guess)

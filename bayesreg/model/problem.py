@@ -242,7 +242,7 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
 
 
 def fix_a_body(points: Float[np.ndarray, "k 3"]) -> bool:
-    """Check whether fixed points determine the position of a rigid body: at least three, not on one line."""
+    """Check whether fixed points determine the pose of a rigid body: at least three, not on one line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return len(points) >= 3 and bool(spread[1] >= 1e-6 * spread[0])
 

@@ -21,7 +21,7 @@ class Problem(NamedTuple):
     Attributes
     ----------
     body : Body
-        What turns values of the blocks into a state.
+        The body, which converts values of the blocks into a state.
     blocks : dict
         The blocks of unknowns by name.
     terms : dict

@@ -50,9 +50,9 @@ class Body(NamedTuple):
     field : StiffnessField or None
         Prior of the logarithm of a factor on λ and μ of every cell.
     slots : (b,) int array
-        Where the sampled nodes stand among `system.prescribed`.
+        Indices of the sampled nodes in `system.prescribed`.
     placed : SparseOperator
-        (prescribed, b): what belongs to the sampled nodes, in their slots; zero in the others.
+        (prescribed, b): puts values of the sampled nodes into their slots, and zero into the others.
     held : (prescribed, 3) array
         Known displacements, zero in the rows of sampled nodes, mm.
     """
@@ -133,12 +133,12 @@ class State:
         Parameters
         ----------
         points : (k, 3) array
-            World RAS mm, known before anything is compiled: not an array that JAX traces.
+            World RAS mm; a concrete array, not one that JAX traces.
 
         Raises
         ------
         InputError
-            If the shape is another one, or a point lies outside the mesh.
+            If the shape is wrong, or a point lies outside the mesh.
         """
         points = np.asarray(points, float)
         if points.ndim != 2 or points.shape[1] != 3:

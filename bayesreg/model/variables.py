@@ -56,7 +56,7 @@ class Variables:
     nodes : (b,) int array
         The sampled nodes.
     entry_names : sequence of str
-        What the entries of λ and μ stand for.
+        The names of the entries of λ and μ.
     """
 
     blocks: Blocks

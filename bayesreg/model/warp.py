@@ -40,9 +40,9 @@ class Covered(NamedTuple):
     ----------
     voxel : (k, 3) int array
     cell : (k,) int array
-        The tetrahedron that holds each.
+        The tetrahedron that holds each voxel centre.
     barycentric : (k, 4) array
-        Where in it.
+        Barycentric coordinates of the centre in its tetrahedron.
     """
 
     voxel: Int[np.ndarray, "k 3"]

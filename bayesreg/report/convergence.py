@@ -34,7 +34,7 @@ def key_table(studies: dict[str, Study]) -> Table:
 
 
 def worst_table(study: Study) -> Table:
-    """Make a table of the estimands with the greatest R̂, with their positions in numbers and in words."""
+    """Make a table of the estimands with the greatest R̂, with their places in numbers and in words."""
     rows = [
         [
             entry.name,

@@ -35,15 +35,15 @@ class Estimand(NamedTuple):
     variable : str
         Name in the posterior.
     position : tuple of int
-        Its place in that variable's array, after chain and draw.
+        The index in that variable's array, after chain and draw.
     name : str
-        For people, as "u_x of node 12" or "λ tumour".
+        The name in the report, such as "u_x of node 12" or "λ tumour".
     place : tuple of float or None
         World position of its node, mm.
     rhat, ess_bulk, ess_tail : float
         NaN where undefined (chains that never moved, say).
     region : str
-        Its place in words; empty where it has none.
+        The place in words; empty if the entry has none.
     """
 
     variable: str
@@ -183,7 +183,7 @@ class Group(NamedTuple):
     ----------
     name : str
     lam, mu : (chain, draw, entries) arrays
-        Entries are one, or the elements of the tissue.
+        One entry, or one for each element of the tissue.
     """
 
     name: str

@@ -28,7 +28,7 @@ def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
     ----------
     manifest : mapping
     elastography : bool
-        Whether the displacement of the boundary is given, and so has no prior.
+        Whether the displacement of the boundary is given; then it has no prior.
     """
     elastic = part(manifest, "model", "elastic_prior") or {}
     loads, normalised = elastic.get("kind") == "loads", elastic.get("normalised")

@@ -53,7 +53,7 @@ class Opening(NamedTuple):
     answers : list of (str, str)
         Questions and answers.
     approximation : str
-        A warning that the draws are not those of the posterior; empty where they are.
+        A warning that the draws are not from the exact posterior; empty if they are.
     warnings : list of str
     """
 

@@ -95,12 +95,12 @@ class Row(NamedTuple):
     Attributes
     ----------
     label : str
-        Of its colour bar.
+        The label of its colour bar.
     picture : function
-        From a plane to its pixels.
+        Maps a plane to its pixels.
     cmap : str
     norm : Normalize or None
-        None for 0 to the greatest value of the row.
+        None means a range from 0 to the greatest value of the row.
     """
 
     label: str

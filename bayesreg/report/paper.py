@@ -122,7 +122,7 @@ def node(study: Study) -> Drawing | None:
 
 
 def node_at_skull(study: Study) -> int | None:
-    """Find the entry along `node` whose mean position is nearest to the skull; None without skull or sampled nodes."""
+    """Find the entry along `node` whose mean place is nearest to the skull; None without skull or sampled nodes."""
     nodes, skull = study.posterior["node"].to_numpy().astype(int), study.run.skull
     if skull is None or not len(nodes):
         return None

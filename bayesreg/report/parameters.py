@@ -17,7 +17,7 @@ from bayesreg.tissues import label_of
 
 # A parameter is identified if its central 90 % interval spans less than a factor of ten.
 IDENTIFIED = 10.0
-# A number has only an upper bound if the median is more than this many times the 1 % quantile (the density reaches 0), …
+# A number has only an upper bound if the median is more than this many times the 1 % quantile (density to 0), …
 REACHES_ZERO = 20.0
 # … and the bound is within this factor of the median.
 BOUND = 5.0
@@ -51,9 +51,9 @@ def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
     Parameters
     ----------
     draws : array
-        Draws of any shape; those that are not finite are left out.
+        Draws of any shape; draws that are not finite are left out.
     prior : Interval, optional
-        Central 95 % interval of its prior; None where it is improper.
+        Central 95 % interval of the prior; None if the prior is improper.
 
     Returns
     -------

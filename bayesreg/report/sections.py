@@ -42,7 +42,7 @@ class Section(NamedTuple):
     ----------
     title : str
     draws : list of functions
-        Each makes a figure, a table, or several of them; None or nothing where a run has none.
+        Each makes a figure, a table, or several of them; None or an empty list if a run has none.
     applies : function
         Whether a run has this section.
     """

@@ -63,7 +63,7 @@ class Plane(NamedTuple):
         return f"{NAMES[self.axis]}, {COORDINATES[self.axis]} = {position:d} mm".replace("-", "−")
 
     def points(self) -> Float[np.ndarray, "rows columns 3"]:
-        """Return the world position of every pixel's centre, with the first row at the bottom."""
+        """Return the world coordinates of every pixel's centre, with the first row at the bottom."""
         across, up = IN_PLANE[self.axis]
         points = np.empty((_count(self.vertical, self.spacing), _count(self.horizontal, self.spacing), 3))
         points[..., self.axis] = self.position

@@ -70,11 +70,11 @@ class Drawing(NamedTuple):
     Attributes
     ----------
     key : str
-        Its anchor.
+        The anchor of the figure.
     title : str
     caption : str
     alt : str
-        What it shows, for those who cannot see it.
+        A description for readers who cannot see the figure.
     uri : str
         The picture itself, a data URI.
     """

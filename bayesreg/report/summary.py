@@ -1,4 +1,4 @@
-"""The summary for a clinician: success, displacement, its uncertainty, and positions of low reliability."""
+"""The summary for a clinician: success, displacement, its uncertainty, and places of low reliability."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bayesreg.report.study import Study
 from bayesreg.report.verdict import fixed, number, part, percent, place_text
 from bayesreg.types import AnyArray
 
-# At a position whose 95 % radius is larger, mm, the result is of little use to a surgeon.
+# At a place whose 95 % radius is larger, mm, the result is of little use to a surgeon.
 COARSE = 2.0
 
 
@@ -39,7 +39,7 @@ def _images(study: Study) -> list[str]:
 
 
 def _held_out(study: Study) -> list[str]:
-    """Describe the distances of held-out landmarks from their measured positions, before and after."""
+    """Describe the distances of held-out landmarks from their measured places, before and after."""
     predicted = study.predicted
     if predicted.evaluation_residual is None or not np.asarray(predicted.evaluation_inside).any():
         return []

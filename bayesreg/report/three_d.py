@@ -150,7 +150,7 @@ def _ellipsoid(place: Place) -> Surface:
 
 
 def _label(place: Place) -> dict[str, Any]:
-    """Draw the name of a place at its displaced position, in front of the scene."""
+    """Draw the name of a place at its displaced place, in front of the scene."""
     at = dict(zip("xyz", (place.point + place.region.mean).tolist(), strict=True))
     return {**at, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6, **LABEL}
 

@@ -34,7 +34,7 @@ class Region(NamedTuple):
     mean : (3,) array
         mm.
     shape : (3, 3) array
-        Semi-axes are the roots of its eigenvalues, mm².
+        The semi-axes are the square roots of its eigenvalues, mm².
     """
 
     mean: Float[np.ndarray, "3"]

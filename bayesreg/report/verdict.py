@@ -30,11 +30,11 @@ class Verdict(NamedTuple):
     Attributes
     ----------
     converged : bool
-        Whether R-hat is below the threshold for every estimand, and the run's own stop rule does not deny it.
+        Whether R-hat is below the threshold for every estimand, and the run's own stop rule agrees.
     headline : str
         One sentence.
     detail : str
-        Why it stopped, and what that means for the figures below.
+        The reason of the stop, and its meaning for the figures below.
     """
 
     converged: bool
@@ -127,7 +127,7 @@ def _at(entry: Estimand) -> str:
 
 
 def place_text(place: Iterable[float]) -> str:
-    """Format a world position, mm."""
+    """Format world coordinates, mm."""
     # Adding zero turns −0 into 0.
     return ("(" + ", ".join(f"{round(coordinate) + 0:d}" for coordinate in place) + ") mm").replace("-", "−")
 

@@ -72,7 +72,7 @@ class BoltzmannTerm(NamedTuple):
     Attributes
     ----------
     determinant : SchurDeterminant or None
-        None leaves the normaliser out, as the paper does.
+        If it is None, the normaliser is omitted, as in the paper.
     """
 
     determinant: SchurDeterminant | None

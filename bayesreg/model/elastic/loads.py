@@ -61,13 +61,13 @@ class LoadsTerm(NamedTuple):
     Attributes
     ----------
     determinant : SchurDeterminant or None
-        None leaves log pdet K out of the normaliser.
+        If it is None, the normaliser omits log pdet K.
     volumes : (n,) array
         Diagonal of M, mm³.
     areas : (n,) array
         Diagonal of A, mm², zero inside.
     rigid : (3n, 6) array
-        Orthonormal basis of the rigid motions, which cost nothing.
+        Orthonormal basis of the rigid motions, which need no force.
     """
 
     determinant: SchurDeterminant | None

@@ -48,7 +48,7 @@ class Skull(NamedTuple):
 
 
 class SoftSkull(NamedTuple):
-    """A skull of uncertain position: exp(−½ Σ (d / width)²), where d is the depth of a sampled node inside the skull.
+    """A skull with an uncertain border: exp(−½ Σ (d / width)²); d is the depth of a sampled node inside the skull.
 
     Attributes
     ----------

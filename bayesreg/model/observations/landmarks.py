@@ -1,4 +1,4 @@
-"""Pairs of points as an observation: the position of some points of the organ in both images."""
+"""Pairs of points as an observation: the places of some points of the organ in both images."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class Landmarks:
         Standard deviation of the error of each coordinate, mm, positive; or the prior of one sd for all points, which
         is then inferred as "<name>_sd".
     name : str, default "landmarks"
-        Its name in tables and in the NumPyro program.
+        The name of the observation in tables and in the NumPyro program.
     labels : sequence of str, optional
-        What to call each pair in the report; the default is its number.
+        The name of each pair in the report; the default is its number.
 
     Raises
     ------
@@ -145,7 +145,7 @@ class ComparedPoints(NamedTuple):
     ----------
     label : Label
     scale : Label or None
-        Name of the block with the sd of all points; None where it is known.
+        Name of the block with the sd of all points; None if the sd is known.
     nodes : (k, 4) int array
         Nodes of the cell that holds each point.
     weights : (k, 4) array
@@ -153,7 +153,7 @@ class ComparedPoints(NamedTuple):
     shift : (k, 3) array
         q − p, mm.
     known_sd : (k,) array
-        mm; the median of its prior where it is inferred.
+        The sd, mm; if it is inferred, the median of its prior.
     """
 
     label: Label
@@ -265,5 +265,5 @@ class LandmarksSection(ObservationSection):
     def figures(
         cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
     ) -> list[ReportFigure]:
-        """Return a figure of the distances between the landmarks and their predicted positions."""
+        """Return a figure of the distances between the landmarks and their predicted places."""
         return [distance_figure(name, summary)] if "residual" in summary else []

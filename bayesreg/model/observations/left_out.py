@@ -28,7 +28,7 @@ class LeftOut(NamedTuple):
     Attributes
     ----------
     residual : (k, 3) array
-        q − p − u(p), mm, u the mean given the others; NaN where these do not determine it.
+        q − p − u(p), mm, where u is the mean given the others; NaN if these do not determine u.
     covariance : (k, 3, 3) array
         Covariance of that residual, mm²: that of u(p) given the others, and the landmark's own error.
     """
@@ -49,9 +49,9 @@ def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -
     ----------
     posterior : Posterior
     term : ComparedPoints
-        Its term of the landmarks.
+        The posterior's term of the landmarks.
     estimands : dict
-        Where the posterior is linearised: its mean.
+        The estimands at which the posterior is linearised: its mean.
     """
     data = posterior.data
     values = complete(data.blocks, estimands)
@@ -72,7 +72,7 @@ def _shares(
     response: Float[np.ndarray, "coordinates rows"],
     sd: Float[np.ndarray, "k"],
 ) -> Float[np.ndarray, "k 3 3"]:
-    """Compute C / s² of every landmark: the share of the information on its position that it contributes itself."""
+    """Compute C / s² of every landmark: its own share of the information about its place."""
     spread = response @ cho_solve(cho_factor(precision), response.T)
     return np.einsum("kikj->kij", spread.reshape(len(sd), 3, len(sd), 3)) / sd[:, None, None] ** 2
 

@@ -26,7 +26,7 @@ class Placed(NamedTuple):
     Attributes
     ----------
     observation : object
-        The observation, prepared for what follows.
+        The observation, prepared for this mesh.
     term : pytree
         The factor of the density (`bayesreg.model.term.Term`).
     blocks : dict
@@ -54,7 +54,7 @@ class Recorded(NamedTuple):
     Attributes
     ----------
     values : xarray.DataArray
-        With names of its dimensions, labels and units.
+        The values, with names of dimensions, labels and units.
     chosen : int array or slice
         The entries of all that was observed, along its first axis.
     """

@@ -22,11 +22,11 @@ class ReportTable(NamedTuple):
     ----------
     title, caption : str
     header : list of str
-        The first is that of the names of the rows.
+        The first entry heads the names of the rows.
     rows : list of lists
-        Text, numbers, which the report rounds, or None, which it shows as missing.
+        Each entry is text, a number, which the report rounds, or None, which it shows as missing.
     places : (rows, 3) array or None
-        World RAS mm in the fixed image: the report says where each row lies.
+        World RAS mm in the fixed image: the report describes the place of each row.
     """
 
     title: str

@@ -22,7 +22,7 @@ def independent_points(residual: Image, mask: Image) -> float:
     residual : Image
         f(x) − m(x + u(x)) on a grid.
     mask : Image
-        Nonzero = inside, on the same grid; where the likelihood looks.
+        Nonzero = inside, on the same grid: the voxels that the likelihood compares.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def independent_scores(
     voxels : (n, 3) int array
         Their places on the grid.
     grid : Image
-        Its shape and affine alone count.
+        Only its shape and affine are used.
 
     Returns
     -------

@@ -63,11 +63,11 @@ class ComparedImages(NamedTuple):
     positions : (q, 3) array
         World positions x_q of the quadrature points, mm.
     independent_share : scalar
-        Effective number of independent quadrature points over that of all: tempers the likelihood.
+        Effective number of independent quadrature points over the number of all; it tempers the likelihood.
     shading : (q, k) array or None
-        Functions of which m has some more than f (`bayesreg.model.observations.images.intensity_map`).
+        Functions whose sum is the shading of m (`bayesreg.model.observations.images.intensity_map`).
     visible : Interpolator or None
-        1 where the moving image is looked at and 0 where it is ignored; None: it is looked at everywhere.
+        1 where the moving image is compared and 0 where it is ignored; None if it is compared everywhere.
     """
 
     comparison: Comparison

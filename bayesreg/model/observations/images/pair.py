@@ -23,27 +23,27 @@ class ImagePair:
     Parameters
     ----------
     fixed, moving : Image
-        f and m; their intensities are taken as they are.
+        f and m; their intensities are not rescaled.
     name : str, default "images"
-        Its name in tables and in the NumPyro program.
+        The name of the pair in tables and in the NumPyro program.
     fixed_ignore : Image, optional
-        Not zero where the fixed image says nothing: no point is compared there. On any grid, in its world.
+        Nonzero where the fixed image is ignored: no point is compared there. On any grid, in the world of f.
     moving_ignore : Image, optional
-        Not zero where the moving image says nothing, such as in a cavity: a point that is taken there may have any
-        intensity of the organ. On any grid, in its world.
+        Nonzero where the moving image is ignored, such as in a cavity: a point displaced into it may have any
+        intensity of the organ. On any grid, in the world of m.
     one_contrast : bool, default True
         False: f is compared through the best map of its intensities to those of m (see `contrast`).
     tissue : Image, optional
-        Labels on the grid of the fixed image, 0 outside: that map is then another one in every tissue.
+        Labels on the grid of the fixed image, 0 outside: that map then differs between tissues.
     **options
         How the images are compared, as in `ImageOptions`: similarity (`SquaredDifferences`, `StudentT`,
         `LocalCorrelation`, `MutualInformation` or `SelfSimilarity`), interpolation, quadrature, most_points, smoothing,
-        intensity_map, independent_points. What is not given is what the preset of the model says.
+        intensity_map, independent_points. The preset of the model gives all other options.
 
     Raises
     ------
     InputError
-        If one is no image, `tissue` lies on another grid, or an option does not exist or is wrong.
+        If an argument is not an image, `tissue` lies on another grid, or an option does not exist or is wrong.
 
     Notes
     -----
@@ -85,7 +85,7 @@ class ImagePair:
         ----------
         mesh : TetMesh
         preset : {"paper", "registration"}
-            That of the model, which says what was not given.
+            The preset of the model, which completes the options.
 
         Raises
         ------

@@ -19,7 +19,7 @@ from bayesreg.types import InputError
 
 
 def visibility(image: Image, ignore: Image) -> Interpolator:
-    """Return a function of the position that is 1 where an image is compared and 0 where it is ignored.
+    """Return a function of the place that is 1 where an image is compared and 0 where it is ignored.
 
     The neighbours of an ignored voxel are ignored, too: they may contain a part of the same structure.
     """

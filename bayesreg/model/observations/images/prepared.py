@@ -61,7 +61,7 @@ class PreparedPair:
         return self.fixed.interpolate(positions, self.options.interpolation)
 
     def moving_function(self) -> Interpolator | InTurn:
-        """Return the compared values of the moving image as a function of the positions of all quadrature points."""
+        """Return the compared values of the moving image as a function of the places of all quadrature points."""
         return self.moving.interpolator(self.options.interpolation)
 
     def smoothed(self, sd: float) -> PreparedPair:

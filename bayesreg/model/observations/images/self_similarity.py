@@ -49,7 +49,7 @@ def describe_self_similarity(
     axes : (3, 3) array
         Directions of the neighbours, in world RAS, one in each column.
     distance : float
-        To the neighbours, mm.
+        Distance to the neighbours, mm.
     """
     voxels = np.asarray(image.voxels, float)
     shifts = [way * distance * axis for axis in axes.T for way in (1, -1)]
@@ -72,12 +72,12 @@ def _patch_distance(image: Image, voxels: np.ndarray, sd: float, shift: np.ndarr
 
 
 class InTurn(NamedTuple):
-    """Several images as one function of positions: point q uses image q modulo their number (a pytree).
+    """Several images as one function of places: point q uses image q modulo their number (a pytree).
 
     Attributes
     ----------
     images : Interpolator
-        Of all images, whose arrays have them as their leading axis.
+        All images in one; the images are the leading axis of its arrays.
     """
 
     images: Interpolator
