@@ -21,10 +21,10 @@ def describe_observations(posterior: Posterior, values: Values) -> dict[str, dic
     Returns
     -------
     dict
-        By the name of the observation its "kind", the "title" of that in words, and its "options" where it has some;
-        the "log" of its term; where the term knows its residuals their number, "values", and the root of the mean of
-        their squares in units of their variance, "residual_rms"; and what else the observation says of itself
-        (`describe`).
+        A dict for each observation, by its name. It has the "kind" of the observation, the "title" of the kind, its
+        "options" if it has any, and the "log" of its term. If the term provides its residuals, it has their number,
+        "values", and the root of their mean square in units of their variance, "residual_rms". It also has the entries
+        that the observation's method `describe` returns.
     """
     filled = posterior.fill(values)
     state = state_of(posterior.data.body, posterior.data.blocks, filled)

@@ -36,18 +36,18 @@ def build_posterior(
     Parameters
     ----------
     mesh : TetMesh
-        In the space of the fixed image.
+        The mesh of the organ, in the space of the fixed image.
     observations : sequence
         `ImagePair`, `Landmarks`, or any object with a `name` and a function `log(state)` that JAX can trace, the log of
-        its factor of the density. It sees the displacement of every node, `state.u` (n, 3), mm, and of points inside
-        the mesh, `state.at(points)`.
+        its factor of the density. The state has the displacements of every node, `state.u` (n, 3), mm, and of points
+        inside the mesh, `state.at(points)`.
     model : ModelConfig, optional
         The default is the paper's model.
     skull : Image, optional
-        Nonzero = forbidden; off its grid is forbidden too. None: no constraint.
+        Nonzero voxels, and points off its grid, are forbidden. None: no constraint.
     reference : mapping, optional
-        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start, and the scale of the
-        coordinate of a parameter without an upper bound; the nearer to the posterior the faster. Default:
+        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start. They are also the scales
+        of the coordinates of parameters without an upper bound. Values near the posterior save time. Default:
         `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01 for a fluid.
 
     Returns

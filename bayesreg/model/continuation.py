@@ -12,9 +12,10 @@ from bayesreg.model.program import Problem
 
 Made = TypeVar("Made")
 
-# Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
-# instead of seven left single nodes of the paper's pair in wrong places, up to 15 mm off. A first stage of ten times
-# the T_r folded a few tetrahedra of three in thirteen calibrated pairs, for good, with nodes about 30 mm off.
+# Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. With three
+# stages instead of seven, single nodes of the paper's pair ended in wrong places, up to 15 mm off. A first stage with
+# ten times the T_r folded a few tetrahedra permanently in three of thirteen calibrated pairs, with nodes about 30 mm
+# off.
 SMOOTHING = (
     (6.0, 30.0, 0.001), (4.0, 30.0, 0.02), (3.0, 20.0, 0.03), (2.0, 10.0, 0.05), (1.5, 5.0, 0.1), (1.0, 3.0, 0.3),
     (0.5, 1.0, 1.0),

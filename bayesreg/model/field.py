@@ -40,7 +40,7 @@ class FieldConfig(Section):
     sd : float
         Scale of the half-normal prior of the field's standard deviation, which is inferred; 0.5 is a factor of e^0.5.
     modes : int
-        Most principal components of the field that are sampled.
+        The greatest number of sampled principal components of the field.
     """
 
     correlation: Positive = 20.0

@@ -155,8 +155,8 @@ class ModelConfig(Section):
     def require_proper_priors(self, tissues: Sequence[str]) -> None:
         """Refuse flat priors on [low, ∞) of free parameters if the density is normalised or u_B is given.
 
-        With flat priors, the images determine only ratios, and the density has a positive limit where a parameter goes
-        to infinity.
+        With flat priors, the images determine only ratios, and the density does not decrease to zero if a parameter
+        goes to infinity.
 
         Raises
         ------

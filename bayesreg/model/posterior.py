@@ -34,13 +34,13 @@ CHEAP_NODES = 200
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """p(u_B, λ, μ | observations) of eq. (9), unnormalised. Make one with `build_posterior`.
+    """The unnormalised posterior p(u_B, λ, μ | observations) of eq. (9); `build_posterior` makes it.
 
     A state has three sets of coordinates:
 
-    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries, "t_similarity", "t_elastic"}``, known
-      entries included, and where the elasticity has a field its "field_sd" and whitened components "field" (k,);
-    - *estimands*: the sampled entries of these only;
+    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries, "t_similarity", "t_elastic"}``, with
+      known entries, and for a field of stiffness its "field_sd" and whitened components "field" (k,);
+    - *estimands*: only the sampled entries of the values;
     - *position*: estimands mapped to the real line: λ and μ as Normal scores (`RangeTransform`), temperatures and the
       field's sd by their logarithm.
 

@@ -155,12 +155,12 @@ class ScaledBeta(dist.Distribution):
     alpha, beta, low, high : arrays of one common shape
         Shape parameters A, B and the range [r1, r2], in the unit of the parameter.
     log_beta : array, optional
-        log B(α, β), where it is known already: it takes longer to compile than the rest of the density.
+        log B(α, β), if it is known already: it takes longer to compile than the rest of the density.
 
     Raises
     ------
     NotImplementedError
-        By `sample`, where the prior is improper.
+        By `sample`, if the prior is improper.
     """
 
     arg_constraints = {  # noqa: RUF012 (NumPyro's convention)

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from bayesreg.report.estimands import DISPLACEMENT, MOST_VALUES
 from bayesreg.types import AnyArray
 
-# Chains belong to different groups if this many estimands differ by this many standard deviations within a chain.
+# Chains belong to different groups if this many of their standard deviations separate them in several estimands.
 APART = 3.0
 TOGETHER_IN_ALL_BUT = 3
 SEEN = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")

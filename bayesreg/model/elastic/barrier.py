@@ -32,7 +32,7 @@ class Barrier(NamedTuple):
     Attributes
     ----------
     least : scalar
-        Between 0 and 1.
+        The least share of volume without cost, between 0 and 1.
     elements : Elements
     """
 

@@ -231,7 +231,7 @@ class ImageLikelihood(dist.Distribution):
         return self.term.independent_share * found
 
     def _hidden_pair(self, pair: Intensities) -> Intensities:
-        """Pair f with an ignored m: m then has its mean over the organ, and its variance adds to the noise."""
+        """Pair an ignored m with f: replace m by the mean of f in the organ, and add the variance of f to the noise."""
         mean, variance = self.term.fixed_values.mean(), self.term.fixed_values.var()
         # A point with this weight has T_s / (2 w) equal to the noise variance plus the variance of m.
         weights = pair.weights / (1 + 2 * pair.weights * variance / self.temperature)

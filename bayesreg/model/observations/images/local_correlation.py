@@ -6,15 +6,15 @@ a_k, b_k and Gaussian noise of the variance T_s / (2 w_q), as in eq. (1). At the
 
 E_s = Σ_k min_{a, b} Σ_{q ∈ k} w_q (f_q − a m_q − b)² = Σ_k V_k var_k(f) (1 − ncc_k²),
 
-where V_k = Σ w_q, and the variances and the correlation ncc_k of f and the warped m within the window are weighted by
-w_q: the minimum lies at a = cov(f, m) / var(m) and b = mean(f) − a mean(m), and leaves var(f) − cov(f, m)² / var(m) of
-the mean square. Where a = 1 and b = 0 are best everywhere, this is eq. (1), so that T_s, the noise that it stands for
-and its prior keep their meaning. Each window takes two degrees of freedom from the noise: of N residuals in K windows
-N − 2K are independent, which the normaliser counts where T_s is inferred. The likelihood is a profile likelihood; with
-a_k and b_k integrated out under flat priors it would prefer a warped m without contrast.
+where V_k = Σ w_q. The variances and the correlation ncc_k of f and the warped m within the window are weighted by w_q.
+The minimum lies at a = cov(f, m) / var(m) and b = mean(f) − a mean(m), and the remaining mean square is var(f) − cov(f,
+m)² / var(m). If a = 1 and b = 0 are best everywhere, this is eq. (1), so that T_s, its noise and its prior keep their
+meaning. Each window uses two degrees of freedom of the noise: of N residuals in K windows, N − 2K are independent. The
+normaliser takes this into account if T_s is inferred. The likelihood is a profile likelihood; an integral over a_k and
+b_k with flat priors would prefer a warped m without contrast.
 
-An m replaced by s m + c leaves E_s as it is, for a negative s, too. A window in which m hardly varies explains nothing:
-var(m) is increased by `RIDGE` times the variance of m over all points, which is a Normal prior of a_k about zero.
+E_s is equal for m and s m + c, also with a negative s. A window with an almost constant m explains nothing: var(m) is
+increased by `RIDGE` times the variance of m over all points, which is a Normal prior of a_k with mean zero.
 """
 
 from __future__ import annotations
@@ -138,9 +138,9 @@ class WindowCorrelation(NamedTuple):
         return self._curvature(self.fit(pair), pair.weights * pair.shares, jnp.zeros_like(pair.fixed))
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W the diagonal of w.
+        """Return Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W = diag(w).
 
-        It is the derivative of the slope −2 w a r, where r and a follow m.
+        It is the derivative of the gradient −2 w a r, where r and a depend on m.
         """
         found = self.fit(pair)
         return self._curvature(found, pair.weights * pair.shares, found.residuals)
