@@ -31,7 +31,7 @@ ONE = np.ones(())
 
 @runtime_checkable
 class Block(Protocol):
-    """One kind of unknown."""
+    """One kind of unknown, with its prior and its map to the real line."""
 
     @property
     def is_sampled(self) -> bool:
@@ -309,7 +309,7 @@ def scale_block(given: float | ScalePrior) -> Scale:
 
 @jax.tree_util.register_pytree_node_class
 class FieldScale(_Positive):
-    """Standard deviation of the field of log-stiffness, with a half-normal prior.
+    """The standard deviation of the field of log-stiffness, with a half-normal prior.
 
     Parameters
     ----------

@@ -46,8 +46,8 @@ def build_posterior(
     skull : Image, optional
         Nonzero voxels, and points off its grid, are forbidden. None: no constraint.
     reference : mapping, optional
-        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start. They are also the scales
-        of the coordinates of parameters without an upper bound. Values near the posterior save time. Default:
+        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start. They are also the
+        scales of the coordinates of parameters without an upper bound. Values near the posterior save time. Default:
         `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01 for a fluid.
 
     Returns

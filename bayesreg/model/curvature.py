@@ -159,7 +159,7 @@ class _Response(NamedTuple):
         Unknowns 3 · node + axis.
     W : (free, modes + sampled) array
     schur : (sampled, sampled) matrix
-        The Schur complement of K in the sampled nodes; sparse where no node is free.
+        The Schur complement of K in the sampled nodes; sparse if no node is free.
     """
 
     sampled: Int[np.ndarray, "sampled"]
@@ -189,7 +189,7 @@ class _Response(NamedTuple):
         return self.W.shape[1] - len(self.sampled)
 
     def reduce(self, nodal: scipy.sparse.csr_matrix, with_field: bool = True) -> Matrix:
-        """Reduce a curvature in all nodes to (z, u_B), or to u_B only; it is sparse if every node is sampled."""
+        """Reduce a curvature in all nodes to (z, u_B), or to u_B only; it is sparse if no node is free."""
         W = self.W if with_field else self.W[:, self.modes :]
         if not len(self.free):
             return nodal[self.sampled][:, self.sampled]
@@ -302,7 +302,7 @@ def _response(
     mu: Float[np.ndarray, "cells"],
     load: Float[np.ndarray, "free loads"],
 ) -> tuple[Float[np.ndarray, "free columns"], Matrix]:
-    """Compute −K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W (sparse if every node is sampled)."""
+    """Compute −K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W (sparse if no node is free)."""
     K = stiffness(mesh, lam, mu)
     coupling = K[free][:, sampled]
     W = np.hstack([load, coupling.toarray()])

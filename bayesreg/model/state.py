@@ -117,7 +117,7 @@ class State:
 
     @property
     def u(self) -> Float[AnyArray, "nodes 3"]:
-        """Displacement of every node, mm."""
+        """The displacement of every node, mm."""
         return self.equilibrium.u
 
     @cached_property

@@ -28,7 +28,7 @@ MOST_VALUES = 10_000_000
 
 
 class Estimand(NamedTuple):
-    """One sampled number.
+    """One sampled scalar, with its convergence figures.
 
     Attributes
     ----------
@@ -192,7 +192,7 @@ class Group(NamedTuple):
 
     @property
     def ratio(self) -> np.ndarray:
-        """The ratio λ/μ, NaN where it is undefined."""
+        """The ratio λ/μ, NaN if it is undefined."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = self.lam / self.mu
         return np.where(np.isfinite(ratio), ratio, np.nan)

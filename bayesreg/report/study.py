@@ -37,7 +37,7 @@ class Study:
         With the groups `posterior` and `sample_stats`, as in the run folder. The coordinate `node` of u_boundary
         holds mesh node indices.
     rhat, ess_bulk, ess_tail : xarray.Dataset
-        The posterior's variables without chain and draw; NaN where an entry was not sampled.
+        The posterior's variables without chain and draw; NaN if an entry was not sampled.
     """
 
     run: Run
@@ -75,7 +75,7 @@ class Study:
 
     @cached_property
     def diagnosed(self) -> Diagnosed:
-        """R̂ and both effective sample sizes of every entry."""
+        """The R̂ and both effective sample sizes of every entry."""
         return Diagnosed(self.rhat, self.ess_bulk, self.ess_tail)
 
     @cached_property

@@ -24,10 +24,11 @@ QUADRATIC_BELOW = 0.05
 
 
 class Barrier(NamedTuple):
-    """exp(−½ Σ (ln(J / least) / WIDTH)²) over the tetrahedra with J < least, J = det(I + ∇u) the share of volume left.
+    """The factor exp(−½ Σ (ln(J / least) / WIDTH)²) over the tetrahedra with J = det(I + ∇u) < least.
 
-    With J its cost reaches 112 and continues to grow, more steeply than the log likelihood of any pair of images. An
-    inverted tetrahedron, J ≤ 0, has a density of at most e^−237.
+    J is the share of its volume that a tetrahedron keeps. The cost is 112 at `QUADRATIC_BELOW` times the least share and
+    continues to grow below it, more steeply than the log likelihood of any pair of images. An inverted tetrahedron,
+    J ≤ 0, has a density of at most e^−237.
 
     Attributes
     ----------

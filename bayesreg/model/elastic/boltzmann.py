@@ -67,7 +67,7 @@ class Boltzmann(Section):
 
 
 class BoltzmannTerm(NamedTuple):
-    """exp(−E_r / T_r), eq. (12), with or without its normaliser.
+    """The factor exp(−E_r / T_r), eq. (12), with or without its normaliser.
 
     Attributes
     ----------

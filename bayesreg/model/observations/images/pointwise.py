@@ -113,7 +113,7 @@ class Pointwise:
 
 @jax.tree_util.register_pytree_node_class
 class SumOfSquaredDifferences(Pointwise):
-    """∫ (f − m(x + u))² dx, eq. (1): Gaussian noise with the variance σ_q² = T_s / (2 w_q)."""
+    """The similarity ∫ (f − m(x + u))² dx, eq. (1): Gaussian noise with the variance σ_q² = T_s / (2 w_q)."""
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return Σ_q w_q (f − m)², which does not depend on the temperature."""
