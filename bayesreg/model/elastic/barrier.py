@@ -26,9 +26,9 @@ QUADRATIC_BELOW = 0.05
 class Barrier(NamedTuple):
     """The factor exp(−½ Σ (ln(J / least) / WIDTH)²) over the tetrahedra with J = det(I + ∇u) < least.
 
-    J is the share of its volume that a tetrahedron keeps. The cost is 112 at `QUADRATIC_BELOW` times the least share and
-    continues to grow below it, more steeply than the log likelihood of any pair of images. An inverted tetrahedron,
-    J ≤ 0, has a density of at most e^−237.
+    J is the share of its volume that a tetrahedron keeps. The cost is 112 at `QUADRATIC_BELOW` times the least share.
+    Below that it continues to grow, more steeply than the log likelihood of any pair of images. An inverted
+    tetrahedron, J ≤ 0, has a density of at most e^−237.
 
     Attributes
     ----------
