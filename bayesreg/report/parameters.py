@@ -17,7 +17,8 @@ from bayesreg.tissues import label_of
 
 # A parameter is identified if its central 90 % interval spans less than a factor of ten.
 IDENTIFIED = 10.0
-# A number has only an upper bound if the median is more than this many times the 1 % quantile (density to 0), …
+# A number has only an upper bound if its median is more than this many times the 1 % quantile, so that the density
+# reaches zero (a lower bound: the 99 % quantile is more than this many times the median), …
 REACHES_ZERO = 20.0
 # … and the bound is within this factor of the median.
 BOUND = 5.0

@@ -17,7 +17,7 @@ NAMES = [
 
 
 def notes(study: Study) -> Sentences | None:
-    """List the results of the search for pose and contrast, a sentence each; None without results."""
+    """List the findings on pose and contrast from before the search, a sentence each; None without findings."""
     sentences = part(study.manifest, "appraisal", "notes")
     return Sentences("What was found of the images", list(sentences)) if sentences else None
 
