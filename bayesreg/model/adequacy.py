@@ -1,4 +1,4 @@
-"""How well every observation fits."""
+"""The fit of every observation to the posterior."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from bayesreg.settings import Section
 
 
 def describe_observations(posterior: Posterior, values: Values) -> dict[str, dict[str, Any]]:
-    """How every observation fits at some values.
+    """Describe how well every observation fits at some values.
 
     Returns
     -------
     dict
-        By the name of the observation its "kind", the "title" of that in words, and its "options" where it has some;
-        the "log" of its term; where the term knows its residuals their number, "values", and the root of the mean of
-        their squares in units of their variance, "residual_rms"; and what else the observation says of itself
-        (`describe`).
+        A dict for each observation, by its name. It has the "kind" of the observation, the "title" of the kind, its
+        "options" if it has any, and the "log" of its term. If the term provides its residuals, it has their number,
+        "values", and the root of their mean square in units of their variance, "residual_rms". It also has the entries
+        that the observation's method `describe` returns.
     """
     filled = posterior.fill(values)
     state = state_of(posterior.data.body, posterior.data.blocks, filled)
@@ -37,7 +37,7 @@ def _describe(observation: Any, term: Any, state: State) -> dict[str, Any]:
     found: dict[str, Any] = {"kind": kind, "title": title, "log": float(term.log(state))}
     if isinstance(options := getattr(observation, "options", None), Section):
         found["options"] = options.model_dump(mode="json")
-    # The term of an observation from outside knows its log alone.
+    # An observation from outside the package may provide nothing but its log.
     standardised = next((one for one in (term, observation) if isinstance(one, Standardised)), None)
     if standardised is not None:
         z = np.asarray(standardised.standardised_residual(state))

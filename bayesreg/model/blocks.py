@@ -1,8 +1,8 @@
-"""Blocks of unknowns: what each kind of unknown is called, its prior, and its map to the real line.
+"""Blocks of unknowns: the names of each kind of unknown, its prior, and its map to the real line.
 
-Three sets of coordinates name one state (see `bayesreg.Posterior`). A *value* has all entries of a block, known ones
-included; an *estimand* has the sampled entries alone; a *position* is the estimand mapped to the real line. A block
-says how one becomes another. It is a pytree; what decides on shapes is static.
+A state has three sets of coordinates (see `bayesreg.Posterior`). A *value* has all entries of a block, including the
+known ones. An *estimand* has the sampled entries only. A *position* is the estimand mapped to the real line. A block
+converts one into another. It is a pytree; everything that determines shapes is static.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ ONE = np.ones(())
 
 @runtime_checkable
 class Block(Protocol):
-    """One kind of unknown."""
+    """One kind of unknown, with its prior and its map to the real line."""
 
     @property
     def is_sampled(self) -> bool:
-        """Whether any of its entries is unknown."""
+        """Whether any entry of the block is unknown."""
 
     def draw(self, name: str) -> AnyArray:
-        """Draw the value in a NumPyro program: a sample site of that name, or the known value."""
+        """Draw the value in a NumPyro program: a sample site with this name, or the known value."""
 
     def reference(self) -> AnyArray:
-        """The value at rest, where chains may start."""
+        """Return the value at rest, at which chains may start."""
 
     def complete(self, estimand: AnyArray) -> AnyArray:
-        """The value of an estimand."""
+        """Return the value that belongs to an estimand."""
 
     def estimand(self, value: AnyArray) -> AnyArray:
-        """The sampled entries of a value."""
+        """Return the sampled entries of a value."""
 
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
-        """The estimand of a position, and the logarithm of the Jacobian."""
+        """Return the estimand of a position, and the logarithm of the Jacobian."""
 
     def unconstrain(self, estimand: AnyArray) -> AnyArray:
-        """The position of an estimand."""
+        """Return the position of an estimand."""
 
     def least_curvature(self, position: AnyArray) -> AnyArray:
-        """The curvature of −log density in every coordinate where the data say next to nothing."""
+        """Return the curvature of −log density in every coordinate that the data hardly constrain."""
 
     def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
-        """Whether every sampled entry lies in the range of its prior."""
+        """Check whether every sampled entry lies in the range of its prior."""
 
 
 class _Arrays:
-    """A block whose arrays are all data: it is sampled as a whole, and its position is the value itself.
+    """A block whose arrays are all data. All its entries are sampled, and its position equals its value.
 
     A subclass names its arrays in `arrays`, in the order of its arguments.
     """
@@ -72,46 +72,46 @@ class _Arrays:
 
     @property
     def is_sampled(self) -> bool:
-        """See `Block`."""
+        """Whether any entry is unknown; see `Block`."""
         return True
 
     def complete(self, estimand: AnyArray | float) -> AnyArray:
-        """The estimand itself."""
+        """Return the estimand unchanged: it has all entries."""
         return jnp.asarray(estimand)
 
     def estimand(self, value: AnyArray | float) -> AnyArray:
-        """The value itself."""
+        """Return the value unchanged: all its entries are sampled."""
         return jnp.asarray(value, float)
 
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
-        """The position itself."""
+        """Return the position unchanged, and a log-Jacobian of zero."""
         return position, jnp.zeros(())
 
     def unconstrain(self, estimand: AnyArray | float) -> AnyArray:
-        """The estimand itself."""
+        """Return the estimand unchanged: it equals its position."""
         return jnp.asarray(estimand)
 
     def least_curvature(self, position: AnyArray) -> AnyArray:
-        """One."""
+        """Return one for every coordinate."""
         return jnp.ones_like(position)
 
     def allows(self, value: AnyArray | float) -> Bool[AnyArray, ""]:
-        """Anywhere."""
+        """Accept every value: the range is the whole real line."""
         return jnp.array(True)
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """The arrays of the block."""
+        """Return the arrays of the block, for JAX."""
         return tuple(getattr(self, name) for name in self.arrays), None
 
     @classmethod
     def tree_unflatten(cls, _: None, children: Any) -> Any:
-        """The inverse."""
+        """Build the block from its arrays, for JAX."""
         return cls(*children)
 
 
 @jax.tree_util.register_pytree_node_class
 class Displacement(_Arrays):
-    """Displacements of the sampled nodes, mm, with a flat base measure; walls are a term.
+    """Displacements of the sampled nodes, mm, with a flat base measure. The skull is a separate term.
 
     Parameters
     ----------
@@ -125,17 +125,17 @@ class Displacement(_Arrays):
         self.points = points
 
     def draw(self, name: str) -> AnyArray:
-        """See `Block`."""
+        """Draw the displacements in a NumPyro program; see `Block`."""
         return numpyro.sample(name, dist.ImproperUniform(constraints.real_matrix, (), event_shape=self.points.shape))
 
     def reference(self) -> AnyArray:
-        """No displacement."""
+        """Return displacements of zero."""
         return jnp.zeros(self.points.shape)
 
 
 @jax.tree_util.register_static
 class FreeEntries:
-    """The sampled entries of a block; they are static, for shapes follow from them.
+    """The sampled entries of a block. They are static because shapes depend on them.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ class FreeEntries:
 
 
 class LameParameter(NamedTuple):
-    """λ or μ: prior, known entries, and where they start.
+    """The Lamé parameter λ or μ: its prior, its known entries, and its values at the start.
 
     Attributes
     ----------
@@ -166,8 +166,8 @@ class LameParameter(NamedTuple):
     free : FreeEntries
         The entries that are sampled.
     at_rest : (entries,) array
-        The known value, or the one at which the interior solve is preconditioned and chains may start, and which is
-        the scale of the coordinate where there is no upper bound.
+        The known value, or the value at which the interior solve is preconditioned and chains may start. Without an
+        upper bound, it is also the scale of the coordinate.
     """
 
     alpha: Float[AnyArray, "entries"]
@@ -180,28 +180,28 @@ class LameParameter(NamedTuple):
 
     @property
     def is_sampled(self) -> bool:
-        """See `Block`."""
+        """Whether any entry is unknown; see `Block`."""
         return bool(self.free.is_free.any())
 
     def prior(self) -> dist.Distribution:
-        """p(λ) or p(μ); known entries are no part of the density."""
+        """Return the prior p(λ) or p(μ) of the sampled entries; known entries have no density."""
         beta = ScaledBeta(self.alpha, self.beta, self.low, self.high, self.log_beta)
         return beta.mask(self.free.is_free).to_event(1)
 
     def draw(self, name: str) -> AnyArray:
-        """See `Block`."""
+        """Draw the parameter in a NumPyro program; see `Block`."""
         return numpyro.sample(name, self.prior())
 
     def reference(self) -> AnyArray:
-        """See `at_rest`."""
+        """Return the reference values, `at_rest`."""
         return jnp.asarray(self.at_rest)
 
     def complete(self, estimand: AnyArray) -> AnyArray:
-        """All entries."""
+        """Return all entries, including the known ones."""
         return jnp.asarray(self.at_rest).at[self.free.index].set(estimand)
 
     def estimand(self, value: AnyArray) -> AnyArray:
-        """The sampled entries."""
+        """Return the sampled entries of a value."""
         return jnp.asarray(value, float)[..., self.free.index]
 
     @property
@@ -212,19 +212,20 @@ class LameParameter(NamedTuple):
         return RangeTransform(low, high, scale)
 
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
-        """Normal scores to λ or μ."""
+        """Map Normal scores to λ or μ."""
         to_range = self.transform
         estimand = to_range(position)
         return estimand, to_range.log_abs_det_jacobian(position, estimand).sum()
 
     def unconstrain(self, estimand: AnyArray) -> AnyArray:
-        """λ or μ to Normal scores."""
+        """Map λ or μ to Normal scores."""
         return self.transform.inv(estimand)
 
     def least_curvature(self, position: AnyArray) -> AnyArray:
-        """One, the curvature of a Normal score.
+        """Return one, the curvature of a Normal score, or less for a large score without an upper bound.
 
-        Without an upper bound a score is scale · z²/2 far out, where its logarithm, which knows no scale, has one.
+        Without an upper bound, λ and μ grow as scale · z²/2 for large scores z. The curvature in log λ or log μ does
+        not depend on the scale, and is one.
         """
         to_range = self.transform
         x = to_range(position)
@@ -232,7 +233,7 @@ class LameParameter(NamedTuple):
         return jnp.where(jnp.isinf(to_range.high), jnp.minimum(growth, 1.0) ** 2, 1.0)
 
     def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
-        """Whether the sampled entries lie in [low, high]."""
+        """Check whether the sampled entries lie in [low, high]."""
         return (~self.free.is_free | ((value >= self.low) & (value <= self.high))).all()
 
 
@@ -240,15 +241,15 @@ class _Positive(_Arrays):
     """A positive scalar, whose position is its logarithm."""
 
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
-        """The exponential."""
+        """Return the exponential of a position, and the log-Jacobian."""
         return jnp.exp(position), position
 
     def unconstrain(self, estimand: AnyArray | float) -> AnyArray:
-        """The logarithm."""
+        """Return the logarithm of an estimand."""
         return jnp.log(estimand)
 
     def allows(self, value: AnyArray | float) -> Bool[AnyArray, ""]:
-        """Whether it is positive and finite."""
+        """Check whether the value is positive and finite."""
         return jnp.isfinite(value) & (value > 0)
 
 
@@ -263,7 +264,7 @@ class Scale(_Positive):
     log_sd : scalar, optional
         Standard deviation of the logarithm; None means that the value is known.
     factor : scalar
-        The value is the estimand times this, which is one but on the way to a mode.
+        The value is the estimand times this factor; it is one except in the search for a mode.
     """
 
     arrays = ("median", "log_sd", "factor")
@@ -273,34 +274,34 @@ class Scale(_Positive):
 
     @property
     def is_sampled(self) -> bool:
-        """See `Block`."""
+        """Whether the scale is unknown; see `Block`."""
         return self.log_sd is not None
 
     def draw(self, name: str) -> AnyArray:
-        """See `Block`."""
+        """Draw the scale in a NumPyro program; see `Block`."""
         if not self.is_sampled:
             return self.median
         return numpyro.sample(name, dist.LogNormal(jnp.log(self.median), self.log_sd))
 
     def reference(self) -> AnyArray:
-        """The median."""
+        """Return the median of the prior, or the known value."""
         return jnp.asarray(self.median)
 
     def complete(self, estimand: AnyArray | float) -> AnyArray:
-        """The estimand times the factor."""
+        """Return the estimand multiplied by the factor."""
         return jnp.asarray(estimand) * self.factor
 
     def estimand(self, value: AnyArray | float) -> AnyArray:
-        """The value over the factor."""
+        """Return the value divided by the factor."""
         return jnp.asarray(value, float) / self.factor
 
     def times(self, factor: float) -> Scale:
-        """The scale whose values are those of this one times a factor."""
+        """Return a scale whose values are those of this scale multiplied by a factor."""
         return Scale(factor * self.median, self.log_sd, factor * self.factor)
 
 
 def scale_block(given: float | ScalePrior) -> Scale:
-    """The block of a scale that is known, a number, or inferred, with a prior."""
+    """Make the block of a scale from a number, if it is known, or from a prior, if it is inferred."""
     if isinstance(given, ScalePrior):
         return Scale(jnp.asarray(given.median), jnp.asarray(given.log_sd))
     return Scale(jnp.asarray(given))
@@ -308,7 +309,7 @@ def scale_block(given: float | ScalePrior) -> Scale:
 
 @jax.tree_util.register_pytree_node_class
 class FieldScale(_Positive):
-    """Standard deviation of the field of log-stiffness, with a half-normal prior.
+    """The standard deviation of the field of log-stiffness, with a half-normal prior.
 
     Parameters
     ----------
@@ -322,17 +323,17 @@ class FieldScale(_Positive):
         self.width = width
 
     def draw(self, name: str) -> AnyArray:
-        """See `Block`."""
+        """Draw the standard deviation in a NumPyro program; see `Block`."""
         return numpyro.sample(name, dist.HalfNormal(self.width))
 
     def reference(self) -> AnyArray:
-        """The scale of the prior."""
+        """Return the scale of the prior."""
         return jnp.asarray(self.width)
 
 
 @jax.tree_util.register_pytree_node_class
 class Coefficients(_Arrays):
-    """Independent Normal numbers of mean zero, such as the whitened components of the field of log-stiffness.
+    """Independent Normal coefficients with mean zero, such as the whitened components of the field of log-stiffness.
 
     Parameters
     ----------
@@ -346,13 +347,13 @@ class Coefficients(_Arrays):
         self.sd = sd
 
     def draw(self, name: str) -> AnyArray:
-        """See `Block`."""
+        """Draw the coefficients in a NumPyro program; see `Block`."""
         return numpyro.sample(name, dist.Normal(jnp.zeros_like(self.sd), self.sd).to_event(1))
 
     def reference(self) -> AnyArray:
-        """Zero."""
+        """Return coefficients of zero."""
         return jnp.zeros_like(self.sd)
 
 
-# Blocks by name; what is particular to one kind is asked of it by those who know that it is there.
+# Blocks by name. Only code that expects one kind of block uses the members that are particular to it.
 Blocks = dict[str, Any]

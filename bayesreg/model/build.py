@@ -29,25 +29,25 @@ def build_posterior(
     skull: Image | None = None,
     reference: Mapping[str, AnyArray] | None = None,
 ) -> Posterior:
-    """The posterior of a registration problem.
+    """Build the posterior of a registration problem.
 
     ``build_posterior(mesh, [ImagePair(fixed, moving), Landmarks(p, q, sd=1.0)])``
 
     Parameters
     ----------
     mesh : TetMesh
-        In the space of the fixed image.
+        The mesh of the organ, in the space of the fixed image.
     observations : sequence
         `ImagePair`, `Landmarks`, or any object with a `name` and a function `log(state)` that JAX can trace, the log of
-        its factor of the density. It sees the displacement of every node, `state.u` (n, 3), mm, and of points inside
-        the mesh, `state.at(points)`.
+        its factor of the density. The state has the displacements of every node, `state.u` (n, 3), mm, and of points
+        inside the mesh, `state.at(points)`.
     model : ModelConfig, optional
         The default is the paper's model.
     skull : Image, optional
-        Nonzero = forbidden; off its grid is forbidden too. None: no constraint.
+        Nonzero voxels, and points off its grid, are forbidden. None: no constraint.
     reference : mapping, optional
-        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start, and the scale of the
-        coordinate of a parameter without an upper bound; the nearer to the posterior the faster. Default:
+        "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start. They are also the
+        scales of the coordinates of parameters without an upper bound. Values near the posterior save time. Default:
         `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01 for a fluid.
 
     Returns
@@ -72,7 +72,7 @@ def build_posterior(
 
 
 def require_observations(given: Any) -> list[Any]:
-    """The observations in a list; InputError if there is none, or one is no observation."""
+    """Return the observations as a list; raise InputError if there is none, or one is not an observation."""
     if not isinstance(given, Sequence):
         raise InputError(f"observations must be a list, got {type(given).__name__}; put one observation in a list, too")
     if not len(given):
@@ -85,14 +85,14 @@ def require_observations(given: Any) -> list[Any]:
                 f"an observation needs a name (text) and a function log(state); got {type(one).__name__}: use "
                 "ImagePair, Landmarks, or an object of your own with both"
             )
-        # It names variables in files.
+        # The name becomes part of variable names in files.
         if not name.isidentifier():
             raise InputError(f"an observation is named {name!r}; expected letters, digits and _, such as left_lobe")
     return list(given)
 
 
 def _require_bounded(posterior: Posterior) -> None:
-    """Raise InputError where nothing bounds the rigid motions: landmarks alone, too few of them, and no prior."""
+    """Raise InputError if nothing bounds the rigid motions: too few landmarks, no image, no skull and no prior."""
     bounding = [points_that_bound(one) for one in posterior.observations.values()]
     bounded = not len(posterior.sampled) or {"rigid", "skull"} & set(posterior.data.terms)
     if bounded or any(points is None for points in bounding):
@@ -107,7 +107,7 @@ def _require_bounded(posterior: Posterior) -> None:
 
 
 def _require_numbers(posterior: Posterior) -> None:
-    """Raise InputError where an observation from outside gives no real number, before anything long begins."""
+    """Raise InputError if an observation from outside the package does not give a real number at rest."""
     problem, values = posterior.data, posterior.reference()
     rest = state_of(problem.body, problem.blocks, values)
     for name, term in problem.terms.items():
@@ -128,5 +128,5 @@ def _require_numbers(posterior: Posterior) -> None:
 
 
 def _log_at(term: Outside, state: State, u: AnyArray) -> Any:
-    """The log of the term where the nodes have moved by u, mm."""
+    """Compute the log of a term for nodes that are displaced by u, mm."""
     return term.log(replace(state, equilibrium=state.equilibrium._replace(u=u)))

@@ -1,4 +1,4 @@
-"""A problem prepared for chains near some estimands, where its solves are fast."""
+"""A problem prepared for chains near some estimands, with fast elastic solves."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from bayesreg.model.coordinates import complete
 from bayesreg.model.program import Problem
 from bayesreg.model.state import StaticMesh
 
-# Tolerance of the solves of chains: it leaves an error of some thousandths in the log density, which no acceptance
-# can tell.
+# Tolerance of the solves in chains. It causes an error of some thousandths in the log density, too small to affect
+# acceptance.
 CHAIN_TOLERANCE = 1e-6
 
-# Tolerance of the solves behind their slopes. A slope that is a little off, and the same at the same place, leaves the
-# sampled density as it is: it only proposes.
+# Tolerance of the solves for gradients. A small error of the gradient that is always the same in one state leaves
+# the sampled density unchanged, because the gradient only proposes.
 CHAIN_ADJOINT_TOLERANCE = 1e-3
 
-# Solves are preconditioned at λ and μ within this factor of the posterior's own reference.
+# The solves are preconditioned at λ and μ within this factor of the posterior's own reference.
 NEAR = 1e3
 
 
 def condition(problem: Problem, estimands: Values) -> Problem:
-    """The problem with solves for chains, preconditioned at these λ, μ and field.
+    """Return the problem with fast solves for chains, preconditioned at these λ, μ and field.
 
-    (By a dense inverse, that is; a multigrid hierarchy stays that of the problem's own reference.) Solves end at
-    `CHAIN_TOLERANCE`.
+    The preconditioner is a dense inverse; a multigrid hierarchy remains that of the problem's own reference. Solves
+    stop at the tolerance `CHAIN_TOLERANCE`.
     """
     body, values = problem.body, complete(problem.blocks, estimands)
-    # A tissue that is next to nothing leaves K_II without a factor.
+    # K_II has no factor if a tissue has almost no stiffness.
     reference = {name: np.asarray(problem.blocks[name].reference()) for name in LAME}
     near = {name: np.clip(values[name], x / NEAR, x * NEAR) for name, x in reference.items()}
     lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell({**values, **near}))
@@ -43,7 +43,8 @@ def condition(problem: Problem, estimands: Values) -> Problem:
 
 def _conditioned_system(mesh: StaticMesh, system: ElasticSystem, lam: np.ndarray, mu: np.ndarray) -> ElasticSystem:
     if isinstance(system.preconditioner, Multigrid):
-        # Another reference has aggregates of its own, of other shapes, and everything would be compiled again.
+        # Another reference would have aggregates with other shapes, which would require a new compilation of
+        # everything.
         return system._replace(
             tolerance=jnp.asarray(CHAIN_TOLERANCE), adjoint_tolerance=jnp.asarray(CHAIN_ADJOINT_TOLERANCE)
         )

@@ -1,4 +1,4 @@
-"""The way to a mode: problems of growing difficulty that lead to the posterior's own."""
+"""A sequence of problems of growing difficulty, which leads to the mode of the posterior."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from bayesreg.model.program import Problem
 
 Made = TypeVar("Made")
 
-# Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. Three stages
-# instead of seven left single nodes of the paper's pair in wrong places, up to 15 mm off. A first stage of ten times
-# the T_r folded a few tetrahedra of three in thirteen calibrated pairs, for good, with nodes about 30 mm off.
+# Sd of the smoothing, mm, and factors on T_s and T_r of the problems that lead to the posterior's mode. With three
+# stages instead of seven, single nodes of the paper's pair ended in wrong places, up to 15 mm off. A first stage with
+# ten times the T_r folded a few tetrahedra permanently in three of thirteen calibrated pairs, with nodes about 30 mm
+# off.
 SMOOTHING = (
     (6.0, 30.0, 0.001), (4.0, 30.0, 0.02), (3.0, 20.0, 0.03), (2.0, 10.0, 0.05), (1.5, 5.0, 0.1), (1.0, 3.0, 0.3),
     (0.5, 1.0, 1.0),
@@ -22,11 +23,11 @@ SMOOTHING = (
 
 
 def continuation(problem: Problem, observations: Mapping[str, object]) -> Iterator[Problem]:
-    """Every problem, each to be solved for the displacements alone.
+    """Yield every problem of the sequence; the search solves each for the displacements only.
 
-    Images smoothed by 6 mm and less and less, with a warmer similarity and a colder elastic prior: a displacement of
-    many times its posterior standard deviation is found step by step. The last is the posterior's own. Where no node is
-    sampled there is none, and without images, no easier one.
+    The first problems have images smoothed by up to 6 mm, a higher T_s and a lower T_r. The search can then find
+    displacements of many posterior standard deviations step by step. The last problem is the posterior's own. The
+    sequence is empty if no node is sampled, and has no easier problem if there are no images.
     """
     pairs = {name: pair for name, pair in observations.items() if isinstance(pair, Eased)}
     if not len(problem.body.slots):
@@ -37,7 +38,7 @@ def continuation(problem: Problem, observations: Mapping[str, object]) -> Iterat
 
 
 def _ease(problem: Problem, pairs: Mapping[str, Eased], sd: float, similarity: float, elastic: float) -> Problem:
-    """The problem with all images smoothed, and factors on T_s and T_r, or on the loads."""
+    """Return the problem with all images smoothed, and with factors on T_s and T_r, or on the loads."""
     smooth = {name: pair.eased(problem.terms[name], sd) for name, pair in pairs.items()}
     easing = {**dict.fromkeys(pairs, similarity), "elastic": elastic}
     powers = {term: problem.terms[term].powers for term in easing if term in problem.terms}
@@ -47,7 +48,7 @@ def _ease(problem: Problem, pairs: Mapping[str, Eased], sd: float, similarity: f
 
 
 def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
-    """Yield the result of each maker, and let the next one work in the background meanwhile."""
+    """Yield the result of each maker, while a background thread computes the next one."""
     pool = ThreadPoolExecutor(max_workers=1)
     try:
         coming = pool.submit(makers[0])
@@ -56,5 +57,5 @@ def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
             yield made
         yield coming.result()
     finally:
-        # A caller that stops early does not wait for problems that are still being made.
+        # A caller that stops early must not wait for problems that are still being made.
         pool.shutdown(wait=False, cancel_futures=True)

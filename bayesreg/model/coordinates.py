@@ -14,9 +14,9 @@ from bayesreg.types import AnyArray, Scalar
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """The map between estimands and positions, as the samplers see it (`bayesreg.inference.target.Coordinates`).
+    """The map between estimands and positions for the samplers (`bayesreg.inference.target.Coordinates`).
 
-    The `data` of its functions are a `Problem`, the posterior's own or a similar one.
+    The argument `data` of its functions is a `Problem`: the posterior's own or a similar one.
 
     Attributes
     ----------
@@ -27,40 +27,40 @@ class Coordinates:
     blocks: Blocks
 
     def reference(self) -> dict[str, AnyArray]:
-        """Estimands at rest."""
+        """Return the estimands at rest."""
         return estimands_of(self.blocks, reference_values(self.blocks))
 
     def constrain(self, data: Any, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
-        """Estimands of a position, and the logarithm of the Jacobian."""
+        """Return the estimands of a position, and the logarithm of the Jacobian."""
         return constrain(data.blocks, position)
 
     def unconstrain(self, data: Any, estimands: Values) -> dict[str, AnyArray]:
-        """Position of estimands; the inverse of `constrain`."""
+        """Return the position of estimands; this is the inverse of `constrain`."""
         return unconstrain(data.blocks, estimands)
 
     def least_curvature(self, data: Any, position: Values) -> dict[str, AnyArray]:
-        """Curvature of −log density in every coordinate of which the data say next to nothing."""
+        """Return the curvature of −log density in every coordinate that the data hardly constrain."""
         blocks = sampled_blocks(data.blocks)
         return {name: block.least_curvature(position[name]) for name, block in blocks.items()}
 
 
 def sampled_blocks(blocks: Blocks) -> Blocks:
-    """The blocks that have unknown entries."""
+    """Return the blocks that have unknown entries."""
     return {name: block for name, block in blocks.items() if block.is_sampled}
 
 
 def reference_values(blocks: Blocks) -> dict[str, AnyArray]:
-    """The value of every block at rest."""
+    """Return the value of every block at rest."""
     return {name: block.reference() for name, block in blocks.items()}
 
 
 def fill(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
-    """Values in which blocks without unknowns that were left out are filled in."""
+    """Add the known values of blocks without unknowns that were omitted."""
     return {name: values[name] if name in values else block.reference() for name, block in blocks.items()}
 
 
 def complete(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
-    """The values of estimands: known entries and known blocks are filled in."""
+    """Return the values of estimands, with known entries and known blocks added."""
     return {
         name: block.complete(estimands[name]) if block.is_sampled else block.reference()
         for name, block in blocks.items()
@@ -68,23 +68,23 @@ def complete(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
 
 
 def estimands_of(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
-    """The sampled entries of values."""
+    """Return the sampled entries of values."""
     return {name: block.estimand(values[name]) for name, block in sampled_blocks(blocks).items()}
 
 
 def constrain(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
-    """The estimands of a position, and the logarithm of the Jacobian."""
+    """Return the estimands of a position, and the logarithm of the Jacobian."""
     found = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
     return {name: estimand for name, (estimand, _) in found.items()}, sum(log for _, log in found.values())
 
 
 def unconstrain(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
-    """The position of estimands."""
+    """Return the position of estimands."""
     return {name: block.unconstrain(estimands[name]) for name, block in sampled_blocks(blocks).items()}
 
 
 def is_in_range(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
-    """Whether every value lies in the range of its prior."""
+    """Check whether every value lies in the range of its prior."""
     found = jnp.array(True)
     for name, block in blocks.items():
         found &= block.allows(values[name])

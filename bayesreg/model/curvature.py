@@ -22,23 +22,24 @@ from bayesreg.model.state import Body, State, StaticMesh
 from bayesreg.model.term import Curved, Outside, PointCurvature
 from bayesreg.types import AnyArray, Equilibrium, Matrix
 
-# With more entries of λ or μ, as by element, derivatives in each of them would cost too much.
+# With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
 FEW_ENTRIES = 20
 
-# Random places at which a term from outside shows what it looks at, and the sd of their displacements, mm.
+# Number of random displacements at which the dependence of a term from outside is tested, and the sd of their
+# displacements, mm.
 NEARBY, NEARBY_SD = 3, 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Curvature:
-    """The curvature of minus a log density.
+    """The curvature (Hessian) of minus a log density.
 
     Attributes
     ----------
     gauss_newton : (r, r) array
         Positive semidefinite.
     second_derivatives : callable
-        () → `remainder`, which not everybody needs.
+        () → `remainder`; it is computed only on demand.
     """
 
     gauss_newton: Float[np.ndarray, "rows rows"]
@@ -46,18 +47,18 @@ class Curvature:
 
     @cached_property
     def remainder(self) -> Float[np.ndarray, "rows rows"]:
-        """The rest of the exact curvature, residuals times second derivatives; it is small where the images agree."""
+        """The rest of the exact curvature: residuals times second derivatives. It is small if the images agree."""
         return self.second_derivatives()
 
 
 def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> Curvature:
-    """Curvature of −log p in the field's components z, if any, and the sampled displacements.
+    """Compute the curvature of −log p in the field's components z, if any, and the sampled displacements.
 
-    With u_I = W u_B of eq. (7), W = −K_II⁻¹ K_IB, the elastic energy has the Hessian K_BB + K_BI W, and an observation
-    with the curvature H in all nodes (Gauss and Newton's, such as 2 Jᵀ J of a sum of squares) that of [1; W]ᵀ H [1; W];
-    the remainder is what the exact H has besides. The field multiplies the stiffness of element e by exp(s_e),
-    s = sd · basis · z, so that ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I; z has the prior N(0, I), and E_r, small beside E_s in z
-    and not convex, is left out there, as are the second derivatives of u_I.
+    With u_I = W u_B of eq. (7), W = −K_II⁻¹ K_IB, the elastic energy has the Hessian K_BB + K_BI W. An observation with
+    the curvature H in all nodes has the Hessian [1; W]ᵀ H [1; W]. H is the Gauss–Newton curvature, such as 2 Jᵀ J of a
+    sum of squares; the remainder is the exact curvature minus it. The field multiplies the stiffness of element e by
+    exp(s_e), s = sd · basis · z, so that ∂u_I/∂s_e = −K_II⁻¹ (K_e u)_I. The prior of z is N(0, I). Two parts are
+    omitted in z: E_r, which is small compared with E_s and not convex, and the second derivatives of u_I.
 
     Parameters
     ----------
@@ -85,12 +86,13 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
 
 
 def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float[AnyArray, "nodes 3"]) -> Matrix:
-    """The curvature of all terms but images, barrier and skull, which are quadratic in the displacements, or nearly.
+    """Compute the curvature of all terms that are quadratic, or nearly quadratic, in the displacements.
 
-    The equilibrium follows the sampled nodes as at other values near by. Since it minimises the energy, the first
-    derivatives of the curvature in the values are those of the curvature itself.
+    These are all terms except images, barrier and skull. The equilibrium depends on the sampled nodes as at other
+    values near by. Since the equilibrium minimises the energy, the first derivatives of the result in the values equal
+    those of the exact curvature.
 
-    Its rows are those of `displacement_curvature`.
+    The rows are in the order of `displacement_curvature`.
 
     Parameters
     ----------
@@ -98,7 +100,7 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     values, near : mapping
         Values of all blocks.
     u : (n, 3) array
-        The equilibrium at the latter, mm.
+        The equilibrium at `near`, mm.
     """
     response = _Response.at(problem, near, u)
     K = _stiffness(problem.body, values)
@@ -115,12 +117,12 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
 
 
 def is_nearly_quadratic(term: object) -> bool:
-    """Whether the log of a term is quadratic in the displacements, or nearly: all but images, barrier and skull."""
+    """Check whether the log of a term is nearly quadratic in the displacements: all but images, barrier and skull."""
     return getattr(term, "is_nearly_quadratic", True)
 
 
 def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
-    """K; where there are a few entries of λ and μ, as a sum of fixed matrices."""
+    """Return K, assembled from fixed matrices if λ and μ have few entries."""
     entries = tuple(np.asarray(body.cell_entry).tolist())
     if body.field is not None or max(entries) >= FEW_ENTRIES:
         return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
@@ -134,7 +136,7 @@ def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
 def _stiffness_parts(
     mesh: StaticMesh, entries: tuple[int, ...]
 ) -> tuple[scipy.sparse.csr_matrix, Float[np.ndarray, "entries parameters"]]:
-    """A matrix with the pattern of K, and the entries of K by each λ and μ."""
+    """Return a matrix with the pattern of K, and the derivatives of the entries of K in each λ and μ."""
     owned = [np.equal(entries, entry).astype(float) for entry in range(max(entries) + 1)]
     nothing = np.zeros(len(entries))
     pattern = stiffness(mesh.mesh, np.ones(len(entries)), np.ones(len(entries)))
@@ -142,14 +144,14 @@ def _stiffness_parts(
     parts = [stiffness(mesh.mesh, one, nothing) for one in owned] + [
         stiffness(mesh.mesh, nothing, one) for one in owned
     ]
-    # All have the same pattern, zeros stored.
+    # All parts must have the same pattern, so zeros are stored.
     for part in parts:
         part.sort_indices()
     return pattern, np.stack([part.data for part in parts], axis=1)
 
 
 class _Response(NamedTuple):
-    """How the nodes that are not sampled follow, and the field moves all of these: u_I = W (z, u_B).
+    """The linear response u_I = W (z, u_B) of the nodes that are not sampled to the sampled nodes and the field.
 
     Attributes
     ----------
@@ -157,7 +159,7 @@ class _Response(NamedTuple):
         Unknowns 3 · node + axis.
     W : (free, modes + sampled) array
     schur : (sampled, sampled) matrix
-        The Schur complement of K in the sampled nodes; sparse where no node is free.
+        The Schur complement of K in the sampled nodes; sparse if no node is free.
     """
 
     sampled: Int[np.ndarray, "sampled"]
@@ -167,7 +169,7 @@ class _Response(NamedTuple):
 
     @classmethod
     def at(cls, problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> _Response:
-        """The response at some values and their equilibrium u, mm."""
+        """Compute the response at some values and their equilibrium u, mm."""
         body, u = problem.body, jnp.asarray(u)
         mesh = body.mesh.mesh
         sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.slots)])
@@ -187,12 +189,11 @@ class _Response(NamedTuple):
         return self.W.shape[1] - len(self.sampled)
 
     def reduce(self, nodal: scipy.sparse.csr_matrix, with_field: bool = True) -> Matrix:
-        """The curvature in (z, u_B), or in u_B alone, of one in all nodes; sparse where no node is free."""
+        """Reduce a curvature in all nodes to (z, u_B), or to u_B only; it is sparse if no node is free."""
         W = self.W if with_field else self.W[:, self.modes :]
         if not len(self.free):
             return nodal[self.sampled][:, self.sampled]
         modes = W.shape[1] - len(self.sampled)
-        # Sampled nodes move by themselves, and the others by W.
         cross = nodal[self.sampled][:, self.free] @ W
         found = W.T @ (nodal[self.free][:, self.free] @ W)
         found[modes:] += cross
@@ -201,12 +202,12 @@ class _Response(NamedTuple):
         return (found + found.T) / 2
 
     def place(self, curvature: Matrix) -> Float[np.ndarray, "rows rows"]:
-        """A curvature in u_B as one in (z, u_B)."""
+        """Expand a curvature in u_B to (z, u_B)."""
         return np.pad(_dense(curvature), (self.modes, 0))
 
 
 def _prior_curvature(problem: Problem, energy: Matrix, values: Values) -> Matrix:
-    """The curvature of the elastic and the rigid prior in u_B, where the elastic energy has the Hessian `energy`."""
+    """Compute the curvature of the elastic and rigid priors in u_B; `energy` is the Hessian of the elastic energy."""
     found = scipy.sparse.csr_matrix(energy.shape)
     if "elastic" in problem.terms:
         found = problem.terms["elastic"].curvature(energy, values)
@@ -216,7 +217,7 @@ def _prior_curvature(problem: Problem, energy: Matrix, values: Values) -> Matrix
 
 
 def _outside_curvatures(problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
-    """The sum over the terms from outside of the package, in all nodes."""
+    """Sum the curvatures of all terms from outside the package, in all nodes."""
     lam, mu = problem.body.lame_by_cell(values)
     seen = _Seen(problem, dict(values), lam, mu)
     found = scipy.sparse.csr_matrix((3 * len(u), 3 * len(u)))
@@ -229,13 +230,13 @@ def _dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
 
 
 def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
-    """Curvatures in the places of points as one in all nodes, row 3 · node + axis."""
+    """Sum the curvatures in displacements of points into one in all nodes, with row 3 · node + axis."""
     empty = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
     return sum((_assemble(nodes, part) for part in parts), empty)
 
 
 class _Seen(NamedTuple):
-    """The place at which a term from outside is differentiated (a pytree): a state less its displacements."""
+    """The state, without its displacements, at which a term from outside is differentiated (a pytree)."""
 
     problem: Problem
     values: dict[str, AnyArray]
@@ -244,7 +245,7 @@ class _Seen(NamedTuple):
 
 
 def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
-    """The convex part of the Hessian of −log in all nodes, for a term that knows nothing but its log."""
+    """Compute the convex part of the Hessian of −log in all nodes, for a term that provides only its log."""
     touched = _find_touched(term, seen, u)
     found = scipy.sparse.csr_matrix((u.size, u.size))
     if not len(touched):
@@ -256,7 +257,7 @@ def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]
 
 
 def _find_touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
-    """The unknowns that a term looks at: its slope is not zero there at one of some random places near u."""
+    """Find the unknowns on which a term depends: its gradient is not zero there at some random displacement near u."""
     steps = NEARBY_SD * np.random.default_rng(0).normal(size=(NEARBY, *u.shape))
     slopes = [np.asarray(_slope(term, seen, (u + step).ravel())) for step in steps]
     return np.flatnonzero((np.stack(slopes) != 0).any(axis=0))
@@ -265,7 +266,7 @@ def _find_touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> 
 def _hessian(
     term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"], touched: Int[np.ndarray, "touched"]
 ) -> Float[np.ndarray, "touched touched"]:
-    """The Hessian of −log in some unknowns, a product with a direction for each of them."""
+    """Compute the Hessian of −log in some unknowns by one Hessian-vector product for each of them."""
     found = np.asarray(_products(term, seen, u.ravel(), jnp.asarray(touched)))[:, touched]
     return (found + found.T) / 2
 
@@ -283,7 +284,7 @@ def _products(
 
 @jax.jit
 def _slope(term: Outside, seen: _Seen, flat: Float[AnyArray, "unknowns"]) -> Float[AnyArray, "unknowns"]:
-    """∇(−log) in the displacements of all nodes."""
+    """Compute ∇(−log) in the displacements of all nodes."""
     body = seen.problem.body
 
     def energy(flat: AnyArray) -> AnyArray:
@@ -301,7 +302,7 @@ def _response(
     mu: Float[np.ndarray, "cells"],
     load: Float[np.ndarray, "free loads"],
 ) -> tuple[Float[np.ndarray, "free columns"], Matrix]:
-    """−K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W, sparse where no node is free."""
+    """Compute −K_II⁻¹ [load, K_IB], and the Schur complement K_BB + K_BI W (sparse if no node is free)."""
     K = stiffness(mesh, lam, mu)
     coupling = K[free][:, sampled]
     W = np.hstack([load, coupling.toarray()])
@@ -316,13 +317,13 @@ def _response(
 def _kept_response(
     mesh: TetMesh, sampled: tuple[int, ...], free: tuple[int, ...], lam: tuple[float, ...], mu: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "free sampled"], Matrix]:
-    """`_response` without loads, kept for the stages of a search, which share λ and μ."""
+    """Compute `_response` without loads, and cache it for the stages of a search, which share λ and μ."""
     rows, others = np.array(sampled, int), np.array(free, int)
     return _response(mesh, rows, others, np.array(lam), np.array(mu), np.zeros((len(others), 0)))
 
 
 def _element_forces(body: Body, lam: AnyArray, mu: AnyArray, u: AnyArray) -> scipy.sparse.csr_matrix:
-    """Column e: the nodal forces K_e u of element e alone."""
+    """Compute the nodal forces K_e u of each element e; column e belongs to element e."""
     elements = body.system.elements
     corners = jnp.moveaxis(jnp.asarray(u)[elements.cells], -1, 0)
     forces = jnp.einsum("aibjm,jbm->aim", element_stiffness(elements, jnp.asarray(lam), jnp.asarray(mu)), corners)
@@ -333,7 +334,7 @@ def _element_forces(body: Body, lam: AnyArray, mu: AnyArray, u: AnyArray) -> sci
 
 
 def _assemble(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
-    """Σ_q C_q N_a N_b, and g gᵀ of groups: a curvature in the places of points as one in all nodes."""
+    """Sum Σ_q C_q N_a N_b, and g gᵀ of groups: convert a curvature in displacements of points to one in all nodes."""
     curvature = np.asarray(points.matrices)
     count = len(curvature)
     if not count:

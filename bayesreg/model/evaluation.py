@@ -1,4 +1,4 @@
-"""The program evaluated: its log density, its terms, and what is found on the way."""
+"""Evaluation of the NumPyro program: its log density, its terms, and intermediate results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Evaluation(NamedTuple):
-    """The log density at one place, and what was found on the way.
+    """The log density of one state, with intermediate results of its computation.
 
     Attributes
     ----------
@@ -44,11 +44,11 @@ class Evaluation(NamedTuple):
 def evaluate(
     problem: Problem, values: dict[str, AnyArray], guess: Float[AnyArray, "nodes 3"] | None = None
 ) -> Evaluation:
-    """The density of values and what was found on the way; a guess of u saves iterations and costs the derivative."""
+    """Evaluate the log density at some values; a `guess` of u saves iterations but removes the derivative."""
     total, trace = log_density(registration, (problem, guess), {}, values)
     names = ("u", "strain_energy", "solver_iterations", "solver_failed", "outside_support")
     found = {name: trace[name]["value"] for name in names}
-    # Any NaN is a failure too: −∞, never NaN, so that no sampler can move there.
+    # Any NaN counts as a failure and becomes −∞, so that no sampler can move there.
     return Evaluation(
         logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), similarity_energy=_similarity_energy(trace), **found
     )
@@ -56,7 +56,7 @@ def evaluate(
 
 @jax.jit
 def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
-    """Every factor of the density by name, and the energies behind them."""
+    """Return every factor of the density by name, and the energies."""
     _, trace = log_density(registration, (problem,), {}, values)
     found = {"similarity_energy": _similarity_energy(trace), "strain_energy": trace["strain_energy"]["value"]}
     for name in (*problem.terms, "support", "solved"):

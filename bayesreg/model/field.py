@@ -1,14 +1,14 @@
 """A Gaussian Markov random field of log-stiffness on the graph of the elements that share a face.
 
-The field s multiplies λ and μ of an element alike, by e^s: it makes tissue stiffer or softer and leaves ν alone. It has
+The field s multiplies λ and μ of an element by e^s: it makes tissue stiffer or softer and leaves ν unchanged. It has
 the Matérn covariance of smoothness ½ in space, sd² exp(−κr), through the stochastic equation of Lindgren, Rue and
-Lindström (2011), (κ² − Δ) s = white noise, in finite volumes: with the elements' volumes V and the weights
-w_ef = area of the common face / distance of the centroids in the graph's Laplacian G, the precision is
+Lindström (2011), (κ² − Δ) s = white noise, in finite volumes. With the elements' volumes V and the weights w_ef = area
+of the common face / distance of the centroids in the graph's Laplacian G, the precision is
 
 Q = (κ²V + G) V⁻¹ (κ²V + G) / (8πκ sd²).
 
-The weights make it the same field on every mesh; a plain graph Laplacian would tie small elements as fast as large
-ones. At the surface, where the equation's flux is zero, the variance rises towards its double.
+The weights make the field the same on every mesh; a plain graph Laplacian would couple small elements as strongly as
+large ones. At the surface the flux of the equation is zero, and the variance rises to almost twice its value inside.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from bayesreg.mesh import TetMesh
 from bayesreg.settings import Positive, Section
 from bayesreg.types import AnyArray, InputError, Scalar
 
-# Beyond this many elements the dense covariance (8 bytes × their square, a few times over) outgrows memory.
+# With more elements than this, the dense covariance (8 bytes × their square, several times) exceeds the memory.
 DENSE_LIMIT = 8000
 
 
 class FieldConfig(Section):
-    """Prior of the field of log-stiffness of `elasticity: field`; see `bayesreg.model.field`.
+    """Prior of the field of log-stiffness for `elasticity: field`; see `bayesreg.model.field`.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class FieldConfig(Section):
     sd : float
         Scale of the half-normal prior of the field's standard deviation, which is inferred; 0.5 is a factor of e^0.5.
     modes : int
-        Most principal components of the field that are sampled.
+        The greatest number of sampled principal components of the field.
     """
 
     correlation: Positive = 20.0
@@ -67,10 +67,10 @@ class StiffnessField(NamedTuple):
 
 
 def stiffness_field(mesh: TetMesh, options: FieldConfig) -> StiffnessField:
-    """The field on a mesh, conditioned on a mean of zero in every tissue.
+    """Make the field on a mesh, conditioned on a mean of zero in every tissue.
 
-    So λ and μ of a tissue are its geometric mean stiffness, and the field is what differs inside it: without the
-    condition, a shift of the field and one of the tissue's μ would be told apart by the prior alone.
+    Then λ and μ of a tissue are its geometric mean stiffness, and the field describes the variation inside it. Without
+    this condition, only the prior would distinguish a shift of the field from a change of the tissue's μ.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def stiffness_field(mesh: TetMesh, options: FieldConfig) -> StiffnessField:
             "give a longer mesh.edge_length"
         )
     covariance = _condition(scipy.linalg.inv(precision(mesh, options.correlation).toarray()), _tissue_means(mesh))
-    # The best k components in the mean square over the volume.
+    # The k components with the largest mean square over the volume.
     root = np.sqrt(mesh.volumes)
     weighted = root[:, None] * covariance * root
     modes = min(options.modes, count - len(np.unique(mesh.tissue)))
@@ -95,7 +95,7 @@ def stiffness_field(mesh: TetMesh, options: FieldConfig) -> StiffnessField:
 
 
 def precision(mesh: TetMesh, correlation: float) -> scipy.sparse.csr_matrix:
-    """Q of the field with sd = 1 inside, before it is conditioned; sparse: an element, its neighbours, and theirs.
+    """Compute Q of the field with sd = 1 inside, before conditioning; sparse: an element, its neighbours, and theirs.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def precision(mesh: TetMesh, correlation: float) -> scipy.sparse.csr_matrix:
 
 
 def face_laplacian(mesh: TetMesh) -> scipy.sparse.csr_matrix:
-    """G: sᵀGs = Σ over pairs of elements that share a face of w_ef (s_e − s_f)² ≈ ∫|∇s|², in mm."""
+    """Compute G: sᵀGs = Σ w_ef (s_e − s_f)² over pairs of elements that share a face ≈ ∫|∇s|², in mm."""
     one, other = mesh.neighbours.T
     corners = mesh.cells[one]
     shared = (corners[:, :, None] == mesh.cells[other][:, None, :]).any(axis=2)
@@ -124,7 +124,7 @@ def face_laplacian(mesh: TetMesh) -> scipy.sparse.csr_matrix:
 
 
 def _tissue_means(mesh: TetMesh) -> Float[np.ndarray, "tissues cells"]:
-    """Rows that take the mean over the volume of each tissue that the mesh has."""
+    """Return rows that take the mean over the volume of each tissue that occurs in the mesh."""
     rows = [(mesh.tissue == tissue) * mesh.volumes for tissue in np.unique(mesh.tissue)]
     return np.array([row / row.sum() for row in rows])
 
@@ -132,6 +132,6 @@ def _tissue_means(mesh: TetMesh) -> Float[np.ndarray, "tissues cells"]:
 def _condition(
     covariance: Float[np.ndarray, "cells cells"], C: Float[np.ndarray, "tissues cells"]
 ) -> Float[np.ndarray, "cells cells"]:
-    """Covariance given C s = 0."""
+    """Compute the covariance given C s = 0."""
     cross = covariance @ C.T
     return covariance - cross @ np.linalg.solve(C @ cross, cross.T)

@@ -1,4 +1,4 @@
-"""The search for a mode, as the samplers see it: easier problems on the way, and the curvature."""
+"""The interface of the search for a mode: easier problems, and the curvature."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from bayesreg.types import AnyArray
 
 @dataclass(frozen=True, eq=False)
 class ModeSearch:
-    """The posterior as the search for a mode sees it (`bayesreg.inference.target.ModeSearch`).
+    """The posterior as the search for a mode uses it (`bayesreg.inference.target.ModeSearch`).
 
     Attributes
     ----------
@@ -35,9 +35,9 @@ class ModeSearch:
     observations : mapping
         By name.
     approached : mapping or None
-        Estimands near the mode, that a search has led to already.
+        Estimands near the mode, found by an earlier search.
     tempering : callable or None
-        From estimands near the mode to the posterior that is tempered by its residuals there; None where it is.
+        Maps estimands near the mode to the posterior tempered by its residuals there; None if it is tempered already.
     """
 
     data: Problem
@@ -47,9 +47,9 @@ class ModeSearch:
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
-        """The scales of the elastic prior and of observations, such as T_r and the sd of landmarks, and λ and μ.
+        """The names of the scales of the elastic prior and of observations (T_r, the sd of landmarks), and λ and μ.
 
-        The latter where the elastic prior is normalised and they are not too many.
+        λ and μ are included if the elastic prior is normalised and they have few entries.
         """
         names = [name for term in self.data.terms.values() for name in getattr(term, "hyperparameters", ())]
         elastic = self.data.terms.get("elastic")
@@ -58,32 +58,33 @@ class ModeSearch:
         return tuple(name for name in names if name in self.data.blocks and self.data.blocks[name].is_sampled)
 
     def continuation(self) -> Iterator[Problem]:
-        """Problems of growing difficulty, in the displacements alone, that lead to this one; none once approached."""
+        """Yield problems of growing difficulty that lead to this one, in the displacements; none after an approach."""
         if self.approached is not None:
             return iter(())
         return continuation(self.data, self.observations)
 
     def curvature(self, data: Problem, estimands: Values) -> Curvature:
-        """Curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".
+        """Compute the curvature of −log p(u, λ, μ | m) in "field", if there is one, and "u_boundary".
 
         Returns
         -------
         Curvature
-            First the k components of the field, then row k + 3 · node + axis, 1/mm². The elastic energy counts by its
-            curvature in the displacements alone.
+            First the k components of the field, then row k + 3 · node + axis, 1/mm². The elastic energy contributes
+            only its curvature in the displacements.
         """
         values = complete(data.blocks, estimands)
         return displacement_curvature(data, values, _equilibrium(data, values))
 
     def quadratic_part(self, data: Problem) -> Problem:
-        """The problem without images, barrier and skull: what is left is quadratic in the displacements, or nearly."""
+        """Return the problem without images, barrier and skull; it is nearly quadratic in the displacements."""
         others = [name for name, term in data.terms.items() if not is_nearly_quadratic(term)]
         return reduce(Problem.without_term, others, data)
 
     def quadratic_curvature(self, data: Problem, estimands: Values, near: Values) -> Any:
-        """The part of `curvature` that belongs to `quadratic_part`.
+        """Compute the part of `curvature` that belongs to `quadratic_part`.
 
-        The equilibrium follows the sampled nodes as at the estimands `near`. Sparse where every node is sampled.
+        The equilibrium depends on the sampled nodes as at the estimands `near`. The result is sparse if every node is
+        sampled.
         """
         values, others = (complete(data.blocks, one) for one in (estimands, near))
         return quadratic_curvature(data, values, others, _equilibrium(data, others))

@@ -1,4 +1,4 @@
-"""The normaliser of the elastic prior, as the samplers see it."""
+"""The normaliser of the elastic prior, as the samplers use it."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from bayesreg.model.program import Problem
 from bayesreg.model.state import physical_lame_by_cell
 from bayesreg.types import AnyArray, Scalar
 
-# A modulus that underflows counts as this.
+# A modulus that underflows is replaced by this value.
 SMALLEST = 1e-30
 
 
 @dataclass(frozen=True)
 class Normaliser:
-    """What the elastic prior's normaliser has of λ and μ (`bayesreg.inference.target.Normaliser`).
+    """The normaliser of the elastic prior as a function of λ and μ (`bayesreg.inference.target.Normaliser`).
 
-    ½ log pdet S(λ, μ) − r/2 log(2π T_r) of the Boltzmann prior, and log pdet K(λ, μ) of random loads.
+    It is ½ log pdet S(λ, μ) − r/2 log(2π T_r) for the Boltzmann prior, and log pdet K(λ, μ) for random loads.
 
     Attributes
     ----------
     is_costly : bool
-        Whether it costs much more than the rest of the density.
+        Whether the normaliser costs much more than the rest of the density.
     """
 
     is_costly: bool
 
     @property
     def depends_on(self) -> tuple[str, ...]:
-        """λ and μ, the field that multiplies them, and T_r."""
+        """The names of the blocks on which it depends: λ and μ, the field that multiplies them, and T_r."""
         return (*LAME, "field", "field_sd", "t_elastic")
 
     def smooth_coordinates(self, data: Problem, estimands: Values) -> Float[AnyArray, "coordinates"]:
-        """log(λ + 2μ) for every free λ and log μ for every free μ; the field and the logarithms of scales.
+        """Return log(λ + 2μ) of every free λ, log μ of every free μ, the field, and the logarithms of scales.
 
-        K is a sum of the moduli of longitudinal and of shear waves, and goes on smoothly to λ = 0.
+        K is a sum of the moduli of longitudinal and shear waves, and is a smooth function of these at λ = 0.
         """
         blocks = data.blocks
         values = complete(blocks, estimands)
@@ -54,11 +54,11 @@ class Normaliser:
         return jnp.concatenate(found)
 
     def log(self, data: Problem, estimands: Values) -> Scalar:
-        """The logarithm of this factor; zero in data from which it was left out."""
+        """Return the logarithm of this factor; zero for data without it."""
         return _log_normaliser(data, complete(data.blocks, estimands))
 
     def without(self, data: Problem) -> Problem:
-        """The data of the same problem without it, and without its cost."""
+        """Return the data of the same problem without the normaliser and its cost."""
         return data.with_term("elastic", data.terms["elastic"]._replace(determinant=None))
 
 

@@ -15,7 +15,7 @@ from bayesreg.model.field import FieldConfig
 from bayesreg.settings import NotNegative, Positive, Section, by_kind, is_inferred, wrong
 from bayesreg.tissues import tissue_of_unit_mu
 
-# Names of blocks and of the other sites of the program, which no observation may have.
+# Names of blocks and other sites of the program. No observation may use them.
 TAKEN = (
     "u_boundary", "lam", "mu", "t_elastic", "body_load", "surface_load", "field", "field_sd", "elastic", "rigid",
     "skull", "barrier", "support", "solved", "u", "strain_energy", "similarity_energy", "solver_iterations",
@@ -53,7 +53,7 @@ class PriorConfig(Section):
         return self
 
 
-# Options by the name of a preset; what else is given replaces them.
+# The options of each preset by its name. Options that the user gives replace them.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     "registration": {
@@ -65,23 +65,23 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def _require_tagged(value: object) -> object:
-    """The prior with its kind: that of the paper where none is given."""
+    """Return the prior with its kind; without a given kind, it is the paper's."""
     value = by_kind(value)
     return {"kind": "boltzmann", **value} if isinstance(value, Mapping) else value
 
 
 class ModelConfig(Section):
-    """The posterior to sample, but for what belongs to an observation; the defaults are the paper's.
+    """The options of the posterior, except those of an observation; the defaults are the paper's.
 
     Attributes
     ----------
     preset : {"paper", "registration"}
-        What is not given, here and in observations: as in the paper, or as suits data that no model made.
+        Defaults of options, here and in observations: those of the paper, or those that suit real data.
     elasticity : {"tissue", "uniform", "element", "field"}
         One pair (λ, μ) for each tissue, one for all, one for each tetrahedron; or one for each tissue, times the
         exponential of a smooth random field over its tetrahedra.
     field : FieldConfig, optional
-        Prior of that field; for "field" alone.
+        Prior of that field; only for "field".
     fixed : mapping, optional
         Parameters that are known: ``{"mu": {"liver": 1.0}}`` by tissue name (by element it fixes every
         element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of one tissue
@@ -94,11 +94,11 @@ class ModelConfig(Section):
         random loads, K u = q in place of eq. (7), of all nodes, which depends much less on the mesh.
     skull_width : float
         Depth inside the skull, in voxels of its mask, that counts as one standard deviation: masks are no better known
-        than half a voxel. 0: no sampled node lies in the skull, as in the paper; for the sampler rwmh alone, since no
-        gradient tells of such a wall.
+        than half a voxel. 0: no sampled node lies in the skull, as in the paper; only for the sampler rwmh, since a
+        gradient does not show a hard constraint.
     least_volume : float
-        0: tetrahedra may be inverted. Else a barrier, which begins where a tetrahedron is left with less than this
-        share of its volume (`bayesreg.model.elastic.barrier`). Like the skull it has no part in the normaliser.
+        0: tetrahedra may be inverted. Otherwise a barrier acts on every tetrahedron that keeps less than this
+        share of its volume (`bayesreg.model.elastic.barrier`). Like the skull, it is not part of the normaliser.
     rigid_sd : float, optional
         Standard deviation, mm, of the root-mean-square displacement of each of the six rigid motions of
         the sampled nodes under a Gaussian prior; None is flat.
@@ -147,14 +147,16 @@ class ModelConfig(Section):
                 "sampled nodes with their strain, and the normaliser knows the elastic prior alone",
             )
         if elastic.normalised or elastic.samples_no_node:
-            # Where the options name no tissue, the mesh has one at least, which is free or known as `known` says.
+            # If the options name no tissue, the mesh still has at least one. It is free or known by the rule of
+            # `known`.
             self.require_proper_priors(self._named_tissues or ("the tissue",))
         return self
 
     def require_proper_priors(self, tissues: Sequence[str]) -> None:
-        """Refuse flat priors on [low, ∞) of free parameters where the density is normalised, or u_B given.
+        """Refuse flat priors on [low, ∞) of free parameters if the density is normalised or u_B is given.
 
-        With them the images tell ratios alone, and have a limit where one goes to infinity.
+        With flat priors, the images determine only ratios, and the density does not decrease to zero if a parameter
+        goes to infinity.
 
         Raises
         ------
@@ -174,7 +176,7 @@ class ModelConfig(Section):
                 )
 
     def known(self, tissues: Sequence[str]) -> Mapping[Lame, Any]:
-        """`fixed`, or its default for these tissues."""
+        """Return `fixed`, or its default for these tissues."""
         if self.fixed is not None:
             return self.fixed
         return {"mu": 1.0 if self.elasticity == "uniform" else {tissue_of_unit_mu(tissues): 1.0}}
@@ -186,12 +188,12 @@ class ModelConfig(Section):
 
 
 def is_taken(name: str) -> bool:
-    """Whether no observation may have this name, nor bring an unknown of this name."""
+    """Check whether a name is reserved: no observation, and no unknown that it brings, may use it."""
     return name in TAKEN or name.startswith("prior_")
 
 
 def of_tissue(model: ModelConfig, given: Any, tissue: str) -> Any:
-    """The option of one tissue, given for all or in a mapping by tissue; None where it is not given."""
+    """Return the option of one tissue, from one value for all or a mapping by tissue; None if it is not given."""
     if not isinstance(given, Mapping):
         return given
     return next(iter(given.values()), None) if model.elasticity == "uniform" else given.get(tissue)

@@ -1,4 +1,4 @@
-"""The posterior of displacements and Lamé parameters, to evaluate and to sample."""
+"""The posterior of displacements and Lamé parameters, for evaluation and sampling."""
 
 from __future__ import annotations
 
@@ -28,42 +28,42 @@ from bayesreg.model.program import Problem
 from bayesreg.model.variables import Variables
 from bayesreg.types import AnyArray, InputError, Scalar
 
-# Up to this many nodes the elastic prior's normaliser may stand in every step of a trajectory.
+# With at most this many nodes, every step of a trajectory can evaluate the elastic prior's normaliser.
 CHEAP_NODES = 200
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """p(u_B, λ, μ | observations) of eq. (9), unnormalised. Make one with `build_posterior`.
+    """The unnormalised posterior p(u_B, λ, μ | observations) of eq. (9); `build_posterior` makes it.
 
-    Three sets of coordinates name the same state:
+    A state has three sets of coordinates:
 
-    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries, "t_similarity", "t_elastic"}``, known
-      entries included, and where the elasticity has a field its "field_sd" and whitened components "field" (k,);
-    - *estimands*: the sampled entries of these only;
+    - *values*: ``{"u_boundary": (b, 3), "lam": all entries, "mu": all entries, "t_similarity", "t_elastic"}``, with
+      known entries, and for a field of stiffness its "field_sd" and whitened components "field" (k,);
+    - *estimands*: only the sampled entries of the values;
     - *position*: estimands mapped to the real line: λ and μ as Normal scores (`RangeTransform`), temperatures and the
       field's sd by their logarithm.
 
     Attributes
     ----------
     data : Problem
-        All arrays; an argument of every jitted function, so that none is baked into compiled code.
+        All arrays. It is an argument of every jitted function, so that no array becomes a constant of compiled code.
     mesh : TetMesh
     options : ModelConfig
     sampled : (b,) int array
         The nodes whose displacements are sampled, sorted.
     observations : mapping
-        The observations by name, prepared for this mesh.
+        The observations, prepared for this mesh, by name.
     approached : mapping, optional
-        Estimands near the mode, where a search for it begins.
+        Estimands near the mode, at which a search for it begins.
     tempered : bool
-        False where residuals have yet to tell how many quadrature points are independent (`independent_points:
-        residual`): all count until then.
+        False if residuals must still determine how many quadrature points are independent (`independent_points:
+        residual`); until then, all points count.
 
     Notes
     -----
-    Two are equal if they differ in the values of their arrays alone: what is compiled for one pair of images then
-    serves all others on the mesh.
+    Two posteriors are equal if they differ only in the values of their arrays: code compiled for one pair of images
+    then serves all other pairs on the mesh.
     """
 
     data: Problem
@@ -77,7 +77,7 @@ class Posterior:
     # For a user
 
     def logdensity_constrained(self, values: Values) -> Scalar:
-        """log p(u, λ, μ | m) of section 3.1 up to a constant; differentiable.
+        """Return log p(u, λ, μ | m) of section 3.1 up to a constant; it is differentiable.
 
         Parameters
         ----------
@@ -92,16 +92,16 @@ class Posterior:
         return self.evaluate(values).logdensity
 
     def evaluate(self, values: Values) -> Evaluation:
-        """`logdensity_constrained` with the energies, the full displacement and the state of the solve."""
+        """Return the log density with the energies, the full displacement and the state of the solve."""
         return evaluation.evaluate(self.data, self.fill(values))
 
     def logdensity(self, position: Values) -> Scalar:
-        """Log density of the unconstrained position, the Jacobian of `constrain` included."""
+        """Return the log density of the unconstrained position, including the Jacobian of `constrain`."""
         estimands, log_jacobian = self.coordinates.constrain(self.data, position)
         return self.evaluate_estimands(self.data, estimands).logdensity + log_jacobian
 
     def energies(self, values: Values) -> dict[str, Scalar]:
-        """Every factor of the density by name, and the energies behind them.
+        """Return every factor of the density by name, and the energies.
 
         Returns
         -------
@@ -113,26 +113,26 @@ class Posterior:
         return evaluation.terms(self.data, self.fill(values))
 
     def constrain(self, position: Values) -> dict[str, AnyArray]:
-        """Values (known entries included) of an unconstrained position."""
+        """Return the values (known entries included) of an unconstrained position."""
         return coordinates.complete(self.data.blocks, self.coordinates.constrain(self.data, position)[0])
 
     def unconstrain(self, values: Values) -> dict[str, AnyArray]:
-        """Unconstrained position of values; the inverse of `constrain`."""
+        """Return the unconstrained position of values; this is the inverse of `constrain`."""
         return self.coordinates.unconstrain(self.data, self.estimands(values))
 
     def estimands(self, values: Values) -> dict[str, AnyArray]:
-        """The sampled entries of values."""
+        """Return the sampled entries of values."""
         return coordinates.estimands_of(self.data.blocks, self.fill(values))
 
     def reference(self) -> dict[str, AnyArray]:
-        """Values at rest: no displacement, λ, μ at their known or reference values, temperatures at their medians.
+        """Return the values at rest: displacements of zero, known or reference λ and μ, temperatures at their medians.
 
-        The field is zero, its sd the scale of its prior.
+        The field is zero, and its sd is the scale of its prior.
         """
         return coordinates.reference_values(self.data.blocks)
 
     def initial(self, key: AnyArray) -> dict[str, AnyArray]:
-        """A random position near `reference`: displacements of 0.01 mm, the other coordinates within 0.1."""
+        """Draw a random position near `reference`: displacements with sd 0.01 mm, other coordinates with sd 0.1."""
         position = self.unconstrain(self.reference())
         keys = jax.random.split(key, len(position))
         return {
@@ -141,7 +141,7 @@ class Posterior:
         }
 
     def fill(self, values: Values) -> dict[str, AnyArray]:
-        """Values in which known temperatures that were left out are filled in.
+        """Add known temperatures that were omitted from values.
 
         Raises
         ------
@@ -159,9 +159,10 @@ class Posterior:
         return coordinates.fill(blocks, values)
 
     def count_independent_points(self, values: Values) -> dict[str, float]:
-        """How many quadrature points of each pair of images are independent, by its residuals at these values.
+        """Count the independent quadrature points of each pair of images, from its residuals at these values.
 
-        They are those of the rule "voxels"; see `bayesreg.model.observations.images.independence.independent_scores`.
+        The counted points are those of the rule "voxels"; see
+        `bayesreg.model.observations.images.independence.independent_scores`.
         """
         filled = self.fill(values)
         u = self.evaluate(filled).u
@@ -171,7 +172,7 @@ class Posterior:
         }
 
     def with_independent_points(self, counts: Mapping[str, float]) -> Posterior:
-        """The posterior with the likelihood of pairs of images tempered as for so many independent points."""
+        """Return the posterior with each pair of images tempered to its count of independent points."""
         data = self.data
         for name, count in counts.items():
             data = data.with_term(name, data.terms[name].with_independent_points(count))
@@ -179,7 +180,7 @@ class Posterior:
 
     @property
     def independent_points(self) -> dict[str, float]:
-        """How many quadrature points of each pair of images the likelihood counts as independent."""
+        """The number of independent quadrature points that the likelihood assumes, by name of the pair of images."""
         names = [name for name, one in self.observations.items() if isinstance(one, Correlated)]
         return {name: float(self.data.terms[name].independent_points) for name in names}
 
@@ -209,18 +210,19 @@ class Posterior:
     def evaluate_estimands(
         self, data: Problem, estimands: Values, guess: Float[AnyArray, "nodes 3"] | None = None
     ) -> Evaluation:
-        """`evaluate` as a pure function of the data.
+        """Evaluate the density as a pure function of the data; see `evaluate`.
 
-        With a `guess`, the displacement of every node at a place near by, it is faster and has no gradient.
+        A `guess` is the displacement of every node in a state near by. It makes the evaluation faster and removes
+        the gradient.
         """
         return evaluation.evaluate(data, coordinates.complete(data.blocks, estimands), guess)
 
     def supports(self, data: Problem, estimands: Values) -> Bool[AnyArray, ""]:
-        """Whether estimands lie where the density may be positive; costs no elastic solve."""
+        """Check whether the density may be positive at some estimands; this costs no elastic solve."""
         return program.is_allowed(data, coordinates.complete(data.blocks, estimands))
 
     def condition(self, estimands: Values) -> Problem:
-        """The data for chains near these estimands, see `bayesreg.model.conditioning`."""
+        """Return the data for chains near these estimands; see `bayesreg.model.conditioning`."""
         return condition(self.data, estimands)
 
     @cached_property
@@ -230,30 +232,30 @@ class Posterior:
 
     @cached_property
     def variables(self) -> Variables:
-        """How draws are shown to a reader."""
+        """The names, dimensions and labels with which draws are shown to a reader."""
         by_elasticity = {"uniform": ("all",), "element": tuple(f"element {i}" for i in range(len(self.mesh.cells)))}
         names = by_elasticity.get(self.options.elasticity, self.mesh.names)
         return Variables(self.data.blocks, self.mesh, self.sampled, names)
 
     @property
     def hard_wall(self) -> Callable[[Any, AnyArray], AnyArray] | None:
-        """Which sampled nodes lie in a hard skull, if there is one."""
+        """The function that marks the sampled nodes in a hard skull; None if there is no hard skull."""
         return mark_behind_skull if isinstance(self.data.terms.get("skull"), Skull) else None
 
     @property
     def normaliser(self) -> Normaliser | None:
-        """The elastic prior's, where it is part of the density."""
+        """The normaliser of the elastic prior; None if it is not part of the density."""
         if not self.options.elastic_prior.normalised or "elastic" not in self.data.terms:
             return None
         return Normaliser(is_costly=len(self.mesh.points) > CHEAP_NODES)
 
     @property
     def mode_search(self) -> ModeSearch:
-        """The posterior as the search for a mode sees it."""
+        """The posterior as the search for a mode uses it."""
         tempering = None if self.tempered else self._temper
         return ModeSearch(self.data, self.observations, self.approached, tempering)
 
     def _temper(self, estimands: Values) -> Posterior:
-        """The posterior tempered by its residuals at these estimands, where a search may go on."""
+        """Return the posterior tempered by its residuals at these estimands, from which a search may continue."""
         counts = self.count_independent_points(coordinates.complete(self.data.blocks, estimands))
         return replace(self.with_independent_points(counts), approached=dict(estimands))

@@ -16,7 +16,7 @@ from bayesreg.types import AnyArray
 
 
 class _Range(constraints.Constraint):
-    """low ≤ x ≤ high, entry by entry; high may be infinite."""
+    """The constraint low ≤ x ≤ high of every entry; high may be infinite."""
 
     def __init__(self, low: AnyArray, high: AnyArray) -> None:
         self.low, self.high = low, high
@@ -32,11 +32,11 @@ class _Range(constraints.Constraint):
 
 
 class RangeTransform(Transform):
-    """The real line to [low, high]: what is Normal there is uniform here, or exponential where high is infinite.
+    """Map the real line to [low, high]: Normal numbers become uniform, or exponential if high is infinite.
 
-    With Φ the distribution function of N(0, 1): low + (high − low) Φ(z), or low − scale · log Φ(−z). A density that is
-    flat at a bound falls off towards it as a Normal one then; under a logarithm or a logit as e^−|z|, with excursions
-    that no Gaussian reference follows.
+    With Φ the distribution function of N(0, 1), the map is low + (high − low) Φ(z), or low − scale · log Φ(−z). A
+    density that is flat at a bound then has the tail of a Normal density. Under a logarithm or a logit it would
+    decrease as e^−|z|, and chains would make long excursions that no Gaussian reference follows.
 
     Parameters
     ----------
@@ -51,12 +51,12 @@ class RangeTransform(Transform):
 
     @property
     def domain(self):  # type: ignore[no-untyped-def]
-        """The real line."""
+        """The domain, the real line."""
         return constraints.real
 
     @property
     def codomain(self):  # type: ignore[no-untyped-def]
-        """The interval."""
+        """The interval [low, high]."""
         return _Range(self.low, self.high)
 
     @property
@@ -65,7 +65,7 @@ class RangeTransform(Transform):
 
     @jax.jit
     def __call__(self, z: AnyArray) -> AnyArray:
-        """Constrained values, below an upper bound by more than rounding."""
+        """Return constrained values; they stay below an upper bound by more than rounding."""
         tail = _tail(z)
         below = jnp.minimum(jnp.where(z < 0, tail, 1 - tail), 1 - 8 * jnp.finfo(float).eps)
         return self.low + self._width * jnp.where(jnp.isinf(self.high), -_log_survival(z), below)
@@ -73,7 +73,7 @@ class RangeTransform(Transform):
     @jax.jit
     def _inverse(self, x: AnyArray) -> AnyArray:
         share, endless = (x - self.low) / self._width, jnp.isinf(self.high)
-        # The lesser of the two tails; a branch that is not taken must have a gradient all the same.
+        # The smaller of the two tails is exact. A branch that is not taken must still have a finite gradient.
         upper, far = endless & (share >= 0.5), endless & (share > 600)
         small, middle, beyond = (jnp.where(taken, share, 1.0) for taken in (endless & ~upper, upper & ~far, far))
         tail = jnp.where(endless, jnp.where(upper, jnp.exp(-middle), -jnp.expm1(-small)), share)
@@ -82,32 +82,31 @@ class RangeTransform(Transform):
 
     @jax.jit
     def log_abs_det_jacobian(self, x: AnyArray, y: AnyArray, intermediates: None = None) -> AnyArray:
-        """log |dy/dx|, entry by entry: φ(z) or φ(z) / Φ(−z), times the width."""
+        """Return log |dy/dx| of every entry: φ(z) or φ(z) / Φ(−z), times the width."""
         return jnp.log(self._width) + norm.logpdf(x) - jnp.where(jnp.isinf(self.high), _log_survival(x), 0.0)
 
     def tree_flatten(self):  # type: ignore[no-untyped-def]
-        """All are data."""
+        """Return the parameters as arrays, for JAX."""
         return (self.low, self.high, self.scale), (("low", "high", "scale"), {})
 
 
-# Beyond, log Φ(−z) is its asymptotic series to rounding; Φ(−z) itself underflows soon after.
+# Above this value, log Φ(−z) equals its asymptotic series up to rounding; Φ(−z) itself underflows soon after.
 _FAR = 30.0
 
 
 def _tail(z: AnyArray) -> AnyArray:
-    """Φ(−|z|), above no further out than `_FAR`: next to one, nothing is left of the other tail.
+    """Return Φ(−|z|); above zero, z is limited to `_FAR`, where the other tail is zero next to one.
 
-    All that is needed of Φ is made of one erfc: with Φ and log Φ of the library a good part of the time that a
-    gradient takes to compile went into them.
+    All functions of Φ use one erfc: Φ and log Φ of the library took a large part of the time to compile a gradient.
     """
     away = jnp.where(z < 0, -z, jnp.where(z < _FAR, z, _FAR))
-    # The barrier keeps XLA from writing the whole of it into everything that follows.
+    # The barrier prevents XLA from repeating this expression in everything that uses it.
     return jax.lax.optimization_barrier(erfc(away / np.sqrt(2)) / 2)
 
 
 @jax.custom_jvp
 def _log_survival(z: AnyArray) -> AnyArray:
-    """log Φ(−z)."""
+    """Return log Φ(−z) without loss of digits."""
     tail = _tail(z)
     near = jnp.where(z < 0, jnp.log1p(-tail), jnp.log(tail))
     return jnp.where(z < _FAR, near, _far_log_survival(jnp.where(z < _FAR, _FAR, z)))
@@ -117,18 +116,18 @@ def _log_survival(z: AnyArray) -> AnyArray:
 def _log_survival_jvp(primals: tuple[AnyArray], tangents: tuple[AnyArray]) -> tuple[AnyArray, AnyArray]:
     (z,), (dz,) = primals, tangents
     value, far = _log_survival(z), jnp.where(z < _FAR, _FAR, z)
-    # φ(z) / Φ(−z): the difference of two great logarithms loses its digits.
+    # The hazard is φ(z) / Φ(−z); a difference of two large logarithms would lose digits.
     hazard = jnp.where(z < _FAR, jnp.exp(norm.logpdf(z) - value), far / _far_series(far))
     return value, -hazard * dz
 
 
 def _far_log_survival(z: AnyArray) -> AnyArray:
-    """log Φ(−z) of z ≥ `_FAR`."""
+    """Return log Φ(−z) for z ≥ `_FAR`."""
     return norm.logpdf(z) - jnp.log(z) + jnp.log(_far_series(z))
 
 
 def _far_series(z: AnyArray) -> AnyArray:
-    """z Φ(−z) / φ(z) of z ≥ `_FAR`: 1 − 1/z² + 3/z⁴ − 15/z⁶ + …"""
+    """Return z Φ(−z) / φ(z) for z ≥ `_FAR`: 1 − 1/z² + 3/z⁴ − 15/z⁶ + …"""
     series = jnp.ones_like(z)
     for odd in (9, 7, 5, 3, 1):
         series = 1 - odd / z**2 * series
@@ -136,7 +135,7 @@ def _far_series(z: AnyArray) -> AnyArray:
 
 
 def _far_score(t: AnyArray) -> AnyArray:
-    """The z of −log Φ(−z) = t > 600, by Newton's steps, of which φ(z) / Φ(−z) ≈ z: exact where e^−t underflows."""
+    """Solve −log Φ(−z) = t > 600 for z by Newton's steps with φ(z) / Φ(−z) ≈ z; exact where e^−t underflows."""
     z = jnp.sqrt(2 * t)
     for _ in range(4):
         z += (_far_log_survival(z) + t) / z
@@ -149,19 +148,19 @@ def _biject_to_range(constraint: _Range) -> RangeTransform:
 
 
 class ScaledBeta(dist.Distribution):
-    """Beta(α, β) scaled to [low, high]; where high = ∞ and α = β = 1, the flat improper density 1 on [low, ∞).
+    """Beta(α, β) scaled to [low, high]; if high = ∞ and α = β = 1, the flat improper density 1 on [low, ∞).
 
     Parameters
     ----------
     alpha, beta, low, high : arrays of one common shape
         Shape parameters A, B and the range [r1, r2], in the unit of the parameter.
     log_beta : array, optional
-        log B(α, β), where it is known already: it takes longer to compile than the rest of the density.
+        log B(α, β), if it is known already: it takes longer to compile than the rest of the density.
 
     Raises
     ------
     NotImplementedError
-        By `sample`, where the prior is improper.
+        By `sample`, if the prior is improper.
     """
 
     arg_constraints = {  # noqa: RUF012 (NumPyro's convention)
@@ -182,11 +181,11 @@ class ScaledBeta(dist.Distribution):
 
     @constraints.dependent_property(is_discrete=False, event_dim=0)
     def support(self) -> _Range:
-        """[low, high]."""
+        """The support, the interval [low, high]."""
         return _Range(self.low, self.high)
 
     def log_prob(self, value: Float[AnyArray, "*entries"]) -> Float[AnyArray, "*entries"]:
-        """log p(value), entry by entry; −∞ outside the range."""
+        """Return log p(value) of every entry; −∞ outside the range."""
         inside = self.support(value)
         improper = jnp.isinf(self.high)
         width = jnp.where(improper, 1.0, self.high - self.low)

@@ -1,4 +1,4 @@
-"""From a mesh, observations and options to the arrays of a registration problem, with every input checked."""
+"""The arrays of a registration problem, made from a mesh, observations and options after a check of every input."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from bayesreg.model.term import Terms
 from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
 
-# The solve feeds E_s, whose error is of first order in it: tighter than the default of the solve.
+# The elastic solve affects E_s to first order, so its tolerance is smaller than the solver's default.
 TOLERANCE = 1e-10
 
 
@@ -60,11 +60,11 @@ def problem_of(
     skull: Image | None,
     reference: Mapping[str, AnyArray] | None,
 ) -> tuple[Problem, Int[np.ndarray, "sampled"], dict[str, Any]]:
-    """All arrays of the problem, the sampled nodes, and the prepared observations; see `bayesreg.build_posterior`."""
+    """Make the problem, the sampled nodes and the prepared observations; see `bayesreg.build_posterior`."""
     sampled, held = sampled_nodes(mesh, model)
     require_proper(mesh, model)
     body, blocks = body_of(mesh, model, reference)
-    # The observations first: what is wrong with them is told before anything that takes long.
+    # The observations come first, so that errors in them are reported before any long computation.
     placed = place_observations(mesh, observations, model.preset)
     for one in placed.values():
         blocks |= one.blocks
@@ -74,7 +74,7 @@ def problem_of(
 
 
 def place_observations(mesh: TetMesh, observations: Sequence[Any], preset: str) -> dict[str, Placed]:
-    """The observations on a mesh, by name.
+    """Place the observations on a mesh, by name.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def place_observations(mesh: TetMesh, observations: Sequence[Any], preset: str) 
 
 
 def body_of(mesh: TetMesh, model: ModelConfig, reference: Mapping[str, AnyArray] | None = None) -> tuple[Body, Blocks]:
-    """The elastic body and the unknowns that it brings: what it takes to turn draws into displacements."""
+    """Make the elastic body and its unknowns, from which displacements are computed."""
     sampled, held = sampled_nodes(mesh, model)
     field = stiffness_field(mesh, model.field or FieldConfig()) if model.elasticity == "field" else None
     blocks = _blocks(mesh, model, sampled, field, reference)
@@ -153,7 +153,7 @@ def _priors(
     held: Mapping[int, tuple[float, float, float]],
     skull: Image | None,
 ) -> Terms:
-    """Elastic prior, rigid prior, barrier and skull. Where u_B is given none is there: u_I follows from it, λ and μ."""
+    """Make the elastic prior, rigid prior, barrier and skull; none of them if u_B is given."""
     terms: Terms = {}
     if not len(sampled):
         return terms
@@ -181,7 +181,7 @@ def require_proper(mesh: TetMesh, model: ModelConfig) -> None:
 
 
 def skull_distance(skull: Image, mesh: TetMesh, sampled: Int[np.ndarray, "sampled"]) -> Interpolator:
-    """Signed distance to the skull, for jitted code.
+    """Return the signed distance to the skull, for jitted code.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def skull_distance(skull: Image, mesh: TetMesh, sampled: Int[np.ndarray, "sample
 
 
 def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[int, tuple[float, float, float]]]:
-    """Sorted sampled nodes (held ones left out), and the held nodes with their displacements.
+    """Return the sorted sampled nodes (without the held ones), and the held nodes with their displacements.
 
     Raises
     ------
@@ -242,13 +242,13 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
 
 
 def fix_a_body(points: Float[np.ndarray, "k 3"]) -> bool:
-    """Whether a rigid body rests where these of its points do: three at least, and not on one line."""
+    """Check whether fixed points determine the pose of a rigid body: at least three, not on one line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return len(points) >= 3 and bool(spread[1] >= 1e-6 * spread[0])
 
 
 def cell_entries(mesh: TetMesh, model: ModelConfig) -> Int[np.ndarray, "cells"]:
-    """Index of each cell's entry in λ and μ."""
+    """Return the index of each cell's entry in λ and μ."""
     return {
         "tissue": mesh.tissue,
         "uniform": np.zeros(len(mesh.cells), int),
@@ -260,7 +260,7 @@ def cell_entries(mesh: TetMesh, model: ModelConfig) -> Int[np.ndarray, "cells"]:
 def lame_parameter(
     name: Lame, mesh: TetMesh, model: ModelConfig, reference: Mapping[str, AnyArray] | None
 ) -> LameParameter:
-    """Prior, known entries and reference values of λ or μ.
+    """Make the block of λ or μ with its prior, known entries and reference values.
 
     Raises
     ------
@@ -297,14 +297,14 @@ def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: i
 
 
 def _within(prior: list[PriorConfig], values: Float[np.ndarray, "entries"]) -> Float[np.ndarray, "entries"]:
-    """The values, those outside the range of their prior replaced by one inside."""
+    """Replace values outside the range of their prior by a value inside."""
     low, high = np.array([(p.low, p.high) for p in prior]).T
     inside = np.where(np.isinf(high), low + values, (low + high) / 2)
     return np.where((values > low) & (values < high), values, inside)
 
 
 def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: ModelConfig, entries: int) -> list:
-    """One option per entry of λ or μ, from one for all or a mapping by tissue."""
+    """Return one option for each entry of λ or μ, from one value for all or a mapping by tissue."""
     if not isinstance(given, Mapping):
         return [default if given is None else given] * entries
     unknown = set(given) - set(mesh.names)

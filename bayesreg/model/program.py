@@ -21,7 +21,7 @@ class Problem(NamedTuple):
     Attributes
     ----------
     body : Body
-        What turns values of the blocks into a state.
+        The body, which converts values of the blocks into a state.
     blocks : dict
         The blocks of unknowns by name.
     terms : dict
@@ -33,20 +33,20 @@ class Problem(NamedTuple):
     terms: Terms
 
     def with_term(self, name: str, term: object) -> Problem:
-        """The problem with one term added or replaced."""
+        """Return the problem with one term added or replaced."""
         return self._replace(terms={**self.terms, name: term})
 
     def without_term(self, name: str) -> Problem:
-        """The problem with one term left out, if it is there."""
+        """Return the problem without one term, if it has this term."""
         return self._replace(terms={other: term for other, term in self.terms.items() if other != name})
 
 
 def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = None) -> None:
-    """p(m, u, λ, μ) of eq. (8): the program whose log joint density is the posterior's up to a constant.
+    """Run the program p(m, u, λ, μ) of eq. (8); its log joint density is the posterior's up to a constant.
 
-    The displacements have a flat base measure, on which every term is a factor: an observed site where it is a
-    likelihood. An elastic solve that failed has density zero. A `guess` of the displacement of all nodes speeds up the
-    solve (see `bayesreg.fem.equilibrium.equilibrium`).
+    The displacements have a flat base measure. Every term is a factor on it: an observed site if the term is a
+    likelihood. A failed elastic solve has density zero. A `guess` of the displacement of all nodes makes the solve
+    faster (see `bayesreg.fem.equilibrium.equilibrium`).
     """
     values = {name: block.draw(name) for name, block in problem.blocks.items()}
     state = state_of(problem.body, problem.blocks, values, guess)
@@ -67,7 +67,7 @@ def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = No
 
 
 def is_allowed(problem: Problem, values: Values) -> Bool[AnyArray, ""]:
-    """Whether the density may be positive: parameters physical and in range, every term that knows it; no solve."""
+    """Check, without a solve, whether the density may be positive: parameters physical and in range, each `Support`."""
     found = problem.body.is_physical(values) & coordinates.is_in_range(problem.blocks, values)
     for term in problem.terms.values():
         if isinstance(term, Support):

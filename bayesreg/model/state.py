@@ -26,7 +26,7 @@ from bayesreg.types import AnyArray, Equilibrium, InputError, Scalar
 
 @jax.tree_util.register_static
 class StaticMesh:
-    """A mesh as a part of pytrees that has no arrays; two are equal if their content is."""
+    """A mesh as a part of pytrees that has no arrays; two are equal if their content is equal."""
 
     def __init__(self, mesh: TetMesh) -> None:
         self.mesh = mesh
@@ -39,7 +39,7 @@ class StaticMesh:
 
 
 class Body(NamedTuple):
-    """The elastic body, which turns values into a state (a pytree).
+    """The elastic body, which converts values into a state (a pytree).
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class Body(NamedTuple):
     field : StiffnessField or None
         Prior of the logarithm of a factor on λ and μ of every cell.
     slots : (b,) int array
-        Where the sampled nodes stand among `system.prescribed`.
+        Indices of the sampled nodes in `system.prescribed`.
     placed : SparseOperator
-        (prescribed, b): what belongs to the sampled nodes, in their slots; zero in the others.
+        (prescribed, b): puts values of the sampled nodes into their slots, and zero into the others.
     held : (prescribed, 3) array
         Known displacements, zero in the rows of sampled nodes, mm.
     """
@@ -66,17 +66,17 @@ class Body(NamedTuple):
     held: Float[AnyArray, "prescribed 3"]
 
     def prescribed(self, u_boundary: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "prescribed 3"]:
-        """Displacements of all nodes that have given ones, mm. (XLA makes a loop of a scatter on the CPU.)"""
+        """Return the displacements of all prescribed nodes, mm. (XLA would compile a scatter to a loop on the CPU.)"""
         return self.held + self.placed(u_boundary) if len(self.slots) else self.held
 
     def stiffness_factor(self, values: Values) -> Float[AnyArray, "cells"]:
-        """exp(sd · basis · z), by which the field multiplies λ and μ of every cell."""
+        """Return exp(sd · basis · z), the factor of the field on λ and μ of every cell."""
         if self.field is None:
             return jnp.ones(self.cell_entry.shape)
         return jnp.exp(values["field_sd"] * (self.field.basis @ values["field"]))
 
     def is_physical(self, values: Values) -> Bool[AnyArray, ""]:
-        """Whether K is positive definite up to rigid motions: λ ≥ 0, μ > 0 and the field's factor > 0, all finite."""
+        """Check whether K is positive definite up to rigid motions: finite λ ≥ 0, μ > 0 and field factor > 0."""
         lam, mu = values["lam"], values["mu"]
         found = ((lam >= 0) & jnp.isfinite(lam)).all() & ((mu > 0) & jnp.isfinite(mu)).all()
         if self.field is not None:
@@ -85,7 +85,7 @@ class Body(NamedTuple):
         return found
 
     def lame_by_cell(self, values: Values) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
-        """λ and μ of every cell."""
+        """Return λ and μ of every cell."""
         lam, mu = (jnp.asarray(values[name])[self.cell_entry] for name in LAME)
         if self.field is None:
             return lam, mu
@@ -95,7 +95,7 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The state that every term of the posterior sees; each evaluation makes a new one.
+    """The state on which every term of the posterior depends; each evaluation makes a new one.
 
     Attributes
     ----------
@@ -117,28 +117,28 @@ class State:
 
     @property
     def u(self) -> Float[AnyArray, "nodes 3"]:
-        """Displacement of every node, mm."""
+        """The displacement of every node, mm."""
         return self.equilibrium.u
 
     @cached_property
     def strain_energy(self) -> Scalar:
-        """E_r, eq. (3)."""
+        """The strain energy E_r, eq. (3)."""
         energy = total_strain_energy(self.elements, self.lam, self.mu, self.u)
-        # Without the barrier XLA computes it twice, for the density and for the record.
+        # Without the barrier, XLA computes the energy twice: for the density and for the record.
         return jax.lax.optimization_barrier(energy)
 
     def at(self, points: Any) -> Float[AnyArray, "k 3"]:
-        """Displacements of points inside the mesh, mm.
+        """Return the displacements of points inside the mesh, mm.
 
         Parameters
         ----------
         points : (k, 3) array
-            World RAS mm, known before anything is compiled: not an array that JAX traces.
+            World RAS mm; a concrete array, not one that JAX traces.
 
         Raises
         ------
         InputError
-            If the shape is another one, or a point lies outside the mesh.
+            If the shape is wrong, or a point lies outside the mesh.
         """
         points = np.asarray(points, float)
         if points.ndim != 2 or points.shape[1] != 3:
@@ -148,10 +148,10 @@ class State:
 
 
 def state_of(body: Body, blocks: Blocks, values: Values, guess: Float[AnyArray, "nodes 3"] | None = None) -> State:
-    """The state of values. Where K may be indefinite, the reference λ and μ let the solve end soon.
+    """Compute the state of values; if K may be indefinite, use the reference λ and μ, so that the solve ends soon.
 
-    A `guess` of the displacement of every node speeds up the solve (see `bayesreg.fem.equilibrium.equilibrium`) and has
-    no derivative.
+    A `guess` of the displacement of every node makes the solve faster (see `bayesreg.fem.equilibrium.equilibrium`); it
+    has no derivative.
     """
     lam, mu = physical_lame_by_cell(body, blocks, values)
     found = equilibrium(body.system, lam, mu, body.prescribed(values["u_boundary"]), guess)
@@ -161,7 +161,7 @@ def state_of(body: Body, blocks: Blocks, values: Values, guess: Float[AnyArray, 
 def physical_lame_by_cell(
     body: Body, blocks: Blocks, values: Values
 ) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
-    """λ and μ of every cell; at their references where K may be indefinite: the density is −∞ there."""
+    """Return λ and μ of every cell, or their references if K may be indefinite (the density is −∞ there)."""
     physical = body.is_physical(values)
     lam, mu = (jnp.where(physical, values[name], blocks[name].reference())[body.cell_entry] for name in LAME)
     if body.field is None:

@@ -1,10 +1,10 @@
-"""What a mesh cannot follow: how far a smooth displacement lies from one that is linear in every tetrahedron.
+"""The discretisation error of a mesh: the difference between a smooth displacement and a piecewise linear one.
 
-Between two nodes a and b a smooth u departs from the straight line, in the middle by (G_a − G_b)(x_b − x_a) / 8, with G
-the gradient at the nodes, up to terms of third order. The departure in a tetrahedron, quadratic in the barycentric
-coordinates b, is the sum of 4 b_a b_b times these over its edges. G is recovered as the mean of the gradients of the
-tetrahedra about a node, by volume (Zienkiewicz and Zhu 1987, "A simple error estimator and adaptive procedure for
-practical engineering analysis").
+In the middle between two nodes a and b, a smooth u differs from the straight line by (G_a − G_b)(x_b − x_a) / 8, up to
+terms of third order, where G is the gradient at the nodes. In a tetrahedron the difference is quadratic in the
+barycentric coordinates b: the sum of 4 b_a b_b times these differences over its edges. G is recovered as the mean,
+weighted by volume, of the gradients of the tetrahedra around a node (Zienkiewicz and Zhu 1987, "A simple error
+estimator and adaptive procedure for practical engineering analysis").
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ EDGES = tuple(combinations(range(4), 2))
 
 
 def submesh_variance(mesh: TetMesh, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "cells 3"]:
-    """The mean square of what a mesh cannot follow of a smooth displacement, in every tetrahedron and component.
+    """Compute the mean square of the discretisation error of a displacement, in every tetrahedron and component.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def submesh_variance(mesh: TetMesh, u: Float[np.ndarray, "nodes 3"]) -> Float[np
 
 
 def _nodal_gradient(mesh: TetMesh, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "nodes 3 3"]:
-    """∂u_i/∂x_j at the nodes: the mean over the tetrahedra about each, by volume."""
+    """Compute ∂u_i/∂x_j at the nodes: the mean over the tetrahedra around each, weighted by volume."""
     of_cells = np.einsum("nai,naj->nij", np.asarray(u)[mesh.cells], shape_gradients(mesh))
     total, weight = np.zeros((len(mesh.points), 3, 3)), np.zeros(len(mesh.points))
     for corner in mesh.cells.T:
@@ -55,7 +55,7 @@ def _nodal_gradient(mesh: TetMesh, u: Float[np.ndarray, "nodes 3"]) -> Float[np.
 
 
 def _products() -> Float[np.ndarray, "6 6"]:
-    """The means over a tetrahedron of 16 b_a b_b b_c b_d, for two of its edges: 6 ∏ α! / 7! of ∏ b^α."""
+    """Compute the means over a tetrahedron of 16 b_a b_b b_c b_d, for two of its edges: 6 ∏ α! / 7! of ∏ b^α."""
     found = np.empty((6, 6))
     for p, one in enumerate(EDGES):
         for q, other in enumerate(EDGES):

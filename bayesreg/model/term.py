@@ -1,7 +1,7 @@
 """The protocols of a term.
 
-A term is one factor of the joint density. It has a `name` and `log(state)`. The other classes here are what a term may
-know besides, each asked for by `isinstance`.
+A term is one factor of the joint density. It has a `name` and `log(state)`. The other classes here are optional
+abilities of a term; callers check for each with `isinstance`.
 """
 
 from __future__ import annotations
@@ -20,45 +20,45 @@ from bayesreg.types import AnyArray, Scalar
 
 @runtime_checkable
 class Term(Protocol):
-    """One factor of the joint density; an observation from outside the package needs no more than this."""
+    """One factor of the joint density; an observation from outside the package needs only these two members."""
 
     @property
     def name(self) -> str:
         """The name of the term in tables and in the NumPyro program."""
 
     def log(self, state: State) -> Scalar:
-        """The logarithm of the factor, up to a constant; JAX can trace it."""
+        """Return the logarithm of the factor, up to a constant; JAX can trace it."""
 
 
 @runtime_checkable
 class Likelihood(Protocol):
-    """A term that is the density of something observed."""
+    """A term that is the density of observed values."""
 
     def observed(self) -> AnyArray:
-        """The observed values."""
+        """Return the observed values."""
 
     def likelihood(self, state: State) -> dist.Distribution:
-        """The distribution of the observed values, of which replicates can be drawn."""
+        """Return the distribution of the observed values, from which replicates can be drawn."""
 
 
 @runtime_checkable
 class Support(Protocol):
-    """A term that is zero at some values, which is cheap to tell."""
+    """A term that is zero at some values and can check this at low cost."""
 
     def allows(self, values: Values) -> Bool[AnyArray, ""]:
-        """Whether the density may be positive there."""
+        """Check whether the density may be positive at these values."""
 
 
 @runtime_checkable
 class Standardised(Protocol):
-    """A term that knows its residuals; the report shows their root mean square."""
+    """A term that provides its residuals; the report shows their root mean square."""
 
     def standardised_residual(self, state: State) -> AnyArray:
-        """Residuals in units of their standard deviation: where the model holds their mean square is about one."""
+        """Return the residuals in units of their standard deviation; their mean square is about one in the model."""
 
 
 class SharedCurvature(NamedTuple):
-    """Curvature that groups of points have together: Σ_r s_r Σ_k g_rk g_rkᵀ, where g_rk holds v_rq for q in group k.
+    """The curvature that a group of points shares: Σ_r s_r Σ_k g_rk g_rkᵀ, where g_rk holds v_rq for q in group k.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class SharedCurvature(NamedTuple):
 
 
 class PointCurvature(NamedTuple):
-    """Curvature of −log in the displacements of some points of the mesh.
+    """The curvature of −log in the displacements of some points of the mesh.
 
     Attributes
     ----------
@@ -98,13 +98,13 @@ class PointCurvature(NamedTuple):
 
 @runtime_checkable
 class Curved(Protocol):
-    """A term that knows its curvature in the displacements of points, where the nodes are displaced by u, mm."""
+    """A term that provides its curvature in the displacements of points, at nodal displacements u, mm."""
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Gauss and Newton's part, positive semidefinite."""
+        """Return the Gauss–Newton part, which is positive semidefinite."""
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """The rest of the exact curvature: residuals times second derivatives."""
+        """Return the rest of the exact curvature: residuals times second derivatives."""
 
 
 @jax.tree_util.register_static
@@ -117,14 +117,14 @@ class Label:
 
 @jax.tree_util.register_static
 class Outside:
-    """A term from outside the package, as a part of pytrees that has no arrays: its own are constants when compiled."""
+    """A term from outside the package, as a part of pytrees without arrays; its own arrays become constants."""
 
     def __init__(self, term: Term) -> None:
         self.term = term
 
     @property
     def name(self) -> str:
-        """The term's own."""
+        """The name of the wrapped term."""
         return self.term.name
 
     @property
@@ -133,7 +133,7 @@ class Outside:
         return tuple(getattr(self.term, "blocks", {}))
 
     def log(self, state: State) -> Any:
-        """The term's own."""
+        """Return the log of the wrapped term."""
         return self.term.log(state)
 
     def __eq__(self, other: object) -> bool:

@@ -1,4 +1,4 @@
-"""How draws of a posterior are shown to a reader: names, dimensions and labels, known entries included."""
+"""The presentation of draws to a reader: names, dimensions and labels, known entries included."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Variables:
     nodes : (b,) int array
         The sampled nodes.
     entry_names : sequence of str
-        What the entries of λ and μ stand for.
+        The names of the entries of λ and μ.
     """
 
     blocks: Blocks
@@ -82,13 +82,13 @@ class Variables:
 
     @property
     def attributes(self) -> Mapping[str, Mapping[str, str]]:
-        """What variables and constants mean, and their units."""
+        """The meaning and the units of variables and constants."""
         return {name: {"long_name": meaning, "units": units} for name, (meaning, units) in MEANINGS.items()}
 
     def values(self, estimands: Values) -> dict[str, np.ndarray]:
-        """u_B, all entries of λ, μ and λ/μ, and what else is sampled; arrays may have leading axes.
+        """Return u_B, all entries of λ, μ and λ/μ, and all other sampled values; arrays may have leading axes.
 
-        They are made on the host: there may be many draws.
+        NumPy computes them on the host because there may be many draws.
         """
         found = {"u_boundary": np.asarray(estimands["u_boundary"])}
         leading = found["u_boundary"].shape[:-2]
@@ -103,7 +103,7 @@ class Variables:
         return found | {name: np.asarray(estimands[name]) for name in others}
 
     def estimands(self, values: Values) -> dict[str, np.ndarray]:
-        """The sampled entries of such values."""
+        """Return the sampled entries of values that `values` made."""
         found = {}
         for name, block in sampled_blocks(self.blocks).items():
             value = np.asarray(values[name])

@@ -1,4 +1,4 @@
-"""From nodal displacements to displaced points, warped images and volume change."""
+"""Displaced points, warped images and volume change from nodal displacements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesreg.types import AnyArray
 
 
 def volume_ratio(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "cells"]:
-    """det F = det(I + ∇u) of every cell: its volume after the deformation over that before."""
+    """Compute det F = det(I + ∇u) of every cell: its volume after the deformation over its volume before."""
     gradient = displacement_gradient(elements_of(mesh).derivative, jnp.asarray(u))
     return jnp.linalg.det(jnp.moveaxis(jnp.array(gradient), -1, 0) + jnp.eye(3))
 
@@ -25,7 +25,7 @@ def volume_ratio(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray
 def nodal_field_on_grid(
     mesh: TetMesh, values: Float[np.ndarray, "nodes channels"], grid: Image
 ) -> Float[np.ndarray, "X Y Z channels"]:
-    """Linear interpolation of nodal values at the voxel centres of an image; zero outside the mesh."""
+    """Interpolate nodal values linearly at the voxel centres of an image; zero outside the mesh."""
     field = np.zeros((*grid.shape, values.shape[1]))
     index, cells, barycentric = covered_voxels(grid, mesh)
     nodal = np.asarray(values)[mesh.cells[cells]]
@@ -34,15 +34,15 @@ def nodal_field_on_grid(
 
 
 class Covered(NamedTuple):
-    """Voxels whose centres lie in a mesh.
+    """The voxels whose centres lie in a mesh.
 
     Attributes
     ----------
     voxel : (k, 3) int array
     cell : (k,) int array
-        The tetrahedron that holds each.
+        The tetrahedron that holds each voxel centre.
     barycentric : (k, 4) array
-        Where in it.
+        Barycentric coordinates of the centre in its tetrahedron.
     """
 
     voxel: Int[np.ndarray, "k 3"]
@@ -51,9 +51,9 @@ class Covered(NamedTuple):
 
 
 def covered_voxels(grid: Image, mesh: TetMesh) -> Covered:
-    """The voxels of an image whose centres lie in a mesh."""
+    """Find the voxels of an image whose centres lie in a mesh."""
     corners = grid.world_to_voxel(mesh.points)
-    # What lies on the mesh's own bounding box by rounding is for `locate` to say.
+    # Voxels on the bounding box of the mesh, up to rounding, must reach `locate`, which decides.
     low = np.maximum(np.ceil(corners.min(axis=0) - 1e-6), 0).astype(int)
     high = np.minimum(np.floor(corners.max(axis=0) + 1e-6), np.array(grid.shape) - 1).astype(int)
     index = low + np.argwhere(np.ones(np.maximum(high - low + 1, 0), bool))
@@ -63,7 +63,7 @@ def covered_voxels(grid: Image, mesh: TetMesh) -> Covered:
 
 
 def tissue_on_grid(mesh: TetMesh, voxels: int = 100) -> Image:
-    """The tissue map of a mesh: 0 outside, 1 + tissue inside, int8, cubic voxels, so many along the longest side."""
+    """Make the tissue map of a mesh: 0 outside, 1 + tissue inside, int8; `voxels` cubic voxels on the longest side."""
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     size = float((high - low).max()) / voxels
     affine = np.diag([size, size, size, 1.0])
@@ -78,6 +78,6 @@ def tissue_on_grid(mesh: TetMesh, voxels: int = 100) -> Image:
 def warp_image(
     moving: Image, displacement: Float[np.ndarray, "X Y Z 3"], grid: Image, method: Interpolation = "linear"
 ) -> Image:
-    """m(x + u(x)) at the voxel centres of `grid`, u in mm on that grid; zero where that is beyond the grid of m."""
+    """Compute m(x + u(x)) at the voxel centres of `grid`, u in mm on that grid; zero beyond the grid of m."""
     places = grid.grid_points() + displacement
     return grid.with_voxels(np.where(moving.contains(places), np.asarray(moving.interpolate(places, method)), 0.0))

@@ -20,9 +20,9 @@ CONVENTION = "Neurological convention: the left of the patient is on the left."
 
 
 def before_and_after(study: Study) -> Drawing | None:
-    """Fixed, moving and warped image, and their differences, on three planes; None without images.
+    """Draw the fixed, moving and warped images, and their differences, on three planes; None without images.
 
-    Where the images are of unlike contrast, or the headers do not fit, the borders of the tissues are drawn on all.
+    If the images have unlike contrast, or a pose was needed, the figure shows the borders of the tissues on all images.
     """
     run, view = study.run, study.view
     if run.fixed is None or run.moving is None or run.warped is None:
@@ -43,7 +43,7 @@ def before_and_after(study: Study) -> Drawing | None:
 
 
 def _columns(run: Run) -> dict[str, Image]:
-    """The images to show, under their titles."""
+    """Return the images to show, by their titles."""
     assert run.fixed is not None
     assert run.moving is not None
     assert run.warped is not None
@@ -92,7 +92,7 @@ def _draw_differences(figure: Figure, axes: np.ndarray, view: View, images: list
 
 
 def _difference(view: View, image: Image, plane: Plane) -> np.ndarray:
-    """An image less the fixed one on a plane, NaN outside the mesh."""
+    """Return the difference between an image and the fixed one on a plane, NaN outside the mesh."""
     assert view.run.fixed is not None
     points = plane.points()
     return np.where(view.slice(plane).inside, sample(image, points) - sample(view.run.fixed, points), np.nan)
@@ -114,7 +114,7 @@ def _explain(study: Study) -> list[str]:
 
 
 def displacement(study: Study) -> Drawing:
-    """The posterior mean with arrows, the radius that holds 95 %, and the error where it is known, on three planes."""
+    """Draw the posterior mean with arrows, the radius that holds 95 %, and the known error, on three planes."""
     run, view, reach = study.run, study.view, study.predicted.reach
     rows = [
         Row("|ū|, mm", lambda plane: view.norm(plane, run.u_mean), style.MAGNITUDE),
@@ -138,7 +138,7 @@ def displacement(study: Study) -> Drawing:
 
 
 def _grid(view: View, columns: int) -> tuple[Figure, np.ndarray]:
-    """Rows axial, coronal and sagittal at one scale."""
+    """Make a figure with axial, coronal and sagittal rows at one scale."""
     heights = [float(np.ptp(plane.vertical)) for plane in view.planes[::-1]]
     width = max(np.ptp(plane.horizontal) for plane in view.planes)
     figure = style.new_figure(style.WIDTH / (columns + 0.35) * sum(heights) / width + 0.4)

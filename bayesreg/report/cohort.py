@@ -1,4 +1,4 @@
-"""A cohort's table, and a page with all runs: what came of each, and how stiff tissues are in all of them."""
+"""The table of a cohort, and a page with all runs: the state of each, and the stiffness of tissues in all of them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from bayesreg.report.tables import Table
 from bayesreg.report.verdict import Verdict, fixed, number
 
 TABLE, PARQUET, PAGE = "cohort.csv", "cohort.parquet", "cohort.html"
-# More runs than these are drawn without their names.
+# A cohort of more runs is drawn without their names.
 MOST_NAMED = 60
-# Panels side by side.
+# The greatest number of panels side by side.
 MOST_COLUMNS = 6
 COLUMNS = {
     "R̂": "rhat_max",
@@ -30,7 +30,7 @@ COLUMNS = {
     "Radius, mm": "radius95_mean_mm",
     "Minutes": "minutes",
 }
-# Where values are further apart than this their axis is logarithmic.
+# An axis is logarithmic if its values differ by more than this factor.
 DECADES = 30
 
 
@@ -45,7 +45,7 @@ def write_cohort(table: pd.DataFrame, out: Path) -> None:
     """
     write_text(out / TABLE, table.to_csv(index=False))
     with replacing(out / PARQUET) as temporary:
-        # Settings of a sweep may be of several kinds.
+        # A setting of a sweep may have values of several types, which Parquet cannot store in one column.
         mixed = {name: table[name].astype(str) for name in table if table[name].dtype == object}
         table.assign(**mixed).to_parquet(temporary)
     failed = table[table["state"] == "failed"]
@@ -65,7 +65,7 @@ def write_cohort(table: pd.DataFrame, out: Path) -> None:
 
 
 def _table(finished: pd.DataFrame) -> Table:
-    """A row for each run, whose name leads to its report."""
+    """Make a table with a row for each run, whose name links to its report."""
     link = Markup('<a href="{0}/report.html">{0}</a>')
     rows = [
         [link.format(name), *(_text(row.get(column)) for column in COLUMNS.values())]
@@ -84,7 +84,7 @@ def _text(value: Any) -> str:
 
 
 def _stiffness(finished: pd.DataFrame) -> Drawing:
-    """λ and μ of every tissue, a line for each run."""
+    """Draw λ and μ of every tissue, with a line for each run."""
     names = [name.removesuffix("_low") for name in finished if str(name).endswith("_low")]
     named, columns = len(finished) <= MOST_NAMED, min(len(names), MOST_COLUMNS)
     rows = -(-len(names) // columns)

@@ -1,4 +1,4 @@
-"""Two or more runs side by side, as the paper sets three tissues against uniform parameters."""
+"""The comparison of two or more runs, as the paper compares three tissues with uniform parameters."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def write_comparison(runs: Sequence[tuple], path: str | Path) -> None:
 
 
 def _names(studies: Sequence[Study]) -> list[str]:
-    """A name for each run, none twice: how its parameters vary, where that tells them apart, else its own name."""
+    """Make a unique name for each run: the variation of its parameters if this is unique, otherwise its own name."""
     names = [study.elasticity for study in studies]
     if len(set(names)) < len(names) or not all(names):
         names = [study.name for study in studies]
@@ -66,7 +66,7 @@ def _names(studies: Sequence[Study]) -> list[str]:
 
 
 def _warnings(named: dict[str, Study]) -> list[str]:
-    """Sentences about what makes the comparison unfair."""
+    """Write sentences about differences that make the comparison unfair."""
     first, *others = [study.run for study in named.values()]
     said = []
     if not all(_same(first.fixed, run.fixed) and _same(first.moving, run.moving) for run in others):
@@ -84,7 +84,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _maps(named: dict[str, Study]) -> Drawing:
-    """The paper's Fig. 3: error, standard deviation and divergence of every run on one plane, on common scales."""
+    """Draw the paper's Fig. 3: error, standard deviation and divergence of every run on one plane, on common scales."""
     studies = list(named.values())
     first = studies[0].view
     views, plane = [first.on(study.run) for study in studies], first.main
@@ -112,7 +112,7 @@ def _maps(named: dict[str, Study]) -> Drawing:
 
 
 def _ratios(named: dict[str, Study]) -> Drawing:
-    """The paper's Fig. 4 for every run, one row each."""
+    """Draw the paper's Fig. 4 for every run, one row each."""
     with style.look():
         figure = style.new_figure(2.5 * len(named))
         parts = figure.subfigures(len(named), 1, squeeze=False)

@@ -1,4 +1,4 @@
-"""Convergence: the key numbers, R̂ and ESS over all estimands, the worst of them, traces and ranks."""
+"""Convergence: the key numbers, R̂ and ESS over all estimands, the estimands with the greatest R̂, traces and ranks."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ RUN_COLOURS = ("#2b5c8a", "#b3560f", "#4f9d86", "#7d6aa8", "#a84a63", "#8aa34f")
 
 
 def key_table(studies: dict[str, Study]) -> Table:
-    """The key numbers of runs, a column for each."""
+    """Make a table of the key numbers of runs, with a column for each run."""
     columns = [key_facts(study.manifest, study.entries, study.posterior) for study in studies.values()]
     rows = [[label, *(facts[label] for facts in columns)] for label in columns[0]]
     return Table("Key numbers", "", ["", *studies], [("", rows)])
 
 
 def worst_table(study: Study) -> Table:
-    """The estimands of the greatest R̂, with their places in numbers and in words."""
+    """Make a table of the estimands with the greatest R̂, with their places in numbers and in words."""
     rows = [
         [
             entry.name,
@@ -60,7 +60,7 @@ class Trace(NamedTuple):
 
 
 def traces(study: Study) -> Drawing:
-    """Trace and rank plots of every free parameter, the worst displacements, and the energies."""
+    """Draw trace and rank plots of every free parameter, the displacements with the greatest R̂, and the energies."""
     shown = _choose_traces(study)
     with style.look():
         figure, axes = _pairs(-(-len(shown) // 2))
@@ -84,7 +84,7 @@ def traces(study: Study) -> Drawing:
 
 
 def _pairs(rows: int) -> tuple[Figure, np.ndarray]:
-    """Pairs of a wide and a narrow panel, two to a row; placed by hand, since a solver takes seconds for so many."""
+    """Place pairs of a wide and a narrow panel, two to a row, by hand: a layout solver would take seconds."""
     height = 1.1 * rows + 0.6
     figure = Figure(figsize=(style.WIDTH, height))
     edges = {"left": 0.045, "right": 0.995, "top": 1 - 0.25 / height, "bottom": 0.4 / height}
@@ -112,7 +112,7 @@ def _choose_traces(study: Study) -> list[Trace]:
 
 
 def _symbolic(name: str) -> str:
-    """ "u_x of node 3" with a proper index, for a figure."""
+    """Convert "u_x of node 3" to a formula with an index, for a figure."""
     name = style.literal(name)
     for plain in ("u_x", "u_y", "u_z", "T_s", "T_r"):
         name = name.replace(plain, f"${plain}$") if name.startswith(plain) else name
@@ -147,7 +147,7 @@ def _draw_ranks(axes: Axes, draws: np.ndarray) -> None:
 
 
 def distributions(studies: dict[str, Study]) -> Drawing:
-    """R̂ and ESS of runs over all estimands, as the share of estimands up to each value."""
+    """Draw R̂ and ESS of runs over all estimands, as the share of estimands up to each value."""
     labels = {"rhat": "R̂", "ess_bulk": "effective sample size, bulk", "ess_tail": "effective sample size, tail"}
     with style.look():
         figure = style.new_figure(2.5)
@@ -174,7 +174,7 @@ def _cumulate(axes: Axes, studies: dict[str, Study], figure: str) -> None:
 
 
 def _write_plainly(axes: Axes) -> None:
-    """Write plain numbers along a logarithmic axis; also between the decades, where it spans less than one."""
+    """Write plain numbers on a logarithmic axis, and between the decades if it spans less than one."""
     low, high = axes.get_xlim()
     short = high < 8 * low
     axes.xaxis.set_major_formatter(FuncFormatter(_shorten))

@@ -28,22 +28,22 @@ MOST_VALUES = 10_000_000
 
 
 class Estimand(NamedTuple):
-    """One sampled number.
+    """One sampled scalar, with its convergence figures.
 
     Attributes
     ----------
     variable : str
         Name in the posterior.
     position : tuple of int
-        Its place in that variable's array, after chain and draw.
+        The index in that variable's array, after chain and draw.
     name : str
-        For people, as "u_x of node 12" or "λ tumour".
+        The name in the report, such as "u_x of node 12" or "λ tumour".
     place : tuple of float or None
         World position of its node, mm.
     rhat, ess_bulk, ess_tail : float
         NaN where undefined (chains that never moved, say).
     region : str
-        Its place in words; empty where it has none.
+        The place in words; empty if the entry has none.
     """
 
     variable: str
@@ -57,7 +57,7 @@ class Estimand(NamedTuple):
 
     @property
     def badness(self) -> float:
-        """R-hat for sorting: what is undefined is worst."""
+        """The R-hat for sorting: an undefined R-hat is the greatest."""
         return self.rhat if np.isfinite(self.rhat) else np.inf
 
 
@@ -70,11 +70,11 @@ class Diagnosed(NamedTuple):
 
 
 def estimands(mesh: TetMesh, diagnosed: Diagnosed, posterior: xr.Dataset) -> list[Estimand]:
-    """Every sampled entry of every variable, in the posterior's order.
+    """List every sampled entry of every variable, in the posterior's order.
 
-    An entry of λ or μ without any figure that is the same in all draws was held fixed, and is none; one that only never
-    moved within its chain counts, and so does a displacement that never moved at all. Derived quantities (the ratios)
-    are left out.
+    An entry of λ or μ without any convergence figure that is equal in all draws was fixed, and is not listed. An entry
+    that never moved within its chain is listed, and so is a displacement that never moved at all. Derived quantities
+    (the ratios) are left out.
     """
     found = []
     for variable in diagnosed.rhat.data_vars:
@@ -108,7 +108,7 @@ def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[E
 
 
 def _coordinates(draws: xr.DataArray, dims: list) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Node indices of a displacement; else the labels of parameters."""
+    """Return node indices of a displacement, or the labels of other parameters."""
     if "node" in dims:
         return draws["node"].to_numpy(), None
     return None, draws[dims[0]].to_numpy() if dims else None
@@ -143,17 +143,17 @@ class _Naming(NamedTuple):
 
 
 def worst(entries: Sequence[Estimand], count: int) -> list[Estimand]:
-    """The entries of the greatest R-hat, worst first."""
+    """Return the entries with the greatest R-hat, in decreasing order."""
     return sorted(entries, key=lambda entry: -entry.badness)[:count]
 
 
 def above(entries: Sequence[Estimand], threshold: float) -> int:
-    """Number of entries whose R-hat is not below a threshold."""
+    """Count the entries whose R-hat is not below a threshold."""
     return sum(not entry.rhat < threshold for entry in entries)
 
 
 def draws_of(posterior: xr.Dataset, entry: Estimand, max_draws: int) -> np.ndarray:
-    """Draws of one estimand, (chain, draw), evenly thinned to about `max_draws` per chain."""
+    """Return the draws of one estimand, (chain, draw), evenly thinned to about `max_draws` per chain."""
     draws = posterior[entry.variable]
     dims = [dim for dim in draws.dims if dim not in ("chain", "draw")]
     stride = max(1, draws.sizes["draw"] // max_draws)
@@ -162,13 +162,13 @@ def draws_of(posterior: xr.Dataset, entry: Estimand, max_draws: int) -> np.ndarr
 
 
 def sampled_scales(posterior: xr.Dataset) -> list[str]:
-    """Names of the temperatures, loads and sds of observations: single positive numbers that vary over the draws."""
+    """Return the names of temperatures, loads and sds of observations: positive scalars that vary over the draws."""
     scales = (str(name) for name, draws in posterior.data_vars.items() if set(draws.dims) == {"chain", "draw"})
     return [name for name in scales if name != "field_sd" and np.ptp(posterior[name].to_numpy()) > 0]
 
 
 def symbol_of(name: str) -> str:
-    """The symbol of a variable in a report; the scales of an observation have its name."""
+    """Return the symbol of a variable in a report; the scales of an observation have its name."""
     if name in SYMBOLS:
         return SYMBOLS[name]
     if name.endswith("_t_similarity"):
@@ -177,13 +177,13 @@ def symbol_of(name: str) -> str:
 
 
 class Group(NamedTuple):
-    """Elastic parameters that belong together: a tissue's, or the whole domain's.
+    """Elastic parameters that belong together: of one tissue, or of the whole domain.
 
     Attributes
     ----------
     name : str
     lam, mu : (chain, draw, entries) arrays
-        Entries are one, or the elements of the tissue.
+        One entry, or one for each element of the tissue.
     """
 
     name: str
@@ -192,14 +192,14 @@ class Group(NamedTuple):
 
     @property
     def ratio(self) -> np.ndarray:
-        """λ/μ, NaN where it is undefined."""
+        """The ratio λ/μ, NaN if it is undefined."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = self.lam / self.mu
         return np.where(np.isfinite(ratio), ratio, np.nan)
 
 
 def elastic_draws(posterior: xr.Dataset, max_draws: int) -> tuple[np.ndarray, np.ndarray]:
-    """λ and μ as (chain, draw, entry), thinned to about `max_draws` per chain, fewer where entries are very many."""
+    """Return λ and μ as (chain, draw, entry), thinned to about `max_draws` per chain, fewer for very many entries."""
     entries = max(1, posterior["lam"].size // posterior.sizes["draw"])
     stride = max(1, posterior.sizes["draw"] // min(max_draws, max(20, MOST_VALUES // entries)))
     thinned = posterior[["lam", "mu"]].isel(draw=slice(None, None, stride)).transpose("chain", "draw", ...)
@@ -207,7 +207,7 @@ def elastic_draws(posterior: xr.Dataset, max_draws: int) -> tuple[np.ndarray, np
 
 
 def parameter_groups(mesh: TetMesh, posterior: xr.Dataset, max_draws: int = 5000) -> list[Group]:
-    """Draws of λ and μ by tissue, as one uniform group, or, when sampled by element, gathered by tissue."""
+    """Return the draws of λ and μ by tissue, as one uniform group, or, if sampled by element, gathered by tissue."""
     lam, mu = elastic_draws(posterior, max_draws)
     if lam.shape[-1] == 1:
         return [Group("uniform", lam, mu)]

@@ -1,4 +1,4 @@
-"""Landmarks that were held out: target registration error before and after, and whether it is as large as expected."""
+"""Held-out landmarks: target registration error before and after, and its expected size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEVELS = (0.5, 0.9, 0.95)
 
 
 def evaluation_table(study: Study) -> Table | None:
-    """Distances by the headers, by the pose, and by the posterior mean; None where nothing was held out."""
+    """Make a table of distances by the headers, the pose, and the posterior mean; None without held-out landmarks."""
     predicted = study.predicted
     if predicted.evaluation_residual is None:
         return None
@@ -49,7 +49,7 @@ def evaluation_table(study: Study) -> Table | None:
 
 
 def evaluation(study: Study) -> Drawing | None:
-    """Errors before and after, beside what was expected, and a calibration curve; None where nothing was held out."""
+    """Draw errors before and after, the expected errors, and a calibration curve; None without held-out landmarks."""
     predicted = study.predicted
     if predicted.evaluation_residual is None or predicted.evaluation_posed is None:
         return None
@@ -94,7 +94,7 @@ def evaluation(study: Study) -> Drawing | None:
 
 
 def _surprise(predicted: Predicted) -> np.ndarray:
-    """The probability of the least region that holds each landmark in the mesh."""
+    """Return the probability of the smallest region that holds each landmark in the mesh."""
     inside = np.asarray(predicted.evaluation_inside)
     residual, covariance = (
         np.asarray(x)[inside] for x in (predicted.evaluation_residual, predicted.evaluation_covariance)

@@ -1,4 +1,4 @@
-"""Which chains of a run lie together, and which apart."""
+"""Groups of chains that sample the same region of the posterior."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from scipy.sparse.csgraph import connected_components
 from bayesreg.report.estimands import DISPLACEMENT, MOST_VALUES
 from bayesreg.types import AnyArray
 
-# Chains lie apart where this many estimands differ by so many of their standard deviations within a chain.
+# Chains belong to different groups if this many of their standard deviations separate them in several estimands.
 APART = 3.0
 TOGETHER_IN_ALL_BUT = 3
 SEEN = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")
 
 
 class Grouping(NamedTuple):
-    """The groups of chains that lie together.
+    """The groups of chains with similar means.
 
     Attributes
     ----------
     label : (chains,) int array
         Group of each chain, numbered from 0 in the order of their first chains.
     drifting : (chains,) bool array
-        Whether the halves of a chain lie apart from one another: it is still on its way.
+        Whether the halves of a chain differ, as in a chain that has not arrived yet.
     """
 
     label: Int[np.ndarray, "chains"]
@@ -34,16 +34,16 @@ class Grouping(NamedTuple):
 
     @property
     def groups(self) -> int:
-        """Number of groups."""
+        """The number of groups."""
         return int(self.label.max()) + 1
 
     def chains(self, group: int) -> np.ndarray:
-        """The chains of a group."""
+        """Return the chains of a group."""
         return np.flatnonzero(self.label == group)
 
 
 def grouping(posterior: xr.Dataset) -> Grouping:
-    """Group chains whose means lie close together, measured by the standard deviation within chains."""
+    """Group chains whose means lie close together, relative to the standard deviation within chains."""
     values = _values(posterior)
     means, variances = values.mean(axis=1), values.var(axis=1)
     apart = np.array(
@@ -59,7 +59,7 @@ def _renumber(label: np.ndarray) -> np.ndarray:
 
 
 def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"]:
-    """All estimands side by side."""
+    """Return all estimands as columns of one array."""
     posterior = thin(posterior)
     draws = [posterior[name].transpose("chain", "draw", ...) for name in SEEN if name in posterior]
     flat = [values.to_numpy().reshape(*values.shape[:2], -1) for values in draws]
@@ -67,20 +67,20 @@ def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"
 
 
 def thin(posterior: xr.Dataset) -> xr.Dataset:
-    """Thin the draws evenly, where they would take much memory."""
+    """Thin the draws evenly if they would need much memory."""
     numbers = sum(posterior[name].size for name in SEEN if name in posterior)
     return posterior.isel(draw=slice(None, None, max(1, numbers // MOST_VALUES)))
 
 
 def _separation(means: np.ndarray, variances: np.ndarray, i: int, j: int) -> Float[np.ndarray, "estimands"]:
-    """Distance of two means in standard deviations; none where both stand still at one place."""
+    """Return the distance of two means in standard deviations; zero if both chains stand still at one value."""
     gap, within = np.abs(means[i] - means[j]), np.sqrt((variances[i] + variances[j]) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(gap > 0, gap / within, 0.0)
 
 
 def _distance(separation: np.ndarray) -> float:
-    """The separation that a few estimands reach: one alone may do so by chance, or be a parameter's tail."""
+    """Return the separation that several estimands reach: a single one may differ by chance or in a tail."""
     rank = min(TOGETHER_IN_ALL_BUT, len(separation))
     return float(np.partition(separation, -rank)[-rank])
 
@@ -94,5 +94,5 @@ def _drifts(chain: Float[np.ndarray, "draws estimands"]) -> bool:
 
 
 def group_means(chain_means: Float[AnyArray, "chains *shape"], groups: Grouping) -> Float[np.ndarray, "groups *shape"]:
-    """Mean over the chains of each group."""
+    """Compute the mean over the chains of each group."""
     return np.stack([np.asarray(chain_means)[groups.chains(k)].mean(axis=0) for k in range(groups.groups)])

@@ -44,7 +44,7 @@ def _opening(study: Study) -> Opening:
 
 
 def _describe(study: Study) -> str:
-    """Say what was sampled and how, in one line."""
+    """Describe in one line what was sampled and how."""
     unknowns = "Elastography: posterior of the elastic parameters, the displacement of the boundary given"
     if study.samples_nodes:
         nodes = study.posterior.sizes["node"]

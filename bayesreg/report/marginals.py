@@ -18,15 +18,15 @@ from bayesreg.report.verdict import number, part
 from bayesreg.tissues import colours_of, label_of
 
 BINS = 32
-# A ratio whose interval spans more than this factor has a logarithmic axis.
+# A ratio has a logarithmic axis if its interval spans more than this factor.
 LOG_SPAN = 20.0
-# A mark further than this many widths of the axis from it is named at its edge.
+# A mark that lies further from the axis than this many widths of it is named at its edge.
 FAR = 2.0
 COLUMNS = 4
 
 
 def marginals(study: Study) -> Drawing:
-    """The paper's Fig. 4, marginal posteriors of λ/μ with the truth where it is known; and those of sampled scales."""
+    """Draw the paper's Fig. 4, marginal posteriors of λ/μ with the known truth, and those of sampled scales."""
     groups, scales = study.parameters, sampled_scales(study.posterior)
     count = len(groups) + len(scales)
     columns = min(COLUMNS, count)
@@ -60,7 +60,7 @@ class Mark(NamedTuple):
 
 
 def ratio_panel(axes: Axes, run: Run, group: Group) -> None:
-    """Histogram of λ/μ of one group, with its median, 95 % interval and truth."""
+    """Draw the histogram of λ/μ of one group, with its median, 95 % interval and truth."""
     colours = {"uniform": style.UNIFORM} | dict(zip(run.mesh.names, colours_of(run.mesh.names), strict=True))
     truths = _true_ratios(run, group.name)
     marks = [Mark(value, f"truth {style.literal(name)}", colours[name]) for name, value in truths.items()]
@@ -72,7 +72,7 @@ def ratio_panel(axes: Axes, run: Run, group: Group) -> None:
 
 
 def _true_ratios(run: Run, name: str) -> dict[str, float]:
-    """λ/μ of the named tissue; of all tissues where the parameters are uniform."""
+    """Return λ/μ of the named tissue, or of all tissues if the parameters are uniform."""
     if run.truth is None:
         return {}
     ratios = dict(zip(run.mesh.names, np.asarray(run.truth.lam) / np.asarray(run.truth.mu), strict=True))
@@ -80,7 +80,7 @@ def _true_ratios(run: Run, name: str) -> dict[str, float]:
 
 
 def _scale_panel(axes: Axes, study: Study, name: str) -> None:
-    """Histogram of a temperature, a load or the sd of an observation, and its log-normal prior."""
+    """Draw the histogram of a temperature, a load or the sd of an observation, and its log-normal prior."""
     histogram(axes, np.asarray(study.posterior[name].transpose("chain", "draw").to_numpy(), float), style.UNIFORM, [])
     symbol = symbol_of(name)
     axes.set_xlabel(f"${symbol}$" if symbol in ("T_s", "T_r") else style.literal(symbol))
@@ -94,10 +94,10 @@ def _scale_panel(axes: Axes, study: Study, name: str) -> None:
 
 
 def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: Sequence[Mark], ratio: bool = False) -> None:
-    """Density of (chain, draw) values: pooled and filled, by chain as lines, with median, 95 % interval and marks.
+    """Draw densities of (chain, draw) values: all chains filled, each chain as a line, with median, interval and marks.
 
-    A ratio whose central interval spans more than a factor of twenty gets a logarithmic axis. A mark far outside
-    the draws is named at the edge it lies beyond.
+    The interval is the central 95 % interval. A ratio whose central interval spans more than a factor of twenty has a
+    logarithmic axis. A mark far outside the draws is named at the edge of the axis on its side.
     """
     finite = draws[np.isfinite(draws)]
     axes.set_yticks([])
@@ -123,7 +123,7 @@ def histogram(axes: Axes, draws: np.ndarray, colour: str, marks: Sequence[Mark],
 
 
 def _point_out(axes: Axes, edges: np.ndarray, marks: Sequence[Mark], logarithmic: bool) -> None:
-    """Draw a dashed line at every mark near the draws, and an arrow towards every other."""
+    """Draw a dashed line at every mark near the draws, and an arrow towards every other mark."""
     scale = np.log10 if logarithmic else np.asarray
     first, last = scale(edges[0]), scale(edges[-1])
     for index, mark in enumerate(marks):
@@ -141,7 +141,7 @@ def _point_out(axes: Axes, edges: np.ndarray, marks: Sequence[Mark], logarithmic
 
 
 def _density(values: np.ndarray, edges: np.ndarray, logarithmic: bool) -> np.ndarray:
-    """Per unit of the axis that is drawn, so that areas are probabilities to the eye."""
+    """Compute the density per unit of the drawn axis, so that areas are proportional to probabilities."""
     return np.histogram(values, edges)[0] / max(1, values.size) / np.diff(np.log(edges) if logarithmic else edges)
 
 

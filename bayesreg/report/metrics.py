@@ -17,7 +17,7 @@ WHOLE = "domain"
 
 
 def squared_integral(mesh: TetMesh, field: Float[AnyArray, "nodes 3"]) -> Float[np.ndarray, "cells"]:
-    """∫ |e|² over every tetrahedron, of a piecewise linear field, exactly.
+    """Integrate |e|² over every tetrahedron for a piecewise linear field, exactly.
 
     Parameters
     ----------
@@ -35,9 +35,9 @@ def squared_integral(mesh: TetMesh, field: Float[AnyArray, "nodes 3"]) -> Float[
 
 
 def divergence(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[np.ndarray, "cells"]:
-    """Div u in every tetrahedron: the relative change of volume to first order."""
+    """Compute div u in every tetrahedron: the relative change of volume to first order."""
     points, u = mesh.points[mesh.cells], np.asarray(u, float)[mesh.cells]
-    # Row i of both: an edge vector, and the difference of u along it.
+    # Row i of both arrays: an edge vector, and the difference of u along it.
     gradient = np.linalg.solve(points[:, 1:] - points[:, :1], u[:, 1:] - u[:, :1])
     return np.trace(gradient, axis1=1, axis2=2)
 
@@ -45,7 +45,7 @@ def divergence(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[np.ndarray
 def mean_squared_error(
     mesh: TetMesh, u: Float[AnyArray, "nodes 3"], truth: Float[AnyArray, "nodes 3"]
 ) -> dict[str, float]:
-    """∫_Ωl |u − truth|² / |Ω_l| over the whole domain ("domain") and each tissue that the mesh has, mm² (Table 2)."""
+    """Compute ∫_Ωl |u − truth|² / |Ω_l| for the "domain" and each tissue in the mesh, mm² (Table 2)."""
     integral = squared_integral(mesh, np.asarray(u) - np.asarray(truth))
     result = {WHOLE: float(integral.sum() / mesh.volumes.sum())}
     for index, name in enumerate(mesh.names):
@@ -58,14 +58,14 @@ def mean_squared_error(
 def boundary_error(
     u: Float[AnyArray, "nodes 3"], truth: Float[AnyArray, "nodes 3"], nodes: Int[AnyArray, "boundary"]
 ) -> dict[str, float]:
-    """Median, 95 % quantile and maximum of |u − truth| over the given nodes, mm (Table 1)."""
+    """Compute the median, 95 % quantile and maximum of |u − truth| over the given nodes, mm (Table 1)."""
     distance = np.linalg.norm(np.asarray(u)[nodes] - np.asarray(truth)[nodes], axis=1)
     median, q95, greatest = np.quantile(distance, (0.5, 0.95, 1.0))
     return {"median": float(median), "q95": float(q95), "max": float(greatest)}
 
 
 def coverage(draws: Float[AnyArray, "draws *shape"], truth: Float[AnyArray, "*shape"]) -> dict[str, float]:
-    """Fraction of the entries that move whose truth lies in the central 50, 90 and 95 % intervals."""
+    """Compute the share of moving entries whose truth lies in the central 50, 90 and 95 % intervals."""
     draws, truth = np.asarray(draws), np.asarray(truth)
     moves = np.ptp(draws, axis=0) > 0
     draws, truth = draws[:, moves], truth[moves]
@@ -83,7 +83,7 @@ def compute_metrics(
     posterior: xr.Dataset,
     max_draws: int = 2000,
 ) -> dict[str, Any]:
-    """The content of metrics.json.
+    """Compute the content of metrics.json.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Chains that disagree: what sets their groups apart, and what each group would say."""
+"""Chains that disagree: the differences between their groups, and the result of each group."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ MOST_SHOWN = 4
 
 
 def disagree(study: Study) -> bool:
-    """Whether the chains of a run lie in several groups."""
+    """Check whether the chains of a run lie in several groups."""
     return study.groups.groups > 1
 
 
 def explain(study: Study) -> Sentences:
-    """Say which groups there are, and what they may mean."""
+    """Explain which groups there are in a run, and their possible meaning."""
     return Sentences("", explanation(study.groups))
 
 
 def explanation(groups: Grouping) -> list[str]:
-    """Say which groups there are, and what they may mean."""
+    """Explain which groups there are, and their possible meaning."""
     listed = "; ".join(f"group {k + 1}: {_chain_list(groups.chains(k))}" for k in range(groups.groups))
     apart = f"The chains lie in {groups.groups} groups ({listed}), {APART:g} or more standard deviations apart."
     moving = np.flatnonzero(groups.drifting)
@@ -47,7 +47,7 @@ def _chain_list(chains: np.ndarray) -> str:
 
 
 def modes(study: Study) -> Drawing:
-    """|ū| of each group side by side where they differ most, and how far apart they lie."""
+    """Draw |ū| of each group side by side at the greatest difference, and the distances between the groups."""
     groups, mesh = study.groups, study.mesh
     means = group_means(study.predicted.chain_mean, groups)
     apart = np.linalg.norm(means[:, None] - means[None], axis=-1).max(axis=(0, 1))

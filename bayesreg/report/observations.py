@@ -1,4 +1,4 @@
-"""What was observed: the terms of the density, how each observation fits, and what each kind shows of itself."""
+"""The observations in the report: the terms of the density, the fit of each observation, and the parts of each kind."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from bayesreg.report.verdict import NONE, number, part, place_text
 
 
 def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
-    """The logarithm of the density as a sum of its terms.
+    """Write the logarithm of the density as a sum of its terms.
 
     Parameters
     ----------
     manifest : mapping
     elastography : bool
-        Whether the displacement of the boundary is given, and so has no prior.
+        Whether the displacement of the boundary is given; then it has no prior.
     """
     elastic = part(manifest, "model", "elastic_prior") or {}
     loads, normalised = elastic.get("kind") == "loads", elastic.get("normalised")
@@ -46,19 +46,19 @@ def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
 
 
 def _symbol(name: str) -> str:
-    """The symbol of a scale in HTML, without its unit."""
+    """Return the symbol of a scale in HTML, without its unit."""
     symbol = str(escape(symbol_of(name).removesuffix(", mm")))
     return re.sub(r"^T_([rs])\b", r"<var>T</var><sub>\1</sub>", symbol)
 
 
 def explanations(manifest: Mapping[str, Any]) -> list[Markup]:
-    """What the terms of the observations mean, a sentence for each that says so."""
+    """Explain the terms of the observations, in a sentence for each term that has an explanation."""
     found = [_kind(one).explain(name, one) for name, one in observations_of(manifest).items()]
     return [Markup(text) for text in found if text]
 
 
 def observation_table(manifest: Mapping[str, Any]) -> Table | None:
-    """How each observation fits at the posterior mean; None where the run does not say."""
+    """Make a table of the fit of each observation at the posterior mean; None if the run has no such entry."""
     observed = observations_of(manifest)
     rows = [
         [
@@ -80,7 +80,7 @@ def observation_table(manifest: Mapping[str, Any]) -> Table | None:
 
 
 def shown_by_kinds(manifest: Mapping[str, Any], mesh: TetMesh, predicted: Predicted | None) -> list[Drawing | Table]:
-    """The figures and tables that each observation shows of itself."""
+    """Make the figures and tables that the kind of each observation provides."""
     if predicted is None:
         return []
     shown: list[Drawing | Table] = []
@@ -92,12 +92,12 @@ def shown_by_kinds(manifest: Mapping[str, Any], mesh: TetMesh, predicted: Predic
 
 
 def observations_of(manifest: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
-    """What run.json says of each observation, by its name."""
+    """Return the descriptions of the observations in run.json, by name."""
     return part(manifest, "observations") or {}
 
 
 def _kind(described: Mapping[str, Any]) -> type[ObservationSection]:
-    """The class of a kind of observation; the base where none is registered, as of an observation of one's own."""
+    """Return the class of a kind of observation; the base class if the kind is not registered."""
     return kinds().get(described["kind"], ObservationSection)
 
 

@@ -1,4 +1,4 @@
-"""Pages: a list of sections, each a list of figures, tables and sentences, in one HTML file that needs no network."""
+"""Pages: sections with figures, tables and sentences, in one HTML file that needs no network."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class Part(NamedTuple):
 
     @property
     def anchor(self) -> str:
-        """Its name in a link."""
+        """The name of the section in a link."""
         return self.title.lower().replace(" ", "-")
 
 
 class Opening(NamedTuple):
-    """What a page says first.
+    """The first part of a page.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Opening(NamedTuple):
     answers : list of (str, str)
         Questions and answers.
     approximation : str
-        A warning that the draws are not those of the posterior; empty where they are.
+        A warning that the draws are not from the exact posterior; empty if they are.
     warnings : list of str
     """
 
@@ -83,5 +83,5 @@ def render(template: str, content: Mapping[str, Any]) -> str:
 
 
 def _index(text: str) -> Markup:
-    """Escape text, and set u_x, T_s and the like with a subscript."""
+    """Escape text, and set u_x, T_s and similar symbols with a subscript."""
     return Markup(re.sub(r"\b([uTE])_([xyzrs])\b", r"\1<sub>\2</sub>", str(escape(text))))

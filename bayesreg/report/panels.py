@@ -32,7 +32,7 @@ MAX_VOXELS = 200_000
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A run seen on three planes; `main` is the one that sees most of the displacement.
+    """The three planes on which a run is shown; `main` shows most of the displacement.
 
     Attributes
     ----------
@@ -47,43 +47,43 @@ class View:
 
     @classmethod
     def of(cls, run: Run, point: AnyArray | None = None) -> View:
-        """Planes through a point (mm), else through the node of greatest displacement (true where known)."""
+        """Make planes through a point (mm), or through the node of greatest (if known, true) displacement."""
         u = true_or_mean_displacement(run)
         return cls(
             run, planes_through(run.mesh, run.mesh.points[(u**2).sum(axis=1).argmax()] if point is None else point)
         )
 
     def on(self, run: Run) -> View:
-        """A view of another run on these planes."""
+        """Make a view of another run on these planes."""
         return View(run, self.planes)
 
     @cached_property
     def main(self) -> Plane:
-        """The plane that sees most of the displacement: of the greatest integral of |u|² over its section."""
+        """The plane with the greatest integral of |u|² over its section."""
         u = true_or_mean_displacement(self.run)
         return max(self.planes, key=lambda plane: np.nansum(self.slice(plane).nodal(u) ** 2) * plane.spacing**2)
 
     def slice(self, plane: Plane) -> MeshSlice:
-        """The mesh on a plane."""
+        """Return the section of the mesh on a plane."""
         if plane not in self._slices:
             self._slices[plane] = MeshSlice(self.run.mesh, plane)
         return self._slices[plane]
 
     def norm(self, plane: Plane, vectors: AnyArray) -> np.ndarray:
-        """The length of a nodal vector field on a plane."""
+        """Return the length of a nodal vector field on a plane."""
         return np.linalg.norm(self.slice(plane).nodal(vectors), axis=-1)
 
     def scalar(self, plane: Plane, values: AnyArray) -> np.ndarray:
-        """A nodal number on a plane."""
+        """Return a nodal scalar field on a plane."""
         return self.slice(plane).nodal(np.asarray(values, float)[:, None])[..., 0]
 
     def divergence(self, plane: Plane, u: AnyArray) -> np.ndarray:
-        """Div u on a plane."""
+        """Return div u on a plane."""
         return self.slice(plane).cellwise(divergence(self.run.mesh, u))
 
 
 def error_of(run: Run) -> np.ndarray:
-    """ū − u_true at every node, (n, 3), mm."""
+    """Compute ū − u_true at every node, (n, 3), mm."""
     if run.truth is None:
         raise ValueError("the error of a run is known only where the truth is")
     return np.asarray(run.u_mean) - np.asarray(run.truth.u)
@@ -95,12 +95,12 @@ class Row(NamedTuple):
     Attributes
     ----------
     label : str
-        Of its colour bar.
+        The label of its colour bar.
     picture : function
-        From a plane to its pixels.
+        Maps a plane to its pixels.
     cmap : str
     norm : Normalize or None
-        None for 0 to the greatest value of the row.
+        None means a range from 0 to the greatest value of the row.
     """
 
     label: str
@@ -110,7 +110,7 @@ class Row(NamedTuple):
 
 
 def map_rows(view: View, rows: Sequence[Row]) -> tuple[Figure, np.ndarray]:
-    """A figure of rows of maps on the axial, the coronal and the sagittal plane, and its axes."""
+    """Make a figure of rows of maps on the axial, coronal and sagittal planes, and return its axes, too."""
     planes = view.planes[::-1]
     widths = [float(np.ptp(plane.horizontal)) for plane in planes]
     height = 0.93 * style.WIDTH * max(np.ptp(plane.vertical) for plane in planes) / sum(widths)
@@ -129,12 +129,12 @@ def map_rows(view: View, rows: Sequence[Row]) -> tuple[Figure, np.ndarray]:
 
 
 def true_or_mean_displacement(run: Run) -> np.ndarray:
-    """The true displacement where it is known, else the posterior mean; (n, 3), mm."""
+    """Return the true displacement if it is known, else the posterior mean; (n, 3), mm."""
     return np.asarray(run.u_mean if run.truth is None else run.truth.u, float)
 
 
 def image_panel(axes: Axes, image: Image, plane: Plane, limits: tuple[float, float]) -> AxesImage:
-    """An image on a plane; black where it ends."""
+    """Draw an image on a plane; black beyond its grid."""
     picture = sample(image, plane.points(), outside=limits[0])
     return field_panel(axes, picture, plane, Normalize(*limits), style.GREY, dark=True)
 
@@ -142,25 +142,25 @@ def image_panel(axes: Axes, image: Image, plane: Plane, limits: tuple[float, flo
 def field_panel(
     axes: Axes, picture: np.ndarray, plane: Plane, norm: Normalize, cmap: str, dark: bool = False
 ) -> AxesImage:
-    """Values, or colours, on the pixels of a plane; white where not finite."""
+    """Draw values, or colours, on the pixels of a plane; white where they are not finite."""
     drawn = axes.imshow(picture, origin="lower", extent=plane.extent, cmap=cmap, norm=norm, interpolation="auto")
     _frame(axes, plane, dark)
     return drawn
 
 
 def outline(axes: Axes, view: View, plane: Plane, interfaces: bool = True, colour: str = style.INK) -> None:
-    """The mesh's border and, by default, the interfaces between its tissues."""
+    """Draw the border of the mesh and, by default, the interfaces between its tissues."""
     tissue = np.nan_to_num(view.slice(plane).cellwise(view.run.mesh.tissue), nan=-1.0)
     x, y = np.linspace(*plane.horizontal, tissue.shape[1]), np.linspace(*plane.vertical, tissue.shape[0])
     for label in np.unique(tissue) if interfaces else [-1.0]:
-        # Blurred by a pixel, so that the staircase of the pixels does not show.
+        # A blur of one pixel hides the staircase of the pixels.
         level = ndimage.gaussian_filter((tissue == label).astype(float), 1.0)
         width, alpha = (0.8, 0.9) if label < 0 else (0.35, 0.5)
         axes.contour(x, y, level, [0.5], colors=colour, linewidths=width, alpha=alpha)
 
 
 def ignored(view: View, plane: Plane) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What says nothing on a plane: in the fixed image, in the moving one, and where the posterior mean takes points.
+    """Find the ignored pixels of a plane: in the fixed image, in the moving image, and in the warped image.
 
     Returns
     -------
@@ -187,7 +187,7 @@ def hatch(axes: Axes, plane: Plane, mask: np.ndarray) -> None:
 
 
 def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
-    """Tissue labels and skull."""
+    """Draw the tissue labels and the skull."""
     points = plane.points()
     palette = np.array([to_rgb("white"), *map(to_rgb, colours_of(run.mesh.names))])
     labels = sample(run.tissue, points, order=0, outside=0.0).astype(int)
@@ -199,7 +199,7 @@ def label_panel(axes: Axes, run: Run, plane: Plane) -> None:
 
 
 def label_lines(axes: Axes, run: Run, plane: Plane) -> None:
-    """The borders of the tissue labels."""
+    """Draw the borders of the tissue labels."""
     labels = sample(run.tissue, plane.points(), order=0, outside=0.0)
     x, y = np.linspace(*plane.horizontal, labels.shape[1]), np.linspace(*plane.vertical, labels.shape[0])
     for value in np.unique(labels)[1:]:
@@ -208,7 +208,7 @@ def label_lines(axes: Axes, run: Run, plane: Plane) -> None:
 
 
 def mesh_panel(axes: Axes, mesh: TetMesh, plane: Plane) -> None:
-    """The cut through the mesh, coloured by tissue; white lines between its tetrahedra."""
+    """Draw the section of the mesh, coloured by tissue, with white lines between its tetrahedra."""
     fine = plane._replace(spacing=plane.spacing / 3)
     cell = np.nan_to_num(MeshSlice(mesh, fine).cellwise(np.arange(len(mesh.cells))), nan=-1.0).astype(int)
     palette = np.array([*map(to_rgb, colours_of(mesh.names)), to_rgb("white")])
@@ -219,7 +219,7 @@ def mesh_panel(axes: Axes, mesh: TetMesh, plane: Plane) -> None:
 
 
 def arrows(axes: Axes, view: View, plane: Plane, u: np.ndarray) -> None:
-    """In-plane displacement at true length, every few millimetres."""
+    """Draw the in-plane displacement at true length, every few millimetres."""
     picture = view.slice(plane).nodal(u)
     stride = max(1, picture.shape[1] // 16)
     some = (slice(stride // 2, None, stride),) * 2
@@ -238,13 +238,13 @@ def arrows(axes: Axes, view: View, plane: Plane, u: np.ndarray) -> None:
 
 
 def symmetric(values: np.ndarray, quantile: float = 0.995) -> Normalize:
-    """Colour range −a … a that holds nearly all finite values."""
+    """Return a colour range −a … a that holds nearly all finite values."""
     bound = _bound(np.abs(values), quantile)
     return Normalize(-bound, bound)
 
 
 def from_zero(*values: np.ndarray, quantile: float = 0.998) -> Normalize:
-    """Colour range 0 … a that holds nearly all finite values of all pictures."""
+    """Return a colour range 0 … a that holds nearly all finite values of all pictures."""
     return Normalize(0, max(_bound(value, quantile) for value in values))
 
 
@@ -254,19 +254,19 @@ def _bound(values: np.ndarray, quantile: float) -> float:
 
 
 def grey_limits(run: Run) -> tuple[float, float]:
-    """One grey scale for the images of a run: the range of the background, without its extremes."""
+    """Return one grey scale for the images of a run: the range of the background, without its extremes."""
     return range_of(run.background)
 
 
 def range_of(image: Image) -> tuple[float, float]:
-    """The range of an image, without its extremes, by an even sample of its voxels."""
+    """Return the range of an image, without its extremes, from an even sample of its voxels."""
     values = np.ravel(image.voxels)
     low, high = np.quantile(values[:: max(1, values.size // MAX_VOXELS)].astype(float), (0.005, 0.998))
     return float(low), float(max(high, low + 1e-9))
 
 
 def colourbar(figure: FigureBase, drawn: ScalarMappable, axes: Axes | Sequence[Axes], label: str, **place: Any) -> None:
-    """A slim colour bar with its unit."""
+    """Draw a narrow colour bar with its unit."""
     settings: dict[str, Any] = {"fraction": 0.05, "pad": 0.02, "aspect": 28, "shrink": 0.94} | place
     bar = figure.colorbar(drawn, ax=axes, **settings)
     bar.outline.set_visible(False)
@@ -281,7 +281,7 @@ def colourbar(figure: FigureBase, drawn: ScalarMappable, axes: Axes | Sequence[A
 
 
 def tissue_legend(names: Sequence[str], skull: bool) -> list[Patch]:
-    """Handles for the tissues, and the skull."""
+    """Make legend handles for the tissues and the skull."""
     handles = [
         Patch(color=colour, label=style.literal(label_of(name)))
         for name, colour in zip(names, colours_of(names), strict=True)

@@ -21,7 +21,7 @@ from bayesreg.report.verdict import place_text
 
 
 def data(study: Study) -> Drawing:
-    """Fig. 2: images, labels, mesh cut, divergence and components of the (true) displacement."""
+    """Draw Fig. 2: images, labels, section of the mesh, divergence and components of the (true) displacement."""
     run, view, plane = study.run, study.view, study.view.main
     u, symbol = panels.true_or_mean_displacement(run), "ū" if run.truth is None else "u"
     with style.look():
@@ -52,7 +52,7 @@ def data(study: Study) -> Drawing:
 
 
 def result(study: Study) -> Drawing:
-    """Fig. 3: error where the truth is known (else |ū|), standard deviation, divergence, warped image."""
+    """Draw Fig. 3: error if the truth is known (else |ū|), standard deviation, divergence, warped image."""
     run, view, plane = study.run, study.view, study.view.main
     known = run.truth is not None
     first = ("|ū − u|", panels.error_of(run), style.ERROR) if known else ("|ū|", run.u_mean, style.MAGNITUDE)
@@ -76,7 +76,7 @@ def result(study: Study) -> Drawing:
 
 
 def _image(axes: Axes, run: Run, image: Image | None, plane: Plane) -> None:
-    """Draw an image where there is one."""
+    """Draw an image if there is one."""
     if image is None:
         axes.set_axis_off()
     else:
@@ -84,7 +84,7 @@ def _image(axes: Axes, run: Run, image: Image | None, plane: Plane) -> None:
 
 
 def _divergence(figure: Figure, axes: Axes, view: View, u: np.ndarray, like: np.ndarray) -> None:
-    """Map div u, on the colours that suit the divergence of another field."""
+    """Draw div u, on the colours that suit the divergence of another field."""
     norm = panels.symmetric(divergence(view.run.mesh, like), quantile=0.98)
     drawn = panels.field_panel(axes, view.divergence(view.main, u), view.main, norm, style.SIGNED)
     panels.outline(axes, view, view.main)
@@ -97,14 +97,14 @@ def _letter(axes: np.ndarray, titles: list[str]) -> None:
 
 
 def _rows(plane: Plane, rows: int) -> tuple[Figure, np.ndarray]:
-    """Four panels a row on one plane."""
+    """Make rows of four panels on one plane."""
     height = style.WIDTH / 4.3 * np.ptp(plane.vertical) / np.ptp(plane.horizontal) + 0.55
     figure = style.new_figure(rows * height + 0.4)
     return figure, figure.subplots(rows, 4, squeeze=False)
 
 
 def node(study: Study) -> Drawing | None:
-    """Fig. 5: marginals of the displacement of one node at the skull; None without a skull or sampled nodes."""
+    """Draw Fig. 5: marginals of the displacement of one node at the skull; None without skull or sampled nodes."""
     run, entry = study.run, node_at_skull(study)
     if entry is None:
         return None
@@ -122,7 +122,7 @@ def node(study: Study) -> Drawing | None:
 
 
 def node_at_skull(study: Study) -> int | None:
-    """The entry along the axis `node` whose mean place is nearest to the skull; None without skull or sampled nodes."""
+    """Find the entry along `node` whose mean place is nearest to the skull; None without skull or sampled nodes."""
     nodes, skull = study.posterior["node"].to_numpy().astype(int), study.run.skull
     if skull is None or not len(nodes):
         return None

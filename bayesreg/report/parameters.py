@@ -1,4 +1,4 @@
-"""The elastic parameters in one table: what each is, how sure that is, and what the data say of it beside the prior."""
+"""The table of the elastic parameters: the value of each, its uncertainty, and the information from data and prior."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from bayesreg.report.tables import Table
 from bayesreg.report.verdict import NONE, number, part, rhat_text, threshold_of
 from bayesreg.tissues import label_of
 
-# Identified: the central 90 % interval spans less than a factor of ten.
+# A parameter is identified if its central 90 % interval spans less than a factor of ten.
 IDENTIFIED = 10.0
-# A bound: the median is more than so many times the 1 % quantile, so that the density reaches zero, …
+# A number has only an upper bound if its median is more than this many times the 1 % quantile, so that the density
+# reaches zero (a lower bound: the 99 % quantile is more than this many times the median), …
 REACHES_ZERO = 20.0
 # … and the bound is within this factor of the median.
 BOUND = 5.0
-# An interval of at least this share of the prior’s is called as wide as the prior.
+# An interval of at least this share of the prior’s is described as equally wide.
 PRIOR_SHARE = 0.8
 LAME = ("lam", "mu")
 HEADER = ["", "Median", "95 % interval", "Prior, 95 %", "Data say", "R̂", "Least ESS"]
@@ -32,28 +33,28 @@ CAPTION = (
 
 
 class Interval(NamedTuple):
-    """Central 95 % interval."""
+    """The central 95 % interval."""
 
     low: float
     high: float
 
     @property
     def text(self) -> str:
-        """The interval in words."""
+        """The interval as text."""
         return f"{number(self.low)} to {number(self.high)}"
 
 
 def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
-    """Put in words how a posterior bounds a positive number.
+    """Describe in words how a posterior bounds a positive number.
 
-    It says the same of a number and, with the bounds exchanged, of its reciprocal.
+    For the reciprocal of the number, the description is equal with upper and lower bound exchanged.
 
     Parameters
     ----------
     draws : array
-        Draws of any shape; those that are not finite are left out.
+        Draws of any shape; draws that are not finite are left out.
     prior : Interval, optional
-        Central 95 % interval of its prior; None where it is improper.
+        Central 95 % interval of the prior; None if the prior is improper.
 
     Returns
     -------
@@ -77,13 +78,13 @@ def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
 
 
 def prior_of_scale(prior: Mapping[str, float]) -> Interval:
-    """Central 95 % interval of the log-normal prior of a scale, given by its median and log_sd."""
+    """Return the central 95 % interval of the log-normal prior of a scale, given by its median and log_sd."""
     factor = math.exp(stats.norm.ppf(0.975) * float(prior["log_sd"]))
     return Interval(float(prior["median"]) / factor, float(prior["median"]) * factor)
 
 
 def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> Interval | None:
-    """Central 95 % interval of the prior of "lam" or "mu" of a tissue; None where it is improper.
+    """Return the central 95 % interval of the prior of "lam" or "mu" of a tissue; None if it is improper.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> 
 
 
 def parameter_table(study: Study) -> Table:
-    """A row for λ/μ, λ and μ of every tissue, and one for every sampled scale; the truth where it is known."""
+    """Make a table with a row for λ/μ, λ and μ of every tissue, and for every sampled scale, with the known truth."""
     groups = [(label_of(group.name), _group_rows(study, index, group)) for index, group in enumerate(study.parameters)]
     rows = []
     for name in sampled_scales(study.posterior):
@@ -151,7 +152,7 @@ def _rhat(rhat: float) -> str:
 
 
 def _figures(study: Study, name: str, entry: int | None) -> tuple[float, float, float]:
-    """R̂ and both ESS of one entry; NaN where it has none, or stands for several elements."""
+    """Return R̂ and both ESS of one entry; NaN if it has none, or represents several elements."""
     if entry is None or name not in study.rhat:
         return math.nan, math.nan, math.nan
     rhat, bulk, tail = (float(np.ravel(figure[name].to_numpy())[entry]) for figure in study.diagnosed)
@@ -159,7 +160,7 @@ def _figures(study: Study, name: str, entry: int | None) -> tuple[float, float, 
 
 
 def _truth(study: Study, title: str, symbol: str) -> str:
-    """The true value of a parameter of a tissue; a dash of what has none."""
+    """Format the true value of a parameter of a tissue; a dash if there is none."""
     truth, labels = study.run.truth, [label_of(name) for name in study.mesh.names]
     if truth is None or title not in labels:
         return NONE

@@ -1,4 +1,4 @@
-"""Places in the organ in words: sides by world RAS axes relative to the mesh's centre, and the nearest tissue."""
+"""Descriptions of places: sides by world RAS axes relative to the mesh's centre, and the nearest tissue."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from bayesreg.tissues import label_of
 from bayesreg.types import AnyArray
 
 SIDES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
-# A place counts as on neither side within this share of the mesh's half width.
+# A place within this share of the mesh's half width from the centre is on neither side.
 MIDDLE = 0.15
 
 
 def regions(mesh: TetMesh, places: Float[AnyArray, "places 3"]) -> list[str]:
-    """Each place in words, as "right anterior, tumour"; the tissue is that of the nearest tetrahedron's centre."""
+    """Describe each place in words, as "right anterior, tumour"; the tissue of the nearest tetrahedron's centre."""
     places = np.asarray(places, float)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     offset = (places - (low + high) / 2) / ((high - low) / 2)

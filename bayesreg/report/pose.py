@@ -1,4 +1,4 @@
-"""How the moving image lies beside the fixed one: what was found first, and the rigid part of the displacement."""
+"""The pose of the moving image relative to the fixed one: the initial match, and the rigid part of the displacement."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ NAMES = [
 
 
 def notes(study: Study) -> Sentences | None:
-    """What was found of pose and contrast before the search, a sentence each; None where nothing was."""
+    """List the findings on pose and contrast from before the search, a sentence each; None without findings."""
     sentences = part(study.manifest, "appraisal", "notes")
     return Sentences("What was found of the images", list(sentences)) if sentences else None
 
 
 def pose_table(study: Study) -> Table:
-    """The rigid part of the displacement of the whole organ: mean, sd and 95 % interval of its six numbers."""
+    """Make a table of the rigid part of the organ's displacement: mean, sd and 95 % interval of its six numbers."""
     draws = np.asarray(study.predicted.motion).reshape(-1, 6)
     figures = np.stack([draws.mean(axis=0), draws.std(axis=0), *np.quantile(draws, (0.025, 0.975), axis=0)], axis=1)
     rows = [[name, *(fixed(value, 3) for value in row)] for name, row in zip(NAMES, figures, strict=True)]

@@ -1,4 +1,4 @@
-"""The sections of a report: what a clinician asks first, then the statistics."""
+"""The sections of a report: first the questions of a clinician, then the statistics."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Section(NamedTuple):
     ----------
     title : str
     draws : list of functions
-        Each makes a figure, a table, or several of them; None or nothing where a run has none.
+        Each makes a figure, a table, or several of them; None or an empty list if a run has none.
     applies : function
         Whether a run has this section.
     """

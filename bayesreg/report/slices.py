@@ -52,18 +52,18 @@ class Plane(NamedTuple):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top, mm."""
+        """The left, right, bottom and top edges, mm."""
         return (*self.horizontal, *self.vertical)
 
     @property
     def title(self) -> str:
-        """Name and position, as "axial, z = 12 mm"."""
+        """The name and position of the plane, as "axial, z = 12 mm"."""
         # Adding zero turns −0 into 0.
         position = round(self.position) + 0
         return f"{NAMES[self.axis]}, {COORDINATES[self.axis]} = {position:d} mm".replace("-", "−")
 
     def points(self) -> Float[np.ndarray, "rows columns 3"]:
-        """World position of every pixel's centre, the first row at the bottom."""
+        """Return the world coordinates of every pixel's centre, with the first row at the bottom."""
         across, up = IN_PLANE[self.axis]
         points = np.empty((_count(self.vertical, self.spacing), _count(self.horizontal, self.spacing), 3))
         points[..., self.axis] = self.position
@@ -74,7 +74,7 @@ class Plane(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeshSlice:
-    """A mesh seen on the pixels of a plane."""
+    """The section of a mesh on the pixels of a plane."""
 
     mesh: TetMesh
     plane: Plane
@@ -86,17 +86,17 @@ class MeshSlice:
 
     @cached_property
     def inside(self) -> Bool[np.ndarray, "rows columns"]:
-        """Pixels inside the mesh."""
+        """The pixels inside the mesh."""
         return (self._location[0] >= 0).reshape(self.plane.points().shape[:2])
 
     def nodal(self, values: Float[AnyArray, "nodes components"]) -> Float[np.ndarray, "rows columns components"]:
-        """A piecewise linear field; NaN outside the mesh."""
+        """Evaluate a piecewise linear field; NaN outside the mesh."""
         cell, barycentric = self._location
         corner = np.asarray(values)[self.mesh.cells[cell]]
         return self._picture(np.einsum("ki,kic->kc", barycentric, corner))
 
     def cellwise(self, values: Real[AnyArray, "cells"]) -> Float[np.ndarray, "rows columns"]:
-        """A field that is constant in every tetrahedron; NaN outside the mesh."""
+        """Evaluate a field that is constant in every tetrahedron; NaN outside the mesh."""
         return self._picture(np.asarray(values, float)[self._location[0], None])[..., 0]
 
     def _picture(self, values: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ class MeshSlice:
 
 
 def sample(image: Image, points: Float[np.ndarray, "*shape 3"], order: int = 1, outside: float = np.nan) -> np.ndarray:
-    """Values of an image at world points (mm), linear or (order 0) of the nearest voxel; `outside` off the grid."""
+    """Sample an image at world points (mm), linear or (order 0) nearest voxel; `outside` is the value off the grid."""
     indices = np.asarray(image.world_to_voxel(points))
     on_grid = ((indices >= -0.5) & (indices <= np.array(image.shape) - 0.5)).all(axis=-1)
     voxels = np.asarray(image.voxels, float)
@@ -114,10 +114,10 @@ def sample(image: Image, points: Float[np.ndarray, "*shape 3"], order: int = 1, 
 
 
 def planes_through(mesh: TetMesh, point: Float[np.ndarray, "3"]) -> tuple[Plane, Plane, Plane]:
-    """Sagittal, coronal and axial plane through a point, each as large as the mesh.
+    """Make the sagittal, coronal and axial planes through a point, each as large as the mesh.
 
-    A plane that would only graze the mesh (less than 60 % of the largest parallel section) is moved inwards
-    until it does not.
+    If the section of a plane is less than 60 % of the largest parallel section, the plane is moved inwards until it is
+    not.
     """
     low, high = mesh.points.min(axis=0) - MARGIN, mesh.points.max(axis=0) + MARGIN
     sides = [(float(a), float(b)) for a, b in zip(low, high, strict=True)]
@@ -130,7 +130,7 @@ def planes_through(mesh: TetMesh, point: Float[np.ndarray, "3"]) -> tuple[Plane,
 
 
 def _position(mesh: TetMesh, axis: int, wanted: float) -> float:
-    """The position nearest to the one wanted whose section is large; areas by the mean section of each tetrahedron."""
+    """Find the position nearest to `wanted` with a large section; areas by the mean section of each tetrahedron."""
     heights = mesh.points[mesh.cells, axis]
     low, high = heights.min(axis=1), heights.max(axis=1)
     tried = np.linspace(low.min(), high.max(), POSITIONS_TRIED)

@@ -1,4 +1,4 @@
-"""Maps of the stiffness within tissues: by element, or as a field over each tissue's mean."""
+"""Maps of the stiffness within tissues: by element, or as a field relative to each tissue's mean."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MEDIAN_DRAWS = 500
 
 
 def by_element(study: Study) -> Drawing | None:
-    """Posterior median of λ/μ of every element on three planes; None unless the parameters vary by element."""
+    """Draw the posterior median of λ/μ of every element on three planes; None unless parameters vary by element."""
     ratio = element_ratio(study)
     if ratio is None:
         return None
@@ -27,7 +27,7 @@ def by_element(study: Study) -> Drawing | None:
 
 
 def element_ratio(study: Study) -> np.ndarray | None:
-    """Posterior median of λ/μ of every element, NaN where μ may be 0; None unless the parameters vary by element."""
+    """Compute the posterior median of λ/μ of every element, NaN if μ may be 0; None unless they vary by element."""
     lam, mu = elastic_draws(study.posterior, MEDIAN_DRAWS)
     if lam.shape[2:] != (len(study.mesh.cells),):
         return None
@@ -37,7 +37,7 @@ def element_ratio(study: Study) -> np.ndarray | None:
 
 
 def field(study: Study) -> Drawing | None:
-    """Mean, sd and P(> 1.5) of every element's stiffness over its tissue's; None unless there is a field."""
+    """Draw mean, sd and P(> 1.5) of every element's stiffness over its tissue's; None unless there is a field."""
     predicted, mesh = study.predicted, study.mesh
     if predicted.stiffness_mean is None:
         return None

@@ -1,4 +1,4 @@
-"""A run as its pages see it: the run, its draws, and what is computed once for all figures."""
+"""A run in the form that its pages use: the run, its draws, and results that are computed once for all figures."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Study:
         With the groups `posterior` and `sample_stats`, as in the run folder. The coordinate `node` of u_boundary
         holds mesh node indices.
     rhat, ess_bulk, ess_tail : xarray.Dataset
-        The posterior's variables without chain and draw; NaN where an entry was not sampled.
+        The posterior's variables without chain and draw; NaN if an entry was not sampled.
     """
 
     run: Run
@@ -58,14 +58,14 @@ class Study:
 
     @property
     def predicted(self) -> Predicted:
-        """The predictions of the run; InputError where an old version wrote none."""
+        """The predictions of the run; InputError if an old version wrote none."""
         if self.run.predicted is None:
             raise InputError("the run holds no predicted.npz, which its report needs: run it again with this version")
         return self.run.predicted
 
     @cached_property
     def posterior(self) -> xr.Dataset:
-        """The draws."""
+        """The draws of the run."""
         return dataset(self.idata, "posterior")
 
     @cached_property
@@ -75,12 +75,12 @@ class Study:
 
     @cached_property
     def diagnosed(self) -> Diagnosed:
-        """R̂ and both effective sample sizes of every entry."""
+        """The R̂ and both effective sample sizes of every entry."""
         return Diagnosed(self.rhat, self.ess_bulk, self.ess_tail)
 
     @cached_property
     def entries(self) -> list[Estimand]:
-        """The estimands."""
+        """The estimands with their convergence figures."""
         return estimands(self.mesh, self.diagnosed, self.posterior)
 
     @cached_property
@@ -109,14 +109,14 @@ class Study:
 
     @cached_property
     def metrics(self) -> dict[str, Any] | None:
-        """The errors against the truth, computed now where they were not stored; None where no truth is known."""
+        """The errors against the truth, computed if they were not stored; None if no truth is known."""
         if self.run.metrics is not None or self.run.truth is None:
             return self.run.metrics
         return compute_metrics(self.mesh, self.run.u_mean, self.run.truth, self.posterior)
 
     @cached_property
     def image_differences(self) -> tuple[float, float] | None:
-        """Root mean square of moving less fixed image, and of warped less fixed one; None unless of one contrast."""
+        """The root mean square of moving and warped minus fixed image; None unless the images have one contrast."""
         run = self.run
         if run.fixed is None or run.moving is None or run.warped is None or not run.matching.one_contrast:
             return None
@@ -129,22 +129,22 @@ class Study:
 
     @property
     def samples_nodes(self) -> bool:
-        """Whether displacements were sampled; not so where the boundary was given (elastography)."""
+        """Whether displacements were sampled; false if the boundary was given (elastography)."""
         return bool(self.posterior.sizes["node"])
 
     @property
     def elasticity(self) -> str:
-        """How the elastic parameters vary, in words."""
+        """The variation of the elastic parameters, in words."""
         return ELASTICITY.get(str(part(self.manifest, "model", "elasticity")), "")
 
     @property
     def name(self) -> str:
-        """The name of the run, else what it sampled."""
+        """The name of the run; without a name, a description of its sampled variables."""
         return str(self.manifest.get("name") or self.elasticity or "Registration")
 
 
 def rms_difference(run: Run, image: Image) -> float:
-    """Root mean square of an image less the fixed one over labelled voxels (an even sample of the grid)."""
+    """Compute the root mean square of an image minus the fixed one over an even sample of the labelled voxels."""
     assert run.fixed is not None
     stride = max(1, int(np.prod(run.fixed.shape) // MAX_VOXELS))
     indices = np.stack(np.unravel_index(np.arange(0, np.prod(run.fixed.shape), stride), run.fixed.shape), axis=-1)

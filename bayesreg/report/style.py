@@ -1,4 +1,4 @@
-"""Colours, type and the embedding of figures: one look for all of them."""
+"""Colours, fonts and embedding: one style for all figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ACCENT = "#9b2335"
 TRUTH = "#111111"
 
 SKULL = "#39424e"
-# Borders drawn on grey images.
+# Colour of borders on grey images.
 BORDER = "#f5b83d"
 UNIFORM = "#5b6b7b"
 
@@ -30,7 +30,7 @@ GREY = "gray"
 
 WIDTH = 10.8
 DPI = 160
-# Of pictures, from 1 to 100.
+# Quality of pictures, from 1 to 100.
 QUALITY = 88
 
 _SETTINGS: Any = {
@@ -70,11 +70,11 @@ class Drawing(NamedTuple):
     Attributes
     ----------
     key : str
-        Its anchor.
+        The anchor of the figure.
     title : str
     caption : str
     alt : str
-        What it shows, for those who cannot see it.
+        A description for readers who cannot see the figure.
     uri : str
         The picture itself, a data URI.
     """
@@ -89,18 +89,18 @@ class Drawing(NamedTuple):
 
 @contextmanager
 def look() -> Iterator[None]:
-    """Draw inside this block for the common look."""
+    """Apply the common style inside this block."""
     with mpl.rc_context(_SETTINGS):
         yield
 
 
 def new_figure(height: float, width: float = WIDTH) -> Figure:
-    """A figure of the page's width, inches."""
+    """Make a figure with the width of the page, inches."""
     return Figure(figsize=(width, height), layout=ConstrainedLayoutEngine(hspace=0.04))
 
 
 def data_uri(figure: Figure, kind: str = "webp") -> str:
-    """A figure as a data URI: "webp" for pictures, a fifth of the size of PNG on noisy images; "svg" for curves."""
+    """Encode a figure as a data URI: "webp" for pictures (a fifth of the size of PNG), "svg" for curves."""
     buffer = io.BytesIO()
     if kind == "svg":
         figure.savefig(buffer, format=kind, metadata={"Date": None})
@@ -111,12 +111,12 @@ def data_uri(figure: Figure, kind: str = "webp") -> str:
 
 
 def literal(text: str) -> str:
-    """Text that a user gave, which Matplotlib is not to set as a formula."""
+    """Escape a user's text so that Matplotlib does not format it as a formula."""
     return text.replace("$", r"\$")
 
 
 def chain_colours(count: int) -> list[str]:
-    """A colour per chain."""
+    """Return a colour for each chain."""
     if count <= len(_FEW_CHAINS):
         return list(_FEW_CHAINS[:count])
     colours = mpl.colormaps["viridis"].resampled(count)

@@ -1,4 +1,4 @@
-"""What a clinician reads first: did it work, what moved, how far, how sure is that, and where not to trust it."""
+"""The summary for a clinician: success, displacement, its uncertainty, and places of low reliability."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from bayesreg.report.study import Study
 from bayesreg.report.verdict import fixed, number, part, percent, place_text
 from bayesreg.types import AnyArray
 
-# Beyond this 95 % radius a place is of little use to a hand, mm.
+# At a place whose 95 % radius is larger, mm, the result is of little use to a surgeon.
 COARSE = 2.0
 
 
 def answers(study: Study) -> list[tuple[str, str]]:
-    """Five questions, each with its answer."""
+    """Answer five questions about a run."""
     return [
         ("Did it work?", _success(study)),
         ("What moved?", _pose(study)),
@@ -31,7 +31,7 @@ def _success(study: Study) -> str:
 
 
 def _images(study: Study) -> list[str]:
-    """By how much the images differ, before and after."""
+    """Describe the difference between the images before and after."""
     if study.image_differences is None:
         return []
     before, after = (number(value, 2) for value in study.image_differences)
@@ -39,7 +39,7 @@ def _images(study: Study) -> list[str]:
 
 
 def _held_out(study: Study) -> list[str]:
-    """How far landmarks that the sampler never saw lie from where they were found, before and after."""
+    """Describe the distances of held-out landmarks from their measured places, before and after."""
     predicted = study.predicted
     if predicted.evaluation_residual is None or not np.asarray(predicted.evaluation_inside).any():
         return []
@@ -53,7 +53,7 @@ def _held_out(study: Study) -> list[str]:
 
 
 def _fits(study: Study) -> list[str]:
-    """How large the residuals of each observation are beside what the model expects."""
+    """Describe the size of the residuals of each observation, relative to the expectation of the model."""
     observed = part(study.manifest, "observations") or {}
     return [
         f"Residuals of {name.replace('_', ' ')}: {number(entry['residual_rms'], 2)} times what the model expects."
@@ -105,7 +105,7 @@ def _place(study: Study, node: int) -> str:
 
 
 def _quantile(study: Study, values: AnyArray, level: float) -> float:
-    """The value that so much of the volume does not exceed."""
+    """Return the quantile of nodal values at a level, weighted by volume."""
     order = np.argsort(values)
     share = np.cumsum(study.mesh.nodal_volumes[order]) / study.mesh.nodal_volumes.sum()
     return float(np.asarray(values)[order][np.searchsorted(share, level)])

@@ -1,4 +1,4 @@
-"""Tables as text, and those of the errors against a known truth: the paper's Tables 1 and 2, and coverage."""
+"""Tables as text, and the tables of errors against a known truth: the paper's Tables 1 and 2, and coverage."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Table(NamedTuple):
 
 
 def in_terminal(table: Table) -> TerminalTable:
-    """A table for a terminal, without its caption."""
+    """Format a table for a terminal, without its caption."""
     shown = TerminalTable(title=table.title)
     for index, name in enumerate(table.header):
         shown.add_column(name, justify="right" if index else "left")
@@ -56,7 +56,7 @@ def in_terminal(table: Table) -> TerminalTable:
 def error_tables(
     metrics: Mapping[str, Mapping[str, Any]], tissues: Sequence[str], with_paper: bool = False
 ) -> list[Table]:
-    """Tables 1 and 2 and the coverage of runs (name -> metrics), beside the paper's where asked for."""
+    """Make Tables 1 and 2 and the coverage of runs (name -> metrics), and add the paper's values on request."""
     one, two = ("Table 1. ", "Table 2. ") if with_paper else ("", "")
     columns = ("median", "q95", "max")
     ours = _stages(metrics, "boundary_error", lambda error: [fixed(error.get(key)) for key in columns])
@@ -81,7 +81,7 @@ def _beside(ours: list[list[str]], paper: list[list[str]], with_paper: bool) -> 
 def _stages(
     metrics: Mapping[str, Mapping[str, Any]], name: str, texts: Callable[[Mapping[str, float]], list[str]]
 ) -> list[list[str]]:
-    """Rows of the stages of each run; what all runs have in common stands once."""
+    """Make rows of the stages of each run; stages that all runs share occur once."""
     rows: list[list[str]] = []
     for stage, label in STAGES.items():
         cells = {run: texts(figures[name][stage]) for run, figures in metrics.items() if stage in figures[name]}
@@ -95,7 +95,7 @@ def _stages(
 
 
 def _coverage(metrics: Mapping[str, Mapping[str, Any]]) -> list[Table]:
-    """How many true boundary displacements lie in their intervals; nothing where none was sampled."""
+    """Make a table of the coverage of true boundary displacements; empty if none was sampled."""
     known = {name: figures["coverage"] for name, figures in metrics.items() if figures.get("coverage")}
     if not known:
         return []

@@ -1,4 +1,4 @@
-"""The organ in three dimensions, which the reader can turn: its surface, the fluid in it, and the places."""
+"""An interactive figure of the organ in three dimensions: its surface, the fluid in it, and the places."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from bayesreg.report.uncertainty import Place, places_of
 from bayesreg.tissues import is_fluid
 
 FLUID, PLACE = "#3a6ea5", "#e8891c"
-# A grey that can be read on white and on black.
+# This grey is readable on white and on black.
 TEXT = "#808b96"
-# How many times as large as it is the displacement is shown.
+# Factors by which the displacement is magnified.
 ENLARGED = (0, 1, 2, 5)
 SHOWN = {0: "before", 1: "after"}
 LABEL = {"font": {"color": style.INK}, "bgcolor": "rgba(255,255,255,0.7)"}
@@ -40,23 +40,23 @@ class Surface(NamedTuple):
     faces: Int[np.ndarray, "t 3"]
 
     def at(self, times: int) -> list[list[float]]:
-        """The coordinates x, y and z with the displacement so many times as large."""
+        """Return the coordinates x, y and z with the displacement multiplied by `times`."""
         return np.round(self.points + times * self.u, 2).T.tolist()
 
     def drawn(self, **how: Any) -> go.Mesh3d:
-        """The surface after the displacement."""
+        """Return the surface after the displacement."""
         corners = dict(zip("xyzijk", (*self.at(1), *self.faces.T.tolist()), strict=True))
         return go.Mesh3d(**corners, flatshading=False, **how)
 
 
 def three_d(study: Study) -> Markup:
-    """A figure to turn, with the program that draws it; it loads nothing."""
+    """Return an interactive figure with the program that draws it; it loads nothing from a network."""
     drawn = figure(study).to_html(full_html=False, include_plotlyjs=True, config={"displayModeBar": False})
     return FIGURE.format(Markup(drawn))
 
 
 def figure(study: Study) -> go.Figure:
-    """The surface of the mesh, the places, and the fluid deep inside."""
+    """Draw the surface of the mesh, the places, and the fluid deep inside."""
     mesh, u = study.mesh, np.asarray(study.run.u_mean)
     places = places_of(study)
     surfaces = [_surface(mesh, u, mesh.boundary_faces), *(_ellipsoid(place) for place in places)]
@@ -73,7 +73,7 @@ def figure(study: Study) -> go.Figure:
 
 
 def _scales(study: Study) -> dict[str, dict[str, Any]]:
-    """What the colours of the surface can mean, by name."""
+    """Return the quantities that the colours of the surface can show, by name."""
     nodes = study.mesh.boundary
     length = np.linalg.norm(study.run.u_mean, axis=1)
     values = {
@@ -94,7 +94,7 @@ def _scales(study: Study) -> dict[str, dict[str, Any]]:
 
 
 def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]], labels: list[dict[str, Any]]) -> dict[str, Any]:
-    """The scene without a frame, a slider for the displacement, and buttons for the colours."""
+    """Make the scene without a frame, a slider for the displacement, and buttons for the colours."""
     which = list(range(len(surfaces)))
     steps = [
         {"label": SHOWN.get(times, f"× {times}"), "method": "restyle", "args": [_moved(surfaces, times), which]}
@@ -126,7 +126,7 @@ def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]], labels: 
 
 
 def _moved(surfaces: list[Surface], times: int) -> dict[str, list]:
-    """The coordinates of all surfaces, as a change to the figure."""
+    """Return the coordinates of all surfaces, as a change to the figure."""
     columns = zip(*(surface.at(times) for surface in surfaces), strict=True)
     return dict(zip("xyz", map(list, columns), strict=True))
 
@@ -137,7 +137,7 @@ def _surface(mesh: TetMesh, u: np.ndarray, faces: Int[np.ndarray, "t 3"]) -> Sur
 
 
 def _ellipsoid(place: Place) -> Surface:
-    """The region of a place; it moves as the place does."""
+    """Draw the region of a place; it moves with the place."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, 9), np.linspace(0, 2 * np.pi, 17)[:-1], indexing="ij")
     ball = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
     quads = np.arange(8 * 16).reshape(8, 16)
@@ -150,13 +150,13 @@ def _ellipsoid(place: Place) -> Surface:
 
 
 def _label(place: Place) -> dict[str, Any]:
-    """The name of a place, where it goes; it is drawn over the scene."""
+    """Draw the name of a place at its displaced place, in front of the scene."""
     at = dict(zip("xyz", (place.point + place.region.mean).tolist(), strict=True))
     return {**at, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6, **LABEL}
 
 
 def _fluid_faces(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
-    """The surface of the largest connected piece of fluid deep inside, such as the ventricles; empty without any."""
+    """Find the surface of the largest connected piece of fluid deep inside (the ventricles); empty without any."""
     fluid = np.array([is_fluid(name) for name in mesh.names])[mesh.tissue]
     deep = np.flatnonzero(fluid & ~np.isin(mesh.cells, mesh.boundary).any(axis=1))
     if not len(deep):

@@ -1,4 +1,4 @@
-"""How far the intervals of the displacement can be trusted: what they hold, and what they do not."""
+"""The reliability of the intervals of the displacement: which errors they include, and which they do not."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from bayesreg.report.verdict import number, part
 
 
 def explain(study: Study) -> Sentences | None:
-    """Sentences on the intervals of a run; None where there is nothing to say."""
+    """Write sentences on the intervals of a run; None if there is nothing to report."""
     said = explain_intervals(study.manifest)
     return Sentences("How far the intervals can be trusted", said) if said else None
 
 
 def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
-    """Say what the standard deviations hold besides independent noise, by how much, and why."""
+    """Explain which errors the standard deviations include besides independent noise, their size, and the reason."""
     return [*_correlated(manifest), *_outliers(manifest), *_mesh(manifest), *_folds(manifest)]
 
 

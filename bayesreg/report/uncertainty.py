@@ -1,4 +1,4 @@
-"""How far to trust the displacement at places: regions that hold 95 % of the draws."""
+"""The uncertainty of the displacement at places: regions that hold 95 % of the draws."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ HEADER = ["", "Place (x, y, z)", "Where", "Shift x, y, z, mm", "Length, mm", "95
 
 
 class Region(NamedTuple):
-    """The ellipsoid about the mean of some draws, shaped as their covariance, that holds 95 % of them.
+    """The ellipsoid around the mean of draws, with the shape of their covariance, that holds 95 % of them.
 
     Attributes
     ----------
     mean : (3,) array
         mm.
     shape : (3, 3) array
-        Semi-axes are the roots of its eigenvalues, mm².
+        The semi-axes are the square roots of its eigenvalues, mm².
     """
 
     mean: Float[np.ndarray, "3"]
@@ -42,12 +42,12 @@ class Region(NamedTuple):
 
     @property
     def semi_axes(self) -> Float[np.ndarray, "3"]:
-        """Longest first, mm."""
+        """The lengths of the semi-axes in decreasing order, mm."""
         return np.sqrt(np.clip(np.linalg.eigvalsh(self.shape), 0, None))[::-1]
 
 
 def region(draws: Float[AnyArray, "draws 3"]) -> Region:
-    """The 95 % region of draws; its size is counted off the draws, not taken from the Normal distribution."""
+    """Compute the 95 % region of draws; its size is a quantile of the draws, not of the Normal distribution."""
     draws = np.asarray(draws, float)
     mean, covariance = draws.mean(axis=0), np.cov(draws, rowvar=False) if len(draws) > 1 else np.zeros((3, 3))
     offset = draws - mean
@@ -69,14 +69,14 @@ class Place(NamedTuple):
 
 
 def places_of(study: Study) -> list[Place]:
-    """The places of a run."""
+    """List the places of a run."""
     predicted = study.predicted
     draws, points = np.moveaxis(np.asarray(predicted.place_draws), 2, 0), np.asarray(predicted.place_points, float)
     return [Place(str(name), *rest) for name, *rest in zip(predicted.place_names, points, draws, strict=True)]
 
 
 def place_table(study: Study) -> Table:
-    """Displacement and 95 % region of every place."""
+    """Make a table of the displacement and 95 % region of every place."""
     words, far = regions(study.mesh, study.predicted.place_points), float(study.predicted.far_mm)
     rows = [_place_row(place, where, far) for place, where in zip(places_of(study), words, strict=True)]
     caption = (
@@ -103,7 +103,7 @@ def _place_row(place: Place, where: str, far: float) -> list[str]:
 
 
 def places(study: Study) -> Drawing | None:
-    """The draws and the 95 % region of each place, on the moving image, one column for each; None without images."""
+    """Draw the draws and the 95 % region of each place on the moving image, a column for each; None without images."""
     if study.run.moving is None:
         return None
     shown = places_of(study)
@@ -150,7 +150,7 @@ def _draw_place(axes: Axes, study: Study, place: Place, axis: int, limits: tuple
 
 
 def _draw_ellipse(axes: Axes, centre: np.ndarray, shape: np.ndarray) -> None:
-    """Outline of an ellipsoid seen along an axis: the same matrix without that axis."""
+    """Draw the outline of an ellipsoid seen along an axis: the same matrix without that axis."""
     values, vectors = np.linalg.eigh(shape)
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
     width, height = 2 * np.sqrt(np.clip(values[::-1], 0, None))

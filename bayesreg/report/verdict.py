@@ -1,4 +1,4 @@
-"""The first words of a report: did it converge, the key numbers, and what to beware of."""
+"""The first words of a report: convergence, the key numbers, and warnings."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ UNCONVERGED = (
 
 
 class Verdict(NamedTuple):
-    """Whether the chains converged.
+    """The judgement whether the chains converged.
 
     Attributes
     ----------
     converged : bool
-        Whether R-hat is below the threshold for every estimand, and the run's own stop rule does not deny it.
+        Whether R-hat is below the threshold for every estimand, and the run's own stop rule agrees.
     headline : str
         One sentence.
     detail : str
-        Why it stopped, and what that means for the figures below.
+        The reason of the stop, and its meaning for the figures below.
     """
 
     converged: bool
@@ -43,17 +43,17 @@ class Verdict(NamedTuple):
 
 
 def fixed(value: float | int | None, decimals: int = 2) -> str:
-    """A number with so many decimals; a dash where there is none."""
+    """Format a number with `decimals` decimals; a dash if it is not finite or missing."""
     return NONE if value is None or not math.isfinite(value) else f"{value:,.{decimals}f}".replace("-", "−")
 
 
 def percent(value: float | int | None) -> str:
-    """A fraction as per cent."""
+    """Format a fraction as per cent."""
     return NONE if value is None or not math.isfinite(value) else f"{100 * value:.1f} %"
 
 
 def duration(seconds: float | int | None) -> str:
-    """Seconds as "45 s", "3 min 20 s" or "2 h 05 min"."""
+    """Format seconds as "45 s", "3 min 20 s" or "2 h 05 min"."""
     if seconds is None or not math.isfinite(seconds):
         return NONE
     if seconds < 60:
@@ -63,7 +63,7 @@ def duration(seconds: float | int | None) -> str:
 
 
 def part(manifest: Mapping[str, Any], *keys: str) -> Any:
-    """A nested entry of the manifest, or None."""
+    """Return a nested entry of the manifest, or None."""
     value: Any = manifest
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
@@ -71,14 +71,15 @@ def part(manifest: Mapping[str, Any], *keys: str) -> Any:
 
 
 def threshold_of(manifest: Mapping[str, Any]) -> float:
-    """The R-hat that was asked for; 1.01 where none was."""
+    """Return the R-hat threshold of the stop rule; 1.01 without a stop rule."""
     return float(part(manifest, "stopped", "rhat_threshold") or DEFAULT_THRESHOLD)
 
 
 def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict:
-    """Judge by the estimands, and by the stop rule's own R-hat (unsplit, as in the paper) where it is known.
+    """Judge by the estimands, and by the stop rule's own R-hat (unsplit, as in the paper) if it is known.
 
-    Rank-normalised R-hat cannot grow far beyond one with few chains, the unsplit one misses drifts: both must be low.
+    With few chains, the rank-normalised R-hat cannot be much greater than one, and the unsplit R-hat misses drifts.
+    Both must be low.
     """
     threshold = threshold_of(manifest)
     reason = str(part(manifest, "stopped", "reason") or "").strip().rstrip(".")
@@ -104,7 +105,7 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
 
 
 def _missed_rules(manifest: Mapping[str, Any], threshold: float) -> str:
-    """The figures that the stop rule asked for besides the rank-normalised R-hat, and those reached."""
+    """Describe the figures that the stop rule required besides the rank-normalised R-hat, and the figures reached."""
     wanted = part(manifest, "stopped", "ess_threshold")
     if wanted is None:
         return f"its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, asked for {threshold:g}"
@@ -117,7 +118,7 @@ def _unsplit(manifest: Mapping[str, Any]) -> str:
 
 
 def rhat_text(rhat: float) -> str:
-    """R-hat for people; undefined where a chain never moved."""
+    """Format R-hat; "undefined" if a chain never moved."""
     return "undefined" if math.isnan(rhat) else "infinite" if math.isinf(rhat) else number(rhat, 4)
 
 
@@ -126,7 +127,7 @@ def _at(entry: Estimand) -> str:
 
 
 def place_text(place: Iterable[float]) -> str:
-    """A world position, mm."""
+    """Format world coordinates, mm."""
     # Adding zero turns −0 into 0.
     return ("(" + ", ".join(f"{round(coordinate) + 0:d}" for coordinate in place) + ") mm").replace("-", "−")
 
@@ -144,7 +145,7 @@ def _least(entries: Sequence[Estimand], figure: str) -> float:
 
 
 def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterior: xr.Dataset) -> dict[str, str]:
-    """The key numbers of a run, as text under their labels."""
+    """Return the key numbers of a run, as text by their labels."""
     entry, sizes = partial(part, manifest), posterior.sizes
     implied = entry("implied_noise_sd")
     return {
@@ -175,7 +176,7 @@ def _count(value: float | int | None) -> str:
 
 
 def approximation(manifest: Mapping[str, Any]) -> str:
-    """A warning to the reader of an approximate run; empty where the sampler is exact."""
+    """Return a warning about an approximate sampler; empty if the sampler is exact."""
     if part(manifest, "exact") is not False:
         return ""
     sampler = part(manifest, "sampler", "name")
@@ -188,7 +189,7 @@ def approximation(manifest: Mapping[str, Any]) -> str:
 
 
 def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
-    """All warnings of a run beyond convergence: those of its data, and those of its result.
+    """List all warnings of a run except on convergence: those of its data, and those of its result.
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def _equilibrium(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def doubt_of_equilibrium(model: Mapping[str, Any] | None, simulated: bool) -> str | None:
-    """What is likely wrong where images that no model made are registered with a strict equilibrium inside."""
+    """Return a warning if real images are registered with a strict equilibrium inside; None otherwise."""
     if simulated or part(model or {}, "elastic_prior", "nodes") != "boundary":
         return None
     return (

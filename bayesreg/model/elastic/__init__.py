@@ -1,1 +1,1 @@
-"""The priors of the displacements: elastic energy or random loads, rigid motions, and walls."""
+"""The priors of the displacements: elastic energy or random loads, rigid motions, barrier and skull."""

@@ -1,4 +1,4 @@
-"""A barrier in the prior against tetrahedra that are turned inside out: matter does not."""
+"""A barrier in the prior against inverted tetrahedra, which real tissue cannot have."""
 
 from __future__ import annotations
 
@@ -15,22 +15,25 @@ from bayesreg.model.state import State
 from bayesreg.model.term import PointCurvature, SharedCurvature
 from bayesreg.types import AnyArray, Scalar
 
-# Standard deviation of the logarithm of a share below the least: 0.9 of the least costs 0.14, half of it 6.
+# Standard deviation of the logarithm of a share below the least share. A share of 0.9 of the least costs 0.14, a share
+# of 0.5 costs 6.
 WIDTH = 0.2
-# Below this share of the least volume the barrier goes on to second order: a search may come from a place behind it.
+# Below this share of the least volume, a second-order expansion continues the barrier, because a search may start
+# behind it.
 QUADRATIC_BELOW = 0.05
 
 
 class Barrier(NamedTuple):
-    """exp(−½ Σ (ln(J / least) / WIDTH)²) over the tetrahedra with J < least, J = det(I + ∇u) the share of volume left.
+    """The factor exp(−½ Σ (ln(J / least) / WIDTH)²) over the tetrahedra with J = det(I + ∇u) < least.
 
-    With J its cost goes up to 112 and on, more steeply than any pair of images pulls: an inverted tetrahedron, J ≤ 0,
-    has e^−237 of the density or less.
+    J is the share of its volume that a tetrahedron keeps. The cost is 112 at `QUADRATIC_BELOW` times the least share.
+    Below that it continues to grow, more steeply than the log likelihood of any pair of images. An inverted
+    tetrahedron, J ≤ 0, has a density of at most e^−237.
 
     Attributes
     ----------
     least : scalar
-        Between 0 and 1.
+        The least share of volume without cost, between 0 and 1.
     elements : Elements
     """
 
@@ -39,7 +42,7 @@ class Barrier(NamedTuple):
 
     @property
     def is_nearly_quadratic(self) -> bool:
-        """Not in the displacements."""
+        """Whether the log is nearly quadratic in the displacements; it is not."""
         return False
 
     @property
@@ -48,11 +51,11 @@ class Barrier(NamedTuple):
         return "barrier"
 
     def log(self, state: State) -> Scalar:
-        """The log density up to a constant."""
+        """Return the log density up to a constant."""
         return -cost(volume_shares(self.elements, state.u) / self.least).sum()
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Second derivative of the cost times ∇J ∇Jᵀ of every tetrahedron below the least volume, 1/mm²."""
+        """Compute the second derivative of the cost times ∇J ∇Jᵀ of every tetrahedron below the least volume, 1/mm²."""
         gradient = np.stack([np.stack(row) for row in displacement_gradient(self.elements.derivative, jnp.asarray(u))])
         shares = np.asarray(volume_shares(self.elements, jnp.asarray(u)) / self.least)
         below = np.flatnonzero(shares < 1)
@@ -68,13 +71,13 @@ class Barrier(NamedTuple):
         return PointCurvature(np.broadcast_to(nodes, own.shape), own, np.zeros((len(nodes), 3, 3)), shared)
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Nothing: beside Gauss and Newton's part that of the slope is smaller by J, which is below the least."""
+        """Return zero: the remainder is smaller than the Gauss–Newton part by the factor J, below the least share."""
         found = self.gauss_newton(u, values)
         return found._replace(shared=None)
 
 
 def cost(share: AnyArray) -> AnyArray:
-    """½ (ln(share) / WIDTH)² below 1, the share of the least volume being so small; to second order from there on."""
+    """Return ½ (ln(share) / WIDTH)² below 1, and its second-order expansion below a small share."""
     inside = jnp.clip(share, QUADRATIC_BELOW, 1.0)
     depth = jnp.log(inside) / WIDTH
     slope, bending = depth / (WIDTH * inside), (1 / WIDTH - depth) / (WIDTH * inside**2)
@@ -83,7 +86,7 @@ def cost(share: AnyArray) -> AnyArray:
 
 
 def volume_shares(elements: Elements, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "cells"]:
-    """J = det(I + ∇u) of every tetrahedron: its volume over that at rest, negative where it is inverted."""
+    """Compute J = det(I + ∇u) of every tetrahedron: volume over volume at rest; negative if it is inverted."""
     (a, b, c), (d, e, f), (g, h, i) = displacement_gradient(elements.derivative, u)
     a, e, i = 1 + a, 1 + e, 1 + i
     return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)

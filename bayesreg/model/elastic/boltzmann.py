@@ -53,7 +53,7 @@ class Boltzmann(Section):
 
     @property
     def samples_no_node(self) -> bool:
-        """Whether every displacement is known or follows from known ones (elastography)."""
+        """Whether no displacement is sampled because all are known or follow from known ones (elastography)."""
         return not isinstance(self.nodes, str) and not set(self.nodes) - set(self.held)
 
     @property
@@ -62,17 +62,17 @@ class Boltzmann(Section):
         return {"t_elastic": self.temperature}
 
     def on(self, mesh: TetMesh, determinant: SchurDeterminant | None) -> BoltzmannTerm:
-        """The term on a mesh."""
+        """Make the term on a mesh."""
         return BoltzmannTerm(determinant)
 
 
 class BoltzmannTerm(NamedTuple):
-    """exp(−E_r / T_r), eq. (12), with or without its normaliser.
+    """The factor exp(−E_r / T_r), eq. (12), with or without its normaliser.
 
     Attributes
     ----------
     determinant : SchurDeterminant or None
-        None leaves the normaliser out, as the paper does.
+        If it is None, the normaliser is omitted, as in the paper.
     """
 
     determinant: SchurDeterminant | None
@@ -84,7 +84,7 @@ class BoltzmannTerm(NamedTuple):
 
     @property
     def powers(self) -> dict[str, float]:
-        """Its scales by the names of their blocks, and the powers of a temperature that they are."""
+        """The scales by the names of their blocks; each is the temperature to the given power."""
         return {"t_elastic": 1.0}
 
     @property
@@ -93,19 +93,19 @@ class BoltzmannTerm(NamedTuple):
         return "elastic"
 
     def log(self, state: State) -> Scalar:
-        """−E_r / T_r, and the normaliser if it is part of the density."""
+        """Return −E_r / T_r, plus the log normaliser if it is part of the density."""
         energy = state.strain_energy / state.values["t_elastic"]
         return -energy + self.log_normaliser(state.elements, state.lam, state.mu, state.values)
 
     def log_normaliser(
         self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], values: Values
     ) -> Scalar:
-        """½ log pdet S(λ, μ) − r/2 log(2π T_r), r the rank of S; zero where it is left out."""
+        """Return ½ log pdet S(λ, μ) − r/2 log(2π T_r), where r is the rank of S; zero without normaliser."""
         if self.determinant is None:
             return jnp.zeros(())
         log_pdet = log_pseudo_determinant(self.determinant, elements, lam, mu)
         return 0.5 * (log_pdet - self.determinant.rank * jnp.log(2 * jnp.pi * values["t_elastic"]))
 
     def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
-        """S / T_r, 1/mm², of the Schur complement S of the stiffness in the sampled nodes."""
+        """Return S / T_r, 1/mm², where S is the Schur complement of the stiffness in the sampled nodes."""
         return stiffness / float(values["t_elastic"])

@@ -18,12 +18,12 @@ from bayesreg.model.state import State
 from bayesreg.settings import KnownOrInferred, ScalePrior, Section, Vector
 from bayesreg.types import AnyArray, Matrix, Scalar
 
-# A load of any size within a factor of 400 of this one.
+# This prior allows a load within a factor of 400 of this value.
 WIDE = ScalePrior(median=0.1, log_sd=3.0)
 
 
 class RandomLoads(Section):
-    """Equilibrium with random loads: the displacements of all nodes are sampled, and depend little on the mesh."""
+    """Equilibrium with random loads: all nodes are sampled, and the displacements depend little on the mesh."""
 
     normalised: ClassVar[bool] = True
     nodes: ClassVar[str] = "all"
@@ -42,7 +42,7 @@ class RandomLoads(Section):
         return {"body_load": self.body, "surface_load": self.surface}
 
     def on(self, mesh: TetMesh, determinant: SchurDeterminant | None) -> LoadsTerm:
-        """The term on a mesh whose nodes are all sampled."""
+        """Make the term on a mesh whose nodes are all sampled."""
         volumes = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.points))
         arrays = volumes, boundary_areas(mesh), rigid_modes(mesh.points)
         return LoadsTerm(determinant, *(jnp.asarray(array) for array in arrays))
@@ -51,22 +51,23 @@ class RandomLoads(Section):
 class LoadsTerm(NamedTuple):
     """Equilibrium with random loads: K u = q in place of eq. (7), q ~ N(0, D), D = s² M + t² A on the diagonal.
 
-    The body forces are white noise of the density s, M the lumped volumes of the nodes, and the surface forces white
-    noise of the density t, A their lumped areas; a free body is at rest, so that they are in balance. What follows for
-    u is N(0, (K D⁻¹ K)⁺), up to a rigid motion, as smooth as elastic bodies are. Its variance at a point has a limit
-    where the mesh is refined, unlike that of exp(−E_r / T_r) on all nodes (Lindgren, Rue and Lindström 2011; Bui-Thanh,
-    Ghattas, Martin and Stadler 2013). Without body forces, s → 0, the inside is in equilibrium: eq. (7).
+    The body forces are white noise with density s, where M has the lumped volumes of the nodes. The surface forces are
+    white noise with density t, where A has their lumped areas. The body is free and at rest, so the forces are
+    balanced. The distribution of u is then N(0, (K D⁻¹ K)⁺), up to a rigid motion; u is as smooth as that of an elastic
+    body. Its variance at a point has a limit under mesh refinement, unlike that of exp(−E_r / T_r) on all nodes
+    (Lindgren, Rue and Lindström 2011; Bui-Thanh, Ghattas, Martin and Stadler 2013). Without body forces, s → 0, the
+    inside is in equilibrium: eq. (7).
 
     Attributes
     ----------
     determinant : SchurDeterminant or None
-        None leaves log pdet K out of the normaliser.
+        If it is None, the normaliser omits log pdet K.
     volumes : (n,) array
         Diagonal of M, mm³.
     areas : (n,) array
         Diagonal of A, mm², zero inside.
     rigid : (3n, 6) array
-        Orthonormal basis of the rigid motions, which cost nothing.
+        Orthonormal basis of the rigid motions, which need no force.
     """
 
     determinant: SchurDeterminant | None
@@ -81,7 +82,7 @@ class LoadsTerm(NamedTuple):
 
     @property
     def powers(self) -> dict[str, float]:
-        """Its scales by the names of their blocks, and the powers of a temperature that they are."""
+        """The scales by the names of their blocks; each is a temperature to the given power."""
         return {"body_load": 0.5, "surface_load": 0.5}
 
     @property
@@ -90,11 +91,11 @@ class LoadsTerm(NamedTuple):
         return "elastic"
 
     def variances(self, values: Values) -> Float[AnyArray, "nodes"]:
-        """The diagonal of D, of each node: the variance of every component of its load."""
+        """Return the diagonal of D at each node: the variance of every component of its load."""
         return values["body_load"] ** 2 * self.volumes + values["surface_load"] ** 2 * self.areas
 
     def log(self, state: State) -> Scalar:
-        """−½ qᵀ D⁻¹ q and the normaliser, but for log pdet K where that is left out."""
+        """Return −½ qᵀ D⁻¹ q plus the log normaliser, without log pdet K if that is omitted."""
         load = internal_force(state.elements, state.lam, state.mu, state.u)
         energy = (load**2 / self.variances(state.values)[:, None]).sum() / 2
         log_pdet = self.log_normaliser(state.elements, state.lam, state.mu, state.values)
@@ -103,24 +104,24 @@ class LoadsTerm(NamedTuple):
     def log_normaliser(
         self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"], values: Values
     ) -> Scalar:
-        """log pdet K, the costly part of the normaliser; zero where it is left out.
+        """Return log pdet K, the costly part of the normaliser; zero if it is omitted.
 
         The whole normaliser is ½ log pdet(K D⁻¹ K) − r/2 log 2π, r = 3n − 6. With an orthonormal basis R of the null
-        space of K, pdet(K D⁻¹ K) = (pdet K)² det(Rᵀ D R) / det D, since the block of D⁻¹ in the complement of R has the
-        determinant of the block of D in R over that of D (Jacobi).
+        space of K, pdet(K D⁻¹ K) = (pdet K)² det(Rᵀ D R) / det D. The reason is Jacobi's identity: the determinant of
+        the block of D⁻¹ in the complement of R equals the determinant of the block of D in R over det D.
         """
         if self.determinant is None:
             return jnp.zeros(())
         return log_pseudo_determinant(self.determinant, elements, lam, mu)
 
     def _log_normaliser_of_loads(self, values: Values) -> Scalar:
-        """½ (log det Rᵀ D R − log det D − r log 2π)."""
+        """Return ½ (log det Rᵀ D R − log det D − r log 2π)."""
         variances = jnp.repeat(self.variances(values), 3)
         in_null_space = jnp.linalg.slogdet(self.rigid.T @ (variances[:, None] * self.rigid))[1]
         rank = len(variances) - self.rigid.shape[1]
         return 0.5 * (in_null_space - jnp.log(variances).sum() - rank * jnp.log(2 * jnp.pi))
 
     def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
-        """K D⁻¹ K, 1/mm²."""
+        """Return K D⁻¹ K, 1/mm²."""
         weights = np.repeat(1 / np.asarray(self.variances(values)), 3)
         return stiffness @ (scipy.sparse.diags(weights) @ stiffness)

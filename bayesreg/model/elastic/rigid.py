@@ -11,7 +11,7 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class RigidPrior(NamedTuple):
-    """Gaussian prior of the root-mean-square displacement of each rigid mode over the sampled nodes.
+    """A Gaussian prior of the root-mean-square displacement of each rigid mode over the sampled nodes.
 
     Attributes
     ----------
@@ -30,14 +30,14 @@ class RigidPrior(NamedTuple):
         return "rigid"
 
     def log(self, state: State) -> Scalar:
-        """The log density up to a constant."""
+        """Return the log density up to a constant."""
         return self.log_of(self.modes.T @ state.values["u_boundary"].reshape(-1))
 
     def log_of(self, coefficients: Float[AnyArray, "6"]) -> Scalar:
-        """The log density of the six coefficients of the modes."""
+        """Return the log density of the six coefficients of the modes."""
         mean_square = coefficients**2 / (len(self.modes) // 3)
         return -0.5 * (mean_square / self.sd**2).sum()
 
     def precision(self) -> Float[AnyArray, "rows rows"]:
-        """The curvature in the displacements of the sampled nodes, 1/mm²."""
+        """Return the curvature in the displacements of the sampled nodes, 1/mm²."""
         return self.modes @ self.modes.T / ((len(self.modes) // 3) * self.sd**2)

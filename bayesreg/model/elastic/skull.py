@@ -1,4 +1,4 @@
-"""The skull: no sampled node lies in Ω_SK, or none lies deep in it."""
+"""The skull constraint: no sampled node lies in Ω_SK (hard), or no node lies deep in it (soft)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Skull(NamedTuple):
-    """Zero where a sampled node lies in the forbidden region, one elsewhere: such a state cannot have made the image.
+    """The hard constraint: zero if a sampled node lies in the forbidden region, one otherwise.
 
     Attributes
     ----------
@@ -35,20 +35,20 @@ class Skull(NamedTuple):
         return "skull"
 
     def log(self, state: State) -> Scalar:
-        """Zero or −∞."""
+        """Return zero or −∞."""
         return jnp.where(self.allows(state.values), 0.0, -jnp.inf)
 
     def allows(self, values: Values) -> Bool[AnyArray, ""]:
-        """Whether no sampled node lies in Ω_SK."""
+        """Check whether all sampled nodes lie outside Ω_SK."""
         return (self.gap(values["u_boundary"]) >= 0).all()
 
     def gap(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
-        """Signed distance to Ω_SK of the sampled nodes, displaced by u, mm."""
+        """Return the signed distances to Ω_SK of the sampled nodes, displaced by u, mm."""
         return self.distance(self.points + u)
 
 
 class SoftSkull(NamedTuple):
-    """A skull that nobody knows to a hair: exp(−½ Σ (d / width)²) over the sampled nodes at a depth d inside of it.
+    """A skull with an uncertain border: exp(−½ Σ (d / width)²); d is the depth of a sampled node inside the skull.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class SoftSkull(NamedTuple):
 
     @property
     def is_nearly_quadratic(self) -> bool:
-        """Not in the displacements."""
+        """Whether the log is nearly quadratic in the displacements; it is not."""
         return False
 
     @property
@@ -74,35 +74,35 @@ class SoftSkull(NamedTuple):
         return self.hard.name
 
     def gap(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
-        """See `Skull.gap`."""
+        """Return the signed distances to Ω_SK; see `Skull.gap`."""
         return self.hard.gap(u)
 
     def depth(self, u: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "sampled"]:
-        """How deep the sampled nodes lie inside, displaced by u, mm; zero outside."""
+        """Return the depth of the sampled nodes inside the skull, displaced by u, mm; zero outside."""
         return -jnp.minimum(self.gap(u), 0.0)
 
     def log(self, state: State) -> Scalar:
-        """−½ Σ (d / width)²."""
+        """Return −½ Σ (d / width)²."""
         return -0.5 * (self.depth(state.values["u_boundary"]) ** 2).sum() / self.width**2
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """n nᵀ / width² at every node inside, n the gradient of the distance, 1/mm²."""
+        """Return n nᵀ / width² at every node inside, where n is the gradient of the distance, 1/mm²."""
         normal = jax.grad(lambda u: self.depth(u).sum())(values["u_boundary"]) / self.width
         own = jnp.broadcast_to(jnp.eye(4)[0], (len(self.nodes), 4))
         nodes = jnp.broadcast_to(self.nodes[:, None], own.shape)
         return PointCurvature(nodes, own, normal[:, :, None] * normal[:, None])
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Nothing: walls are nearly flat."""
+        """Return zero: the surface of the skull is nearly flat."""
         found = self.gauss_newton(u, values)
         return found._replace(matrices=jnp.zeros_like(found.matrices))
 
 
 def mark_behind_skull(problem: Any, u: Float[AnyArray, "sampled 3"]) -> Bool[AnyArray, "sampled"]:
-    """Mark the sampled nodes that lie in the skull of a `Problem` where they are displaced by u, mm."""
+    """Mark the sampled nodes that lie in the skull of a `Problem` if they are displaced by u, mm."""
     return problem.terms["skull"].gap(u) < 0
 
 
 def is_allowed(distance: Interpolator, points: Float[AnyArray, "nodes 3"]) -> Bool[AnyArray, "nodes"]:
-    """Tell which points (world, mm) lie outside Ω_SK, by the signed distance."""
+    """Check which points (world, mm) lie outside Ω_SK, by the signed distance."""
     return distance(points) >= 0

@@ -1,1 +1,1 @@
-"""What was observed of the organ: one file, or one folder, for each kind of observation."""
+"""The observations of the organ: one file or folder for each kind of observation."""

@@ -1,4 +1,4 @@
-"""Pairs of points as an observation: where some places of the organ are in the other space."""
+"""Pairs of points as an observation: the places of some points of the organ in both images."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from bayesreg.printable import require_printable
 from bayesreg.settings import FoundFile, KnownOrInferred, ScalePrior
 from bayesreg.types import AnyArray, InputError, Scalar
 
-# Landmarks that are left out in turn, and unknowns up to which there is memory for that.
+# The greatest number of landmarks that are left out in turn, and of unknowns for which the memory suffices.
 MOST_LEFT_OUT, MOST_UNKNOWNS = 60, 12_000
 
 
 class Landmarks:
     """Pairs of points that show the same place of the organ, each with an isotropic Normal error.
 
-    log p = −Σ |q − p − u(p)|² / (2 sd²), and −3k log(sd) where the sd is inferred.
+    log p = −Σ |q − p − u(p)|² / (2 sd²), and −3k log(sd) if the sd is inferred.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ class Landmarks:
         Standard deviation of the error of each coordinate, mm, positive; or the prior of one sd for all points, which
         is then inferred as "<name>_sd".
     name : str, default "landmarks"
-        Its name in tables and in the NumPyro program.
+        The name of the observation in tables and in the NumPyro program.
     labels : sequence of str, optional
-        What to call each pair in the report; the default is its number.
+        The name of each pair in the report; the default is its number.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class Landmarks:
         self.sd = _known_sd(self.prior.median if self.prior else sd, count, name)
 
     def on(self, mesh: TetMesh, preset: str = "paper") -> Placed:
-        """The landmarks on a mesh, with their sd where that is inferred; InputError if a point lies outside it."""
+        """Place the landmarks on a mesh, with their sd if it is inferred; InputError if a point lies outside."""
         labels = [f"{self.name}: point {label}" for label in self.labels]
         nodes, weights = interpolation_at(mesh, self.fixed_points, labels)
         scale = f"{self.name}_sd"
@@ -96,7 +96,7 @@ class Landmarks:
         return Placed(self, term, {} if self.prior is None else {scale: scale_block(self.prior)})
 
     def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
-        """Residuals at a state, and where the landmarks are few, of each as all else predicts it."""
+        """Summarise the residuals at a state, and for few landmarks their predictions by all other observations."""
         term = posterior.data.terms[self.name]
         found = {
             "names": np.array(self.labels),
@@ -110,7 +110,7 @@ class Landmarks:
         return found | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
 
     def recorded(self, term: ComparedPoints) -> Recorded:
-        """Displacements of the landmarks, mm."""
+        """Return the displacements of the landmarks, mm."""
         coords = {f"{self.name}_point": list(self.labels), "axis": list("xyz")}
         attributes = {"units": "mm", "long_name": "displacement of the landmarks, world RAS"}
         return Recorded(xr.DataArray(np.asarray(term.shift), coords, list(coords), attrs=attributes))
@@ -145,7 +145,7 @@ class ComparedPoints(NamedTuple):
     ----------
     label : Label
     scale : Label or None
-        Name of the block with the sd of all points; None where it is known.
+        Name of the block with the sd of all points; None if the sd is known.
     nodes : (k, 4) int array
         Nodes of the cell that holds each point.
     weights : (k, 4) array
@@ -153,7 +153,7 @@ class ComparedPoints(NamedTuple):
     shift : (k, 3) array
         q − p, mm.
     known_sd : (k,) array
-        mm; the median of its prior where it is inferred.
+        The sd, mm; if it is inferred, the median of its prior.
     """
 
     label: Label
@@ -170,56 +170,56 @@ class ComparedPoints(NamedTuple):
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
-        """The name of the sd where it is inferred: its joint mode with the displacements misleads."""
+        """The name of the sd if it is inferred: its joint mode with the displacements misleads."""
         return () if self.scale is None else (self.scale.name,)
 
     def sd(self, values: Values) -> Float[AnyArray, "k"]:
-        """The sd of every point, mm."""
+        """Return the sd of every point, mm."""
         return self.known_sd if self.scale is None else jnp.full(self.known_sd.shape, values[self.scale.name])
 
     def log(self, state: State) -> Scalar:
-        """−Σ |q − p − u(p)|² / (2 sd²), and the part of the normaliser that is not known."""
+        """Return −Σ |q − p − u(p)|² / (2 sd²), and the unknown part of the log normaliser."""
         return self.likelihood(state).log_prob(self.shift).sum()
 
     def observed(self) -> AnyArray:
-        """q − p, mm."""
+        """Return the observed q − p, mm."""
         return self.shift
 
     def likelihood(self, state: State) -> dist.Distribution:
-        """N(u(p), sd²), up to the part of its normaliser that is known."""
+        """Return the distribution N(u(p), sd²), without the known part of its normaliser."""
         sd = self.sd(state.values)
         return PartlyNormalised(self.predicted(state), sd[:, None], self.known_sd[:, None])
 
     def predicted(self, state: State) -> Float[AnyArray, "k 3"]:
-        """u(p), mm."""
+        """Return the predicted displacement u(p), mm."""
         return jnp.einsum("ka,kai->ki", self.weights, state.u[self.nodes])
 
     def pointwise_log_likelihood(self, state: State) -> Float[AnyArray, "k"]:
-        """The log likelihood of every landmark with its normaliser, as leave-one-out needs it."""
+        """Return the log likelihood of every landmark with its normaliser, for leave-one-out."""
         return norm.logpdf(self.shift, self.predicted(state), self.sd(state.values)[:, None]).sum(axis=1)
 
     def standardised_residual(self, state: State) -> Float[AnyArray, "k 3"]:
-        """(q − p − u(p)) / sd: independent standard Normal numbers where the model holds."""
+        """Return (q − p − u(p)) / sd: independent standard Normal numbers if the model holds."""
         return (self.shift - self.predicted(state)) / self.sd(state.values)[:, None]
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """1 / sd² in every coordinate of every point, 1/mm²."""
+        """Return 1 / sd² in every coordinate of every point, 1/mm²."""
         return PointCurvature(self.nodes, self.weights, jnp.eye(3) / self.sd(values)[:, None, None] ** 2)
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Nothing: the density is Gaussian in the displacements."""
+        """Return zero: the density is Gaussian in the displacements."""
         return PointCurvature(self.nodes, self.weights, jnp.zeros((len(self.known_sd), 3, 3)))
 
 
 class PartlyNormalised(dist.Normal):
-    """A Normal distribution whose log density leaves out the normaliser of a known scale."""
+    """A Normal distribution whose log density omits the normaliser of a known scale."""
 
     def __init__(self, loc: Any, scale: Any, known_scale: Any) -> None:
         self.known_scale = known_scale
         super().__init__(loc, scale)
 
     def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
-        """−(value − loc)² / (2 scale²) − log(scale / known scale)."""
+        """Return −(value − loc)² / (2 scale²) − log(scale / known scale)."""
         return -0.5 * ((value - self.loc) / self.scale) ** 2 - jnp.log(self.scale / self.known_scale)
 
 
@@ -240,7 +240,7 @@ class LandmarksSection(ObservationSection):
     """Sd of the error of each coordinate, mm, or its prior; null takes the column sd of the file."""
 
     def read(self) -> dict[str, np.ndarray]:
-        """The points of the files, world RAS mm; InputError where neither section nor file has an sd."""
+        """Read the points from the files, world RAS mm; InputError if neither section nor file has an sd."""
         pairs = read_point_pairs(self.file, self.moving_file)
         if self.sd is None and pairs.sd is None:
             raise InputError(
@@ -250,7 +250,7 @@ class LandmarksSection(ObservationSection):
         return pairs.as_arrays()
 
     def observe(self, inputs: Inputs) -> Sequence[Landmarks]:
-        """The points, those of the moving image brought into the world of the fixed one."""
+        """Make the landmarks; those of the moving image are transformed into the world of the fixed one."""
         pairs = PointPairs.of_arrays(inputs.observed[self.name])
         labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
         sd = pairs.sd if self.sd is None else self.sd
@@ -258,12 +258,12 @@ class LandmarksSection(ObservationSection):
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
-        """Every landmark."""
+        """Return a table of every landmark."""
         return [landmark_table(name, summary)] if "residual" in summary else []
 
     @classmethod
     def figures(
         cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
     ) -> list[ReportFigure]:
-        """How far the landmarks lie from where the posterior takes them."""
+        """Return a figure of the distances between the landmarks and their predicted places."""
         return [distance_figure(name, summary)] if "residual" in summary else []

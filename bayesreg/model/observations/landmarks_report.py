@@ -1,4 +1,4 @@
-"""What the report shows of landmarks: residuals beside their sd, and how well all else predicts each."""
+"""The report on landmarks: residuals with their sd, and the prediction of each by all other observations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LEVELS = (0.5, 0.95)
 
 
 def surprise(residual: Float[AnyArray, "k 3"], covariance: Float[AnyArray, "k 3 3"]) -> Float[np.ndarray, "k"]:
-    """Probability of a residual nearer to zero than this one, by its covariance; NaN where that is not finite."""
+    """Return the probability of a residual nearer to zero than this one, by its covariance; NaN if not finite."""
     residual, covariance = np.asarray(residual), np.asarray(covariance)
     known = np.isfinite(covariance).all(axis=(1, 2))
     probability = np.full(len(residual), np.nan)
@@ -27,7 +27,7 @@ def surprise(residual: Float[AnyArray, "k 3"], covariance: Float[AnyArray, "k 3 
 
 
 def landmark_table(name: str, summary: Arrays) -> ReportTable:
-    """Residual of every landmark at the posterior mean, and where it was left out."""
+    """Make the table of the residual of every landmark, at the posterior mean and with the landmark left out."""
     distance = np.linalg.norm(summary["residual"], axis=1)
     rows = [
         [str(label), float(summary["sd"][k]), float(distance[k]), *_left_out_cells(summary, k)]
@@ -70,7 +70,7 @@ def _caption(summary: Arrays) -> str:
 
 
 def distance_figure(name: str, summary: Arrays) -> ReportFigure:
-    """Distances with each landmark and without it, beside what the model expects of them."""
+    """Make the figure of the distances with and without each landmark, and of their expected distribution."""
     count = len(summary["names"])
     caption = (
         "How far each landmark lies from where the posterior takes it: with the landmark among the data (dots) and "

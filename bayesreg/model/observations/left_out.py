@@ -1,4 +1,4 @@
-"""Landmarks left out in turn: what all other observations say of each, without sampling again."""
+"""Leave-one-out predictions of landmarks by all other observations, without sampling again."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
 from bayesreg.types import AnyArray
 
-# Share of the curvature's trace that keeps directions finite of which nothing is known, such as free rigid motions.
-# Where ten times as much changes a prediction, it is this share that predicts, and not the other observations.
+# This share of the curvature's trace keeps directions finite that no observation determines, such as free rigid
+# motions. If ten times this share changes a prediction, then the share makes the prediction, and not the other
+# observations.
 TRACE, MORE = 1e-10, 10.0
 
 
 class LeftOut(NamedTuple):
-    """Predictions of landmarks, each by all observations but itself.
+    """Predictions of landmarks, each by all other observations.
 
     Attributes
     ----------
     residual : (k, 3) array
-        q − p − u(p), mm, u the mean given the others; NaN where these do not determine it.
+        q − p − u(p), mm, where u is the mean given the others; NaN if these do not determine u.
     covariance : (k, 3, 3) array
         Covariance of that residual, mm²: that of u(p) given the others, and the landmark's own error.
     """
@@ -39,23 +40,23 @@ class LeftOut(NamedTuple):
 def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -> LeftOut:
     """Leave each landmark out in turn, at given stiffness and scales.
 
-    Given these, u_B is Gaussian as far as the other observations are linear in it. With H its precision (Gauss and
-    Newton's at `estimands`), u(p) = A u_B + const and C = A H⁻¹ Aᵀ, taking away a landmark of error s² I leaves the
-    residual (I − C / s²)⁻¹ r with the covariance s² (I − C / s²)⁻¹, r the residual with the landmark (the known result
-    of linear regression, for three rows at a time).
+    For given stiffness and scales, u_B is Gaussian if the other observations are linear in it. Let H be its
+    Gauss–Newton precision at `estimands`, u(p) = A u_B + const, and C = A H⁻¹ Aᵀ. Without a landmark of error s² I the
+    residual is (I − C / s²)⁻¹ r with the covariance s² (I − C / s²)⁻¹, where r is the residual with the landmark (the
+    known result of linear regression, for three rows at a time).
 
     Parameters
     ----------
     posterior : Posterior
     term : ComparedPoints
-        Its term of the landmarks.
+        The posterior's term of the landmarks.
     estimands : dict
-        Where the posterior is linearised: its mean.
+        The estimands at which the posterior is linearised: its mean.
     """
     data = posterior.data
     values = complete(data.blocks, estimands)
     curvature = np.asarray(posterior.mode_search.curvature(data, estimands).gauss_newton)
-    # The components of a field come first.
+    # The components of a field come first in the rows.
     components = len(curvature) - 3 * len(posterior.sampled)
     H = curvature[components:, components:]
     predicted, response = (np.asarray(found) for found in _predicted_with_response(data, term, values))
@@ -71,7 +72,7 @@ def _shares(
     response: Float[np.ndarray, "coordinates rows"],
     sd: Float[np.ndarray, "k"],
 ) -> Float[np.ndarray, "k 3 3"]:
-    """C / s² of every landmark: how much of what is known of its place is its own."""
+    """Compute C / s² of every landmark: its own share of the information about its place."""
     spread = response @ cho_solve(cho_factor(precision), response.T)
     return np.einsum("kikj->kij", spread.reshape(len(sd), 3, len(sd), 3)) / sd[:, None, None] ** 2
 
@@ -79,7 +80,7 @@ def _shares(
 def _without(
     residual: Float[np.ndarray, "3"], share: Float[np.ndarray, "3 3"], less: Float[np.ndarray, "3 3"], sd: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Residual without the landmark, and its covariance; `less` is its share beside more that keeps all finite."""
+    """Compute the residual without the landmark, and its covariance; `less` is its share with more regularisation."""
     others, kept = (np.linalg.eigvalsh(np.eye(3) - one).min() for one in (share, less))
     if kept > 2 * others:
         return np.full(3, np.nan), np.full((3, 3), np.inf)
@@ -89,7 +90,7 @@ def _without(
 
 @jax.jit
 def _predicted_with_response(problem: Problem, term: Any, values: dict[str, AnyArray]) -> tuple[AnyArray, AnyArray]:
-    """u(p), and its derivative by u_B: (k, 3, sampled, 3)."""
+    """Compute u(p), and its derivative by u_B: (k, 3, sampled, 3)."""
 
     def predicted(u_boundary: AnyArray) -> AnyArray:
         return term.predicted(state_of(problem.body, problem.blocks, {**values, "u_boundary": u_boundary}))

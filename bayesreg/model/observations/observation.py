@@ -1,8 +1,8 @@
-"""What an observation is to the posterior.
+"""The interface between an observation and the posterior.
 
-An observation has a `name` and, inside the package, a method `on(mesh, preset)` that places it on a mesh. An object
-from outside with a function `log(state)` alone is an observation, too. The protocols here say what else one may know,
-and who asks for it.
+An observation of the package has a `name` and a method `on(mesh, preset)` that places it on a mesh. An object from
+outside with only a `name` and a function `log(state)` is an observation, too. The protocols here are optional abilities
+of an observation, each with the code that uses it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Placed(NamedTuple):
     Attributes
     ----------
     observation : object
-        The observation, prepared for what follows.
+        The observation, prepared for this mesh.
     term : pytree
         The factor of the density (`bayesreg.model.term.Term`).
     blocks : dict
@@ -45,16 +45,16 @@ class Observation(Protocol):
     name: str
 
     def on(self, mesh: TetMesh, preset: str) -> Placed:
-        """The observation on a mesh; options that were not given are those of the model's preset."""
+        """Place the observation on a mesh; options that were not given are those of the model's preset."""
 
 
 class Recorded(NamedTuple):
-    """What was observed, as ArviZ keeps it.
+    """The observed values in the form that ArviZ stores.
 
     Attributes
     ----------
     values : xarray.DataArray
-        With names of its dimensions, labels and units.
+        The values, with names of dimensions, labels and units.
     chosen : int array or slice
         The entries of all that was observed, along its first axis.
     """
@@ -65,34 +65,34 @@ class Recorded(NamedTuple):
 
 @runtime_checkable
 class Recordable(Protocol):
-    """An observation whose values, and replicates of them, are kept with the draws."""
+    """An observation whose values, and replicates of them, are stored with the draws."""
 
     def recorded(self, term: Any) -> Recorded:
-        """The observed values; the `likelihood` of the term draws replicates of them."""
+        """Return the observed values; the `likelihood` of the term draws replicates of them."""
 
 
 @runtime_checkable
 class Checked(Protocol):
-    """An observation that looks at every draw for a posterior predictive check."""
+    """An observation that evaluates every draw for a posterior predictive check."""
 
     def check_draw(self, term: Any, state: State, key: AnyArray) -> dict[str, AnyArray]:
-        """Small arrays of this draw; JAX can trace it."""
+        """Compute small arrays of this draw; JAX can trace it."""
 
 
 @runtime_checkable
 class Summarised(Protocol):
-    """An observation that leaves arrays for the report."""
+    """An observation that stores arrays for the report."""
 
     def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
-        """Arrays, by name, at the state that the mean of the draws is."""
+        """Return arrays, by name, at the state of the mean of the draws."""
 
 
 @runtime_checkable
 class Eased(Protocol):
-    """An observation of which the search for a mode knows easier forms."""
+    """An observation that has easier forms for the search for a mode."""
 
     def eased(self, term: Any, sd: float) -> Any:
-        """The term with what is compared smoothed, sd in mm."""
+        """Return the term with smoothed data; sd in mm."""
 
 
 @runtime_checkable
@@ -101,19 +101,19 @@ class Correlated(Protocol):
 
     @property
     def is_tempered_by_residuals(self) -> bool:
-        """Whether residuals tell how many values are independent."""
+        """Whether residuals determine the number of independent values."""
 
     def count_independent_points(self, term: Any, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
-        """How many values are independent, by the residuals at these values of all blocks."""
+        """Count the independent values, from the residuals at these values of all blocks."""
 
 
 def place(observation: Any, mesh: TetMesh, preset: str) -> Placed:
-    """An observation of any kind on a mesh."""
+    """Place an observation of any kind on a mesh."""
     if isinstance(observation, Observation):
         return observation.on(mesh, preset)
     return Placed(observation, Outside(observation), getattr(observation, "blocks", {}))
 
 
 def points_that_bound(observation: Any) -> Float[np.ndarray, "points 3"] | None:
-    """The points at which an observation bounds the motion; None where it bounds all of it."""
+    """Return the points at which an observation bounds the motion; None if it bounds all of it."""
     return getattr(observation, "fixed_points", None)

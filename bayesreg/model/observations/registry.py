@@ -18,7 +18,7 @@ _registered: dict[str, type[ObservationSection]] = {}
 
 
 def register(section: type[ObservationSection]) -> type[ObservationSection]:
-    """Add a kind of observation, given by its section of a configuration; may decorate it.
+    """Register a kind of observation, given by its section of a configuration; may be used as a decorator.
 
     Raises
     ------
@@ -37,7 +37,7 @@ for _section in (ImagesSection, LandmarksSection):
 
 
 def kinds() -> Mapping[str, type[ObservationSection]]:
-    """Every kind by its name, those of installed packages included."""
+    """Return every kind by its name, including those of installed packages."""
     _load_entry_points()
     return _registered
 
@@ -49,7 +49,7 @@ def _load_entry_points() -> None:
 
 
 def _as_section(value: object, info: Any) -> ObservationSection:
-    """An entry of the list `observations` as the section of its kind."""
+    """Convert an entry of the list `observations` to the section of its kind."""
     if isinstance(value, ObservationSection):
         return value
     if not isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""What every kind of observation in a configuration has: section of the YAML, reader, and part of the report."""
+"""The base of every kind of observation in a configuration: section of the YAML, reader, and part of the report."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class ReportTable(NamedTuple):
     ----------
     title, caption : str
     header : list of str
-        The first is that of the names of the rows.
+        The first entry heads the names of the rows.
     rows : list of lists
-        Text, numbers, which the report rounds, or None, which it shows as missing.
+        Each entry is text, a number, which the report rounds, or None, which it shows as missing.
     places : (rows, 3) array or None
-        World RAS mm in the fixed image: the report says where each row lies.
+        World RAS mm in the fixed image: the report describes the place of each row.
     """
 
     title: str
@@ -70,11 +70,11 @@ Name = Annotated[str, AfterValidator(_require_free)]
 class ObservationSection(Section):
     """The base of the entries of the list `observations`: a subclass for each kind, with `kind: Literal["…"]`.
 
-    A kind that others define is registered by `bayesreg.model.observations.registry.register`, or by an entry point of
-    the group "bayesreg.observations".
+    Another package registers its kind by `bayesreg.model.observations.registry.register`, or by an entry point of the
+    group "bayesreg.observations".
     """
 
-    # What the kind is called in the report.
+    # The name of the kind in the report.
     title: ClassVar[str] = "an observation of your own"
 
     kind: str
@@ -82,34 +82,34 @@ class ObservationSection(Section):
     """The name of the observation in tables; two observations need two."""
 
     def read(self) -> dict[str, np.ndarray]:
-        """Read the files that the section names, before anything takes long; the arrays are kept in the run folder."""
+        """Read the files that the section names, before any long computation; the run folder stores the arrays."""
         return {}
 
     def observe(self, inputs: Inputs) -> Sequence[Any]:
-        """Make the observations: of what was read, `inputs.observed[self.name]`, and of all else that a run knows."""
+        """Make the observations from the arrays `inputs.observed[self.name]` and from all other inputs of the run."""
         raise NotImplementedError
 
-    # What the report shows. `summary` holds the arrays that the observation's method `summarise` has left, and those of
-    # `check_draw` (chain, draw, …); `described` is what run.json says of it.
+    # For the report: `summary` holds the arrays of the observation's method `summarise`, and those of `check_draw`
+    # (chain, draw, …); `described` is the observation's entry in run.json.
 
     @classmethod
     def log_density(cls, name: str) -> str:
-        """The term of the density in HTML, with its sign."""
+        """Return the term of the log density in HTML, with its sign."""
         return f" + log p({name} | <var>u</var>)"
 
     @classmethod
     def explain(cls, name: str, described: Mapping[str, Any]) -> str:
-        """A sentence in HTML on that term; empty where its name says all."""
+        """Return a sentence in HTML that explains the term; empty if its name is enough."""
         return ""
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
-        """The tables of an observation of this name."""
+        """Return the tables of an observation of this name."""
         return []
 
     @classmethod
     def figures(
         cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
     ) -> list[ReportFigure]:
-        """The figures of an observation of this name; `tissues` are those of the mesh."""
+        """Return the figures of an observation of this name; `tissues` are the tissues of the mesh."""
         return []

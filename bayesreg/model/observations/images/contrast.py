@@ -1,15 +1,15 @@
 """A map from the intensities of f to those of m, for pairs of unlike contrast.
 
-m(x + u) ≈ Σ_k c_k b_k(x): b_k are cubic B-splines of f(x), so that every intensity has one in m; 1 and f(x) within each
-tissue, where the labels are known, so that tissues as bright as one another in f may differ in m; and |∇f(x)|, so that
-borders have a brightness, as in ultrasound. A shading is what `ModelConfig.intensity_map` adds. (Roche et al. 1998,
-"The correlation ratio as a new similarity measure for multimodal image registration"; with |∇f|, Wein et al. 2008,
-"Automatic CT-ultrasound registration for diagnostic imaging and image-guided intervention".) The coefficients that fit
-best at rest carry f into the contrast of m, and the pair is then compared as one of one contrast. What the map lacks,
-for at rest the tissues do not lie on one another, is inferred with all else: the coefficients have Normal priors about
-those at rest, and stand among the unknowns, so that every interval counts with all maps that the images allow.
+m(x + u) ≈ Σ_k c_k b_k(x). The b_k are cubic B-splines of f(x), so that every intensity of f has one in m; 1 and f(x)
+within each tissue, if the labels are known, so that tissues of equal brightness in f may differ in m; and |∇f(x)|, so
+that borders have a brightness, as in ultrasound. `ModelConfig.intensity_map` adds a shading. (Roche et al. 1998, "The
+correlation ratio as a new similarity measure for multimodal image registration"; with |∇f|, Wein et al. 2008,
+"Automatic CT-ultrasound registration for diagnostic imaging and image-guided intervention".) The coefficients with the
+best fit at rest convert f to the contrast of m, and the pair is then compared as a pair of one contrast. The map has an
+error because the tissues do not coincide at rest. Therefore the coefficients are inferred with all other unknowns, with
+Normal priors around their values at rest, so that every interval includes the uncertainty of the map.
 
-Smoothing and a map of intensities do not commute. The b_k are therefore images, which are smoothed as m is.
+Smoothing and a map of intensities do not commute. The b_k are therefore images, and are smoothed as m is.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from scipy.interpolate import BSpline
 
 from bayesreg.image import Image
 
-# Splines of f: they follow four tissues and their partial volumes.
+# Number of splines of f: enough for four tissues and their partial volumes.
 SPLINES = 8
-# The quantiles between which they lie, and how finely they are tabulated.
+# The quantiles of f between which the splines lie, and the number of points of their table.
 ENDS, LEVELS = (0.005, 0.995), 1024
 # Ridge of the fit, as a share of the mean square of a function.
 RIDGE = 1e-4
-# Voxels of the coarser image: all are smoothed by as much for the fit at rest, which tissues that do not lie on one
-# another then harm less.
+# Sd of the smoothing of all images for the fit at rest, in voxels of the coarser image. It reduces the error from
+# tissues that do not coincide.
 BLUR = 1.5
 
 
 def map_contrast(
     fixed: Image, moving: Image, positions: Float[np.ndarray, "points 3"], tissue: Image | None = None
 ) -> Image:
-    """The fixed image in the contrast of the moving one, as far as both tell at rest.
+    """Convert the fixed image to the contrast of the moving one, by the best map at rest.
 
     Parameters
     ----------
@@ -64,16 +64,16 @@ def map_contrast(
 def contrast_functions(
     fixed: Image, positions: Float[np.ndarray, "points 3"], sd: float = 0.0, tissue: Image | None = None
 ) -> Float[np.ndarray, "points functions"]:
-    """b_k at some places, smoothed by sd, both in mm."""
+    """Evaluate b_k at some points, smoothed by sd, both in mm."""
     images = _function_images(fixed, positions, tissue)
     smooth = (image.smoothed(sd) if sd else image for image in images)
     return np.stack([np.asarray(image.interpolate(positions)) for image in smooth], axis=1)
 
 
 def explained_shares(one: Float[np.ndarray, "points"], other: Float[np.ndarray, "points"]) -> tuple[float, float]:
-    """Shares of the variance of the other intensities that a straight line and splines of the first explain.
+    """Compute the shares of the variance of the other intensities that a line and splines of the first explain.
 
-    The former is negative where the line falls.
+    The share of the line is negative if the line falls.
     """
     correlation = float(np.corrcoef(one, other)[0, 1])
     functions = np.stack([spline(one) for spline in _splines(one)], axis=1)
@@ -82,7 +82,7 @@ def explained_shares(one: Float[np.ndarray, "points"], other: Float[np.ndarray, 
 
 
 def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"], tissue: Image | None) -> Iterator[Image]:
-    """The splines of f, between its quantiles at these places, |∇f| over their range, and 1 and f by tissue."""
+    """Return the splines of f between its quantiles at these points, |∇f| over their range, and 1 and f by tissue."""
     voxels, values = np.asarray(fixed.voxels, float), np.asarray(fixed.interpolate(positions))
     for spline in _splines(values):
         yield fixed.with_voxels(spline(voxels))
@@ -96,7 +96,7 @@ def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"], tis
 
 
 def _splines(values: Float[np.ndarray, "points"]) -> list[partial[np.ndarray]]:
-    """Cubic B-splines between two quantiles of some values, constant beyond them."""
+    """Make cubic B-splines between two quantiles of some values, constant beyond them."""
     low, high = np.quantile(values, ENDS)
     knots = np.concatenate([np.full(3, low), np.linspace(low, high, SPLINES - 2), np.full(3, high)])
     levels = np.linspace(low, high, LEVELS)
@@ -104,7 +104,7 @@ def _splines(values: Float[np.ndarray, "points"]) -> list[partial[np.ndarray]]:
 
 
 def _fit(functions: Float[np.ndarray, "points k"], values: Float[np.ndarray, "points"]) -> Float[np.ndarray, "k"]:
-    """Coefficients by least squares, with a little ridge about the mean."""
+    """Compute coefficients by least squares, with a small ridge around the mean."""
     products = functions.T @ functions
     middle = np.full(functions.shape[1], values.mean())
     ridge = RIDGE * np.diag(np.maximum(products.diagonal(), 1e-12 * products.trace()))

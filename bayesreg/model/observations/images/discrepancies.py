@@ -1,4 +1,4 @@
-"""Does the noise model hold? Discrepancies of residuals in units of the noise that T_s stands for."""
+"""Discrepancies of residuals, in units of the noise sd that T_s implies, which test the noise model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def discrepancies(
     points = jax.ops.segment_sum(jnp.ones_like(z), cells, count)
     means = jax.ops.segment_sum(z, cells, count) / jnp.sqrt(jnp.maximum(points, 1))
     one, other = means[neighbours].T
-    # A cell without points (quadrature by voxels) has no say.
+    # A cell without points (quadrature by voxels) is left out.
     both = (points[neighbours] > 0).all(axis=1)
     correlation = (both * one * other).sum() / (both * (one**2 + other**2) / 2).sum()
     return jnp.stack([jnp.sqrt(jnp.mean(z**2)), jnp.abs(z).max(), correlation])

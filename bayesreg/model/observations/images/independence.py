@@ -1,4 +1,4 @@
-"""How many independent points a correlated residual is worth."""
+"""The number of independent points that are equivalent to a correlated residual."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from bayesreg.types import InputError
 
 
 def independent_points(residual: Image, mask: Image) -> float:
-    """Effective number of independent points of a residual inside a mask: its volume over ∫ρ(h) dh.
+    """Compute the effective number of independent points of a residual in a mask: its volume over ∫ρ(h) dh.
 
-    ρ is the autocorrelation at lag h, over all pairs of voxels inside the mask. Its integral runs over the ball up
-    to the lag at which the mean of ρ over directions first is not positive: beyond it lies noise alone.
+    ρ is the autocorrelation at lag h, over all pairs of voxels inside the mask. The integral runs over the ball up to
+    the first lag at which the mean of ρ over directions is not positive: beyond it, ρ contains only noise.
 
     Parameters
     ----------
     residual : Image
         f(x) − m(x + u(x)) on a grid.
     mask : Image
-        Nonzero = inside, on the same grid; where the likelihood looks.
+        Nonzero = inside, on the same grid: the voxels that the likelihood compares.
 
     Returns
     -------
@@ -53,14 +53,15 @@ def independent_points(residual: Image, mask: Image) -> float:
 def independent_scores(
     scores: Float[np.ndarray, "points axes"], voxels: Int[np.ndarray, "points 3"], grid: Image
 ) -> float:
-    """Effective number of independent points of a sum over some voxels: as many have the variance that the sum has.
+    """Compute the effective number of independent points of a sum over voxels, from the variance of the sum.
 
-    The sum is what pulls a displacement that is smooth on the scale on which the scores are correlated: of
-    w (f − m) ∇m at the voxels, say. Noise that is smoother than the images costs it little, and a misfit of the model
-    much. n scores s_i with the autocovariance c(h), summed over the axes, have the variance Σ_h n(h) c(h) of their sum,
-    n(h) the number of pairs at lag h, and count as n² c(0) over it. The sum over h runs as in `independent_points`.
-    (So adjusted, the likelihood has the curvature that the variance of its slope asks for: Ribatet, Cooley and Davison
-    2012, "Bayesian inference from composite likelihoods, with an application to spatial extremes".)
+    An example of a score is w (f − m) ∇m at the voxels: the sum is the force on a displacement that is smooth on the
+    scale on which the scores are correlated. Noise that is smoother than the images reduces the number a little, and a
+    misfit of the model reduces it much. The sum of n scores s_i with the autocovariance c(h), summed over the axes, has
+    the variance Σ_h n(h) c(h), where n(h) is the number of pairs at lag h. The effective number is n² c(0) over this
+    variance. The sum over h runs as in `independent_points`. (With this adjustment, the likelihood has the curvature
+    that the variance of its gradient requires: Ribatet, Cooley and Davison 2012, "Bayesian inference from composite
+    likelihoods, with an application to spatial extremes".)
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def independent_scores(
     voxels : (n, 3) int array
         Their places on the grid.
     grid : Image
-        Its shape and affine alone count.
+        Only its shape and affine are used.
 
     Returns
     -------
@@ -103,7 +104,7 @@ def independent_scores(
 def _autocorrelation(
     centred: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
 ) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
-    """ρ(h) and the number of pairs at every lag, zero lag first, negative lags last."""
+    """Compute ρ(h) and the number of pairs at every lag; zero lag comes first, negative lags last."""
     products, pairs = _products(centred, inside)
     covariance = products / np.maximum(pairs, 1)
     return covariance / covariance[0, 0, 0], pairs
@@ -112,7 +113,7 @@ def _autocorrelation(
 def _products(
     field: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
 ) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
-    """Sums of the products of all pairs at every lag, and the number of these pairs; see `_autocorrelation`."""
+    """Sum the products of all pairs at every lag, and count these pairs; see `_autocorrelation`."""
     shape = [scipy.fft.next_fast_len(2 * n) for n in inside.shape]
 
     def products(field: np.ndarray) -> np.ndarray:
@@ -122,13 +123,13 @@ def _products(
 
 
 def _lag_lengths(shape: tuple[int, ...], grid: Image) -> Float[np.ndarray, "U V W"]:
-    """|h| of every lag, mm."""
+    """Compute |h| of every lag, mm."""
     steps = np.stack(np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in shape), indexing="ij"), axis=-1)
     return np.linalg.norm(steps @ np.asarray(grid.affine)[:3, :3].T, axis=-1)
 
 
 def _first_gap(correlation: np.ndarray, pairs: np.ndarray, lags: np.ndarray, width: float) -> float:
-    """Where the mean of ρ over the directions first is not positive, in shells of a given width, mm."""
+    """Find the first lag at which the mean of ρ over directions is not positive, in shells of a given width, mm."""
     shell = np.rint(lags / width).astype(int).ravel()
     total, weight = (np.bincount(shell, weights=w.ravel()) for w in (pairs * correlation, pairs))
     gaps = np.flatnonzero((total <= 0) & (weight > 0))

@@ -1,7 +1,7 @@
 """A slow shading between two images of one contrast: f(x) ≈ m(x + u) − p(x) f(x) − c, p a polynomial.
 
-What is inferred are coefficients of functions of f and x that are orthogonal at the quadrature points and as great as f
-is there, so that the images say about as much of each, and of each by itself.
+The unknowns are coefficients of functions of f and x that are orthogonal at the quadrature points and have the
+magnitude of f there. The images then constrain all coefficients about equally and independently.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 # Prior standard deviation of each coefficient, as a share of the root mean square of f.
 SHARE = 0.5
-# Functions are one where their parts by themselves are weaker than this share of the strongest.
+# Functions are treated as equal if their independent parts are weaker than this share of the strongest.
 DEPENDENT = 1e-3
 
 
@@ -23,7 +23,7 @@ def shading_basis(
     degree: int,
     more: Float[np.ndarray, "points functions"] | None = None,
 ) -> Float[np.ndarray, "points coefficients"]:
-    """The functions at the points.
+    """Evaluate the basis functions of the shading at the points.
 
     Parameters
     ----------

@@ -63,11 +63,11 @@ class ComparedImages(NamedTuple):
     positions : (q, 3) array
         World positions x_q of the quadrature points, mm.
     independent_share : scalar
-        Effective number of independent quadrature points over that of all: tempers the likelihood.
+        Effective number of independent quadrature points over the number of all; it tempers the likelihood.
     shading : (q, k) array or None
-        Functions of which m has some more than f (`bayesreg.model.observations.images.intensity_map`).
+        Functions whose sum is the shading of m (`bayesreg.model.observations.images.intensity_map`).
     visible : Interpolator or None
-        1 where the moving image is looked at and 0 where it is ignored; None: it is looked at everywhere.
+        1 where the moving image is compared and 0 where it is ignored; None if it is compared everywhere.
     """
 
     comparison: Comparison
@@ -83,106 +83,106 @@ class ComparedImages(NamedTuple):
 
     @property
     def is_nearly_quadratic(self) -> bool:
-        """Not in the displacements."""
+        """Whether the log is nearly quadratic in the displacements; it is not."""
         return False
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the term."""
         return self.comparison.name
 
     @property
     def powers(self) -> dict[str, float]:
-        """The name of T_s, which is the first power of a temperature."""
+        """The name of T_s, with the power of a temperature that it is (one)."""
         return {self.comparison.temperature: 1.0}
 
     @property
     def independent_points(self) -> Scalar:
-        """How many quadrature points the likelihood counts as independent."""
+        """The number of independent quadrature points that the likelihood assumes."""
         return self.independent_share * len(self.positions)
 
     def temperature(self, values: Values) -> Scalar:
-        """T_s."""
+        """Return the temperature T_s."""
         return values[self.comparison.temperature]
 
     def log(self, state: State) -> Scalar:
-        """−E_s / T_s, tempered, and the normaliser where T_s is inferred."""
+        """Return the tempered −E_s / T_s, plus the log normaliser if T_s is inferred."""
         return self.likelihood(state).log_prob(self.fixed_values)
 
     def observed(self) -> Float[AnyArray, "points"]:
-        """f(x_q)."""
+        """Return the observed intensities f(x_q)."""
         return self.fixed_values
 
     def likelihood(self, state: State) -> ImageLikelihood:
-        """The distribution of f(x_q), given m(x_q + u(x_q))."""
-        # Without the barrier XLA interpolates twice, for the density and for the record.
+        """Return the distribution of f(x_q), given m(x_q + u(x_q))."""
+        # Without the barrier, XLA interpolates twice: for the density and for the record.
         compared = jax.lax.optimization_barrier(self.compared(self.places(state.u), state.values))
         return ImageLikelihood(self, compared, self.temperature(state.values))
 
     def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
-        """x_q + u(x_q), mm."""
+        """Return the displaced points x_q + u(x_q), mm."""
         return self.positions + self.quadrature.interpolation(u)
 
     def predicted(self, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING) -> Float[AnyArray, "points"]:
-        """m(x_q + u(x_q)), less the shading, if one is inferred: its coefficients must then be among the values."""
+        """Return m(x_q + u(x_q)), minus the shading if it is inferred; `values` must then hold its coefficients."""
         return self.without_shading(self.moving(self.places(u)), values)
 
     def without_shading(self, moving: Float[AnyArray, "points"], values: Values) -> Float[AnyArray, "points"]:
-        """Values of m less what they have more of than f, if a shading is inferred."""
+        """Subtract the shading from values of m, if a shading is inferred."""
         return moving if self.shading is None else moving - self.shading @ values[shading_name(self.name)]
 
     def compared(self, places: Float[AnyArray, "points 3"], values: Values = NOTHING) -> Intensities:
-        """f(x_q) beside m at some places, mm, and how much of each is looked at."""
+        """Return f(x_q), m at some points, mm, and the share of each point that is compared."""
         predicted = self.without_shading(self.moving(places), values)
         share = None if self.visible is None else self.visible(places)
         return Intensities(self.fixed_values, predicted, self.quadrature.weights, share)
 
     def residuals(self, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING) -> Float[AnyArray, "points"]:
-        """The part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q)); zero where m is ignored."""
+        """Return the part of f(x_q) that noise explains, such as f(x_q) − m(x_q + u(x_q)); zero where m is ignored."""
         pair = self.compared(self.places(u), values)
         return pair.shares * self.similarity.residuals(pair)
 
     def scaled_residual(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points"]:
-        """`residuals` in units of their scale √(T_s / 2w): where the model holds, as `standardised_noise`."""
+        """Return `residuals` in units of their scale √(T_s / 2w); they follow `standardised_noise` in the model."""
         return self.residuals(u, values) * jnp.sqrt(2 * self.quadrature.weights / self.temperature(values))
 
     def standardised_residual(self, state: State) -> Float[AnyArray, "points"]:
-        """`residuals` in units of their standard deviation."""
+        """Return `residuals` in units of their standard deviation."""
         return self.scaled_residual(state.u, state.values) / jnp.sqrt(self.similarity.variance())
 
     def standardised_noise(
         self, key: AnyArray, u: Float[AnyArray, "nodes 3"], values: Values = NOTHING
     ) -> Float[AnyArray, "points"]:
-        """Residuals that follow the model in units of their scale √(T_s / 2w), one number for each quadrature point."""
+        """Draw residuals from the model in units of their scale √(T_s / 2w), one for each quadrature point."""
         pair = self.compared(self.places(u), values)
         return pair.shares * self.similarity.draw(key, pair)
 
     def noise_sd(self, t_similarity: float) -> float:
-        """The noise that T_s stands for at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
+        """Return the noise sd that T_s implies at a point of average weight w: √(T_s / 2w) if it is Gaussian."""
         variance = self.similarity.variance() * t_similarity
         return float(np.sqrt(variance / (2 * np.mean(self.quadrature.weights))))
 
     def scores(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points 3"]:
-        """−∂E_s/∂x at every place x_q + u(x_q), by which the images pull there."""
+        """Return −∂E_s/∂x at every point x_q + u(x_q): the force of the images there."""
         return _scores(self, u, dict(values))
 
     def with_independent_points(self, count: float) -> ComparedImages:
-        """The term with the likelihood tempered as for so many independent points."""
+        """Return the term with the likelihood tempered to this number of independent points."""
         return self._replace(independent_share=jnp.asarray(count / len(self.positions)))
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """Gauss and Newton's curvature of E_s / T_s, tempered: that of eq. (1) is 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
+        """Return the tempered Gauss–Newton curvature of E_s / T_s; for eq. (1) it is 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
         return _gauss_newton(self, u, dict(values))
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-        """The rest of the exact curvature of E_s / T_s, 1/mm²."""
+        """Return the rest of the exact curvature of E_s / T_s, 1/mm²."""
         return _remainder(self, u, dict(values))
 
 
 class ImageLikelihood(dist.Distribution):
-    """Intensities of the fixed image at the quadrature points, given the moving image's there.
+    """The distribution of the fixed intensities at the quadrature points, given the moving intensities there.
 
-    Where m is ignored it may have any intensity that f has in the organ.
+    Where m is ignored, it may have any intensity that f has in the organ.
 
     Parameters
     ----------
@@ -200,11 +200,11 @@ class ImageLikelihood(dist.Distribution):
         super().__init__(event_shape=jnp.shape(compared.moving), validate_args=False)
 
     def energy(self, value: Float[AnyArray, "points"]) -> Scalar:
-        """E_s, mm³ times squared intensity."""
+        """Return the energy E_s, mm³ times squared intensity."""
         return self.term.similarity.energy(self.compared._replace(fixed=value), self.temperature)
 
     def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> Float[AnyArray, "*sample points"]:
-        """Replicates of the fixed image, which the tempering by `independent_share` leaves as they are."""
+        """Draw replicates of the fixed image; the tempering by `independent_share` does not change them."""
         replicates = jax.vmap(self._replicate)(jax.random.split(key, sample_shape).ravel())
         return replicates.reshape(*sample_shape, *self.event_shape)
 
@@ -221,7 +221,7 @@ class ImageLikelihood(dist.Distribution):
         return jnp.where(jax.random.uniform(key_choice, seen.shape) < pair.share, seen, elsewhere)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
-        """The tempered log density; its normaliser is part of it where T_s is inferred or some of m is ignored."""
+        """Return the tempered log density, with its normaliser if T_s is inferred or a part of m is ignored."""
         pair = self.compared._replace(fixed=value)
         found = -self.energy(value) / self.temperature
         if self.term.comparison.normalised or pair.share is not None:
@@ -231,14 +231,14 @@ class ImageLikelihood(dist.Distribution):
         return self.term.independent_share * found
 
     def _hidden_pair(self, pair: Intensities) -> Intensities:
-        """f beside m where m is ignored: m is then as anywhere in the organ, which is so much more noise."""
+        """Pair an ignored m with f: replace m by the mean of f in the organ, and add the variance of f to the noise."""
         mean, variance = self.term.fixed_values.mean(), self.term.fixed_values.var()
-        # T_s / (2 w) of the noise and the variance of m are those of a point with this weight.
+        # A point with this weight has T_s / (2 w) equal to the noise variance plus the variance of m.
         weights = pair.weights / (1 + 2 * pair.weights * variance / self.temperature)
         return Intensities(pair.fixed, jnp.full_like(pair.fixed, mean), weights, 1 - pair.shares)
 
     def _log_hidden(self, pair: Intensities) -> Scalar:
-        """The log density of f where m is ignored."""
+        """Return the log density of f where m is ignored."""
         hidden, noise = self._hidden_pair(pair), self.term.similarity.of_one_point()
         return (
             noise.log_normaliser(hidden, self.temperature) - noise.energy(hidden, self.temperature) / self.temperature
@@ -255,7 +255,7 @@ def _scores(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values)
 
 @jax.jit
 def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-    """Gauss and Newton's curvature in every place x_q + u(x_q), the share that is looked at held fixed."""
+    """Compute the Gauss–Newton curvature at every point x_q + u(x_q), with fixed shares of comparison."""
     moved = term.places(u)
     pair = term.compared(moved, values)
     convexity = term.similarity.convexity(pair, term.temperature(values))
@@ -264,7 +264,7 @@ def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: V
 
 @jax.jit
 def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
-    """The exact curvature, ∇m E″ ∇mᵀ + E′ ∇²m with E″ that in the values m_q, less Gauss and Newton's."""
+    """Compute ∇m E″ ∇mᵀ + E′ ∇²m, with the exact E″ in the values m_q, minus the Gauss–Newton curvature."""
     moved, similarity, t_similarity = term.places(u), term.similarity, term.temperature(values)
     slope = partial(_slope, term)
     columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
@@ -279,7 +279,7 @@ def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Valu
 def _chain(
     term: ComparedImages, values: ValueCurvature, slope: Float[AnyArray, "points 3"], t_similarity: Scalar
 ) -> PointCurvature:
-    """∇m E″ ∇mᵀ, tempered and over T_s."""
+    """Compute the tempered ∇m E″ ∇mᵀ / T_s."""
     share = term.independent_share / t_similarity
     matrices = (share * values.diagonal)[:, None, None] * slope[:, :, None] * slope[:, None]
     shared = values.shared
@@ -289,7 +289,7 @@ def _chain(
 
 
 def _subtract(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
-    """One curvature less another; both have the same groups, or neither has any."""
+    """Subtract one curvature from another; both have the same groups, or neither has groups."""
     diagonal = one.diagonal - other.diagonal
     if one.shared is None or other.shared is None:
         return ValueCurvature(diagonal)
@@ -299,15 +299,15 @@ def _subtract(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
 
 
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
-    """∇m."""
+    """Compute the gradient ∇m."""
     return jax.grad(lambda x: term.moving(x).sum())(places)
 
 
 def images_of(problem: Any) -> ComparedImages | None:
-    """The first pair of images of a `Problem`, if there is one."""
+    """Return the first pair of images of a `Problem`; None if there is none."""
     return next((term for term in problem.terms.values() if isinstance(term, ComparedImages)), None)
 
 
 def shading_name(name: str) -> str:
-    """The name of the coefficients of the shading of a pair of images."""
+    """Return the name of the coefficients of the shading of a pair of images."""
     return f"{name}_shading"

@@ -1,20 +1,20 @@
-"""Local normalised cross-correlation, for pairs of unlike contrast: squared differences that a local map may explain.
+"""Local normalised cross-correlation, for pairs of unlike contrast: squared differences after a local affine map.
 
 Another sequence, or a bias field, changes intensities by a map that is nearly affine within some millimetres. The
-quadrature points are therefore parted into windows. In window k the model is f = a_k m + b_k + noise with a_k, b_k
-unknown and Gaussian noise of the variance T_s / (2 w_q), as in eq. (1). At the best a_k, b_k
+quadrature points are therefore divided into windows. In window k the model is f = a_k m + b_k + noise, with unknown
+a_k, b_k and Gaussian noise of the variance T_s / (2 w_q), as in eq. (1). At the best a_k, b_k
 
 E_s = Σ_k min_{a, b} Σ_{q ∈ k} w_q (f_q − a m_q − b)² = Σ_k V_k var_k(f) (1 − ncc_k²),
 
-where V_k = Σ w_q, and the variances and the correlation ncc_k of f and the warped m within the window are weighted by
-w_q: the minimum lies at a = cov(f, m) / var(m) and b = mean(f) − a mean(m), and leaves var(f) − cov(f, m)² / var(m) of
-the mean square. Where a = 1 and b = 0 are best everywhere, this is eq. (1), so that T_s, the noise that it stands for
-and its prior keep their meaning. Each window takes two degrees of freedom from the noise: of N residuals in K windows
-N − 2K are independent, which the normaliser counts where T_s is inferred. The likelihood is a profile likelihood; with
-a_k and b_k integrated out under flat priors it would prefer a warped m without contrast.
+where V_k = Σ w_q. The variances and the correlation ncc_k of f and the warped m within the window are weighted by w_q.
+The minimum lies at a = cov(f, m) / var(m) and b = mean(f) − a mean(m), and the remaining mean square is var(f) − cov(f,
+m)² / var(m). If a = 1 and b = 0 are best everywhere, this is eq. (1), so that T_s, its noise and its prior keep their
+meaning. Each window uses two degrees of freedom of the noise: of N residuals in K windows, N − 2K are independent. The
+normaliser takes this into account if T_s is inferred. The likelihood is a profile likelihood; an integral over a_k and
+b_k with flat priors would prefer a warped m without contrast.
 
-An m replaced by s m + c leaves E_s as it is, for a negative s, too. A window in which m hardly varies explains nothing:
-var(m) is increased by `RIDGE` times the variance of m over all points, which is a Normal prior of a_k about zero.
+E_s is equal for m and s m + c, also with a negative s. A window with an almost constant m explains nothing: var(m) is
+increased by `RIDGE` times the variance of m over all points, which is a Normal prior of a_k with mean zero.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from bayesreg.model.term import SharedCurvature
 from bayesreg.settings import Positive
 from bayesreg.types import AnyArray, InputError, Scalar
 
-# Fewest points of a window: two of their degrees of freedom are lost.
+# Fewest points of a window: each window uses two degrees of freedom.
 LEAST = 16
 # Share of the variance of m: the square of a hundredth of its sd, which is less than the noise of most images.
 RIDGE = 1e-4
@@ -60,16 +60,16 @@ class Windows(NamedTuple):
 
     @property
     def number(self) -> int:
-        """How many windows there are."""
+        """The number of windows."""
         return len(self.members.matrix.starts) - 1
 
     def sums(self, values: Float[AnyArray, "points columns"]) -> Float[AnyArray, "points columns"]:
-        """The sum over the window of each point, at that point."""
+        """Sum values over the window of each point, and return the sum at that point."""
         return self.members.transpose(self.members(values))
 
 
 class LocalFit(NamedTuple):
-    """The best affine map of intensities in the window of each point, and what is known of the window (all (q,)).
+    """The best affine map of intensities in the window of each point, and properties of the window (all (q,)).
 
     Attributes
     ----------
@@ -110,10 +110,10 @@ class WindowCorrelation(NamedTuple):
     width: Scalar
 
     def fit(self, pair: Intensities) -> LocalFit:
-        """The best map in every window."""
+        """Fit the best map in every window."""
         weights = pair.weights * pair.shares
         volume, *sums = self.windows.sums(weights[:, None] * jnp.stack([jnp.ones_like(weights), *pair[:2]], axis=1)).T
-        # A window that is not compared at all.
+        # A window that is not compared at all has the weight zero.
         volume = jnp.maximum(volume, jnp.finfo(volume.dtype).tiny)
         f, m = (values - total / volume for values, total in zip(pair[:2], sums, strict=True))
         covariance, variance = self.windows.sums(jnp.stack([weights * f * m, weights * m**2], axis=1)).T / volume
@@ -121,26 +121,26 @@ class WindowCorrelation(NamedTuple):
         return LocalFit(volume, f, m, variance, gain, f - gain * m)
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """Σ_k V_k (var_k(f) − cov_k(f, m)² / (var_k(m) + ridge)), at any temperature."""
+        """Return Σ_k V_k (var_k(f) − cov_k(f, m)² / (var_k(m) + ridge)), which does not depend on the temperature."""
         return _energy(self, pair._replace(weights=pair.weights * pair.shares, share=None))
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """The log normaliser of Gaussian noise in N − 2K dimensions, up to a constant."""
+        """Return the log normaliser of Gaussian noise in N − 2K dimensions, up to a constant."""
         lost = self.windows.number * jnp.log(jnp.pi * temperature)
         return 0.5 * pair.shares @ jnp.log(pair.weights / (jnp.pi * temperature)) + lost
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
-        """f − a m − b."""
+        """Return the residuals f − a m − b."""
         return self.fit(pair).residuals
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """`curvature` with residuals of zero, which is twice a² W less its projection on the maps of every window."""
+        """Return `curvature` for residuals of zero: twice a² W minus its projection on the maps of every window."""
         return self._curvature(self.fit(pair), pair.weights * pair.shares, jnp.zeros_like(pair.fixed))
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W the diagonal of w.
+        """Return Σ_k 2a² (W − w wᵀ / V) − 2 v vᵀ / (V (var(m) + ridge)), v = w (r − a (m − mean(m))), W = diag(w).
 
-        It is the derivative of the slope −2 w a r, where r and a follow m.
+        It is the derivative of the gradient −2 w a r, where r and a depend on m.
         """
         found = self.fit(pair)
         return self._curvature(found, pair.weights * pair.shares, found.residuals)
@@ -155,17 +155,17 @@ class WindowCorrelation(NamedTuple):
         return ValueCurvature(2 * weights * found.gain**2, shared)
 
     def variance(self) -> Scalar:
-        """(N − 2K) / N."""
+        """Return the mean variance (N − 2K) / N."""
         return jnp.asarray(1 - 2 * self.windows.number / len(self.windows.label))
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
-        """Standard Normal numbers less what an affine map of m explains of them in each window."""
+        """Draw standard Normal numbers minus the part that an affine map of m explains in each window."""
         scale = jnp.sqrt(pair.weights)
         noise = jax.random.normal(key, scale.shape) / scale
         return scale * self.residuals(pair._replace(fixed=noise, share=None))
 
     def of_one_point(self) -> SumOfSquaredDifferences:
-        """Gaussian noise."""
+        """Return Gaussian noise, the noise of one point."""
         return SumOfSquaredDifferences()
 
 
@@ -177,7 +177,7 @@ def _energy(similarity: WindowCorrelation, pair: Intensities) -> Scalar:
 
 @_energy.defjvp
 def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
-    """The derivative with a and b held fixed, for E_s is least in them; the second derivative lets them follow m."""
+    """Compute the derivative with a and b fixed, since E_s is minimal in them; the second derivative varies them."""
     (similarity, pair), (_, change) = primals, tangents
     found = similarity.fit(pair)
     slope = 2 * (pair.weights * found.residuals) @ (change.fixed - found.gain * change.moving)
@@ -186,7 +186,7 @@ def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Sc
 
 
 def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Windows:
-    """Boxes of points, halved across their longest side while that exceeds the width and both halves hold enough.
+    """Divide points into boxes: halve the longest side while it exceeds the width and both halves have enough points.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ class LocalCorrelation(SimilaritySettings):
     few points, windows are as much larger as to hold 16."""
 
     def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> WindowCorrelation:
-        """The similarity at these points; see `AnySimilarity`.
+        """Make the similarity at these points; see `AnySimilarity`.
 
         Raises
         ------
@@ -233,7 +233,7 @@ class LocalCorrelation(SimilaritySettings):
             If the moving image is constant at the points.
         """
         values = rest.moving
-        # The spline of a constant image varies by rounding.
+        # Rounding changes the spline of a constant image.
         if jnp.ptp(values) <= 1e-9 * abs(values).max():
             raise InputError("the moving image is constant in the mesh: similarity 'lncc' has nothing to correlate")
         ridge, width = RIDGE * values.var(), jnp.asarray(self.window_mm)

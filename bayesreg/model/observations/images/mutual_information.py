@@ -1,16 +1,16 @@
 """Mutual information, for pairs of unlike contrast: every intensity of m may mean any mixture of intensities of f.
 
-The model is that f(x_q) is drawn from a distribution p(f | m(x_q + u)) of which nothing is known but that it is one for
-all points. Put in by its best estimate from the pair itself, the joint histogram P, it gives the profile likelihood
+The model is that f(x_q) is drawn from a distribution p(f | m(x_q + u)) that is unknown, but the same for all points.
+Its best estimate from the pair itself, the joint histogram P, gives the profile likelihood
 
 log p(f | m) = Σ_q log p(f_q | m_q) = N (I(P) − H(f)),    I = Σ_ij P_ij log(P_ij / (P_i P_j)),
 
-where H(f) does not depend on u: the points that are compared are fixed, so that nothing needs the normalisation that
-other programs add for overlaps that change. P is a histogram of cubic B-splines (Thévenaz and Unser 2000, "Optimization
-of mutual information for multiresolution image registration"), which makes it smooth in u.
+where H(f) does not depend on u: the compared points are fixed, so that the normalisation that other programs use for
+changing overlaps is not needed. P is a histogram of cubic B-splines (Thévenaz and Unser 2000, "Optimization of mutual
+information for multiresolution image registration"), which makes it smooth in u.
 
-There is no noise and so no T_s to infer. The temperature of the options is that of the likelihood itself: E_s is
-−T_s N I, and where a search for the mode warms T_s, the likelihood is tempered.
+The model has no noise sd, so T_s cannot be inferred. The temperature of the options tempers the likelihood itself: E_s
+is −T_s N I, and a search for the mode that raises T_s tempers the likelihood.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from bayesreg.model.observations.images.pointwise import (
 from bayesreg.settings import Positive
 from bayesreg.types import AnyArray, InputError, Scalar
 
-# Bins of each image; the outer ones hold what lies beyond the range.
+# Bins of each image; the outer bins hold the values beyond the range.
 BINS = 24
-# Share of the points that every pair of bins has at least, so that no logarithm is infinite.
+# Every pair of bins has at least this share of the points, so that no logarithm is infinite.
 LEAST = 1e-9
 
 
 class Histogram(NamedTuple):
-    """The joint histogram of a pair, and the bins that each point lies in.
+    """The joint histogram of a pair, and the bins of each point.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Histogram(NamedTuple):
     count: Scalar
 
     def surprise(self) -> Float[AnyArray, "bins bins"]:
-        """log(P_ij / P_j): the log probability of the bins of f, given those of m."""
+        """Return log(P_ij / P_j): the log probability of the bins of f, given those of m."""
         return jnp.log(self.joint) - jnp.log(self.joint.sum(axis=0))
 
 
@@ -76,47 +76,47 @@ class JointInformation(NamedTuple):
     moving_range: Float[AnyArray, "2"]
 
     def histogram(self, pair: Intensities) -> Histogram:
-        """The joint histogram of a pair."""
+        """Compute the joint histogram of a pair."""
         fixed, moving = _bins(pair.fixed, self.fixed_range), _bins(pair.moving, self.moving_range)
         counted = pair.weights / pair.weights.mean() * pair.shares
         joint = (fixed * counted[:, None]).T @ moving + LEAST * len(counted)
         return Histogram(joint / joint.sum(), fixed, moving, counted.sum())
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """−T_s N I."""
+        """Return the energy −T_s N I."""
         found = self.histogram(pair)
         information = (found.joint * (found.surprise() - jnp.log(found.joint.sum(axis=1))[:, None])).sum()
         return -self.temperature * found.count * information
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """Σ_q log p(f_q), with which the likelihood is a density of f."""
+        """Return Σ_q log p(f_q), with which the likelihood is a density of f."""
         found = self.histogram(pair)
         width = (self.fixed_range[1] - self.fixed_range[0]) / (BINS - 3)
         return pair.shares @ (found.fixed @ jnp.log(found.joint.sum(axis=1) / width))
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
-        """F less its mean given m."""
+        """Return f minus its mean given m."""
         found = self.histogram(pair)
         given = found.moving @ found.joint.T
         return pair.fixed - given @ _centres(self.fixed_range) / given.sum(axis=1)
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """T_s times Fisher's information as it is observed: the square of each point's ∂ log p(f_q | m_q) / ∂m_q."""
+        """Return T_s times the observed Fisher information: the square of each point's ∂ log p(f_q | m_q) / ∂m_q."""
         found = self.histogram(pair)
         slope = jax.jvp(lambda m: _bins(m, self.moving_range), (pair.moving,), (jnp.ones_like(pair.moving),))[1]
         score = ((found.fixed @ found.surprise()) * slope).sum(axis=1)
         return ValueCurvature(self.temperature * pair.weights / pair.weights.mean() * pair.shares * score**2)
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """`convexity`: in the mean over the points the curvature of a log likelihood is the square of its slope."""
+        """Return `convexity`: on average, the curvature of a log likelihood equals the square of its gradient."""
         return self.convexity(pair, temperature)
 
     def variance(self) -> Scalar:
-        """One: the residuals have no scale that T_s gives."""
+        """Return one: T_s does not determine the scale of the residuals."""
         return jnp.ones(())
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
-        """Residuals of f drawn from p(f | m)."""
+        """Draw residuals of f from p(f | m)."""
         found = self.histogram(pair)
         given, centres = found.moving @ found.joint.T, _centres(self.fixed_range)
         one, other = jax.random.split(key)
@@ -126,18 +126,18 @@ class JointInformation(NamedTuple):
         return (drawn - given @ centres / given.sum(axis=1)) / scale
 
     def of_one_point(self) -> SumOfSquaredDifferences:
-        """Gaussian noise."""
+        """Return Gaussian noise, the noise of one point."""
         return SumOfSquaredDifferences()
 
 
 def _centres(bounds: Float[AnyArray, "2"]) -> Float[AnyArray, "bins"]:
-    """The intensities that the bins stand for: one bin beyond each end, whose splines reach inside."""
+    """Return the intensities at the centres of the bins, with one more bin beyond each end for its spline."""
     width = (bounds[1] - bounds[0]) / (BINS - 3)
     return bounds[0] + (jnp.arange(BINS) - 1) * width
 
 
 def _bins(values: Float[AnyArray, "points"], bounds: Float[AnyArray, "2"]) -> Float[AnyArray, "points bins"]:
-    """The share of each value in every bin, by a cubic B-spline; what lies beyond the range counts as its end."""
+    """Compute the share of each value in every bin, by a cubic B-spline; values beyond the range count as its end."""
     inside = jnp.clip(values, bounds[0], bounds[1])
     centres = _centres(bounds)
     t = jnp.abs((inside[:, None] - centres) / (centres[1] - centres[0]))
@@ -146,7 +146,7 @@ def _bins(values: Float[AnyArray, "points"], bounds: Float[AnyArray, "2"]) -> Fl
 
 
 class MutualInformation(SimilaritySettings):
-    """Mutual information, for unlike contrasts; it knows no noise, and its temperature is that of the likelihood."""
+    """Mutual information, for unlike contrasts. It has no noise sd, and its temperature tempers the likelihood."""
 
     serves_any_contrast = True
     formula = (
@@ -160,7 +160,7 @@ class MutualInformation(SimilaritySettings):
     """Temperature of the likelihood, a number: there is no noise of which it could be inferred."""
 
     def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> JointInformation:
-        """The similarity at these points; see `AnySimilarity`.
+        """Make the similarity at these points; see `AnySimilarity`.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""How a pair of images is compared: the options of the observation, and what each preset makes of them."""
+"""The options of the comparison of a pair of images, and their values in each preset."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from bayesreg.model.observations.images.pointwise import SimilaritySettings, Squ
 from bayesreg.model.observations.images.similarity import SIMILARITIES, AnySimilarity
 from bayesreg.settings import NotNegative, Positive, Section, by_kind, wrong
 
-# The kinds of similarities that bring a map of intensities of their own.
+# The kinds of similarities that include a map of intensities.
 OF_ANY_CONTRAST = [kind for kind, one in SIMILARITIES.items() if one.serves_any_contrast]
 
-# What is not given, by the name of the model's preset. The options of "paper" are the defaults of `ImageOptions`.
+# Defaults by the name of the model's preset. The options of "paper" are the defaults of `ImageOptions`.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     "registration": {
@@ -31,7 +31,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 class ImageOptions(Section):
-    """How two images are compared."""
+    """The options of the comparison of two images."""
 
     similarity: Annotated[AnySimilarity, Field(discriminator="kind"), BeforeValidator(by_kind)] = SquaredDifferences()
     """The similarity, and with it the noise and its temperature T_s: ssd, student_t, or for images of unlike contrast
@@ -66,7 +66,7 @@ class ImageOptions(Section):
 
 
 def with_preset(preset: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that are given, completed by those of a preset that agree with them."""
+    """Return the given options, completed by the options of a preset that are compatible with them."""
     chosen = dict(PRESETS[preset])
     if "similarity" in given:
         usual = chosen.pop("similarity", {"kind": "ssd"})
@@ -77,7 +77,7 @@ def with_preset(preset: str, given: Mapping[str, Any]) -> dict[str, Any]:
             kind = similarity.get("kind", usual["kind"])
             if kind in OF_ANY_CONTRAST:
                 chosen.pop("intensity_map", None)
-            # Mutual information knows no noise to infer.
+            # Mutual information has no noise to infer.
             temperature = {} if kind == "mi" else {key: usual[key] for key in ("temperature",) if key in usual}
             given = {**given, "similarity": {"kind": kind, **temperature, **similarity}}
     return {**chosen, **given}

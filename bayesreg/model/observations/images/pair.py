@@ -1,4 +1,4 @@
-"""A pair of images as a user gives it."""
+"""A pair of images in the form that a user gives."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from bayesreg.types import InputError
 
 
 class ImagePair:
-    """A pair of images of which one shows the organ before and the other after it has deformed.
+    """A pair of images: one shows the organ before, the other after its deformation.
 
     Parameters
     ----------
     fixed, moving : Image
-        f and m; their intensities are taken as they are.
+        f and m; their intensities are not rescaled.
     name : str, default "images"
-        Its name in tables and in the NumPyro program.
+        The name of the pair in tables and in the NumPyro program.
     fixed_ignore : Image, optional
-        Not zero where the fixed image says nothing: no point is compared there. On any grid, in its world.
+        Nonzero where the fixed image is ignored: no point is compared there. On any grid, in the world of f.
     moving_ignore : Image, optional
-        Not zero where the moving image says nothing, such as in a cavity: a point that is taken there may have any
-        intensity of the organ. On any grid, in its world.
+        Nonzero where the moving image is ignored, such as in a cavity: a point displaced into it may have any
+        intensity of the organ. On any grid, in the world of m.
     one_contrast : bool, default True
         False: f is compared through the best map of its intensities to those of m (see `contrast`).
     tissue : Image, optional
-        Labels on the grid of the fixed image, 0 outside: that map is then another one in every tissue.
+        Labels on the grid of the fixed image, 0 outside: that map then differs between tissues.
     **options
         How the images are compared, as in `ImageOptions`: similarity (`SquaredDifferences`, `StudentT`,
         `LocalCorrelation`, `MutualInformation` or `SelfSimilarity`), interpolation, quadrature, most_points, smoothing,
-        intensity_map, independent_points. What is not given is what the preset of the model says.
+        intensity_map, independent_points. The preset of the model gives all other options.
 
     Raises
     ------
     InputError
-        If one is no image, `tissue` lies on another grid, or an option does not exist or is wrong.
+        If an argument is not an image, `tissue` lies on another grid, or an option does not exist or is wrong.
 
     Notes
     -----
@@ -77,15 +77,15 @@ class ImagePair:
         _require_options(name, self.options)
 
     def prepared(self, mesh: TetMesh, preset: str = "paper") -> PreparedPair:
-        """The pair as it is compared: f in the contrast of m, as far as a map tells at rest, or descriptors.
+        """Prepare the pair for comparison: convert f to the contrast of m by a map at rest, or compute descriptors.
 
-        What is ignored is filled with what lies beside it.
+        Ignored voxels are filled with the values beside them.
 
         Parameters
         ----------
         mesh : TetMesh
         preset : {"paper", "registration"}
-            That of the model, which says what was not given.
+            The preset of the model, which completes the options.
 
         Raises
         ------
@@ -104,7 +104,7 @@ class ImagePair:
         return MappedPair(mapped, moving, self.name, self.fixed_ignore, self.moving_ignore, options, fixed, self.tissue)
 
     def on(self, mesh: TetMesh, preset: str = "paper") -> Placed:
-        """The pair on a mesh, with a T_s of its own.
+        """Place the pair on a mesh, with its own T_s.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class ImagePair:
 
 
 def _require_options(name: str, given: dict[str, Any]) -> None:
-    """Raise InputError where options are wrong whatever the preset of the model, which is not known yet."""
+    """Raise InputError if options are wrong for every preset; the preset of the model is not known yet."""
     errors = []
     for preset in PRESETS:
         try:

@@ -19,9 +19,9 @@ from bayesreg.types import InputError
 
 
 def visibility(image: Image, ignore: Image) -> Interpolator:
-    """1 where an image is looked at and 0 where it is ignored, as a function of the place.
+    """Return a function of the place that is 1 where an image is compared and 0 where it is ignored.
 
-    The neighbours of an ignored voxel are ignored with it: they may hold some of what it holds.
+    The neighbours of an ignored voxel are ignored, too: they may contain a part of the same structure.
     """
     ignored = ndimage.binary_dilation(ignored_voxels(image, ignore), ndimage.generate_binary_structure(3, 3))
     return image.with_voxels(1.0 - ignored).interpolator("linear")
@@ -41,7 +41,7 @@ def require_overlap(mesh: TetMesh, image: Image, name: str) -> None:
 
 
 def quadrature_of(mesh: TetMesh, fixed: Image, options: ImageOptions) -> Quadrature:
-    """The rule that the options name.
+    """Make the quadrature rule that the options name.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def quadrature_of(mesh: TetMesh, fixed: Image, options: ImageOptions) -> Quadrat
 
 @lru_cache(maxsize=4)
 def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
-    """The rule of voxel centres; a map of intensities asks for it, too."""
+    """Make the rule of voxel centres; a map of intensities uses it, too."""
     centres = fixed.grid_points().reshape(-1, 3)
     near = centres[((centres >= mesh.points.min(axis=0)) & (centres <= mesh.points.max(axis=0))).all(axis=1)]
     cells, barycentric = locate(mesh.points, mesh.cells, near)
@@ -72,9 +72,9 @@ def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
 def seen_points(
     mesh: TetMesh, quadrature: Quadrature, moving: Image, visible: Interpolator | None = None
 ) -> Quadrature:
-    """The points that rest on the grid of the moving image, and are visible: what lies beyond has not been seen.
+    """Return the visible points that lie on the grid of the moving image at rest; nothing was observed elsewhere.
 
-    Which points count must not depend on the displacement: a posterior could do without those that do not fit.
+    The choice of points must not depend on the displacement: the posterior could then exclude points that do not fit.
 
     Raises
     ------

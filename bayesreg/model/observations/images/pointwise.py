@@ -1,4 +1,4 @@
-"""Similarities that compare the images point by point: every residual f(x_q) − m(x_q + u(x_q)) has its own noise."""
+"""Similarities that compare the images point by point: each residual f(x_q) − m(x_q + u(x_q)) has independent noise."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Same = TypeVar("Same")
 
 
 class Intensities(NamedTuple):
-    """Intensities of two images at the quadrature points.
+    """The intensities of two images at the quadrature points.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Intensities(NamedTuple):
 
     @property
     def differences(self) -> Float[AnyArray, "points"]:
-        """f − m."""
+        """The differences f − m."""
         return self.fixed - self.moving
 
     @property
@@ -50,7 +50,7 @@ class Intensities(NamedTuple):
 
 
 class ValueCurvature(NamedTuple):
-    """Curvature of E_s in the values m_q, mm³.
+    """The curvature of E_s in the values m_q, mm³.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class ValueCurvature(NamedTuple):
 
 
 class Pointwise:
-    """Base of these similarities; see `bayesreg.model.observations.images.similarity.Similarity`.
+    """The base of these similarities; see `bayesreg.model.observations.images.similarity.Similarity`.
 
     A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `energy`,
     `log_normaliser`, `variance` and `draw`.
@@ -73,70 +73,70 @@ class Pointwise:
     arrays: ClassVar[tuple[str, ...]] = ()
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """E_s, a sum over the points, mm³ times squared intensity."""
+        """Return E_s, a sum over the points, mm³ times squared intensity."""
         raise NotImplementedError
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
-        """f − m."""
+        """Return the residuals f − m."""
         return pair.differences
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """The curvature of eq. (1), 2 w."""
+        """Return the curvature of eq. (1), 2 w."""
         return ValueCurvature(2 * pair.weights * pair.shares)
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """∂²E_s/∂m_q²: the Hessian is diagonal."""
+        """Return ∂²E_s/∂m_q²: the Hessian is diagonal."""
         slope = jax.grad(lambda values: self.energy(pair._replace(moving=values), temperature))
         return ValueCurvature(jax.jvp(slope, (pair.moving,), (jnp.ones_like(pair.moving),))[1])
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """−log Z_s, a sum over the points."""
+        """Return −log Z_s, a sum over the points."""
         raise NotImplementedError
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
-        """Residuals that follow the model, in units of their scales."""
+        """Draw residuals from the model, in units of their scales."""
         raise NotImplementedError
 
     def of_one_point(self: Same) -> Same:
-        """The similarity itself."""
+        """Return the similarity itself: its points are independent."""
         return self
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """The arrays, for JAX."""
+        """Return the arrays, for JAX."""
         return tuple(getattr(self, name) for name in self.arrays), None
 
     @classmethod
     def tree_unflatten(cls, _: None, arrays: tuple[Any, ...]) -> Any:
-        """The similarity of these arrays, for JAX."""
+        """Build the similarity from its arrays, for JAX."""
         return cls(*arrays)
 
 
 @jax.tree_util.register_pytree_node_class
 class SumOfSquaredDifferences(Pointwise):
-    """∫ (f − m(x + u))² dx, eq. (1): Gaussian noise with the variance σ_q² = T_s / (2 w_q)."""
+    """The similarity ∫ (f − m(x + u))² dx, eq. (1): Gaussian noise with the variance σ_q² = T_s / (2 w_q)."""
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """Σ_q w_q (f − m)², at any temperature."""
-        # A product of vectors, not a sum of products: XLA would fuse the sum with the interpolation that made `moving`
-        # and then redo the index arithmetic for each of its taps.
+        """Return Σ_q w_q (f − m)², which does not depend on the temperature."""
+        # A product of vectors instead of a sum of products: XLA would fuse the sum with the interpolation that made
+        # `moving`, and repeat the index arithmetic for each of its taps.
         return (pair.weights * pair.shares) @ pair.differences**2
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """Σ_q −½ log(2π σ_q²)."""
+        """Return Σ_q −½ log(2π σ_q²)."""
         return 0.5 * pair.shares @ jnp.log(pair.weights / (jnp.pi * temperature))
 
     def variance(self) -> Scalar:
-        """One."""
+        """Return one, the variance of the noise in units of its squared scale."""
         return jnp.ones(())
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
-        """Independent standard Normal numbers."""
+        """Draw independent standard Normal numbers."""
         return jax.random.normal(key, pair.weights.shape)
 
 
 @jax.tree_util.register_pytree_node_class
 class StudentTNoise(Pointwise):
-    """Student's t noise of the squared scale s_q² = T_s / (2 w_q), which forgives outliers.
+    """Student's t noise of the squared scale s_q² = T_s / (2 w_q), which gives outliers a small weight.
 
     Parameters
     ----------
@@ -150,10 +150,10 @@ class StudentTNoise(Pointwise):
         self.degrees_of_freedom = degrees_of_freedom
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """T_s (ν + 1)/2 Σ_q log(1 + 2 w_q (f − m)² / (ν T_s)).
+        """Return T_s (ν + 1)/2 Σ_q log(1 + 2 w_q (f − m)² / (ν T_s)).
 
         It is −T_s times the log of Student's t without its normaliser. For small residuals, and for many degrees of
-        freedom, it is eq. (1); a large residual adds its logarithm alone.
+        freedom, it equals eq. (1); a large residual adds only its logarithm.
         """
         nu = self.degrees_of_freedom
         surprise = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
@@ -161,27 +161,27 @@ class StudentTNoise(Pointwise):
         return temperature * (nu + 1) / 2 * (pair.shares @ surprise)
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """2 w (ν + 1)/(ν + 3) times the weights (ν + 1)/(ν + z²) of iteratively reweighted least squares.
+        """Return 2 w (ν + 1)/(ν + 3) times the weights (ν + 1)/(ν + z²) of iteratively reweighted least squares.
 
-        The mean of the weights is one where residuals z, in units of their scale, follow the model, and the curvature
-        then Fisher's information; it is less where they are outliers.
+        If the residuals z, in units of their scale, follow the model, then the mean of the weights is one, and the
+        curvature is Fisher's information. Outliers reduce the mean.
         """
         nu = self.degrees_of_freedom
         squares = 2 * pair.weights * pair.differences**2 / temperature
         return ValueCurvature(2 * pair.weights * pair.shares * (nu + 1) ** 2 / ((nu + 3) * (nu + squares)))
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""
+        """Return Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""
         nu = self.degrees_of_freedom
         shape = gammaln((nu + 1) / 2) - gammaln(nu / 2)
         return pair.shares @ (shape + 0.5 * jnp.log(2 * pair.weights / (jnp.pi * nu * temperature)))
 
     def variance(self) -> Scalar:
-        """ν / (ν − 2)."""
+        """Return the variance ν / (ν − 2)."""
         return self.degrees_of_freedom / (self.degrees_of_freedom - 2)
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
-        """Independent numbers of Student's t."""
+        """Draw independent numbers of Student's t."""
         return jax.random.t(key, self.degrees_of_freedom, pair.weights.shape)
 
 
@@ -194,7 +194,7 @@ class SimilaritySettings(Section):
 
     serves_any_contrast: ClassVar[bool] = False
     compares_descriptors: ClassVar[bool] = False
-    # E_s in the report, and what its residual is where that is not f − m(x + u).
+    # E_s in the report, and the description of its residual if that is not f − m(x + u).
     formula: ClassVar[str]
     residual: ClassVar[str] = ""
 
@@ -207,12 +207,12 @@ class SquaredDifferences(SimilaritySettings):
     kind: Literal["ssd"] = "ssd"
 
     def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> SumOfSquaredDifferences:
-        """The similarity at these points; see `AnySimilarity`."""
+        """Make the similarity at these points; see `AnySimilarity`."""
         return SumOfSquaredDifferences()
 
 
 class StudentT(SimilaritySettings):
-    """Student's t noise, which forgives outliers."""
+    """Student's t noise, which gives outliers a small weight."""
 
     formula = (
         "<var>T</var><sub>s</sub> (ν+1)/2 Σ log(1 + 2<var>wr</var>² / (ν<var>T</var><sub>s</sub>)), where "
@@ -225,5 +225,5 @@ class StudentT(SimilaritySettings):
     """ν, above 2: the fewer, the heavier the tails; many are Gaussian."""
 
     def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> StudentTNoise:
-        """The similarity at these points; see `AnySimilarity`."""
+        """Make the similarity at these points; see `AnySimilarity`."""
         return StudentTNoise(jnp.asarray(self.degrees_of_freedom))

@@ -1,4 +1,4 @@
-"""A pair of images as it is compared, its options complete."""
+"""A pair of images with complete options, prepared for comparison."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from bayesreg.model.state import State
 from bayesreg.settings import is_inferred
 from bayesreg.types import AnyArray, InputError
 
-# Quadrature points at which observed and replicated intensities are kept for ArviZ.
+# The number of quadrature points at which observed and replicated intensities are stored for ArviZ.
 MOST_POINTS = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedPair:
-    """A pair of images as it is compared.
+    """A pair of images, prepared for comparison.
 
     Attributes
     ----------
@@ -57,26 +57,26 @@ class PreparedPair:
     kind: ClassVar[str] = "images"
 
     def fixed_at(self, positions: Float[np.ndarray, "points 3"]) -> Float[AnyArray, "points"]:
-        """What is compared of the fixed image at all quadrature points, mm."""
+        """Return the compared values of the fixed image at all quadrature points, mm."""
         return self.fixed.interpolate(positions, self.options.interpolation)
 
     def moving_function(self) -> Interpolator | InTurn:
-        """What is compared of the moving image, as a function of the places of all quadrature points."""
+        """Return the compared values of the moving image as a function of the places of all quadrature points."""
         return self.moving.interpolator(self.options.interpolation)
 
     def smoothed(self, sd: float) -> PreparedPair:
-        """The pair with what is compared smoothed, sd in mm."""
+        """Return the pair with smoothed images, sd in mm."""
         # SciPy's filters let other threads run.
         with ThreadPoolExecutor() as pool:
             fixed, moving = pool.map(lambda image: image.smoothed(sd), (self.fixed, self.moving))
         return replace(self, fixed=fixed, moving=moving)
 
     def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
-        """Functions, besides those of a shading, of which m may have some more than f, smoothed by sd, mm."""
+        """Return functions, besides a shading, whose amounts may differ between m and f, smoothed by sd, mm."""
         return np.zeros((len(positions), 0))
 
     def compared_points(self, mesh: TetMesh) -> Any:
-        """The quadrature points that are compared.
+        """Return the quadrature points that are compared.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class PreparedPair:
         return seen_points(mesh, quadrature_of(mesh, self.fixed, self.options), self.moving, visible)
 
     def on(self, mesh: TetMesh) -> Placed:
-        """See `ImagePair.on`."""
+        """Place the pair on a mesh; see `ImagePair.on`."""
         quadrature, options = self.compared_points(mesh), self.options
         positions = quadrature.positions(mesh)
         smooth = self._smoothed_by_options()
@@ -116,7 +116,7 @@ class PreparedPair:
         return "t_similarity" if self.name == "images" else f"{self.name}_t_similarity"
 
     def _blocks(self, term: ComparedImages) -> Blocks:
-        """T_s, and the coefficients of the shading where there is one."""
+        """Make the block of T_s, and the block of the coefficients of a shading if there is one."""
         blocks: Blocks = {self.temperature_name: scale_block(self.options.similarity.temperature)}
         if term.shading is not None:
             blocks[shading_name(self.name)] = Coefficients(jnp.full(term.shading.shape[1], SHARE))
@@ -132,7 +132,7 @@ class PreparedPair:
 
     @property
     def _smoothing_sd(self) -> float:
-        """By how much the options smooth both images, mm."""
+        """The sd of the smoothing of both images that the options ask for, mm."""
         return self.options.smoothing * max(image.voxel_volume for image in (self.fixed, self.moving)) ** (1 / 3)
 
     def _smoothed_by_options(self) -> PreparedPair:
@@ -141,11 +141,11 @@ class PreparedPair:
     # For the judgement of the fit
 
     def describe(self, term: ComparedImages, state: State) -> dict[str, float]:
-        """The noise and the residual at a state.
+        """Describe the noise and the residual at a state.
 
-        "noise_sd", that of a point of average weight, by T_s; "residual_sd"; and "residual_to_noise", how many times as
-        great as T_s implies a residual is: by its sd, or with Student's t by its median, since a few outliers, which
-        Student's t forgives, have a great share in the former.
+        "noise_sd" is the sd that T_s implies at a point of average weight; "residual_sd" is that of the residual.
+        "residual_to_noise" is the ratio of the residual to the noise that T_s implies: a ratio of sds, or of medians
+        with Student's t, since a few outliers with small weights would dominate the sd.
         """
         z = np.asarray(term.scaled_residual(state.u, state.values))
         similarity = self.options.similarity
@@ -160,7 +160,7 @@ class PreparedPair:
         }
 
     def check_draw(self, term: ComparedImages, state: State, key: AnyArray) -> dict[str, AnyArray]:
-        """Discrepancies of the residuals at a draw, "observed", and of noise that follows the model, "replicated"."""
+        """Compute the discrepancies of the residuals at a draw, "observed", and of simulated noise, "replicated"."""
         mesh, cells = state.mesh, term.quadrature.cells
         z = term.scaled_residual(state.u, state.values)
         noise = term.standardised_noise(key, state.u, state.values)
@@ -170,14 +170,14 @@ class PreparedPair:
         }
 
     def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
-        """The residual at a state, in units of the noise, and the tissue of each of its points."""
+        """Return the residual at a state, in units of the noise, and the tissue of each of its points."""
         term = posterior.data.terms[self.name]
         residual = term.scaled_residual(state.u, state.values)
         tissue = posterior.mesh.tissue[np.asarray(term.quadrature.cells)]
         return {"residual": np.asarray(residual, np.float32), "residual_tissue": tissue.astype(np.int8)}
 
     def recorded(self, term: ComparedImages) -> Recorded:
-        """Intensities of f, as they are compared, at up to 1,000 evenly spaced quadrature points."""
+        """Return the compared intensities of f at up to 1,000 evenly spaced quadrature points."""
         points = np.linspace(0, len(term.positions) - 1, min(len(term.positions), MOST_POINTS)).round().astype(int)
         where = {"units": "mm", "long_name": "position of the point in the fixed image, world RAS"}
         dim, places = f"{self.name}_point", zip("xyz", np.asarray(term.positions)[points].T, strict=True)
@@ -188,24 +188,24 @@ class PreparedPair:
     # For the search for the mode
 
     def eased(self, term: ComparedImages, sd: float) -> ComparedImages:
-        """The term with what is compared smoothed further, sd in mm."""
+        """Return the term with further smoothed images, sd in mm."""
         smooth = self._smoothed_by_options().smoothed(sd)
         return term._replace(moving=smooth.moving_function(), fixed_values=smooth.fixed_at(np.asarray(term.positions)))
 
     @property
     def is_tempered_by_residuals(self) -> bool:
-        """Whether residuals tell how many quadrature points are independent."""
+        """Whether residuals determine the number of independent quadrature points."""
         return self.options.independent_points == "residual"
 
     def count_independent_points(self, term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
-        """How many quadrature points are independent, by the residuals at these values (see `independent_scores`)."""
+        """Count the independent quadrature points, from the residuals at these values (see `independent_scores`)."""
         voxels = np.rint(self.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
         return independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
 
 
 @dataclass(frozen=True, eq=False)
 class MappedPair(PreparedPair):
-    """A pair whose fixed image was mapped into the contrast of the moving one.
+    """A pair whose fixed image was converted to the contrast of the moving one.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class MappedPair(PreparedPair):
     tissue: Image | None
 
     def functions(self, positions: Float[np.ndarray, "points 3"], sd: float) -> Float[np.ndarray, "points functions"]:
-        """The functions that make up the map: how much of each is there is inferred with all else."""
+        """Return the functions of the map; their amounts are inferred with all other unknowns."""
         return contrast_functions(self.source, positions, sd, self.tissue)
 
 
@@ -235,16 +235,16 @@ class SelfSimilarPair(PreparedPair):
     descriptors: tuple[tuple[Image, Image], ...]
 
     def fixed_at(self, positions: Float[np.ndarray, "points 3"]) -> Float[AnyArray, "points"]:
-        """The descriptors of f, one at each point."""
+        """Return the descriptors of f, one at each point."""
         functions = [fixed.interpolator(self.options.interpolation) for fixed, _ in self.descriptors]
         return InTurn.of(functions)(jnp.asarray(positions))
 
     def moving_function(self) -> InTurn:
-        """The descriptors of m, one at each point."""
+        """Return the descriptors of m, one at each point."""
         return InTurn.of([moving.interpolator(self.options.interpolation) for _, moving in self.descriptors])
 
     def smoothed(self, sd: float) -> SelfSimilarPair:
-        """The pair with its descriptors smoothed, sd in mm."""
+        """Return the pair with smoothed descriptors, sd in mm."""
         with ThreadPoolExecutor() as pool:
             smooth = pool.map(lambda two: (two[0].smoothed(sd), two[1].smoothed(sd)), self.descriptors)
             return replace(self, descriptors=tuple(smooth))
@@ -256,14 +256,14 @@ def _kept_smoothed(pair: PreparedPair, sd: float) -> PreparedPair:
 
 
 def describe_pair(pair: PreparedPair) -> SelfSimilarPair:
-    """The pair, compared by the self-similarity of its images."""
+    """Convert a pair to one that is compared by the self-similarity of its images."""
     axes, distance = pair.fixed.axes, max(float(image.voxel_sizes.max()) for image in (pair.fixed, pair.moving))
     fixed, moving = (describe_self_similarity(image, axes, distance) for image in (pair.fixed, pair.moving))
     return SelfSimilarPair(**vars(pair), descriptors=tuple(zip(fixed, moving, strict=True)))
 
 
 def _independent_share(name: str, options: ImageOptions, points: int) -> float:
-    """Effective number of independent quadrature points over the number of all.
+    """Return the effective number of independent quadrature points over the number of all.
 
     Raises
     ------
@@ -271,7 +271,7 @@ def _independent_share(name: str, options: ImageOptions, points: int) -> float:
         If there are fewer points than are said to be independent.
     """
     count = options.independent_points
-    # What residuals tell is known later, see `Posterior.count_independent_points`.
+    # The residuals are known later; see `Posterior.count_independent_points`.
     if count is None or count == "residual":
         return 1.0
     if count > points:

@@ -1,4 +1,4 @@
-"""What the report shows of a pair of images: the residual, and posterior predictive checks of it."""
+"""The report on a pair of images: the residual, and its posterior predictive checks."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ NAMES = {
     "greatest": "greatest |residual|",
     "neighbours": "correlation between neighbouring cells",
 }
-# Outside of these a posterior predictive p-value is called extreme.
+# A posterior predictive p-value outside this range is called extreme.
 EXTREME = (0.025, 0.975)
 BINS = 60
-# A tissue with fewer quadrature points has no curve of its own.
+# A tissue with fewer quadrature points has no curve in the figure.
 LEAST_POINTS = 50
 
 
 class ExpectedNoise(NamedTuple):
-    """The distribution of standardised residuals where the model holds: its name, density, and share beyond ±3."""
+    """The distribution of standardised residuals if the model holds: its name, density, and share beyond ±3."""
 
     name: str
     density: Callable[[np.ndarray], np.ndarray]
@@ -35,7 +35,7 @@ class ExpectedNoise(NamedTuple):
 
 
 def noise_of(similarity: Mapping[str, Any]) -> ExpectedNoise:
-    """The noise of a similarity, given by its settings, in units of the scale √(T_s / 2w)."""
+    """Return the noise of a similarity, given by its settings, in units of the scale √(T_s / 2w)."""
     if similarity["kind"] == "student_t":
         nu = float(similarity["degrees_of_freedom"])
         return ExpectedNoise(f"Student’s t with ν = {nu:g}", stats.t(nu).pdf, float(2 * stats.t.sf(3, nu)))
@@ -43,7 +43,7 @@ def noise_of(similarity: Mapping[str, Any]) -> ExpectedNoise:
 
 
 def check_table(name: str, summary: Arrays) -> ReportTable:
-    """Realised against replicated discrepancies, with posterior predictive p-values."""
+    """Make the table of realised and replicated discrepancies, with posterior predictive p-values."""
     rows, size = [], int(np.prod(summary["observed"].shape[:2]))
     for k, discrepancy in enumerate(DISCREPANCIES):
         observed, replicated = summary["observed"][..., k], summary["replicated"][..., k]
@@ -62,7 +62,7 @@ def check_table(name: str, summary: Arrays) -> ReportTable:
 def residual_figure(
     name: str, summary: Arrays, tissues: Sequence[str], similarity: Mapping[str, Any], residual: str
 ) -> ReportFigure:
-    """The histogram of the residual at the posterior mean, and the discrepancies."""
+    """Make the histogram of the residual at the posterior mean, and the figure of the discrepancies."""
     z, expected = summary["residual"], noise_of(similarity)
     beyond = f"{float((np.abs(z) > 3).mean()):.2%}".replace("%", " %")
     caption = (
@@ -78,7 +78,7 @@ def residual_figure(
 
 
 def of_pair(name: str) -> str:
-    """What distinguishes a title of a pair of this name."""
+    """Return the part of a title that names the pair; empty for the main pair."""
     return "" if name == "images" else f" of {name}"
 
 
@@ -119,9 +119,9 @@ def _draw_discrepancy(axes: Any, name: str, observed: np.ndarray, replicated: np
 
 
 def predictive_p(observed: np.ndarray, replicated: np.ndarray) -> float:
-    """Posterior predictive p-value: how often a replicated discrepancy is at least the realised one.
+    """Compute the posterior predictive p-value: the share of draws whose replicated discrepancy is not smaller.
 
-    Near 0 the data show more of it than the model would, near 1 less.
+    Near 0, the discrepancy of the data is larger than the model predicts; near 1, it is smaller.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def predictive_p(observed: np.ndarray, replicated: np.ndarray) -> float:
 
 
 def _p_text(p: float, draws: int) -> str:
-    """A p-value; a bound where no draw, or every draw, exceeds."""
+    """Format a p-value, or a bound if no draw or every draw exceeds."""
     return f"p < {1 / draws:.2g}" if p == 0 else f"p > {1 - 1 / draws:.3g}" if p == 1 else f"p = {p:.3f}"
 
 

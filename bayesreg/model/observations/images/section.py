@@ -41,11 +41,11 @@ class ImagesSection(ObservationSection, ImageOptions):
 
     @property
     def options(self) -> dict[str, Any]:
-        """How the images are compared."""
+        """The options of the comparison of the images."""
         return {name: getattr(self, name) for name in ImageOptions.model_fields}
 
     def observe(self, inputs: Inputs) -> Sequence[ImagePair]:
-        """The pair in one world, as it was matched."""
+        """Make the pair with both images in one world, by the matched pose."""
         if inputs.fixed is None or inputs.moving is None:
             raise InputError("the run compares images, and its folder holds none: inputs/fixed.nii.gz is missing")
         images = inputs.fixed, inputs.moving, self.name, inputs.fixed_ignore, inputs.moving_ignore
@@ -57,26 +57,26 @@ class ImagesSection(ObservationSection, ImageOptions):
 
     @classmethod
     def log_density(cls, name: str) -> str:
-        """−E_s / T_s, of the pair of this name where there are others."""
+        """Return −E_s / T_s in HTML, with the name of the pair if it is not the main pair."""
         of_pair = "" if name == "images" else f"({name})"
         return f" − <var>E</var><sub>s</sub>{of_pair} / <var>T</var><sub>s</sub>{of_pair}"
 
     @classmethod
     def explain(cls, name: str, described: Mapping[str, Any]) -> str:
-        """E_s of the similarity."""
+        """Return the formula of E_s of the similarity."""
         similarity = SIMILARITIES[described["options"]["similarity"]["kind"]]
         return f"<var>E</var><sub>s</sub>{'' if name == 'images' else f'({name})'} = {similarity.formula}"
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
-        """Posterior predictive checks."""
+        """Return the table of posterior predictive checks."""
         return [check_table(name, summary)] if "observed" in summary else []
 
     @classmethod
     def figures(
         cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
     ) -> list[ReportFigure]:
-        """The residual beside what the model expects of it."""
+        """Return the figure of the residual and its expected distribution."""
         if "residual" not in summary:
             return []
         similarity = described["options"]["similarity"]

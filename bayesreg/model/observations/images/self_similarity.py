@@ -1,17 +1,18 @@
-"""Self-similarity of an image, for pairs of unlike contrast: what a place looks like beside its neighbours.
+"""Self-similarity of an image, for pairs of unlike contrast: the differences of a point from its neighbours.
 
-Tissues change their brightness from one contrast to another, and their borders stay where they are. The descriptor of
-Heinrich et al. 2012, "MIND: modality independent neighbourhood descriptor for multi-modal deformable registration",
-has one value for each of six neighbours at x ± d along the axes of the fixed image, d being the voxel size of the
+Tissues change their brightness from one contrast to another, but their borders stay in place. The descriptor of
+Heinrich et al. 2012, "MIND: modality independent neighbourhood descriptor for multi-modal deformable registration", has
+one value for each of six neighbours at x ± d along the axes of the fixed image, where d is the voxel size of the
 coarser image,
 
 MIND_r(x) = exp(−(D_r(x) − min_s D_s(x)) / V(x)),    D_r = G * (I(x) − I(x + r))²,
 
-with a Gaussian patch G and V the mean of the D_r. It lies between 0 and 1, and is the same for a + b I as for I. The
-six are images, which are compared by squared differences: their noise is Gaussian, of one variance that T_s stands for.
+with a Gaussian patch G and V the mean of the D_r. It lies between 0 and 1, and a + b I has the same descriptor as I.
+The six descriptors are images, which are compared by squared differences: their noise is Gaussian with one variance,
+which T_s determines.
 
-The likelihood looks at one neighbour at every quadrature point, at each in turn. Six values of one place would be six
-looks at much the same, and cost as many.
+The likelihood uses one neighbour at every quadrature point, each neighbour in turn. Six values at one point would be
+strongly dependent, and cost six times as much.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ from bayesreg.types import AnyArray
 
 # Standard deviation of the patch, as a share of the distance between neighbours, as in the paper.
 PATCH = 0.5
-# The least V, as a share of its mean over the grid: where nothing is to be seen, noise is not made great.
+# The smallest V, as a share of its mean over the grid: it prevents an amplification of noise in uniform regions.
 LEAST = 1e-3
 
 
 def describe_self_similarity(
     image: Image, axes: Float[np.ndarray, "3 3"], distance: float
 ) -> tuple[Image, Image, Image, Image, Image, Image]:
-    """The six descriptors of an image, on its grid.
+    """Compute the six descriptors of an image, on its grid.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def describe_self_similarity(
     axes : (3, 3) array
         Directions of the neighbours, in world RAS, one in each column.
     distance : float
-        To the neighbours, mm.
+        Distance to the neighbours, mm.
     """
     voxels = np.asarray(image.voxels, float)
     shifts = [way * distance * axis for axis in axes.T for way in (1, -1)]
@@ -65,29 +66,29 @@ def describe_self_similarity(
 
 
 def _patch_distance(image: Image, voxels: np.ndarray, sd: float, shift: np.ndarray) -> np.ndarray:
-    """D_r(x) with r a shift, mm; the image continues with its nearest value."""
+    """Compute D_r(x) with r a shift, mm; beyond its grid the image continues with its nearest value."""
     shifted = ndimage.shift(voxels, -(image.to_voxel[:3, :3] @ shift), order=1, mode="nearest")
     return np.asarray(ndimage.gaussian_filter((voxels - shifted) ** 2, sd / image.voxel_sizes))
 
 
 class InTurn(NamedTuple):
-    """Several images as one function of places: point q is looked up in image q modulo their number (a pytree).
+    """Several images as one function of places: point q uses image q modulo their number (a pytree).
 
     Attributes
     ----------
     images : Interpolator
-        Of all images, whose arrays have them as their leading axis.
+        All images in one; the images are the leading axis of its arrays.
     """
 
     images: Interpolator
 
     @classmethod
     def of(cls, images: list[Interpolator]) -> InTurn:
-        """These images in turn; their grids have one shape."""
+        """Combine these images; their grids have one shape."""
         return cls(jax.tree.map(lambda *arrays: jnp.stack(arrays), *images))
 
     def __call__(self, points: Float[AnyArray, "points 3"]) -> Float[AnyArray, "points"]:
-        """Values at world points, mm, of which all must be given in their order."""
+        """Return the values at world points, mm; all points must be given, in their order."""
         count, images = len(points), len(self.images.to_voxel)
         turns = -(-count // images)
         filled = jnp.pad(points, ((0, turns * images - count), (0, 0)), mode="edge").reshape(turns, images, 3)
@@ -96,7 +97,7 @@ class InTurn(NamedTuple):
 
 
 class SelfSimilarity(SimilaritySettings):
-    """Squared differences of what places look like beside their neighbours, for unlike contrasts."""
+    """Squared differences of self-similarity descriptors, for unlike contrasts."""
 
     serves_any_contrast = compares_descriptors = True
     formula = (
@@ -108,5 +109,5 @@ class SelfSimilarity(SimilaritySettings):
     kind: Literal["mind"] = "mind"
 
     def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> SumOfSquaredDifferences:
-        """The similarity at these points; see `AnySimilarity`."""
+        """Make the similarity at these points; see `AnySimilarity`."""
         return SumOfSquaredDifferences()

@@ -20,34 +20,34 @@ from bayesreg.types import AnyArray, Scalar
 
 
 class Similarity(Protocol):
-    """How the likelihood compares f and the warped m (a pytree).
+    """The comparison of f and the warped m in the likelihood (a pytree).
 
-    `temperature` stands for T_s, mm³ times squared intensity.
+    The argument `temperature` is T_s, mm³ times squared intensity.
     """
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """E_s, mm³ times squared intensity."""
+        """Return E_s, mm³ times squared intensity."""
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
-        """−log Z_s, with which exp(−E_s / T_s) is a density of the residuals of what is compared."""
+        """Return −log Z_s, with which exp(−E_s / T_s) is a density of the residuals of the compared values."""
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
-        """The part of f that noise explains."""
+        """Return the part of f that noise explains."""
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """Gauss and Newton's curvature of E_s in the values m_q, positive semidefinite."""
+        """Return the Gauss–Newton curvature of E_s in the values m_q, positive semidefinite."""
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
-        """The curvature of E_s in the values m_q."""
+        """Return the curvature of E_s in the values m_q."""
 
     def variance(self) -> Scalar:
-        """The mean of the residuals' variances in units of their squared scales."""
+        """Return the mean of the residuals' variances in units of their squared scales."""
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
-        """Residuals that follow the model, in units of their scales."""
+        """Draw residuals from the model, in units of their scales."""
 
     def of_one_point(self) -> Pointwise:
-        """The noise of a point by itself."""
+        """Return the noise of a single point."""
 
 
 AnySimilarity = SquaredDifferences | StudentT | LocalCorrelation | MutualInformation | SelfSimilarity
