@@ -27,7 +27,6 @@ from bayesreg.report.panels import View, ignored
 from bayesreg.report.slices import planes_through
 from bayesreg.results.slicer import slicer
 from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
-from bayesreg.workflow.assembly import _observations
 from bayesreg.workflow.preparation import prepare
 from tests.io.test_alignment import FIXED, MASK, motion
 from tests.phantoms import ball_mesh
@@ -175,7 +174,8 @@ def test_a_channel_on_another_grid_has_the_tissues_where_they_are(result, folder
     affine[:3, 3] = channel.fixed.voxel_to_world(np.array([channel.fixed.shape[0] - 1.0, 0, 0]))
     affine[:3, 0] *= -1
     backwards = channel._replace(fixed=br.Image(np.asarray(channel.fixed.voxels)[::-1], affine))
-    first, second = _observations(config, inputs._replace(channels={"flair": backwards}))[:2]
+    inputs = inputs._replace(channels={"flair": backwards})
+    first, second = (pair for section in config.observations[:2] for pair in section.observe(inputs))
     np.testing.assert_array_equal(np.asarray(second.tissue.voxels)[::-1], first.tissue.voxels)
 
 

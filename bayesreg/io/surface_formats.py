@@ -13,7 +13,7 @@ from typing import Any, Literal, cast
 from urllib.parse import unquote
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, Shaped
 
 _HEAD = re.compile(
     rb"# vtk DataFile Version (\d+)\.\d+[^\n]*\n[^\n]*\n\s*(ASCII|BINARY)\s+DATASET\s+(POLYDATA|UNSTRUCTURED_GRID)\b",
@@ -106,7 +106,7 @@ def join_cells(offsets: Int[np.ndarray, "c"], points: Int[np.ndarray, "k"]) -> I
     return np.insert(points, offsets[:-1], counts)
 
 
-def split_cells(cells: Int[np.ndarray, "n"], count: int) -> list[np.ndarray]:
+def split_cells(cells: Shaped[np.ndarray, "n"], count: int) -> list[np.ndarray]:
     """Split joined cells into the point indices of each cell.
 
     Raise ValueError if a cell has an index of `count` or more, or does not end within the array.

@@ -150,10 +150,10 @@ def _resume(
     require_same_sources(config, provenance.get("sources", {}), MAY_CHANGE, out)
     finished = stage_of(out) == "finished"
     if finished and all(getattr(known, name) == getattr(config, name) for name in MAY_CHANGE):
-        _log.info(f"{out} holds a finished run already; another budget (stop) would continue it")
+        _log.info("%s holds a finished run already; another budget (stop) would continue it", out)
         if not is_sound(out, REPORT):
             report(out)
-            return load_result(out)
+        return load_result(out)
     inputs = store.read_inputs(out)
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(out, provenance, posterior, observations)
