@@ -165,8 +165,9 @@ def test_a_search_goes_on_where_the_tempering_has_led_to():
 
 
 def test_residuals_tell_of_voxels_alone():
+    images = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
     with pytest.raises(ValueError, match="residual needs quadrature: voxels"):
-        br.ImagePair(*(smooth_image(MESH.points, seed=seed) for seed in (1, 2)), independent_points="residual")
+        br.build_posterior(MESH, [br.ImagePair(*images, independent_points="residual", quadrature="gauss4")])
 
 
 @pytest.mark.long
