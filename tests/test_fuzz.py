@@ -27,6 +27,7 @@ from bayesreg.io.fields import load_displacement
 from bayesreg.io.points import read_points
 from bayesreg.io.surface_files import read_surface
 from bayesreg.io.transforms import save_transform
+from bayesreg.messages import from_level
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 from tests.phantoms import box_mesh
@@ -250,10 +251,8 @@ def _read(folder, sound, damage):
     path = folder / name
     path.write_bytes(_spoil(sound[name], *how))
     began = time.perf_counter()
-    logging.disable(logging.CRITICAL)
-    with suppress(InputError):
+    with from_level(logging.CRITICAL), suppress(InputError):
         FORMATS[name][1](path)
-    logging.disable(logging.NOTSET)
     return time.perf_counter() - began
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
+from zlib import crc32
 
 import jax
 import jax.numpy as jnp
@@ -93,8 +94,10 @@ def predict(
                  "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
                  "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         of_draw = jax.random.fold_in(key, number.astype(int))
-        for index, (name, one) in enumerate(checked.items()):
-            figures = one.check_draw(data.terms[name], state, jax.random.fold_in(of_draw, index))
+        for name, observation in checked.items():
+            # The noise depends on the name, so that other observations of the run do not change it.
+            noise = jax.random.fold_in(of_draw, crc32(name.encode()))
+            figures = observation.check_draw(data.terms[name], state, noise)
             found |= {f"{name}/{figure}": value for figure, value in figures.items()}
         return found
 

@@ -70,7 +70,7 @@ def test_both_are_checked_for_fit():
         return predict(post, posterior, mean, still, still, places, 0, Pose.identity()).observations
 
     found = predicted(both)
-    for name, post in zip(("images",), alone[:1], strict=True):  # The noise of later observations is their own.
+    for name, post in zip(("images", "flair"), alone, strict=True):
         expected = predicted(post)
         assert {f"{name}/observed", f"{name}/replicated", f"{name}/residual"} <= set(expected)
         assert found[f"{name}/observed"].shape[:2] == (chains, draws)
