@@ -7,7 +7,7 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from bayesreg.cli import app
-from bayesreg.workflow import preparation
+from bayesreg.workflow import meshing
 
 SHAPE = (24, 24, 24)
 
@@ -23,7 +23,7 @@ def pair(tmp_path, monkeypatch):
     def build_mesh(*_):
         raise LongWorkError
 
-    monkeypatch.setattr(preparation, "build_mesh", build_mesh)
+    monkeypatch.setattr(meshing, "build_mesh", build_mesh)
     radius = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0)
     labels = np.select([radius < 2, radius < 6, radius < 8], [1, 3, 2], 0)
     image = np.random.default_rng(0).normal(labels, 0.1)

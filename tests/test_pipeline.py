@@ -22,7 +22,7 @@ from bayesreg.fem.location import interpolation_at
 from bayesreg.io import checkpoints, ledger, store
 from bayesreg.io.datasets import Anatomy
 from bayesreg.model import problem
-from bayesreg.workflow import preparation
+from bayesreg.workflow import meshing, preparation
 from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.check import check
@@ -246,7 +246,7 @@ def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
 
 
 def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):
-    monkeypatch.setattr(preparation, "make_pair", None)
+    monkeypatch.setattr(preparation, "simulate_pair", None)
     np.savez(folder / "other.npz", u=np.zeros((9, 3)))
     with pytest.raises(br.InputError, match=r"other\.npz has shape \(9, 3\); expected \(\d\d+, 3\)"):
         check(synthetic("paper", "start.field=other.npz"))
@@ -306,7 +306,7 @@ def test_uniform_beside_tissues(finished, folder):
 @pytest.fixture
 def synthetic(folder, anatomy, monkeypatch):
     monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
-    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38, spacing=15))
+    monkeypatch.setattr(meshing, "build_mesh", lambda *_: ball_mesh(radius=38, spacing=15))
 
     def config(kind, *overrides):
         content = {
@@ -366,7 +366,7 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     """On a phantom in place of MNI152, from a quickstart made small, with a field of stiffness, which is mapped."""
     code, of_points = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     monkeypatch.setattr(preparation, "mni152", lambda: anatomy)
-    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=38, spacing=24))
+    monkeypatch.setattr(meshing, "build_mesh", lambda *_: ball_mesh(radius=38, spacing=24))
     monkeypatch.chdir(tmp_path)
     small = {
         "simulate": {"displacement": 3, "patch_nodes": 4},

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from bayesreg.cli import app
 from bayesreg.io import readers
 from bayesreg.label_tables import TABLES
-from bayesreg.workflow import preparation
+from bayesreg.workflow import meshing, preparation
 from bayesreg.workflow.register import understand
 from tests.phantoms import ball_mesh
 
@@ -183,7 +183,7 @@ def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):
         return read(source, path)
 
     monkeypatch.setattr(readers, "_voxels", counting)
-    monkeypatch.setattr(preparation, "build_mesh", lambda *_: ball_mesh(radius=8, spacing=6))
+    monkeypatch.setattr(meshing, "build_mesh", lambda *_: ball_mesh(radius=8, spacing=6))
     pair = f"{path['a,b']},{path['a,b']}"
     understood = understand(
         path["fixed"], path["moving"], path["labels"], None, path["mask"], path["cavity"], path["cavity"],

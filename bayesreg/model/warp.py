@@ -22,17 +22,6 @@ def volume_ratio(mesh: TetMesh, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray
     return jnp.linalg.det(jnp.moveaxis(jnp.array(gradient), -1, 0) + jnp.eye(3))
 
 
-def nodal_field_on_grid(
-    mesh: TetMesh, values: Float[np.ndarray, "nodes channels"], grid: Image
-) -> Float[np.ndarray, "X Y Z channels"]:
-    """Interpolate nodal values linearly at the voxel centres of an image; zero outside the mesh."""
-    field = np.zeros((*grid.shape, values.shape[1]))
-    index, cells, barycentric = covered_voxels(grid, mesh)
-    nodal = np.asarray(values)[mesh.cells[cells]]
-    field[tuple(index.T)] = np.einsum("qa,qac->qc", barycentric, nodal)
-    return field
-
-
 class Covered(NamedTuple):
     """The voxels whose centres lie in a mesh.
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rich.table import Table as TerminalTable
-
 from bayesreg.report.metrics import WHOLE
 from bayesreg.report.verdict import fixed, number, percent
 from bayesreg.tissues import BRAIN, label_of
@@ -40,17 +38,6 @@ class Table(NamedTuple):
     header: list[str]
     groups: list[tuple[str, list[list[str]]]]
     kind: str = "table"
-
-
-def in_terminal(table: Table) -> TerminalTable:
-    """Format a table for a terminal, without its caption."""
-    shown = TerminalTable(title=table.title)
-    for index, name in enumerate(table.header):
-        shown.add_column(name, justify="right" if index else "left")
-    for _, rows in table.groups:
-        for row in rows:
-            shown.add_row(*row)
-    return shown
 
 
 def error_tables(

@@ -15,7 +15,8 @@ from jaxtyping import Bool
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.io.points import Points, read_side, write_table
+from bayesreg.io.point_formats import Points
+from bayesreg.io.points import read_side, write_table
 from bayesreg.io.surface_files import Space, SurfaceFile, read_surface, save_outline, write_surface
 from bayesreg.io.volumes import load_image, load_whole_numbers, save_image, write_nifti
 from bayesreg.results.carried_labels import carry_labels

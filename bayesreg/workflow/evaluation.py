@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bayesreg.io.points import PointPairs
+from bayesreg.io.point_formats import PointPairs
 from bayesreg.results.transform import Transform, spread
 from bayesreg.types import AnyArray, InputError
 

@@ -15,7 +15,7 @@ from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
 from bayesreg.io import checkpoints, store
 from bayesreg.io.ledger import drop, writing
-from bayesreg.io.points import PointPairs
+from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.records import Inputs, Run
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import warp_image

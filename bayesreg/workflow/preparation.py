@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.config import Config, resolved_yaml
-from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData
-from bayesreg.config.sections import MeshConfig
+from bayesreg.config.data import BrainWebData, FilesData
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
 from bayesreg.image import Image, robust_scale
@@ -20,24 +19,26 @@ from bayesreg.io import store
 from bayesreg.io.agreement import require_agreement
 from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_forms_taken, without_labels
 from bayesreg.io.displacements import IDENTITY, read_boundary, require_displacement
-from bayesreg.io.domain import size_of_solid, without_ridges
+from bayesreg.io.domain import without_ridges
 from bayesreg.io.intensities import in_levels
 from bayesreg.io.ledger import writing
-from bayesreg.io.meshing import MeshOptions, build_mesh, domain_labels, load_mesh, mesh_domain
-from bayesreg.io.points import PointPairs, read_point_pairs
+from bayesreg.io.meshing import domain_labels, load_mesh, mesh_domain
+from bayesreg.io.point_formats import PointPairs
+from bayesreg.io.points import read_point_pairs
 from bayesreg.io.records import Channel, Inputs, Truth
 from bayesreg.io.volumes import load_ignored, load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.observations.section import Arrays
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.pose import Pose
-from bayesreg.synthetic.pair import SyntheticPair, make_pair
-from bayesreg.tissues import BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
+from bayesreg.tissues import BRAIN_CLOSING
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.evaluation import NAME, require_unseen
 from bayesreg.workflow.matching import Matched, match_channel, match_images
+from bayesreg.workflow.meshing import complete_lengths, mesh_of, size_of_organ
 from bayesreg.workflow.prediction import require_inside
+from bayesreg.workflow.simulated_pair import describe_pair, simulate_pair
 
 PROVENANCE = "inputs/provenance.json"
 
@@ -86,15 +87,15 @@ def prepare(config: Config) -> Prepared:
     if anatomy.intracranial is not None:
         anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
     clock.lap("anatomy")
-    size = _size(config, anatomy)
+    size = size_of_organ(config, anatomy)
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, size * BRAIN_CLOSING, anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
     fixed_ignore = None if anatomy.image is None else _ignored(config, "fixed", anatomy.image)
     matched = _match(config, anatomy, domain, fixed_ignore)
     appraisal = _appraise(config, anatomy, domain, matched)
     clock.lap("images")
-    settings = _sized(config.mesh, size)
-    mesh = _mesh(anatomy, domain, settings)
+    settings = complete_lengths(config.mesh, size)
+    mesh = mesh_of(anatomy, domain, settings)
     if settings.file is not None:
         require_agreement(mesh, tissue, settings.file)
     clock.lap("mesh")
@@ -119,14 +120,14 @@ def prepare(config: Config) -> Prepared:
         return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
     fixed = robust_scale(anatomy.image, domain.voxels != 0)(anatomy.image)
-    pair = _pair(config, settings, fixed, anatomy, domain, skull, mesh)
+    pair = simulate_pair(config, settings, fixed, anatomy, domain, skull, mesh)
     clock.lap("pair")
     u = pair.u if pair.mesh is mesh else transfer(pair.u, pair.mesh, mesh.points)
     truth = Truth(u, np.asarray(pair.lam), np.asarray(pair.mu))
     images = _as_stored(pair.fixed), _as_stored(pair.moving)
     boundary = _known_boundary(config, mesh, truth)
     inputs = Inputs(resolved_yaml(config), mesh, *images, tissue, skull, truth, boundary, observed)
-    return Prepared(inputs, clock.laps, _describe(config, pair), appraisal)
+    return Prepared(inputs, clock.laps, describe_pair(config, pair), appraisal)
 
 
 def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Image | None) -> dict[str, Channel]:
@@ -285,90 +286,7 @@ def _anatomy(config: Config) -> Anatomy:
     return mni152()
 
 
-def _size(config: Config, anatomy: Anatomy) -> float:
-    """Return the size of the organ relative to a human brain; it is one for the data that ship, which are brains."""
-    return size_of_solid(anatomy.tissue, anatomy.names) if isinstance(config.data, FilesData) else 1.0
-
-
-def _sized(settings: MeshConfig, size: float) -> MeshConfig:
-    """Complete the settings of the mesh with the default lengths for an organ of this size."""
-    usual = {"edge_length": size * BRAIN_EDGE, "skull_gap": size * BRAIN_GAP}
-    return settings.model_copy(update={name: x for name, x in usual.items() if getattr(settings, name) is None})
-
-
-def _mesh(anatomy: Anatomy, domain: Image, settings: MeshConfig, edge_length: float | None = None) -> TetMesh:
-    if settings.file is not None and edge_length is None:
-        return _load_mesh(settings.file, anatomy.names)
-    assert settings.edge_length is not None
-    assert settings.skull_gap is not None
-    options = MeshOptions(
-        edge_length=edge_length or settings.edge_length,
-        envelope=None if edge_length else settings.envelope,
-        skull_gap=settings.skull_gap,
-    )
-    return build_mesh(anatomy.tissue, anatomy.intracranial, options, domain, anatomy.names)
-
-
-def _load_mesh(path: Path, names: tuple[str, ...]) -> TetMesh:
-    """Load a mesh from a file; InputError if its tissues differ from those of the labels."""
-    mesh = load_mesh(path, names)
-    if mesh.names != names:
-        raise InputError(
-            f"mesh.file {path} has the tissues {', '.join(mesh.names)}, and the labels have {', '.join(names)}: both "
-            "need the same names in the same order"
-        )
-    return mesh
-
-
 def _as_stored(image: Image) -> Image:
     """Round an image to the precision of a NIfTI file, so that a resumed run reads exactly the same numbers."""
     stored = in_levels(image) if np.asarray(image.voxels).dtype.kind == "f" else image
     return Image(stored.voxels, image.affine.astype(np.float32))
-
-
-def _pair(
-    config: Config,
-    meshed: MeshConfig,
-    fixed: Image,
-    anatomy: Anatomy,
-    domain: Image,
-    skull: Image | None,
-    mesh: TetMesh,
-) -> SyntheticPair:
-    settings = config.simulate
-    assert settings is not None
-    assert skull is not None
-    making = mesh
-    if isinstance(settings, CalibratedPair):
-        making = _mesh(anatomy, domain, meshed, settings.making_edge_length)
-    given = {} if settings.smoothing_mm is None else {"smoothing_mm": settings.smoothing_mm}
-    return make_pair(
-        fixed,
-        anatomy.tissue,
-        skull,
-        making,
-        lam=np.array([settings.lam[name] for name in anatomy.names]),
-        mu=np.array([settings.mu[name] for name in anatomy.names]),
-        displacement=settings.displacement,
-        patch_nodes=settings.patch_nodes,
-        direction=settings.direction,
-        noise_sd=settings.noise_sd,
-        seed=config.seed,
-        **given,
-    )
-
-
-def _describe(config: Config, pair: SyntheticPair) -> dict[str, object]:
-    assert config.simulate is not None
-    same = "the mesh of the registration (the inverse crime)"
-    return {
-        "kind": config.simulate.kind,
-        "made_on": same if config.simulate.kind == "paper" else f"a finer mesh of {len(pair.mesh.points)} nodes",
-        "noise_sd": pair.noise_sd,
-        "smoothing_mm": pair.smoothing_mm,
-        "residual_sd_at_truth": pair.residual_sd,
-        "interpolation_sd_at_truth": pair.interpolation_sd,
-        "patch": pair.deformation.patch.tolist(),
-        "contact": pair.deformation.contact.tolist(),
-        "least_volume_ratio": float(pair.deformation.volume_ratio.min()),
-    }

@@ -21,7 +21,8 @@ import numpy as np
 from scipy import stats
 
 import bayesreg as br
-from bayesreg.io.points import PointPairs, read_point_pairs
+from bayesreg.io.point_formats import PointPairs
+from bayesreg.io.points import read_point_pairs
 from tests.phantoms import box_mesh
 
 MARGIN, CELLS_PER_SIDE = 10.0, 4

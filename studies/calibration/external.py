@@ -18,7 +18,7 @@ import numpy as np
 import bayesreg as br
 from bayesreg.config import Config
 from bayesreg.inference.draws.inference_data import dataset
-from bayesreg.model.warp import nodal_field_on_grid
+from bayesreg.model.warp import covered_voxels
 from bayesreg.results.result import Result
 from studies.external.make_pair import data_folder, make_pair
 from studies.external.score import LEVELS, TISSUES, compare, read_field, read_truth
@@ -86,7 +86,10 @@ def judge(pair: Path, result: Result) -> Found:
     truth = read_truth(pair)
     mean, sd = (read_field(result.folder / f"displacement_{name}.nii.gz") for name in ("mean", "sd"))
     inside = np.abs(sd).sum(axis=-1) > 0
-    of_nodes = nodal_field_on_grid(result.mesh, result.u_sd, br.load_image(pair / "fixed.nii.gz"))
+    of_nodes = np.zeros_like(sd)
+    covered = covered_voxels(br.load_image(pair / "fixed.nii.gz"), result.mesh)
+    nodal = result.u_sd[result.mesh.cells[covered.cell]]
+    of_nodes[tuple(covered.voxel.T)] = np.einsum("qa,qac->qc", covered.barycentric, nodal)
     before, after = (compare(truth, mean, np.abs(one), inside) for one in (of_nodes, sd))
     mu = dataset(result.idata, "posterior")["mu"]
     ratio = (mu.sel(tissue="wm") / mu.sel(tissue="gm")).to_numpy()

@@ -23,12 +23,12 @@ from bayesreg.inference.samplers.registry import SAMPLERS
 from bayesreg.io import store
 from bayesreg.io.atomic import write_json, write_text
 from bayesreg.messages import show_messages
-from bayesreg.report.tables import in_terminal
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of
 from bayesreg.workflow.preparation import prepared_inputs
 from studies.compare_samplers.efficiency import Budget, Efficiency, measure_efficiency
 from studies.compare_samplers.table import Setting, efficiency_table
+from studies.terminal import in_terminal
 
 BLOCK = 50
 

@@ -22,12 +22,13 @@ from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io.atomic import read_json, write_json
 from bayesreg.io.meshing import MeshOptions, build_mesh, load_mesh, save_mesh
 from bayesreg.mesh import TetMesh
-from bayesreg.report.tables import Table, in_terminal
+from bayesreg.report.tables import Table
 from bayesreg.results.result import Result, load_result
 from bayesreg.types import InputError
 from studies.mesh_error.bodies import Subject, register_body, sought_tissues
 from studies.mesh_error.ratios import allowing, draw_ratios, enough, mesh_table, sound
 from studies.mesh_error.recalibration import least_bodies
+from studies.terminal import in_terminal
 
 BODIES = "bodies.json"
 # Ratio of the finer mesh's edges to those of the registering one.

@@ -10,7 +10,7 @@ import SimpleITK
 import bayesreg as br
 from bayesreg.io.displacements import read_boundary, read_start
 from bayesreg.io.fields import load_displacement, save_displacement
-from bayesreg.model.warp import nodal_field_on_grid
+from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Motion, Pose
 from tests.phantoms import ball_mesh, rotated_affine
 
@@ -72,7 +72,9 @@ def test_a_field_may_be_where_chains_start(tmp_path):
 def test_a_field_that_ends_at_the_boundary_is_refused(tmp_path):
     """As a run's displacement_mean.nii.gz does: it is zero outside the mesh."""
     image = grid()
-    inside = nodal_field_on_grid(MESH, affine_field(MESH.points), image)
+    voxel = covered_voxels(image, MESH).voxel
+    inside = np.zeros((*image.shape, 3))
+    inside[tuple(voxel.T)] = affine_field(image.voxel_to_world(voxel))
     save_displacement(tmp_path / "mean.nii.gz", inside, image.affine)
     with pytest.raises(br.types.InputError, match=r"ends at \d+ of the \d+ boundary nodes.* mesh.vtu"):
         read_boundary(tmp_path / "mean.nii.gz", MESH)

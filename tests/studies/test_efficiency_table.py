@@ -5,9 +5,9 @@ import io
 from rich.cells import cell_len
 from rich.console import Console
 
-from bayesreg.report.tables import in_terminal
 from studies.compare_samplers.efficiency import Efficiency
 from studies.compare_samplers.table import HEADER, Setting, efficiency_table
+from studies.terminal import in_terminal
 
 SETTING = Setting("a phantom", 4, 5.0, "R̂ below 1.01 and ESS above 400")
 FOUND = [

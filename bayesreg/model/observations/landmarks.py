@@ -13,7 +13,8 @@ from jax.scipy.stats import norm
 from jaxtyping import Float, Int
 
 from bayesreg.fem.location import interpolation_at
-from bayesreg.io.points import PointPairs, read_point_pairs
+from bayesreg.io.point_formats import PointPairs
+from bayesreg.io.points import read_point_pairs
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values, scale_block

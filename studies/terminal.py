@@ -1,0 +1,18 @@
+"""Tables of studies on the terminal."""
+
+from __future__ import annotations
+
+from rich.table import Table as TerminalTable
+
+from bayesreg.report.tables import Table
+
+
+def in_terminal(table: Table) -> TerminalTable:
+    """Format a table for a terminal, without its caption."""
+    shown = TerminalTable(title=table.title)
+    for index, name in enumerate(table.header):
+        shown.add_column(name, justify="right" if index else "left")
+    for _, rows in table.groups:
+        for row in rows:
+            shown.add_row(*row)
+    return shown
