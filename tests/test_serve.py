@@ -56,7 +56,7 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
         umbridge.HTTPModel(address, name) for name in ("log_posterior", "forward", "start")
     )
     at_rest = start([])
-    sizes = [part.stop - part.start for part in slices(posterior).values()]
+    sizes = [part.stop - part.start for part in slices(posterior.target).values()]
     assert [len(part) for part in at_rest] == log_posterior.get_input_sizes() == sizes
     rng = np.random.default_rng(0)
     position = [(np.array(part) + 0.1 * rng.normal(size=len(part))).tolist() for part in at_rest]
@@ -65,7 +65,7 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
     value, slope = jax.value_and_grad(lambda x: posterior.logdensity(back(x)))(flat)
     # The program compiles for speed of compilation, and rounds in another order.
     assert log_posterior(position)[0][0] == pytest.approx(float(value), rel=1e-8)
-    for k, part in enumerate(slices(posterior).values()):
+    for k, part in enumerate(slices(posterior.target).values()):
         found = log_posterior.gradient(0, k, position, [2.0])
         np.testing.assert_allclose(found, 2 * np.asarray(slope)[part], rtol=1e-6, atol=1e-8)
     u, predicted = forward(position)
@@ -73,7 +73,7 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
     np.testing.assert_allclose(np.reshape(u, (-1, 3)), expected.u, atol=1e-9)
     np.testing.assert_allclose(predicted, posterior.images.predicted(expected.u), atol=1e-9)
     # By finite differences, through the client alone.
-    which = list(slices(posterior)).index("u_boundary")
+    which = list(slices(posterior.target)).index("u_boundary")
     sensitivity = rng.normal(size=len(u))
     pulled = forward.gradient(0, which, position, sensitivity.tolist())
     step = 1e-5 * rng.normal(size=len(position[which]))
@@ -102,7 +102,7 @@ def test_what_is_no_number_is_never_accepted(posterior, value):
     log_posterior, forward, start = serve.models_of(posterior)
     position = start([])
     sound = log_posterior(position)[0][0]
-    which = list(slices(posterior)).index("mu")
+    which = list(slices(posterior.target)).index("mu")
     position[which] = [value] * len(position[which])
     assert log_posterior(position)[0][0] == serve.IMPOSSIBLE < sound
     assert not np.any(log_posterior.gradient(0, which, position, [1.0]))

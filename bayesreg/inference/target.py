@@ -125,7 +125,7 @@ class ModeSearch(Protocol):
         """
 
     @property
-    def approached(self) -> Estimands | None:
+    def search_start(self) -> Estimands | None:
         """Estimands near the mode, where the search begins; None if it begins where the chains start."""
 
     @property

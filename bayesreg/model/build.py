@@ -13,12 +13,12 @@ import numpy as np
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
-from bayesreg.model.observations.observation import Correlated, Observation, points_that_bound
+from bayesreg.model.observations.observation import Correlated, Observation, bounding_points
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.problem import fix_a_body, problem_of
+from bayesreg.model.problem import determine_pose, problem_of
 from bayesreg.model.state import State, state_of
-from bayesreg.model.term import Outside
+from bayesreg.model.term import ExternalTerm
 from bayesreg.types import AnyArray, InputError
 
 
@@ -93,13 +93,13 @@ def require_observations(given: Any) -> list[Any]:
 
 def _require_bounded(posterior: Posterior) -> None:
     """Raise InputError if nothing bounds the rigid motions: too few landmarks, no image, no skull and no prior."""
-    bounding = [points_that_bound(one) for one in posterior.observations.values()]
+    bounding = [bounding_points(one) for one in posterior.observations.values()]
     bounded = not len(posterior.sampled) or {"rigid", "skull"} & set(posterior.data.terms)
     if bounded or any(points is None for points in bounding):
         return
     held = posterior.mesh.points[list(posterior.options.elastic_prior.held)].reshape(-1, 3)
     points = np.concatenate([*(points for points in bounding if points is not None), held])
-    if not fix_a_body(points):
+    if not determine_pose(points):
         raise InputError(
             f"{len(points)} landmarks and held nodes do not say how the whole shifts and turns: the posterior would be "
             "improper; give at least three that are not on one line, images, a skull, or model.rigid_sd"
@@ -111,7 +111,7 @@ def _require_numbers(posterior: Posterior) -> None:
     problem, values = posterior.data, posterior.reference()
     rest = state_of(problem.body, problem.blocks, values)
     for name, term in problem.terms.items():
-        if not isinstance(term, Outside):
+        if not isinstance(term, ExternalTerm):
             continue
         log = partial(_log_at, term, rest)
         found = jax.eval_shape(log, rest.u)
@@ -127,6 +127,6 @@ def _require_numbers(posterior: Posterior) -> None:
             )
 
 
-def _log_at(term: Outside, state: State, u: AnyArray) -> Any:
+def _log_at(term: ExternalTerm, state: State, u: AnyArray) -> Any:
     """Compute the log of a term for nodes that are displaced by u, mm."""
     return term.log(replace(state, equilibrium=state.equilibrium._replace(u=u)))

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TypeVar
 
-from bayesreg.model.observations.observation import Eased
+from bayesreg.model.observations.observation import Smoothable
 from bayesreg.model.program import Problem
 
 Made = TypeVar("Made")
@@ -29,17 +29,17 @@ def continuation(problem: Problem, observations: Mapping[str, object]) -> Iterat
     displacements of many posterior standard deviations step by step. The last problem is the posterior's own. The
     sequence is empty if no node is sampled, and has no easier problem if there are no images.
     """
-    pairs = {name: pair for name, pair in observations.items() if isinstance(pair, Eased)}
-    if not len(problem.body.slots):
+    pairs = {name: pair for name, pair in observations.items() if isinstance(pair, Smoothable)}
+    if not len(problem.body.sampled_index):
         return
     if pairs:
-        yield from _ahead([partial(_ease, problem, pairs, *stage) for stage in SMOOTHING])
+        yield from _prefetch([partial(_ease, problem, pairs, *stage) for stage in SMOOTHING])
     yield problem
 
 
-def _ease(problem: Problem, pairs: Mapping[str, Eased], sd: float, similarity: float, elastic: float) -> Problem:
+def _ease(problem: Problem, pairs: Mapping[str, Smoothable], sd: float, similarity: float, elastic: float) -> Problem:
     """Return the problem with all images smoothed, and with factors on T_s and T_r, or on the loads."""
-    smooth = {name: pair.eased(problem.terms[name], sd) for name, pair in pairs.items()}
+    smooth = {name: pair.smoothed_term(problem.terms[name], sd) for name, pair in pairs.items()}
     easing = {**dict.fromkeys(pairs, similarity), "elastic": elastic}
     powers = {term: problem.terms[term].powers for term in easing if term in problem.terms}
     factors = {name: easing[term] ** power for term, scales in powers.items() for name, power in scales.items()}
@@ -47,7 +47,7 @@ def _ease(problem: Problem, pairs: Mapping[str, Eased], sd: float, similarity: f
     return problem._replace(blocks={**problem.blocks, **scales}, terms={**problem.terms, **smooth})
 
 
-def _ahead(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
+def _prefetch(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
     """Yield the result of each maker, while a background thread computes the next one."""
     pool = ThreadPoolExecutor(max_workers=1)
     try:

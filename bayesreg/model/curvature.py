@@ -19,7 +19,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, State, StaticMesh
-from bayesreg.model.term import Curved, Outside, PointCurvature
+from bayesreg.model.term import ExternalTerm, HasCurvature, PointCurvature
 from bayesreg.types import AnyArray, Equilibrium, Matrix
 
 # With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
@@ -74,7 +74,7 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
         First z, then row 3 · node + axis, 1/mm².
     """
     response = _Response.at(problem, values, u)
-    curved = [term for term in problem.terms.values() if isinstance(term, Curved)]
+    curved = [term for term in problem.terms.values() if isinstance(term, HasCurvature)]
     summed = partial(_sum, len(u))
     outside = _outside_curvatures(problem, values, u)
     gauss_newton = _dense(response.reduce(outside + summed(term.gauss_newton(u, values) for term in curved)))
@@ -104,7 +104,7 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     """
     response = _Response.at(problem, near, u)
     K = _stiffness(problem.body, values)
-    curved = (term for term in problem.terms.values() if isinstance(term, Curved) and is_nearly_quadratic(term))
+    curved = (term for term in problem.terms.values() if isinstance(term, HasCurvature) and is_nearly_quadratic(term))
     observed = _sum(len(u), (term.gauss_newton(u, values) for term in curved))
     found = response.reduce(observed + _outside_curvatures(problem, values, u))
     energy = response.reduce(K, with_field=False)
@@ -172,7 +172,7 @@ class _Response(NamedTuple):
         """Compute the response at some values and their equilibrium u, mm."""
         body, u = problem.body, jnp.asarray(u)
         mesh = body.mesh.mesh
-        sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.slots)])
+        sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.sampled_index)])
         free = unknowns_of(np.asarray(body.system.free))
         lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell(values))
         parts = sampled, free, lam, mu
@@ -219,9 +219,9 @@ def _prior_curvature(problem: Problem, energy: Matrix, values: Values) -> Matrix
 def _outside_curvatures(problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
     """Sum the curvatures of all terms from outside the package, in all nodes."""
     lam, mu = problem.body.lame_by_cell(values)
-    seen = _Seen(problem, dict(values), lam, mu)
+    seen = FixedState(problem, dict(values), lam, mu)
     found = scipy.sparse.csr_matrix((3 * len(u), 3 * len(u)))
-    terms = (term for term in problem.terms.values() if isinstance(term, Outside))
+    terms = (term for term in problem.terms.values() if isinstance(term, ExternalTerm))
     return sum((_outside_curvature(term, seen, jnp.asarray(u)) for term in terms), found)
 
 
@@ -235,7 +235,7 @@ def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix
     return sum((_assemble(nodes, part) for part in parts), empty)
 
 
-class _Seen(NamedTuple):
+class FixedState(NamedTuple):
     """The state, without its displacements, at which a term from outside is differentiated (a pytree)."""
 
     problem: Problem
@@ -244,7 +244,7 @@ class _Seen(NamedTuple):
     mu: AnyArray
 
 
-def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
+def _outside_curvature(term: ExternalTerm, seen: FixedState, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
     """Compute the convex part of the Hessian of −log in all nodes, for a term that provides only its log."""
     touched = _find_touched(term, seen, u)
     found = scipy.sparse.csr_matrix((u.size, u.size))
@@ -256,7 +256,7 @@ def _outside_curvature(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]
     return scipy.sparse.csr_matrix((convex.ravel(), (rows, columns)), shape=found.shape)
 
 
-def _find_touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
+def _find_touched(term: ExternalTerm, seen: FixedState, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
     """Find the unknowns on which a term depends: its gradient is not zero there at some random displacement near u."""
     steps = NEARBY_SD * np.random.default_rng(0).normal(size=(NEARBY, *u.shape))
     slopes = [np.asarray(_slope(term, seen, (u + step).ravel())) for step in steps]
@@ -264,7 +264,7 @@ def _find_touched(term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"]) -> 
 
 
 def _hessian(
-    term: Outside, seen: _Seen, u: Float[AnyArray, "nodes 3"], touched: Int[np.ndarray, "touched"]
+    term: ExternalTerm, seen: FixedState, u: Float[AnyArray, "nodes 3"], touched: Int[np.ndarray, "touched"]
 ) -> Float[np.ndarray, "touched touched"]:
     """Compute the Hessian of −log in some unknowns by one Hessian-vector product for each of them."""
     found = np.asarray(_products(term, seen, u.ravel(), jnp.asarray(touched)))[:, touched]
@@ -273,7 +273,7 @@ def _hessian(
 
 @jax.jit
 def _products(
-    term: Outside, seen: _Seen, flat: Float[AnyArray, "unknowns"], directions: Int[AnyArray, "k"]
+    term: ExternalTerm, seen: FixedState, flat: Float[AnyArray, "unknowns"], directions: Int[AnyArray, "k"]
 ) -> Float[AnyArray, "k unknowns"]:
     def row(unknown: AnyArray) -> AnyArray:
         direction = jnp.zeros_like(flat).at[unknown].set(1.0)
@@ -283,7 +283,7 @@ def _products(
 
 
 @jax.jit
-def _slope(term: Outside, seen: _Seen, flat: Float[AnyArray, "unknowns"]) -> Float[AnyArray, "unknowns"]:
+def _slope(term: ExternalTerm, seen: FixedState, flat: Float[AnyArray, "unknowns"]) -> Float[AnyArray, "unknowns"]:
     """Compute ∇(−log) in the displacements of all nodes."""
     body = seen.problem.body
 

@@ -34,7 +34,7 @@ class ModeSearch:
     data : Problem
     observations : mapping
         By name.
-    approached : mapping or None
+    search_start : mapping or None
         Estimands near the mode, found by an earlier search.
     tempering : callable or None
         Maps estimands near the mode to the posterior tempered by its residuals there; None if it is tempered already.
@@ -42,7 +42,7 @@ class ModeSearch:
 
     data: Problem
     observations: Mapping[str, Any]
-    approached: Values | None = None
+    search_start: Values | None = None
     tempering: Callable[[Values], Any] | None = None
 
     @property
@@ -59,7 +59,7 @@ class ModeSearch:
 
     def continuation(self) -> Iterator[Problem]:
         """Yield problems of growing difficulty that lead to this one, in the displacements; none after an approach."""
-        if self.approached is not None:
+        if self.search_start is not None:
             return iter(())
         return continuation(self.data, self.observations)
 

@@ -187,7 +187,7 @@ class ModelConfig(Section):
         return sorted({tissue for section in sections if isinstance(section, Mapping) for tissue in section})
 
 
-def is_taken(name: str) -> bool:
+def is_reserved_name(name: str) -> bool:
     """Check whether a name is reserved: no observation, and no unknown that it brings, may use it."""
     return name in TAKEN or name.startswith("prior_")
 

@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
 from bayesreg.mesh import TetMesh
-from bayesreg.model import coordinates, evaluation, program
+from bayesreg.model import coordinates, evaluation
 from bayesreg.model.blocks import LAME, Values
-from bayesreg.model.conditioning import condition
-from bayesreg.model.coordinates import Coordinates
-from bayesreg.model.elastic.skull import Skull, mark_behind_skull
 from bayesreg.model.evaluation import Evaluation
-from bayesreg.model.mode_search import ModeSearch
-from bayesreg.model.normaliser import Normaliser
 from bayesreg.model.observations.images.likelihood import ComparedImages, images_of
 from bayesreg.model.observations.observation import Correlated
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.program import Problem
-from bayesreg.model.variables import Variables
+from bayesreg.model.target import PosteriorTarget
 from bayesreg.types import AnyArray, InputError, Scalar
-
-# With at most this many nodes, every step of a trajectory can evaluate the elastic prior's normaliser.
-CHEAP_NODES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,16 +45,11 @@ class Posterior:
         The nodes whose displacements are sampled, sorted.
     observations : mapping
         The observations, prepared for this mesh, by name.
-    approached : mapping, optional
+    search_start : mapping, optional
         Estimands near the mode, at which a search for it begins.
     tempered : bool
         False if residuals must still determine how many quadrature points are independent (`independent_points:
         residual`); until then, all points count.
-
-    Notes
-    -----
-    Two posteriors are equal if they differ only in the values of their arrays: code compiled for one pair of images
-    then serves all other pairs on the mesh.
     """
 
     data: Problem
@@ -71,10 +57,8 @@ class Posterior:
     options: ModelConfig
     sampled: Int[np.ndarray, "sampled"]
     observations: Mapping[str, Any]
-    approached: Values | None = None
+    search_start: Values | None = None
     tempered: bool = True
-
-    # For a user
 
     def logdensity_constrained(self, values: Values) -> Scalar:
         """Return log p(u, λ, μ | m) of section 3.1 up to a constant; it is differentiable.
@@ -97,8 +81,8 @@ class Posterior:
 
     def logdensity(self, position: Values) -> Scalar:
         """Return the log density of the unconstrained position, including the Jacobian of `constrain`."""
-        estimands, log_jacobian = self.coordinates.constrain(self.data, position)
-        return self.evaluate_estimands(self.data, estimands).logdensity + log_jacobian
+        estimands, log_jacobian = self.target.coordinates.constrain(self.data, position)
+        return self.target.evaluate_estimands(self.data, estimands).logdensity + log_jacobian
 
     def energies(self, values: Values) -> dict[str, Scalar]:
         """Return every factor of the density by name, and the energies.
@@ -114,11 +98,11 @@ class Posterior:
 
     def constrain(self, position: Values) -> dict[str, AnyArray]:
         """Return the values (known entries included) of an unconstrained position."""
-        return coordinates.complete(self.data.blocks, self.coordinates.constrain(self.data, position)[0])
+        return coordinates.complete(self.data.blocks, self.target.coordinates.constrain(self.data, position)[0])
 
     def unconstrain(self, values: Values) -> dict[str, AnyArray]:
         """Return the unconstrained position of values; this is the inverse of `constrain`."""
-        return self.coordinates.unconstrain(self.data, self.estimands(values))
+        return self.target.coordinates.unconstrain(self.data, self.estimands(values))
 
     def estimands(self, values: Values) -> dict[str, AnyArray]:
         """Return the sampled entries of values."""
@@ -192,70 +176,7 @@ class Posterior:
             raise InputError("the posterior has no pair of images, and so neither residuals nor noise of images")
         return images
 
-    # For the samplers (`bayesreg.inference.target.Target`)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Posterior) and self._structure == other._structure
-
-    def __hash__(self) -> int:
-        return hash(self._structure)
-
     @cached_property
-    def _structure(self) -> tuple[Hashable, ...]:
-        leaves, tree = jax.tree.flatten(self.data)
-        shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-        options = [self.options, *(getattr(one, "options", None) for one in self.observations.values())]
-        return repr(options), self.normaliser, tuple(self.sampled.tolist()), tree, shapes
-
-    def evaluate_estimands(
-        self, data: Problem, estimands: Values, guess: Float[AnyArray, "nodes 3"] | None = None
-    ) -> Evaluation:
-        """Evaluate the density as a pure function of the data; see `evaluate`.
-
-        A `guess` is the displacement of every node in a state near by. It makes the evaluation faster and removes
-        the gradient.
-        """
-        return evaluation.evaluate(data, coordinates.complete(data.blocks, estimands), guess)
-
-    def supports(self, data: Problem, estimands: Values) -> Bool[AnyArray, ""]:
-        """Check whether the density may be positive at some estimands; this costs no elastic solve."""
-        return program.is_allowed(data, coordinates.complete(data.blocks, estimands))
-
-    def condition(self, estimands: Values) -> Problem:
-        """Return the data for chains near these estimands; see `bayesreg.model.conditioning`."""
-        return condition(self.data, estimands)
-
-    @cached_property
-    def coordinates(self) -> Coordinates:
-        """The map between estimands and the real line."""
-        return Coordinates(self.data.blocks)
-
-    @cached_property
-    def variables(self) -> Variables:
-        """The names, dimensions and labels with which draws are shown to a reader."""
-        by_elasticity = {"uniform": ("all",), "element": tuple(f"element {i}" for i in range(len(self.mesh.cells)))}
-        names = by_elasticity.get(self.options.elasticity, self.mesh.names)
-        return Variables(self.data.blocks, self.mesh, self.sampled, names)
-
-    @property
-    def hard_wall(self) -> Callable[[Any, AnyArray], AnyArray] | None:
-        """The function that marks the sampled nodes in a hard skull; None if there is no hard skull."""
-        return mark_behind_skull if isinstance(self.data.terms.get("skull"), Skull) else None
-
-    @property
-    def normaliser(self) -> Normaliser | None:
-        """The normaliser of the elastic prior; None if it is not part of the density."""
-        if not self.options.elastic_prior.normalised or "elastic" not in self.data.terms:
-            return None
-        return Normaliser(is_costly=len(self.mesh.points) > CHEAP_NODES)
-
-    @property
-    def mode_search(self) -> ModeSearch:
-        """The posterior as the search for a mode uses it."""
-        tempering = None if self.tempered else self._temper
-        return ModeSearch(self.data, self.observations, self.approached, tempering)
-
-    def _temper(self, estimands: Values) -> Posterior:
-        """Return the posterior tempered by its residuals at these estimands, from which a search may continue."""
-        counts = self.count_independent_points(coordinates.complete(self.data.blocks, estimands))
-        return replace(self.with_independent_points(counts), approached=dict(estimands))
+    def target(self) -> PosteriorTarget:
+        """The posterior as the samplers use it."""
+        return PosteriorTarget(self)

@@ -40,7 +40,7 @@ from bayesreg.model.options import (
     Lame,
     ModelConfig,
     PriorConfig,
-    is_taken,
+    is_reserved_name,
     of_tissue,
 )
 from bayesreg.model.program import Problem
@@ -83,13 +83,13 @@ def place_observations(mesh: TetMesh, observations: Sequence[Any], preset: str) 
     """
     placed: dict[str, Placed] = {}
     for observation in observations:
-        if observation.name in placed or is_taken(observation.name):
+        if observation.name in placed or is_reserved_name(observation.name):
             raise InputError(f"the name {observation.name!r} of an observation is taken; give another one")
         placed[observation.name] = place(observation, mesh, preset)
     owners: dict[str, str] = {}
     for name, one in placed.items():
         for block in one.blocks:
-            if block in owners or block in placed or is_taken(block):
+            if block in owners or block in placed or is_reserved_name(block):
                 raise InputError(f"the name {block!r} of an unknown of {name!r} is taken; rename the latter")
             owners[block] = name
     return placed
@@ -130,7 +130,7 @@ def _body(
     blocks: Blocks,
 ) -> Body:
     prescribed = np.union1d(sampled, list(held)).astype(int)
-    slots = np.searchsorted(prescribed, sampled)
+    sampled_index = np.searchsorted(prescribed, sampled)
     displacement = np.zeros((len(prescribed), 3))
     displacement[np.searchsorted(prescribed, list(held)).astype(int)] = list(held.values()) or np.zeros((0, 3))
     entry = cell_entries(mesh, model)
@@ -140,8 +140,8 @@ def _body(
         system=elastic_system(mesh, prescribed, lam, mu, TOLERANCE),
         cell_entry=jnp.asarray(entry),
         field=field,
-        slots=jnp.asarray(slots),
-        placed=sparse_operator(scipy.sparse.eye_array(len(prescribed), format="csc")[:, slots]),
+        sampled_index=jnp.asarray(sampled_index),
+        scatter_to_prescribed=sparse_operator(scipy.sparse.eye_array(len(prescribed), format="csc")[:, sampled_index]),
         held=jnp.asarray(displacement),
     )
 
@@ -233,7 +233,7 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
             f"needs every boundary node held (model.elastic_prior.held); {len(unknown)} of {len(mesh.boundary)} are "
             f"not, the first is node {unknown[0]}"
         )
-    if not fix_a_body(prescribed):
+    if not determine_pose(prescribed):
         raise InputError(
             f"{len(prescribed)} sampled and held nodes do not hold the mesh in place: "
             "give at least three that are not on one line (nodes and held of model.elastic_prior)"
@@ -241,7 +241,7 @@ def sampled_nodes(mesh: TetMesh, model: ModelConfig) -> tuple[np.ndarray, dict[i
     return sampled, held
 
 
-def fix_a_body(points: Float[np.ndarray, "k 3"]) -> bool:
+def determine_pose(points: Float[np.ndarray, "k 3"]) -> bool:
     """Check whether fixed points determine the pose of a rigid body: at least three, not on one line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return len(points) >= 3 and bool(spread[1] >= 1e-6 * spread[0])

@@ -49,10 +49,10 @@ class Body(NamedTuple):
         Index of each cell's entry in λ and μ.
     field : StiffnessField or None
         Prior of the logarithm of a factor on λ and μ of every cell.
-    slots : (b,) int array
+    sampled_index : (b,) int array
         Indices of the sampled nodes in `system.prescribed`.
-    placed : SparseOperator
-        (prescribed, b): puts values of the sampled nodes into their slots, and zero into the others.
+    scatter_to_prescribed : SparseOperator
+        (prescribed, b): puts values of the sampled nodes into their places, and zero into the others.
     held : (prescribed, 3) array
         Known displacements, zero in the rows of sampled nodes, mm.
     """
@@ -61,13 +61,13 @@ class Body(NamedTuple):
     system: ElasticSystem
     cell_entry: Int[AnyArray, "cells"]
     field: StiffnessField | None
-    slots: Int[AnyArray, "sampled"]
-    placed: SparseOperator
+    sampled_index: Int[AnyArray, "sampled"]
+    scatter_to_prescribed: SparseOperator
     held: Float[AnyArray, "prescribed 3"]
 
     def prescribed(self, u_boundary: Float[AnyArray, "sampled 3"]) -> Float[AnyArray, "prescribed 3"]:
         """Return the displacements of all prescribed nodes, mm. (XLA would compile a scatter to a loop on the CPU.)"""
-        return self.held + self.placed(u_boundary) if len(self.slots) else self.held
+        return self.held + self.scatter_to_prescribed(u_boundary) if len(self.sampled_index) else self.held
 
     def stiffness_factor(self, values: Values) -> Float[AnyArray, "cells"]:
         """Return exp(sd · basis · z), the factor of the field on λ and μ of every cell."""

@@ -97,7 +97,7 @@ class PointCurvature(NamedTuple):
 
 
 @runtime_checkable
-class Curved(Protocol):
+class HasCurvature(Protocol):
     """A term that provides its curvature in the displacements of points, at nodal displacements u, mm."""
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
@@ -116,7 +116,7 @@ class Label:
 
 
 @jax.tree_util.register_static
-class Outside:
+class ExternalTerm:
     """A term from outside the package, as a part of pytrees without arrays; its own arrays become constants."""
 
     def __init__(self, term: Term) -> None:
@@ -137,7 +137,7 @@ class Outside:
         return self.term.log(state)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Outside) and self.term is other.term
+        return isinstance(other, ExternalTerm) and self.term is other.term
 
     def __hash__(self) -> int:
         return id(self.term)

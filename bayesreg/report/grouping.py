@@ -13,9 +13,9 @@ from bayesreg.report.estimands import DISPLACEMENT, MOST_VALUES
 from bayesreg.types import AnyArray
 
 # Chains belong to different groups if this many of their standard deviations separate them in several estimands.
-APART = 3.0
-TOGETHER_IN_ALL_BUT = 3
-SEEN = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")
+SEPARATION_SD = 3.0
+MIN_SEPARATED_ESTIMANDS = 3
+GROUPED_VARIABLES = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")
 
 
 class Grouping(NamedTuple):
@@ -49,7 +49,7 @@ def grouping(posterior: xr.Dataset) -> Grouping:
     apart = np.array(
         [[_distance(_separation(means, variances, i, j)) for j in range(len(means))] for i in range(len(means))]
     )
-    _, label = connected_components(apart < APART, directed=False)
+    _, label = connected_components(apart < SEPARATION_SD, directed=False)
     return Grouping(_renumber(label), np.array([_drifts(chain) for chain in values]))
 
 
@@ -61,14 +61,14 @@ def _renumber(label: np.ndarray) -> np.ndarray:
 def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"]:
     """Return all estimands as columns of one array."""
     posterior = thin(posterior)
-    draws = [posterior[name].transpose("chain", "draw", ...) for name in SEEN if name in posterior]
+    draws = [posterior[name].transpose("chain", "draw", ...) for name in GROUPED_VARIABLES if name in posterior]
     flat = [values.to_numpy().reshape(*values.shape[:2], -1) for values in draws]
     return np.concatenate(flat, axis=-1).astype(float)
 
 
 def thin(posterior: xr.Dataset) -> xr.Dataset:
     """Thin the draws evenly if they would need much memory."""
-    numbers = sum(posterior[name].size for name in SEEN if name in posterior)
+    numbers = sum(posterior[name].size for name in GROUPED_VARIABLES if name in posterior)
     return posterior.isel(draw=slice(None, None, max(1, numbers // MOST_VALUES)))
 
 
@@ -81,7 +81,7 @@ def _separation(means: np.ndarray, variances: np.ndarray, i: int, j: int) -> Flo
 
 def _distance(separation: np.ndarray) -> float:
     """Return the separation that several estimands reach: a single one may differ by chance or in a tail."""
-    rank = min(TOGETHER_IN_ALL_BUT, len(separation))
+    rank = min(MIN_SEPARATED_ESTIMANDS, len(separation))
     return float(np.partition(separation, -rank)[-rank])
 
 
@@ -90,7 +90,7 @@ def _drifts(chain: Float[np.ndarray, "draws estimands"]) -> bool:
     if len(halves[0]) < 2 or len(halves[1]) < 2:
         return True
     means, variances = (np.stack([getattr(half, figure)(axis=0) for half in halves]) for figure in ("mean", "var"))
-    return _distance(_separation(means, variances, 0, 1)) >= APART
+    return _distance(_separation(means, variances, 0, 1)) >= SEPARATION_SD
 
 
 def group_means(chain_means: Float[AnyArray, "chains *shape"], groups: Grouping) -> Float[np.ndarray, "groups *shape"]:

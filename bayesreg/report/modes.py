@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesreg.report import panels, style
-from bayesreg.report.grouping import APART, Grouping, group_means
+from bayesreg.report.grouping import SEPARATION_SD, Grouping, group_means
 from bayesreg.report.page import Sentences
 from bayesreg.report.panels import View
 from bayesreg.report.places import regions
@@ -29,7 +29,7 @@ def explain(study: Study) -> Sentences:
 def explanation(groups: Grouping) -> list[str]:
     """Explain which groups there are, and their possible meaning."""
     listed = "; ".join(f"group {k + 1}: {_chain_list(groups.chains(k))}" for k in range(groups.groups))
-    apart = f"The chains lie in {groups.groups} groups ({listed}), {APART:g} or more standard deviations apart."
+    apart = f"The chains lie in {groups.groups} groups ({listed}), {SEPARATION_SD:g} or more standard deviations apart."
     moving = np.flatnonzero(groups.drifting)
     if len(moving):
         verb = "is" if len(moving) == 1 else "are"

@@ -44,7 +44,7 @@ class Interval(NamedTuple):
         return f"{number(self.low)} to {number(self.high)}"
 
 
-def reading(draws: np.ndarray, prior: Interval | None = None) -> str:
+def describe_bounds(draws: np.ndarray, prior: Interval | None = None) -> str:
     """Describe in words how a posterior bounds a positive number.
 
     For the reciprocal of the number, the description is equal with upper and lower bound exchanged.
@@ -110,7 +110,7 @@ def parameter_table(study: Study) -> Table:
     for name in sampled_scales(study.posterior):
         known = part(study.manifest, "scales", name)
         draws, prior = study.posterior[name].to_numpy(), prior_of_scale(known) if known else None
-        rows.append(_row(study, symbol_of(name), draws, (name, 0), prior, reading(draws, prior)))
+        rows.append(_row(study, symbol_of(name), draws, (name, 0), prior, describe_bounds(draws, prior)))
     groups += [("Scales", rows)] if rows else []
     header, caption = list(HEADER), CAPTION
     if study.run.truth is not None:
@@ -124,10 +124,10 @@ def parameter_table(study: Study) -> Table:
 def _group_rows(study: Study, index: int, group: Group) -> list[list[str]]:
     model = part(study.manifest, "model") or {}
     entry = None if group.lam.shape[-1] > 1 else index
-    rows = [_row(study, SYMBOLS["ratio"], group.ratio, ("ratio", entry), None, reading(group.ratio))]
+    rows = [_row(study, SYMBOLS["ratio"], group.ratio, ("ratio", entry), None, describe_bounds(group.ratio))]
     for name in LAME:
         draws, prior = getattr(group, name), prior_of(model, name, group.name)
-        rows.append(_row(study, SYMBOLS[name], draws, (name, entry), prior, reading(draws, prior)))
+        rows.append(_row(study, SYMBOLS[name], draws, (name, entry), prior, describe_bounds(draws, prior)))
     rows[0][3] = NONE
     return rows
 

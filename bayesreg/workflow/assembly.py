@@ -62,8 +62,8 @@ def start_of(config: Config, inputs: Inputs, posterior: Posterior) -> Start:
     return Start(
         field=None if field is None else field[posterior.sampled],
         fraction=config.start.fraction,
-        lam=config.start.entries("lam", posterior.variables.entry_names),
-        mu=config.start.entries("mu", posterior.variables.entry_names),
+        lam=config.start.entries("lam", posterior.target.variables.entry_names),
+        mu=config.start.entries("mu", posterior.target.variables.entry_names),
         spread=config.start.spread,
     )
 

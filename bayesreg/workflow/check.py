@@ -45,7 +45,7 @@ def check(config: str | Path | Config) -> Check:
     seconds_per_step = (reached[1] - reached[0]) / trial
     device = sum(leaf.nbytes for leaf in jax.tree.leaves(posterior.data))
     draws = config.stop.max_steps // options.thin
-    numbers = sum(np.size(value) for value in posterior.coordinates.reference().values()) + 8
+    numbers = sum(np.size(value) for value in posterior.target.coordinates.reference().values()) + 8
     return Check(
         nodes=len(inputs.mesh.points),
         cells=len(inputs.mesh.cells),

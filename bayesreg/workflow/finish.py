@@ -91,7 +91,7 @@ def _store_draws(posterior: Posterior, samples: Samples, out: Path, seed: int) -
     """Write posterior.nc with the draws and ArviZ's groups of the observations, and open it."""
     with writing(out) as place:
         path = place(POSTERIOR)
-        save_posterior(posterior, samples.blocks, path)
+        save_posterior(posterior.target, samples.blocks, path)
         # Groups cannot be appended to an open file.
         with xr.open_dataset(path, group="posterior") as draws:
             groups = predictive_groups(posterior, draws, seed)

@@ -35,6 +35,7 @@ from bayesreg.memory import memory_of_machine
 from bayesreg.messages import show_messages
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.target import PosteriorTarget
 from bayesreg.results.result import REPORT, Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
@@ -161,7 +162,7 @@ def _resume(
     posterior = temper(config, inputs, posterior)
     provenance["independent_points"] = posterior.independent_points
     if finished:
-        checkpoints.reopen(out, to_blocks(posterior, load_result(out).idata, BLOCK))
+        checkpoints.reopen(out, to_blocks(posterior.target, load_result(out).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
     if known.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
@@ -258,11 +259,12 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
     if posterior.tempered:
         return posterior
     _log.info("how many points are independent: where the images first lead to")
-    found = temper_target(posterior, config.sampler.chains, config.seed, start_of(config, inputs, posterior))
-    assert isinstance(found, Posterior)
-    for name, count in found.independent_points.items():
-        _log.info(f"{name}: {count:,.0f} of {len(found.data.terms[name].positions):,} points are independent")
-    return found
+    target = temper_target(posterior.target, config.sampler.chains, config.seed, start_of(config, inputs, posterior))
+    assert isinstance(target, PosteriorTarget)
+    tempered = target.posterior
+    for name, count in tempered.independent_points.items():
+        _log.info(f"{name}: {count:,.0f} of {len(tempered.data.terms[name].positions):,} points are independent")
+    return tempered
 
 
 def _first(
@@ -273,7 +275,7 @@ def _first(
     The `seconds` that were spent before count as sampling.
     """
     options, start = config.sampler, start_of(config, inputs, posterior)
-    found = first_checkpoint(posterior, options.name, options.chains, config.seed, start, **options.settings)
+    found = first_checkpoint(posterior.target, options.name, options.chains, config.seed, start, **options.settings)
     found = found._replace(seconds=found.seconds + seconds)
     return found, checkpoints.StoredBlocks(out, 0)
 
@@ -285,7 +287,7 @@ def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Pat
         return _first(config, inputs, posterior, out, progress)
     blocks = checkpoints.StoredBlocks(out, int(state.pop("blocks")))
     options = config.sampler
-    return checkpoint_from_arrays(state, posterior, options.name, options.chains, **options.settings), blocks
+    return checkpoint_from_arrays(state, posterior.target, options.name, options.chains, **options.settings), blocks
 
 
 def _save_state(out: Path, checkpoint: Checkpoint, blocks: Blocks) -> None:

@@ -135,7 +135,7 @@ def models_of(posterior: Posterior) -> list[Served]:
         intensities of the moving image at the quadrature points. "start" has no input; its outputs are the parts of the
         position at rest, where a sampler can begin.
     """
-    back, parts = unravel(posterior), slices(posterior)
+    back, parts = unravel(posterior.target), slices(posterior.target)
     sizes = [part.stop - part.start for part in parts.values()]
 
     # The data are an argument, because JAX would compile data of a closure as constants.
@@ -151,7 +151,7 @@ def models_of(posterior: Posterior) -> list[Served]:
         return [u.ravel(), *([] if images is None else [images.predicted(u, here.fill(estimands))])]
 
     def start(data: Any, _: Any) -> list[Any]:
-        at_rest = posterior.coordinates.unconstrain(data, posterior.estimands(posterior.reference()))
+        at_rest = posterior.target.coordinates.unconstrain(data, posterior.estimands(posterior.reference()))
         return [jnp.ravel(at_rest[name]) for name in parts]
 
     functions = {LOG_POSTERIOR: (log_posterior, sizes), "forward": (forward, sizes), "start": (start, [])}
@@ -179,7 +179,7 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
         raise InputError("the package umbridge is missing: pip install 'bayesreg[serve]'") from error
     posterior = posterior_of_run(config)
     models = models_of(posterior)
-    names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior).items())
+    names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior.target).items())
     served = ", ".join(one.name for one in models)
     _log.info("inputs: %s; serving %s at http://%s:%d", names, served, LOOPBACK, port)
     # By default umbridge accepts connections from every machine.

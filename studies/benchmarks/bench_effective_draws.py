@@ -78,7 +78,7 @@ def estimands_of(posterior, draws):
 
 def papers_acceptance(posterior, draws):
     """Mean over the posterior of the probability that a step is accepted, and the share of steps in the support."""
-    kernel, places = choose_sampler("rwmh", posterior).sampler, estimands_of(posterior, draws)
+    kernel, places = choose_sampler("rwmh", posterior.target).sampler, estimands_of(posterior.target, draws)
 
     @jax.jit
     def tried(data, place, keys):
@@ -98,9 +98,9 @@ def papers_acceptance(posterior, draws):
 
 def papers_speed(posterior, draws):
     """Steps per second of each of three chains, from draws of the posterior, in blocks as a run makes them."""
-    last = jax.tree.map(lambda x: x[-CHAINS:], estimands_of(posterior, draws))
+    last = jax.tree.map(lambda x: x[-CHAINS:], estimands_of(posterior.target, draws))
     setup = jax.tree.map(lambda x: x.mean(axis=0), last)
-    block = block_from(choose_sampler("rwmh", posterior), setup, last, STEPS_TIMED // PAPERS_THIN, PAPERS_THIN)
+    block = block_from(choose_sampler("rwmh", posterior.target), setup, last, STEPS_TIMED // PAPERS_THIN, PAPERS_THIN)
     return STEPS_TIMED / _median(block)
 
 

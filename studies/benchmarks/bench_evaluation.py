@@ -145,7 +145,7 @@ def _problem(mesh: str, interpolation: str) -> Problem:
     _forget()
     posterior = _brain(mesh, interpolation) if mesh in EDGES_OF_BRAINS else _ball(BALLS[mesh], interpolation)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
-    return Problem(mesh, interpolation, posterior, posterior.condition(posterior.estimands(values)))
+    return Problem(mesh, interpolation, posterior, posterior.target.condition(posterior.estimands(values)))
 
 
 def _forget() -> None:
@@ -186,7 +186,7 @@ def _places(mesh: str, interpolation: str, chains: int) -> Places:
     positions = scattered(posterior, chains)
 
     def settled(data: Data, position: dict[str, jax.Array]) -> Any:
-        values = complete(data.blocks, estimands_of(posterior, data, position))
+        values = complete(data.blocks, estimands_of(posterior.target, data, position))
         lam, mu = data.body.lame_by_cell(values)
         given = data.body.prescribed(values["u_boundary"])
         found = equilibrium(data.body.system, lam, mu, given)
@@ -229,7 +229,7 @@ def program(problem: Problem, places: Places, part: str) -> tuple[Any, tuple[Any
         images = data.terms["images"]
         return images.quadrature.weights @ images.residuals(u) ** 2
 
-    density = partial(logdensity, problem.posterior)
+    density = partial(logdensity, problem.posterior.target)
     one, each = {
         "density": (density, (places.positions,)),
         "gradient": (jax.value_and_grad(density, argnums=1), (places.positions,)),

@@ -50,7 +50,7 @@ def finished() -> Finished:
     assert arrays is not None
     assert options.name == "hmc"
     arrays.pop("blocks")
-    end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
+    end = checkpoint_from_arrays(arrays, posterior.target, options.name, options.chains, **options.settings)
     draws = br.load_result(folder).idata.posterior.isel(draw=-1)
     known = posterior.reference()
     values = {name: jnp.asarray(draws[name].values, float) for name in known if name in draws}
@@ -68,7 +68,7 @@ def block_from(chosen: Chosen, setup: Any, places: dict[str, jax.Array], draws: 
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "smc"])
 def bench_draw(name: str, finished: Finished, timed: Any) -> None:
     posterior, end, places = finished
-    sampler = choose_sampler(name, posterior)
+    sampler = choose_sampler(name, posterior.target)
     setup = jax.tree.map(lambda x: x.mean(axis=0), places) if name == "rwmh" else end.setup
     count, thin = (STEPS, PAPERS_THIN) if name == "rwmh" else (DRAWS, 1)
     block = block_from(sampler, setup, places, count // thin, thin)

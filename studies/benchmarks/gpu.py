@@ -62,10 +62,10 @@ def throughput(posterior: br.Posterior, truth: Any, sizes: list[int]) -> None:
     at = posterior.reference()
     if truth is not None:
         at = at | {"u_boundary": jnp.asarray(truth.u[posterior.sampled])}
-    data = posterior.condition(posterior.estimands(at))
+    data = posterior.target.condition(posterior.estimands(at))
     middle = posterior.unconstrain(at)
-    density = jax.jit(jax.vmap(partial(logdensity, posterior), (None, 0)))
-    gradient = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior), argnums=1), (None, 0)))
+    density = jax.jit(jax.vmap(partial(logdensity, posterior.target), (None, 0)))
+    gradient = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior.target), argnums=1), (None, 0)))
     print("\n| chains | ms per density | densities per second | ms per gradient | gradients per second | peak memory |")
     print("|---|---|---|---|---|---|")
     for chains in sizes:
@@ -115,7 +115,7 @@ def effective_draws(posterior: br.Posterior, sizes: list[int], minutes: float) -
             print(f"  {time.perf_counter() - began:.1f} s  {text}", file=sys.stderr, flush=True)
 
         with show_messages():
-            first = first_checkpoint(posterior, "hmc", chains, seed=0)
+            first = first_checkpoint(posterior.target, "hmc", chains, seed=0)
         prepared = time.perf_counter() - began
         stop, block = StopRule(rhat=1.01, ess=400, max_seconds=60 * minutes), 100 if chains < 32 else 25
         found = sample(

@@ -79,11 +79,11 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     begun = time.perf_counter()
     posterior = phantom(nodes, voxels)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
-    data = posterior.condition(posterior.estimands(values))
+    data = posterior.target.condition(posterior.estimands(values))
     positions = scattered(posterior, chains)
     setup = time.perf_counter() - begun
-    many = jax.jit(jax.vmap(partial(logdensity, posterior), in_axes=(None, 0)))
-    slopes = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior), argnums=1), in_axes=(None, 0)))
+    many = jax.jit(jax.vmap(partial(logdensity, posterior.target), in_axes=(None, 0)))
+    slopes = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior.target), argnums=1), in_axes=(None, 0)))
     begun = time.perf_counter()
     compiled = [function.lower(data, positions).compile() for function in (many, slopes)]
     compiling = time.perf_counter() - begun
@@ -91,7 +91,7 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
     density, gradient = (_median(function, data, positions) for function in compiled)
 
     def evaluated(data: Any, position: Any) -> Any:
-        return posterior.evaluate_estimands(data, estimands_of(posterior, data, position))
+        return posterior.target.evaluate_estimands(data, estimands_of(posterior.target, data, position))
 
     iterations = jax.jit(jax.vmap(evaluated, in_axes=(None, 0)))(data, positions).solver_iterations
     return {

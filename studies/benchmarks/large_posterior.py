@@ -95,7 +95,7 @@ def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
         posterior = posterior_of(config, inputs)
         nodal = np.ones(inputs.mesh.points.shape)
         samples = Samples(
-            posterior, MadeUp(posterior, chains, draws), 0 * nodal, SD * nodal,
+            posterior.target, MadeUp(posterior, chains, draws), 0 * nodal, SD * nodal,
             {name: np.ones(np.shape(value)) for name, value in posterior.reference().items()},
             jax.tree.map(lambda zeros: np.asarray(zeros) + 1, no_steps((chains,))), None, "made up", 1.0, exact=True,
         )  # fmt: skip

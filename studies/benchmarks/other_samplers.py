@@ -146,7 +146,7 @@ def phantom() -> tuple[br.Posterior, Start]:
 
 def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.ndarray, Checkpoint, Moment]:
     """Flat positions about the mode, where `hmc` warms up to its checkpoint, and when its search last spoke."""
-    about_mode = first_checkpoint(posterior, "laplace", chains, seed, start)
+    about_mode = first_checkpoint(posterior.target, "laplace", chains, seed, start)
     heard = [now()]
 
     def hear(record: logging.LogRecord) -> bool:
@@ -156,7 +156,7 @@ def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.n
     log = logging.getLogger("bayesreg.inference.gaussian.mode_search")
     log.setLevel(logging.INFO)
     log.addFilter(hear)
-    first = first_checkpoint(posterior, "hmc", chains, seed, start)
+    first = first_checkpoint(posterior.target, "hmc", chains, seed, start)
     log.removeFilter(hear)
     return np.asarray(jax.vmap(about_mode.setup.gaussian.place)(about_mode.state.position)), first, heard[-1]
 
@@ -174,8 +174,8 @@ def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) 
 
 def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str, Problem]:
     """The density in unconstrained coordinates, and in those of `hmc` after its warm-up."""
-    gaussian, middle = first.setup.gaussian, unravel(posterior)(first.setup.middle)
-    data = posterior.condition(estimands_of(posterior, posterior.data, middle))
+    gaussian, middle = first.setup.gaussian, unravel(posterior.target)(first.setup.middle)
+    data = posterior.target.condition(estimands_of(posterior.target, posterior.data, middle))
     xi = np.asarray(jax.vmap(partial(whiten, gaussian))(jnp.asarray(places)))
     return {
         "unconstrained": Problem(posterior, data, None, places, 0.008),
@@ -185,7 +185,7 @@ def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str,
 
 def position(posterior: Any, gaussian: Gaussian | None, x: jax.Array) -> dict[str, jax.Array]:
     """The position at flat coordinates."""
-    return unravel(posterior)(x if gaussian is None else gaussian.place(x))
+    return unravel(posterior.target)(x if gaussian is None else gaussian.place(x))
 
 
 def logdensity(posterior: Any, data: Any, gaussian: Gaussian | None, x: jax.Array) -> jax.Array:
@@ -200,7 +200,9 @@ value_and_slope = jax.jit(jax.value_and_grad(logdensity, argnums=3), static_argn
 def estimands(problem: Problem, draws: np.ndarray) -> list[Block]:
     """Flat coordinates (chain, draw, …) as a block of draws, if there are any."""
     posterior, data, gaussian = problem[:3]
-    every = jax.jit(jax.vmap(jax.vmap(lambda x: estimands_of(posterior, data, position(posterior, gaussian, x)))))
+    every = jax.jit(
+        jax.vmap(jax.vmap(lambda x: estimands_of(posterior.target, data, position(posterior, gaussian, x))))
+    )
     return [jax.tree.map(np.asarray, every(draws))] if draws.size else []
 
 

@@ -54,8 +54,8 @@ def main() -> None:
     ):
         parser.error("RUN must be a run of hmc that has begun, with Gaussian noise and without a field of stiffness")
     arrays.pop("blocks")
-    end = checkpoint_from_arrays(arrays, posterior, options.name, options.chains, **options.settings)
-    sampler = choose_sampler(options.name, posterior, **options.settings).sampler
+    end = checkpoint_from_arrays(arrays, posterior.target, options.name, options.chains, **options.settings)
+    sampler = choose_sampler(options.name, posterior.target, **options.settings).sampler
     data, setup = sampler.data(end.setup), end.setup
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled, {int(setup.steps)} gradients a draw")
     print(f"\nA draw, {options.chains} chains")
@@ -100,7 +100,7 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
         return whitened_density(posterior, data, setup)(xi)
 
     def values_of(xi: jax.Array) -> Any:
-        estimands = estimands_of(posterior, data, whitened_position(posterior, setup.gaussian, xi))
+        estimands = estimands_of(posterior.target, data, whitened_position(posterior, setup.gaussian, xi))
         values = complete(data.blocks, estimands)
         return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 

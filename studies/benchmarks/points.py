@@ -116,11 +116,11 @@ def prior_covariances(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     marks = br.Landmarks(points, points, sd=1.0)
     posterior = br.build_posterior(mesh, [marks], model)
     data = posterior.data.without_term("landmarks")
-    precision = posterior.mode_search.curvature(data, posterior.estimands(posterior.reference())).gauss_newton
+    precision = posterior.target.mode_search.curvature(data, posterior.estimands(posterior.reference())).gauss_newton
     modes, term = np.asarray(data.terms["rigid"].modes), posterior.data.terms["landmarks"]
 
     def moved(u_boundary: jax.Array) -> jax.Array:
-        u = posterior.evaluate_estimands(data, {"u_boundary": u_boundary}).u
+        u = posterior.target.evaluate_estimands(data, {"u_boundary": u_boundary}).u
         return (term.weights[:, :, None] * u[term.nodes]).sum(axis=1).ravel()
 
     J = np.asarray(jax.jacrev(moved)(posterior.reference()["u_boundary"])).reshape(3 * len(points), -1)

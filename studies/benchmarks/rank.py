@@ -30,7 +30,8 @@ def eigenvalues(folder: Path) -> np.ndarray:
     estimands = posterior.estimands(last)
     without_images = posterior.data._replace(blocks={**posterior.data.blocks, "t_similarity": Scale(jnp.asarray(1e30))})
     both, prior = (
-        posterior.mode_search.curvature(data, estimands).gauss_newton for data in (posterior.data, without_images)
+        posterior.target.mode_search.curvature(data, estimands).gauss_newton
+        for data in (posterior.data, without_images)
     )
     # The prior leaves rigid motions free: a trace of the identity keeps it definite.
     held = prior + 1e-9 * np.trace(prior) / len(prior) * np.eye(len(prior))

@@ -48,10 +48,10 @@ def main() -> None:
     parser.add_argument("--proposals", type=int, default=400)
     given = parser.parse_args()
     posterior = posterior_of(br.load_config(given.run / "config.yaml"), store.read_inputs(given.run))
-    draws = estimands_of(posterior, br.load_result(given.run).idata.posterior.load())
+    draws = estimands_of(posterior.target, br.load_result(given.run).idata.posterior.load())
     every = len(draws["u_boundary"]) // given.chains
     places = jax.tree.map(lambda x: x[::every][: given.chains], draws)
-    data = posterior.condition(jax.tree.map(lambda x: x.mean(axis=0), draws))
+    data = posterior.target.condition(jax.tree.map(lambda x: x.mean(axis=0), draws))
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled; {given.chains} chains")
     frozen(posterior, data, places)
     two_stages(posterior, data, places, given.proposals)
@@ -71,7 +71,7 @@ def frozen(posterior: Posterior, data: Any, places: dict[str, jax.Array]) -> Non
     free, slots = np.asarray(data.body.system.free), np.asarray(posterior.sampled)
 
     def usual(data: Any, place: dict[str, jax.Array], u: jax.Array) -> jax.Array:
-        return posterior.evaluate_estimands(data, place | {"u_boundary": u}).logdensity
+        return posterior.target.evaluate_estimands(data, place | {"u_boundary": u}).logdensity
 
     def given(data: Any, response: jax.Array, form: jax.Array, u: jax.Array) -> jax.Array:
         nodes = jnp.zeros((len(posterior.mesh.points), 3)).at[slots].set(u)
@@ -101,8 +101,8 @@ def matrices(posterior: Posterior, lam: np.ndarray, mu: np.ndarray) -> tuple[np.
 def two_stages(posterior: Posterior, data: Any, places: dict[str, jax.Array], proposals: int) -> None:
     """Of proposals in the support: times of both stages, what passes the first, and what is accepted."""
     chains = len(places["u_boundary"])
-    evaluate = jax.vmap(posterior.evaluate_estimands, in_axes=(None, 0, 0))
-    states = jax.jit(jax.vmap(posterior.evaluate_estimands, in_axes=(None, 0)))(data, places)
+    evaluate = jax.vmap(posterior.target.evaluate_estimands, in_axes=(None, 0, 0))
+    states = jax.jit(jax.vmap(posterior.target.evaluate_estimands, in_axes=(None, 0)))(data, places)
     whole = jax.jit(evaluate).lower(data, places, states.u).compile()
     with mock.patch.object(equilibrium, "MAX_ITERATIONS", 1):
         jax.clear_caches()
@@ -114,7 +114,7 @@ def two_stages(posterior: Posterior, data: Any, places: dict[str, jax.Array], pr
         keys = jax.random.split(key, chains)
         moves = jax.vmap(lambda key, place: _normal_step(key, place, STEPS))(keys, places)
         found = jax.tree.map(jnp.add, places, moves)
-        return found, jax.vmap(posterior.supports, in_axes=(None, 0))(data, found)
+        return found, jax.vmap(posterior.target.supports, in_axes=(None, 0))(data, found)
 
     images, values = data.terms["images"], posterior.reference()
     times: dict[str, list[float]] = {"first": [], "full": []}

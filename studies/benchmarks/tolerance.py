@@ -74,10 +74,10 @@ def at_draws(folder: Path) -> None:
     )
     at = [{n: jnp.asarray(draws[n].values[place], float) for n in known if n in draws} for place in places]
     estimands = [posterior.estimands(known | values) for values in at]
-    positions = [posterior.coordinates.unconstrain(posterior.data, e) for e in estimands]
+    positions = [posterior.target.coordinates.unconstrain(posterior.data, e) for e in estimands]
     middle = jax.tree.map(lambda *x: jnp.stack(x).mean(axis=0), *positions)
-    data = posterior.condition(estimands_of(posterior, posterior.data, middle))
-    evaluate = jax.jit(posterior.evaluate_estimands)
+    data = posterior.target.condition(estimands_of(posterior.target, posterior.data, middle))
+    evaluate = jax.jit(posterior.target.evaluate_estimands)
 
     def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         system = data.body.system._replace(tolerance=jnp.asarray(tolerance))

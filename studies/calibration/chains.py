@@ -33,7 +33,7 @@ Estimands = dict[str, Any]
 
 def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
     """What is looked at: parameters, some displacements, E_s and the log density."""
-    labels, blocks = posterior.variables.entry_names, posterior.data.blocks
+    labels, blocks = posterior.target.variables.entry_names, posterior.data.blocks
     entries = [f"{name} {labels[i]}" for name in LAME for i in blocks[name].free.index]
     warm = [name for name in PARAMETERS if name not in LAME and name in blocks and blocks[name].is_sampled]
     nodes = [f"u{posterior.sampled[node]} {axis}" for node in NODES for axis in "xyz"]
@@ -48,7 +48,7 @@ def quantities(estimands: Estimands, evaluation: Any) -> Any:
 
 
 def quantities_at(posterior: br.Posterior, data: Any, observed: Any, estimands: Estimands) -> Any:
-    return quantities(estimands, posterior.evaluate_estimands(observing(data, observed), estimands))
+    return quantities(estimands, posterior.target.evaluate_estimands(observing(data, observed), estimands))
 
 
 def of_posterior(posterior: br.Posterior, estimands: Estimands) -> Estimands:
@@ -67,7 +67,7 @@ def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Gaussian:
     truth = simulator.draw_prior(np.random.default_rng(1000), 1)
     observed = simulated(simulator.posterior, simulator.posterior.data, truth, jax.random.key(1000))[0]
     at_rest = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
-    return laplace(posterior, np.asarray(at_rest), observing(posterior.data, observed))
+    return laplace(posterior.target, np.asarray(at_rest), observing(posterior.data, observed))
 
 
 def setups_about(
@@ -84,11 +84,11 @@ def setups_about(
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
     def about(gaussian: Gaussian, middle: Any) -> Setup:
-        return setup_about(posterior, gaussian, middle)._replace(**size)
+        return setup_about(posterior.target, gaussian, middle)._replace(**size)
 
     return jax.vmap(about)(stacked, jnp.asarray(middles))._replace(stand_in=normalisers)
 
 
 def condition(posterior: br.Posterior) -> Any:
     """The data for chains: for all of them about rest."""
-    return posterior.condition(posterior.estimands(posterior.reference()))
+    return posterior.target.condition(posterior.estimands(posterior.reference()))

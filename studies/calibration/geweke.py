@@ -76,7 +76,7 @@ def compare(
     """Moments of a kernel's chains against those where they start; a posterior not the simulator's own is an error."""
     posterior = simulator.posterior if posterior is None else posterior
     first = of_posterior(posterior, simulator.draw_prior(np.random.default_rng(seed), chains))
-    kernel = choose_sampler(sampler, posterior, **(RANDOM_WALK if sampler == "rwmh" else {})).sampler
+    kernel = choose_sampler(sampler, posterior.target, **(RANDOM_WALK if sampler == "rwmh" else {})).sampler
     setup, data = None, condition(posterior)
     if sampler != "rwmh":
         reference = prior_reference(simulator, posterior)

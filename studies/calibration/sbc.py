@@ -188,7 +188,7 @@ def sample(
     say: Say = lambda text: None,
 ) -> Sampled:
     """Sample the posterior of each of the data sets (r, q), one chain each, from draws of the prior."""
-    kernel = choose_sampler(sampler, posterior).sampler
+    kernel = choose_sampler(sampler, posterior.target).sampler
     say("a mode for each replication")
     problems = [replace(posterior, data=observing(posterior.data, f)) for f in observed]
     modes = _modes(problems, starts)
@@ -229,7 +229,9 @@ def _scattered(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, 
     def one(given: Any) -> Estimands:
         setup, observed, key = given
         xi = jax.random.normal(key, setup.middle.shape)
-        return estimands_of(posterior, observing(data, observed), whitened_position(posterior, setup.gaussian, xi))
+        return estimands_of(
+            posterior.target, observing(data, observed), whitened_position(posterior, setup.gaussian, xi)
+        )
 
     return jax.lax.map(one, (setup, observed, keys), batch_size=BATCH)
 
@@ -252,7 +254,7 @@ def _advance(  # type: ignore[no-untyped-def]
         here = observing(data, observed)
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
-        place = ravel_pytree(posterior.coordinates.unconstrain(data, drawn.estimands))[0]
+        place = ravel_pytree(posterior.target.coordinates.unconstrain(data, drawn.estimands))[0]
         seen = quantities(drawn.estimands, drawn.evaluation), drawn.evaluation.u
         return state, drawn.estimands, place, *seen, info.acceptance_rate
 

@@ -184,7 +184,10 @@ class Simulator:
 
 def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
     """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
-    u, images = posterior.evaluate_estimands(without_normaliser(posterior, data), estimands).u, data.terms["images"]
+    u, images = (
+        posterior.target.evaluate_estimands(without_normaliser(posterior.target, data), estimands).u,
+        data.terms["images"],
+    )
     t_similarity = estimands.get("t_similarity", data.blocks["t_similarity"].reference())
     scale = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
     if isinstance(posterior.observations["images"].options.similarity, br.StudentT):

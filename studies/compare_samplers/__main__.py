@@ -17,7 +17,6 @@ from rich.console import Console
 from bayesreg.config import Config, load_config, resolved_yaml
 from bayesreg.config.samplers import sampler_section
 from bayesreg.config.sections import StopConfig
-from bayesreg.inference.chains.run import temper_target
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.samplers.registry import SAMPLERS
 from bayesreg.io import store
@@ -26,6 +25,7 @@ from bayesreg.messages import show_messages
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of
 from bayesreg.workflow.preparation import prepared_inputs
+from bayesreg.workflow.run import temper
 from studies.compare_samplers.efficiency import Budget, Efficiency, measure_efficiency
 from studies.compare_samplers.table import Setting, efficiency_table
 from studies.terminal import in_terminal
@@ -72,7 +72,7 @@ def compare_samplers(
     inputs = prepared_inputs(config)[0]
     posterior, setting = posterior_of(config, inputs), _setting(config, minutes)
     start = start_of(config, inputs, posterior)
-    target = temper_target(posterior, config.sampler.chains, config.seed, start)
+    posterior = temper(config, inputs, posterior)
     rule = StopRule(config.stop.rhat, config.stop.ess, 60 * minutes)
     efficiencies: list[Efficiency] = []
     for name in samplers:
@@ -81,7 +81,7 @@ def compare_samplers(
         budget = Budget(config.sampler.chains, max(config.stop.max_steps // own.thin, 4), rule)
         efficiencies.append(
             measure_efficiency(
-                target,
+                posterior,
                 name,
                 budget,
                 config.seed,

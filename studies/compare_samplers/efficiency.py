@@ -9,10 +9,9 @@ import numpy as np
 
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.inference.chains.run import Samples, first_checkpoint, sample
+from bayesreg.inference.chains.run import Samples, Targeted, first_checkpoint, sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block
-from bayesreg.inference.target import Target
 from bayesreg.types import InputError
 
 
@@ -86,7 +85,7 @@ class Budget(NamedTuple):
 
 
 def measure_efficiency(
-    posterior: Target,
+    posterior: Targeted,
     sampler: str,
     budget: Budget,
     seed: int = 0,
@@ -107,7 +106,7 @@ def measure_efficiency(
         ends.append((int(checkpoint.draws), float(checkpoint.seconds)))
 
     try:
-        first = first_checkpoint(posterior, sampler, budget.chains, seed, start, **settings)
+        first = first_checkpoint(posterior.target, sampler, budget.chains, seed, start, **settings)
         samples = sample(
             posterior, sampler, budget.chains, budget.draws, seed, thin=thin, block=block, stop=budget.stop,
             progress=progress, resume=(first, []), on_block=keep, **settings,

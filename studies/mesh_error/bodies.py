@@ -152,6 +152,6 @@ def _push(
 def _mode(posterior: Posterior) -> tuple[dict[str, Any], int]:
     """Values at the mode, and how many tetrahedra it turns inside out."""
     rest = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
-    values = posterior.constrain(unravel(posterior)(jnp.asarray(find_mode(posterior, rest))))
+    values = posterior.constrain(unravel(posterior.target)(jnp.asarray(find_mode(posterior.target, rest))))
     mesh, u = posterior.mesh, np.asarray(posterior.evaluate(values).u)
     return values, int((signed_volumes(mesh.points + u, mesh.cells) <= 0).sum())

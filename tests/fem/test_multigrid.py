@@ -140,13 +140,13 @@ def test_a_posterior_of_a_large_mesh_is_compiled_once(monkeypatch):
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
     post = posterior_of(*images, mesh, interpolation="cubic")
     values = post.reference()
-    here = post.condition(post.estimands(values))
-    there = post.condition(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))
-    density = jax.jit(partial(logdensity, post))
+    here = post.target.condition(post.estimands(values))
+    there = post.target.condition(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))
+    density = jax.jit(partial(logdensity, post.target))
     first, second = (float(density(data, post.initial(jax.random.key(0)))) for data in (here, there))
     assert density._cache_size() == 1
     assert first == pytest.approx(second, rel=1e-5)
-    slope = jax.grad(lambda x: logdensity(post, here, x))(post.initial(jax.random.key(0)))
+    slope = jax.grad(lambda x: logdensity(post.target, here, x))(post.initial(jax.random.key(0)))
     exact = jax.grad(post.logdensity)(post.initial(jax.random.key(0)))
     for name, value in exact.items():
         np.testing.assert_allclose(slope[name], value, atol=0.01 * float(abs(value).max()))

@@ -65,7 +65,7 @@ class ModeSearch:
         self.data = data
 
     hyperparameters = ()
-    approached = tempering = None
+    search_start = tempering = None
 
     def continuation(self):
         yield self.data
@@ -97,6 +97,10 @@ class GaussianTarget:
         self.width = width
         self.mode_search = ModeSearch(self.data)
         self.hard_wall = None if width else lambda data, u: gap(data, u) < 0
+
+    @property
+    def target(self):
+        return self
 
     def height(self, data, u):
         away = jnp.stack([u.ravel() - data.mean, u.ravel() + data.mean])

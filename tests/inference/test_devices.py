@@ -22,7 +22,8 @@ CHAINS, DRAWS = 4, 12
 
 def found(sampler):
     """What differs between two devices, one, two again, and two with chains in another order."""
-    target = GaussianTarget() if sampler == "hmc" else posterior()
+    problem = GaussianTarget() if sampler == "hmc" else posterior()
+    target = problem.target
     settings = {} if sampler == "rwmh" else {"warm_up": 5}
     chosen, begun = (
         choose_sampler(sampler, target, **settings),
@@ -44,7 +45,7 @@ def found(sampler):
     )  # fmt: skip
     return {
         "devices": count,
-        "programs": programs(target, sampler, settings),
+        "programs": programs(problem, sampler, settings),
         "spread": float(here.std()),
         "moved": float(abs(here[:, 1:] - here[:, :-1]).max()),
         "one": float(abs(here - there).max()),
@@ -53,10 +54,10 @@ def found(sampler):
     }
 
 
-def programs(target, sampler, settings):
+def programs(problem, sampler, settings):
     """Compiled for a run of two blocks."""
     before = run_block._cache_size()
-    sample(target, sampler, CHAINS, draws=8, block=4, progress=False, **settings)
+    sample(problem, sampler, CHAINS, draws=8, block=4, progress=False, **settings)
     return run_block._cache_size() - before
 
 

@@ -23,8 +23,8 @@ from tests.phantoms import flat_skull, smooth_image
 def test_a_gaussian_posterior_is_its_own_approximation():
     posterior, _, exact = problem()
     start = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
-    mode = find_mode(posterior, np.asarray(start) + 0.5)
-    reference = laplace(posterior, mode)
+    mode = find_mode(posterior.target, np.asarray(start) + 0.5)
+    reference = laplace(posterior.target, mode)
     sd = np.sqrt(np.diag(np.linalg.inv(exact.precision)))
     assert (abs(mode - exact.mean) / sd).max() < 0.02
     covariance = np.asarray(reference.factor @ reference.factor.T)
@@ -47,10 +47,10 @@ def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
         return 0.5 * np.linalg.slogdet(exact.precision)[1] - float(posterior.logdensity(place))
 
     best = minimize_scalar(minus_evidence, bounds=(-3, 8), method="bounded", options={"xatol": 1e-3}).x
-    mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
+    mode = find_mode(posterior.target, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
     assert abs(best - np.log(20.0)) > 0.1
-    assert unravel(posterior)(mode)["t_elastic"] == pytest.approx(best, abs=0.01)
-    factor, step = np.asarray(laplace(posterior, mode).factor), 0.1
+    assert unravel(posterior.target)(mode)["t_elastic"] == pytest.approx(best, abs=0.01)
+    factor, step = np.asarray(laplace(posterior.target, mode).factor), 0.1
     curvature = sum(way * minus_evidence(best + at * step) for at, way in ((-1, 1), (0, -2), (1, 1))) / step**2
     assert 1 / (factor[0] @ factor[0]) == pytest.approx(curvature, rel=0.03)
     assert curvature > 1.5
@@ -62,7 +62,7 @@ def test_the_mode_at_a_wall_is_that_of_the_quadratic_program():
     exact, skull = found.exact, flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
     images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
     posterior = posterior_of(*images, MESH, skull, **OPTIONS, skull_width=1e-2)
-    mode = find_mode(posterior, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
+    mode = find_mode(posterior.target, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
     root = np.linalg.cholesky(exact.precision).T
     highest = np.full(len(mode), np.inf)
     highest[::3] = wall - MESH.points[posterior.sampled][:, 0]
@@ -74,7 +74,9 @@ def test_a_gaussian_is_found_from_beside_it():
     """One Newton step from a place where the force is not zero gives the mean."""
     exact = problem().exact
     place = exact.mean + np.tile([3.0, 0, 0], len(exact.mean) // 3)
-    centre = np.asarray(recentre(problem().posterior, laplace(problem().posterior, place), [place]).centre)
+    centre = np.asarray(
+        recentre(problem().posterior.target, laplace(problem().posterior.target, place), [place]).centre
+    )
     sd = np.sqrt(np.diag(np.linalg.inv(exact.precision)))
     assert (abs(centre - exact.mean) / sd).max() < 0.02 < (abs(place - exact.mean) / sd).max()
 
@@ -86,10 +88,10 @@ def test_curvature_of_parameters_is_the_hessian():
     options = {"interpolation": "cubic", "t_elastic": 30.0, "rigid_sd": 1.0}
     posterior = posterior_of(*images, MESH, priors={"lam": prior, "mu": prior}, **options)
     flat = np.asarray(ravel_pytree(posterior.initial(jax.random.key(0)))[0])
-    reference = laplace(posterior, flat)
+    reference = laplace(posterior.target, flat)
     precision = np.linalg.inv(np.asarray(reference.factor @ reference.factor.T))
 
-    slope = jax.grad(lambda x: -logdensity(posterior, posterior.data, unravel(posterior)(x)))
+    slope = jax.grad(lambda x: -logdensity(posterior.target, posterior.data, unravel(posterior.target)(x)))
     hessian_row = jax.jit(lambda direction: jax.jvp(slope, (jnp.asarray(flat),), (direction,))[1])
     count = len(flat) - 3 * len(posterior.sampled)
     for k, direction in enumerate(np.eye(len(flat))[:count]):
@@ -136,7 +138,7 @@ def test_a_parameter_far_above_its_scale_is_as_wide_as_its_logarithm(above):
     z = np.asarray(posterior.data.blocks["lam"].unconstrain(jnp.asarray(x)[:, None] * jnp.array([0.0, 1.0, 0.0])))[:, 1]
     position = posterior.unconstrain(posterior.reference())
     at = {**position, "lam": position["lam"].at[1].set(np.median(z))}
-    least = posterior.coordinates.least_curvature(posterior.data, at)["lam"][1]
+    least = posterior.target.coordinates.least_curvature(posterior.data, at)["lam"][1]
     assert 0.5 < z.std() * np.sqrt(least) < 1.5
 
 
@@ -154,4 +156,4 @@ def test_a_search_without_an_end_is_told():
     posterior = posterior_of(flat, flat, MESH, rigid_sd=1.0)
     start = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
     with pytest.raises(br.InputError, match="runs away"):
-        find_mode(posterior, start)
+        find_mode(posterior.target, start)

@@ -39,7 +39,7 @@ MESH = box_mesh(2)
 @pytest.fixture(autouse=True)
 def costly(monkeypatch):
     """A mesh of few nodes treated like one of many."""
-    monkeypatch.setattr("bayesreg.model.posterior.CHEAP_NODES", 0)
+    monkeypatch.setattr("bayesreg.model.target.CHEAP_NODES", 0)
 
 
 @cache
@@ -65,7 +65,7 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
     """Also where the first Lamé parameters, small already, are next to nothing."""
     post = posterior()
     flat = np.array(flat_of(post))
-    flat[slices(post)["lam"]] = -3.0
+    flat[slices(post.target)["lam"]] = -3.0
     found = make_stand_in(post, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
     entries = np.flatnonzero(mark_normaliser(post))
     rng = np.random.default_rng(0)
@@ -73,7 +73,7 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     places = np.tile(flat, (21, 1))
     places[:20, entries] += 0.3 * REACH * rng.uniform(size=20)[:, None] * directions
-    places[20, np.arange(len(flat))[slices(post)["lam"]]] = -8.0
+    places[20, np.arange(len(flat))[slices(post.target)["lam"]]] = -8.0
     expected = np.array([float(log_normaliser_at(post, post.data, place)) for place in places])
     error = expected - [float(found(smooth_coordinates(post, post.data, jnp.asarray(place)))) for place in places]
     error -= error[:20].mean()
@@ -158,9 +158,9 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     post = posterior()
     sampler = hmc(post, Hmc())
     estimands = post.estimands(post.reference())
-    flat = jax.flatten_util.ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0]
+    flat = jax.flatten_util.ravel_pytree(post.target.coordinates.unconstrain(post.data, estimands))[0]
     gaussian = Gaussian(flat, 0.05 * jnp.eye(len(flat)))
-    setup = setup_about(post, gaussian, flat)
+    setup = setup_about(post.target, gaussian, flat)
     setup = setup._replace(stand_in=make_stand_in(post, gaussian, flat), step_size=jnp.asarray(0.3))
 
     @jax.jit
@@ -176,7 +176,9 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
     found, gradients = moved(sampler.data(setup), setup, jax.random.key(0))
     # Those of trajectories of one step.
     assert (gradients == TOGETHER).all()
-    expected = jax.vmap(lambda estimands: post.evaluate_estimands(post.data, estimands).logdensity)(found.estimands)
+    expected = jax.vmap(lambda estimands: post.target.evaluate_estimands(post.data, estimands).logdensity)(
+        found.estimands
+    )
     np.testing.assert_allclose(found.evaluation.logdensity, expected, rtol=1e-9)
     assert (found.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
 
@@ -185,7 +187,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 @pytest.mark.slow
 def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     post = posterior()
-    points = starting_points(post, br.Start(), 2, jax.random.key(0))
+    points = starting_points(post.target, br.Start(), 2, jax.random.key(0))
     setup, _ = hmc(post, Hmc(warm_up=2)).prepare(points, jax.random.key(1))
     sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post)
     places = np.asarray(setup.middle) + sd * np.random.default_rng(0).normal(size=(10, len(sd)))

@@ -76,7 +76,7 @@ def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_ar
 def test_a_resumed_run_is_the_run_that_was_not_cut_off():
     samples, blocks = whole()
     arrays = {name: value.copy() for name, value in checkpoint_to_arrays(blocks[0][2]).items()}
-    checkpoint = checkpoint_from_arrays(arrays, posterior(), "rwmh", 3)
+    checkpoint = checkpoint_from_arrays(arrays, posterior().target, "rwmh", 3)
     assert int(checkpoint.draws) == 4
     kept = [blocks[0][1]]
     resumed = br.sample(posterior(), draws=12, block=4, resume=(checkpoint, kept), **OPTIONS)
@@ -123,7 +123,7 @@ def test_a_setting_that_is_none_is_refused(given, message):
 def test_a_checkpoint_of_another_problem_is_refused():
     arrays = checkpoint_to_arrays(whole()[1][0][2])
     with pytest.raises(ValueError, match="another problem"):
-        checkpoint_from_arrays(arrays, posterior(), "rwmh", 4)
+        checkpoint_from_arrays(arrays, posterior().target, "rwmh", 4)
 
 
 def test_accumulated_mean_and_sd_are_those_of_the_draws():
@@ -211,7 +211,7 @@ def test_starts_spread_over_the_field_and_stay_out_of_the_skull():
 
 def test_posterior_file_round_trip(tmp_path):
     samples, _ = whole()
-    save_posterior(posterior(), samples.blocks, tmp_path / "posterior.nc")
+    save_posterior(posterior().target, samples.blocks, tmp_path / "posterior.nc")
     found = open_posterior(tmp_path / "posterior.nc")
     assert set(found.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
     assert found.posterior.u_boundary.dims == ("chain", "draw", "node", "axis")

@@ -81,8 +81,8 @@ def test_the_mode_has_no_inverted_tetrahedron(least):
     moving = fixed.copy()
     moving[-1] += 1.5 * (mesh.points[rest[0]] - mesh.points[middle])
     posterior = build(mesh, fixed, moving, least)
-    start = np.asarray(flat_position(posterior, posterior.data, posterior.estimands(posterior.reference())))
-    mode = unravel(posterior)(jnp.asarray(find_mode(posterior, start)))
+    start = np.asarray(flat_position(posterior.target, posterior.data, posterior.estimands(posterior.reference())))
+    mode = unravel(posterior.target)(jnp.asarray(find_mode(posterior.target, start)))
     u = np.asarray(posterior.constrain(mode)["u_boundary"])
     assert (signed_volumes(mesh.points + u, mesh.cells).min() > 0) == bool(least)
 
@@ -104,8 +104,8 @@ def test_displacements_that_the_evidence_takes_too_far_rest(wild, monkeypatch):
         sampled="all", least_volume=0.1, normalised=True, t_elastic={"median": 10.0}, fixed={"lam": 1.0, "mu": 1.0}
     )
     posterior = br.build_posterior(mesh, [landmarks], model)
-    start = np.asarray(flat_position(posterior, posterior.data, posterior.estimands(posterior.reference())))
-    expected, searches = find_mode(posterior, start), []
+    start = np.asarray(flat_position(posterior.target, posterior.data, posterior.estimands(posterior.reference())))
+    expected, searches = find_mode(posterior.target, start), []
 
     def go_too_far(target, flat, *rest):
         found = maximise_evidence(target, flat, *rest)
@@ -115,5 +115,5 @@ def test_displacements_that_the_evidence_takes_too_far_rest(wild, monkeypatch):
         return found._replace(flat=far) if len(searches) == 1 else found
 
     monkeypatch.setattr(mode_search, "maximise_evidence", go_too_far)
-    np.testing.assert_allclose(find_mode(posterior, start), expected, atol=0.02)
+    np.testing.assert_allclose(find_mode(posterior.target, start), expected, atol=0.02)
     assert len(searches) > 1

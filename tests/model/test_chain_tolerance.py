@@ -28,12 +28,14 @@ def posterior():
 
 def test_the_density_of_chains_is_the_density_to_a_hundredth():
     post = posterior()
-    conditioned = post.condition(post.estimands(post.reference()))
+    conditioned = post.target.condition(post.estimands(post.reference()))
     for seed in range(5):
         rng = np.random.default_rng(seed)
         values = post.reference() | {"u_boundary": jnp.asarray(0.3 * rng.normal(size=(len(MESH.boundary), 3)))}
         values |= {name: values[name] * np.exp(0.4 * rng.normal(size=3)) for name in ("lam", "mu")}
-        exact, near = (post.evaluate_estimands(data, post.estimands(values)) for data in (post.data, conditioned))
+        exact, near = (
+            post.target.evaluate_estimands(data, post.estimands(values)) for data in (post.data, conditioned)
+        )
         assert near.solver_iterations < exact.solver_iterations
         assert 0 < abs(near.logdensity - exact.logdensity) < 0.01
 
@@ -43,9 +45,11 @@ def chains():
     """Data conditioned for chains, and (data) → where 60 transitions of 4 chains lead, and how probably they go."""
     post, count = posterior(), 4
     estimands = post.estimands(post.reference())
-    flat = np.asarray(ravel_pytree(post.coordinates.unconstrain(post.data, estimands))[0])
-    setup = setup_about(post, laplace(post, flat), flat)._replace(step_size=jnp.asarray(0.3), steps=jnp.asarray(5))
-    kernel = choose_sampler("hmc", post).sampler
+    flat = np.asarray(ravel_pytree(post.target.coordinates.unconstrain(post.data, estimands))[0])
+    setup = setup_about(post.target, laplace(post.target, flat), flat)._replace(
+        step_size=jnp.asarray(0.3), steps=jnp.asarray(5)
+    )
+    kernel = choose_sampler("hmc", post.target).sampler
 
     @jax.jit
     def draws(data):
@@ -56,7 +60,7 @@ def chains():
         states = jax.vmap(lambda _: kernel.init(data, setup, estimands))(jnp.arange(count))
         return jax.lax.scan(step, states, jax.random.split(jax.random.key(0), (60, count)))[1]
 
-    return post.condition(estimands), draws
+    return post.target.condition(estimands), draws
 
 
 def with_tolerances(data, solve, slope):
@@ -88,7 +92,7 @@ def test_slopes_a_million_times_as_exact_are_accepted_no_more_often():
 def test_steps_of_the_papers_kernel_are_as_probable_as_exact_ones():
     """Its solves begin at the chain's present displacement, and end as early as those of the others."""
     post, count = posterior(), 200
-    kernel = choose_sampler("rwmh", post, sigma_u=0.05).sampler
+    kernel = choose_sampler("rwmh", post.target, sigma_u=0.05).sampler
     start = post.estimands(post.reference())
     near = kernel.data(start)
     exact = with_tolerances(near, 1e4, 1)

@@ -78,8 +78,8 @@ def error_of(moving, one_contrast, **options):
     model = model_of(preset="registration", fixed={"lam": 10.0, "mu": 1.0}, surface_load=1.0, body_load=0.1)
     pair = br.ImagePair(FIXED, moving, one_contrast=one_contrast, independent_points=None, **options)
     posterior = br.build_posterior(MESH, [pair], model)
-    start = flat_position(posterior, posterior.data, posterior.estimands(posterior.reference()))
-    mode = unravel(posterior)(find_mode(posterior, np.asarray(start)))
+    start = flat_position(posterior.target, posterior.data, posterior.estimands(posterior.reference()))
+    mode = unravel(posterior.target)(find_mode(posterior.target, np.asarray(start)))
     found = posterior.constrain(mode)["u_boundary"]
     return np.linalg.norm(np.asarray(found) - displacement(MESH.points), axis=1).mean()
 

@@ -159,7 +159,7 @@ def test_curvature_is_gauss_newtons(share):
     post, place = example(), values(u_sd=0.3)
     images, estimands = post.images._replace(independent_share=jnp.asarray(share)), post.estimands(place)
     data = post.data.with_term("images", images)
-    H = post.mode_search.curvature(data, estimands).gauss_newton
+    H = post.target.mode_search.curvature(data, estimands).gauss_newton
     assert H.shape == (MODES + 3 * len(MESH.boundary),) * 2
     assert np.linalg.eigvalsh(H).min() > -1e-6 * np.trace(H)
     residuals = jax.jit(lambda v: post.images.residuals(post.evaluate(v).u))

@@ -124,7 +124,7 @@ def test_curvature_in_the_displacements_is_the_hessian(similarity):
     """With its remainder, against differences of the gradient; the images differ, so that it is more than rounding."""
     post = posterior(similarity=similarity, rigid_sd=0.5, fixed={"lam": by_tissue(LAM), "mu": by_tissue(MU)})
     u = state(LAM, MU)["u_boundary"]
-    found = post.mode_search.curvature(post.data, {"u_boundary": u})
+    found = post.target.mode_search.curvature(post.data, {"u_boundary": u})
     slope = jax.jit(jax.grad(lambda u: -post.logdensity({"u_boundary": u})))
     for direction in np.random.default_rng(1).normal(size=(3, *u.shape)):
         expected = (slope(u + 1e-4 * direction) - slope(u - 1e-4 * direction)) / 2e-4
@@ -139,7 +139,7 @@ def test_curvature_follows_lam_and_mu():
     u = state(LAM, MU)["u_boundary"]
     data = post.data._replace(blocks={**post.data.blocks, "t_similarity": Scale(jnp.asarray(1e12))})
     soft, stiff, again = (
-        post.mode_search.curvature(data, {"u_boundary": u, "lam": factor * LAM, "mu": factor * MU}).gauss_newton
+        post.target.mode_search.curvature(data, {"u_boundary": u, "lam": factor * LAM, "mu": factor * MU}).gauss_newton
         for factor in (1.0, 2.0, 1.0)
     )
     np.testing.assert_allclose(stiff, 2 * soft, atol=1e-6 * abs(soft).max())

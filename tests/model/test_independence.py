@@ -142,13 +142,13 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted(caplog):
     caplog.set_level(logging.INFO)
     post = posterior(independent_points="residual")
     assert not post.tempered
-    found = temper_target(post, 2, 0)
+    found = temper_target(post.target, 2, 0)
     count = found.independent_points["images"]
     assert found.tempered
     assert caplog.messages
     # The images are smooth, and no displacement makes them equal: far fewer than all are independent.
     assert 1 < count < 0.2 * len(post.images.positions)
-    values = complete(post.data.blocks, found.approached)
+    values = complete(post.data.blocks, found.search_start)
     assert post.count_independent_points(values)["images"] == pytest.approx(count, rel=1e-9)
     same = posterior(independent_points=count)
     assert float(found.logdensity_constrained(values)) == pytest.approx(float(same.logdensity_constrained(values)))
@@ -156,10 +156,10 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted(caplog):
 
 
 def test_a_search_goes_on_where_the_tempering_has_led_to():
-    found = temper_target(posterior(independent_points="residual"), 2, 0)
+    found = temper_target(posterior(independent_points="residual").target, 2, 0)
     start, there = (
         np.asarray(flat_position(found, found.data, at))
-        for at in (found.estimands(found.reference()), found.approached)
+        for at in (found.estimands(found.reference()), found.search_start)
     )
     np.testing.assert_array_equal(approach(found, start), there)
 

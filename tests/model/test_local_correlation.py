@@ -166,7 +166,7 @@ def test_derivatives_of_the_energy_are_those_of_the_loop():
 def test_curvature_in_the_displacements_is_the_hessian():
     """With its remainder, against differences of the gradient; Gauss and Newton's part is positive semidefinite."""
     post, state = posterior(fixed=KNOWN, quadrature="gauss32", rigid_sd=0.5), values()
-    found = post.mode_search.curvature(post.data, {"u_boundary": state["u_boundary"]})
+    found = post.target.mode_search.curvature(post.data, {"u_boundary": state["u_boundary"]})
     slope = jax.jit(jax.grad(lambda u: -post.logdensity_constrained({**state, "u_boundary": u})))
     for direction in np.random.default_rng(1).normal(size=(3, *state["u_boundary"].shape)):
         ahead, behind = (slope(state["u_boundary"] + sign * 1e-4 * direction) for sign in (1, -1))
@@ -268,8 +268,8 @@ def test_predictive_checks_hold_where_the_model_does():
 def test_the_same_windows_serve_smoothed_images():
     post = posterior(quadrature="voxels", fixed=KNOWN)
     estimands = {"u_boundary": values()["u_boundary"]}
-    for stage in post.mode_search.continuation():
-        found = post.evaluate_estimands(stage, estimands)
+    for stage in post.target.mode_search.continuation():
+        found = post.target.evaluate_estimands(stage, estimands)
         assert 0 < float(found.similarity_energy) < np.inf
 
 

@@ -121,12 +121,16 @@ def replicated():
 
     def density(u):
         def at(mu):
-            return post.evaluate_estimands(without_normaliser(post, post.data), {"u_boundary": u, "mu": mu}).logdensity
+            return post.target.evaluate_estimands(
+                without_normaliser(post.target, post.data), {"u_boundary": u, "mu": mu}
+            ).logdensity
 
         return jax.vmap(at)(grid)
 
     without = np.asarray(jax.lax.map(density, draws))
-    normaliser = np.array([float(post.normaliser.log(post.data, {"u_boundary": draws[0], "mu": mu})) for mu in grid])
+    normaliser = np.array(
+        [float(post.target.normaliser.log(post.data, {"u_boundary": draws[0], "mu": mu})) for mu in grid]
+    )
     return tuple(mean_of_level(log_p) - TRUTHS for log_p in (without, without + normaliser))
 
 

@@ -15,10 +15,10 @@ from bayesreg.fem.location import interpolation_at
 from bayesreg.model import curvature
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.build import require_observations
-from bayesreg.model.curvature import _assemble, _outside_curvature, _Seen
+from bayesreg.model.curvature import FixedState, _assemble, _outside_curvature
 from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.state import State
-from bayesreg.model.term import Outside, PointCurvature, SharedCurvature
+from bayesreg.model.term import ExternalTerm, PointCurvature, SharedCurvature
 from bayesreg.types import Equilibrium
 from tests.options import model_of
 from tests.oracles import paper
@@ -148,7 +148,7 @@ def test_density_is_the_gaussian(with_region):
 @pytest.mark.parametrize("with_region", [False, True])
 def test_curvature_is_the_gaussians(with_region):
     post = posterior(with_region)
-    found = post.mode_search.curvature(post.data, post.estimands(post.reference()))
+    found = post.target.mode_search.curvature(post.data, post.estimands(post.reference()))
     np.testing.assert_allclose(found.gauss_newton, np.linalg.inv(exact(with_region)[1]), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(found.remainder, 0, atol=1e-12)
 
@@ -271,8 +271,8 @@ def test_curvature_of_a_term_from_outside_is_the_dense_hessian():
     eigenvalues, vectors = np.linalg.eigh(dense)
     assert eigenvalues.min() < -0.1 < 0.1 < eigenvalues.max()
     convex = (vectors * np.maximum(eigenvalues, 0)) @ vectors.T
-    seen = _Seen(post.data, {}, jnp.zeros(len(mesh.cells)), jnp.zeros(len(mesh.cells)))
-    found = _outside_curvature(Outside(term), seen, jnp.asarray(u)).toarray()
+    seen = FixedState(post.data, {}, jnp.zeros(len(mesh.cells)), jnp.zeros(len(mesh.cells)))
+    found = _outside_curvature(ExternalTerm(term), seen, jnp.asarray(u)).toarray()
     np.testing.assert_allclose(found, convex, atol=1e-10 * eigenvalues.max())
 
 

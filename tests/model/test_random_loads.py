@@ -119,8 +119,8 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
         logs = stats.norm.logpdf(theta[:2], np.log(0.3), 2.0).sum() + stats.norm.logpdf(theta[2])
         return -stats.multivariate_normal.logpdf(apart.T @ moved.ravel(), cov=marginal) - logs
 
-    start = np.asarray(flat_position(post, post.data, post.coordinates.reference()))
-    found = unravel(post)(find_mode(post, start))
+    start = np.asarray(flat_position(post.target, post.data, post.target.coordinates.reference()))
+    found = unravel(post.target)(find_mode(post.target, start))
     found = np.r_[found["body_load"], found["surface_load"], found["mu"]]
     best = minimize(minus_evidence, found + 0.2, method="Nelder-Mead", options={"xatol": 1e-4}).x
     np.testing.assert_allclose(found, best, atol=0.02)

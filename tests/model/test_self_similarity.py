@@ -9,7 +9,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.image import Image
-from bayesreg.model.observations.images.self_similarity import PATCH, InTurn, describe_self_similarity
+from bayesreg.model.observations.images.self_similarity import PATCH, AlternatingImages, describe_self_similarity
 from tests.model.test_contrast import FIXED, MESH, error_of, moved, other_contrast
 from tests.model.test_gradients import assert_gradient
 from tests.options import posterior_of
@@ -75,7 +75,7 @@ def test_a_constant_image_is_like_itself_everywhere():
 def test_images_take_turns(count):
     images = [small_image().interpolator("cubic") for _ in range(6)]
     points = jnp.asarray(RNG.uniform(2, 18, (count, 3)))
-    turns = InTurn.of(images)
+    turns = AlternatingImages.of(images)
     expected = [images[q % 6](points[q]) for q in range(count)]
     np.testing.assert_allclose(turns(points), expected, rtol=1e-12)
     slope = jax.grad(lambda x: turns(x).sum())(points)
@@ -111,7 +111,7 @@ def test_the_curvature_is_the_hessian():
     """Against differences of the gradient."""
     post = posterior(quadrature="gauss32", fixed={"lam": 10.0, "mu": 1.0}, rigid_sd=0.5)
     u = post.constrain(post.initial(jax.random.key(1)))["u_boundary"]
-    found = post.mode_search.curvature(post.data, {"u_boundary": u})
+    found = post.target.mode_search.curvature(post.data, {"u_boundary": u})
     values = post.reference()
     slope = jax.jit(jax.grad(lambda u: -post.logdensity_constrained({**values, "u_boundary": u})))
     for direction in RNG.normal(size=(3, *u.shape)):

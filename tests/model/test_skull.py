@@ -141,7 +141,7 @@ def test_a_soft_skull_lets_nodes_in_at_a_price():
     depth = np.maximum(posterior.mesh.points[posterior.sampled, 2] + 3.0 - wall, 0.0)
     assert 0 < (depth > 0).sum() < len(depth)
     assert float(posterior.energies(values)["skull"]) == pytest.approx(-0.5 * (depth**2).sum() / 0.25)
-    assert posterior.hard_wall is None
+    assert posterior.target.hard_wall is None
     assert np.isfinite(posterior.evaluate(values).logdensity)
     outside = values | {"u_boundary": np.zeros_like(values["u_boundary"])}
     assert float(posterior.energies(outside)["skull"]) == 0

@@ -160,7 +160,7 @@ def test_known_temperatures_are_no_estimands():
 def test_a_temperature_that_is_not_positive_is_outside_the_support(name, value):
     post = posterior(**BOTH, **PROPER)
     state = values(**({"t_similarity": 5.0, "t_elastic": 100.0} | {name: value}))
-    assert not post.supports(post.data, post.estimands(state))
+    assert not post.target.supports(post.data, post.estimands(state))
     assert float(post.logdensity_constrained(state)) == -np.inf
 
 

@@ -5,7 +5,7 @@ from scipy import stats
 
 from bayesreg.image import Image
 from bayesreg.io.records import Run
-from bayesreg.report.parameters import Interval, parameter_table, prior_of, prior_of_scale, reading
+from bayesreg.report.parameters import Interval, describe_bounds, parameter_table, prior_of, prior_of_scale
 from bayesreg.report.study import Study
 from tests.phantoms import box_mesh
 from tests.report.conftest import Draws
@@ -63,17 +63,17 @@ def posterior():
 )
 def test_readings_of_known_laws(law, said):
     draws = law.ppf((np.arange(DRAWS) + 0.5) / DRAWS)
-    assert reading(draws) == said
+    assert describe_bounds(draws) == said
     mirror = {"only an upper bound": "only a lower bound", "only a lower bound": "only an upper bound"}
-    assert reading(1 / draws) == mirror.get(said, said)
+    assert describe_bounds(1 / draws) == mirror.get(said, said)
 
 
 def test_a_posterior_like_its_prior_is_not_identified():
     draws = np.linspace(0, 30, 1001)
-    assert reading(draws, Interval(0.75, 29.25)) == "not identified"
-    assert reading(np.linspace(10, 12, 1001), Interval(0.75, 29.25)) == "identified"
-    assert reading(np.ones(9)) == "fixed"
-    assert reading(np.full(3, np.nan)) == "undefined"
+    assert describe_bounds(draws, Interval(0.75, 29.25)) == "not identified"
+    assert describe_bounds(np.linspace(10, 12, 1001), Interval(0.75, 29.25)) == "identified"
+    assert describe_bounds(np.ones(9)) == "fixed"
+    assert describe_bounds(np.full(3, np.nan)) == "undefined"
 
 
 def test_priors_are_read_from_the_manifest():

@@ -102,7 +102,7 @@ def test_data_are_the_moving_image_at_displaced_points_and_noise(name):
     moving, residuals = posterior.observations["images"].moving, []
     for i, f in enumerate(observed):
         estimands = {key: value[i] for key, value in draws.items()}
-        values = posterior.constrain(posterior.coordinates.unconstrain(posterior.data, estimands))
+        values = posterior.constrain(posterior.target.coordinates.unconstrain(posterior.data, estimands))
         lam, mu = (np.asarray(values[key])[MESH.tissue] for key in ("lam", "mu"))
         u = paper.solve_unknown(
             paper.stiffness(MESH.points, MESH.cells, lam, mu), MESH.boundary, draws["u_boundary"][i]

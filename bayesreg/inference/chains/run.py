@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -29,14 +29,23 @@ from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
 
 
+@runtime_checkable
+class Targeted(Protocol):
+    """A posterior that samplers can draw from, such as `bayesreg.Posterior`."""
+
+    @property
+    def target(self) -> Target:
+        """The posterior as the samplers use it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """The results of sampling.
 
     Attributes
     ----------
-    posterior : Posterior
-        The posterior of the draws, tempered if the options ask for it.
+    target : Target
+        The posterior of the draws as the sampler uses it, tempered if the options ask for it.
     blocks : Blocks
         The draws, as arrays (chain, draw, …) of the estimands and of their statistics.
     u_mean, u_sd : (n, 3) arrays
@@ -56,7 +65,7 @@ class Samples:
         The figures of all estimands, if the stop rule needed them.
     """
 
-    posterior: Target
+    target: Target
     blocks: Blocks
     u_mean: np.ndarray
     u_sd: np.ndarray
@@ -71,16 +80,16 @@ class Samples:
     @cached_property
     def idata(self) -> Any:
         """All draws in memory as ArviZ data (InferenceData or DataTree): posterior and sample_stats."""
-        return to_inference_data(self.posterior, self.blocks)
+        return to_inference_data(self.target, self.blocks)
 
     @cached_property
     def convergence(self) -> Convergence:
         """R̂ and effective sample sizes of every estimand."""
-        return labelled(self.posterior, self.blocks, self.figures or figures(self.blocks))
+        return labelled(self.target, self.blocks, self.figures or figures(self.blocks))
 
 
 def sample(
-    posterior: Target,
+    posterior: Targeted,
     sampler: str = "hmc",
     chains: int = 4,
     draws: int = 1000,
@@ -140,13 +149,14 @@ def sample(
             raise InputError(f"{name} must be at least 1, got {value}")
     stop = stop or StopRule()
     began = time.perf_counter()
+    target = posterior.target
     if resume is None:
-        posterior = temper_target(posterior, chains, seed, start)
-    elif posterior.mode_search is not None and posterior.mode_search.tempering is not None:
+        target = temper_target(target, chains, seed, start)
+    elif target.mode_search is not None and target.mode_search.tempering is not None:
         raise InputError("these draws are of a tempered posterior: resume them with the posterior of their samples")
-    chosen = choose_sampler(sampler, posterior, **settings)
+    chosen = choose_sampler(sampler, target, **settings)
     if resume is None:
-        checkpoint = first_checkpoint(posterior, sampler, chains, seed, start, **settings)
+        checkpoint = first_checkpoint(target, sampler, chains, seed, start, **settings)
         checkpoint = checkpoint._replace(seconds=np.array(time.perf_counter() - began))
         blocks: Blocks = []
         began = time.perf_counter()
@@ -163,19 +173,19 @@ def sample(
             if on_block is not None:
                 on_block(len(blocks) - 1, drawn, checkpoint)
             verdict, ended = _judge(stop, checkpoint, blocks, bar)
-    return _gather_samples(posterior, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
+    return _gather_samples(target, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
 
 
 def temper_target(
-    posterior: Target,
+    target: Target,
     chains: int,
     seed: int,
     start: Start | None = None,
 ) -> Target:
-    """Temper a posterior by its residuals if its options ask for it; `sample` draws from the result."""
-    points = starting_points(posterior, start or Start(), chains, _start_key(seed))
+    """Temper a target by its residuals if its options ask for it; `sample` draws from the result."""
+    points = starting_points(target, start or Start(), chains, _start_key(seed))
     require_numbers(points)
-    return temper(posterior, points)
+    return temper(target, points)
 
 
 def _start_key(seed: int) -> AnyArray:
@@ -183,7 +193,7 @@ def _start_key(seed: int) -> AnyArray:
 
 
 def first_checkpoint(
-    posterior: Target,
+    target: Target,
     sampler: str,
     chains: int,
     seed: int,
@@ -199,9 +209,9 @@ def first_checkpoint(
     """
     began = time.perf_counter()
     key_start = _start_key(seed)
-    points = starting_points(posterior, start or Start(), chains, key_start)
+    points = starting_points(target, start or Start(), chains, key_start)
     require_numbers(points)
-    chosen = choose_sampler(sampler, posterior, **settings)
+    chosen = choose_sampler(sampler, target, **settings)
     setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1))
     data = chosen.sampler.data(setup)
     checkpoint = _first(chosen, data, setup, points)
@@ -210,7 +220,7 @@ def first_checkpoint(
 
 
 def checkpoint_from_arrays(
-    arrays: dict[str, np.ndarray], posterior: Target, sampler: str, chains: int, **settings: Any
+    arrays: dict[str, np.ndarray], target: Target, sampler: str, chains: int, **settings: Any
 ) -> Checkpoint:
     """Convert named arrays to a checkpoint, for the same posterior, sampler and number of chains.
 
@@ -221,9 +231,9 @@ def checkpoint_from_arrays(
     InputError
         If the arrays belong to another problem.
     """
-    chosen = choose_sampler(sampler, posterior, **settings)
-    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), posterior.coordinates.reference())
-    expected = jax.eval_shape(partial(_first, chosen, posterior.data), chosen.sampler.blank(), points)
+    chosen = choose_sampler(sampler, target, **settings)
+    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), target.coordinates.reference())
+    expected = jax.eval_shape(partial(_first, chosen, target.data), chosen.sampler.blank(), points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
     if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:
@@ -303,7 +313,7 @@ def _judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress
 
 
 def _gather_samples(
-    posterior: Target,
+    target: Target,
     exact: bool,
     blocks: Blocks,
     checkpoint: Checkpoint,
@@ -317,7 +327,7 @@ def _gather_samples(
     mean, sd = pool(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
     return Samples(
-        posterior=posterior,
+        target=target,
         blocks=blocks,
         u_mean=mean["u"],
         u_sd=sd["u"],

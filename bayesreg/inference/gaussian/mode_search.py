@@ -70,12 +70,12 @@ def approach(
 ) -> Float[np.ndarray, "dimension"]:
     """Move the displacements along the target's continuation.
 
-    The start is the target's `approached` estimands if it has them, else the given flat position.
+    The start is the target's `search_start` estimands if it has them, else the given flat position.
     """
     assert target.mode_search is not None
     flat = np.asarray(start)
-    if target.mode_search.approached is not None:
-        flat = np.asarray(flat_position(target, target.data, target.mode_search.approached))
+    if target.mode_search.search_start is not None:
+        flat = np.asarray(flat_position(target, target.data, target.mode_search.search_start))
     for data in target.mode_search.continuation():
         flat = _improve(target, data, flat, False, iterations, gain=ROUGH)
     return flat

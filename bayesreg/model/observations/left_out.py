@@ -55,7 +55,7 @@ def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -
     """
     data = posterior.data
     values = complete(data.blocks, estimands)
-    curvature = np.asarray(posterior.mode_search.curvature(data, estimands).gauss_newton)
+    curvature = np.asarray(posterior.target.mode_search.curvature(data, estimands).gauss_newton)
     # The components of a field come first in the rows.
     components = len(curvature) - 3 * len(posterior.sampled)
     H = curvature[components:, components:]

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Blocks, Values
 from bayesreg.model.state import State
-from bayesreg.model.term import Outside
+from bayesreg.model.term import ExternalTerm
 from bayesreg.types import AnyArray
 
 
@@ -88,10 +88,10 @@ class Summarised(Protocol):
 
 
 @runtime_checkable
-class Eased(Protocol):
+class Smoothable(Protocol):
     """An observation that has easier forms for the search for a mode."""
 
-    def eased(self, term: Any, sd: float) -> Any:
+    def smoothed_term(self, term: Any, sd: float) -> Any:
         """Return the term with smoothed data; sd in mm."""
 
 
@@ -111,9 +111,9 @@ def place(observation: Any, mesh: TetMesh, preset: str) -> Placed:
     """Place an observation of any kind on a mesh."""
     if isinstance(observation, Observation):
         return observation.on(mesh, preset)
-    return Placed(observation, Outside(observation), getattr(observation, "blocks", {}))
+    return Placed(observation, ExternalTerm(observation), getattr(observation, "blocks", {}))
 
 
-def points_that_bound(observation: Any) -> Float[np.ndarray, "points 3"] | None:
+def bounding_points(observation: Any) -> Float[np.ndarray, "points 3"] | None:
     """Return the points at which an observation bounds the motion; None if it bounds all of it."""
     return getattr(observation, "fixed_points", None)

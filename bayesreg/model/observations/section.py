@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from bayesreg.io.records import Inputs
-from bayesreg.model.options import is_taken
+from bayesreg.model.options import is_reserved_name
 from bayesreg.settings import Section
 
 Arrays = Mapping[str, np.ndarray]
@@ -59,7 +59,7 @@ class ReportFigure(NamedTuple):
 def _require_free(name: str) -> str:
     if not name.isidentifier():
         raise ValueError("expected a name of letters, digits and _, such as left_lobe")
-    if is_taken(name):
+    if is_reserved_name(name):
         raise ValueError("this name is taken; expected another one")
     return name
 

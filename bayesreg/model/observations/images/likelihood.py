@@ -18,7 +18,7 @@ from bayesreg.fem.elements import Quadrature
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
 from bayesreg.model.observations.images.pointwise import Intensities, ValueCurvature
-from bayesreg.model.observations.images.self_similarity import InTurn
+from bayesreg.model.observations.images.self_similarity import AlternatingImages
 from bayesreg.model.observations.images.similarity import Similarity
 from bayesreg.model.state import State
 from bayesreg.model.term import PointCurvature, SharedCurvature
@@ -55,7 +55,7 @@ class ComparedImages(NamedTuple):
     similarity : Similarity
     fixed_values : (q,) array
         f(x_q).
-    moving : Interpolator or InTurn
+    moving : Interpolator or AlternatingImages
         m, or what is compared of it.
     quadrature : Quadrature
     nodes : (q, 4) int array
@@ -73,7 +73,7 @@ class ComparedImages(NamedTuple):
     comparison: Comparison
     similarity: Similarity
     fixed_values: Float[AnyArray, "points"]
-    moving: Interpolator | InTurn
+    moving: Interpolator | AlternatingImages
     quadrature: Quadrature
     nodes: Int[AnyArray, "points 4"]
     positions: Float[AnyArray, "points 3"]

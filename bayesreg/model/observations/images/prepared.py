@@ -25,7 +25,7 @@ from bayesreg.model.observations.images.likelihood import ComparedImages, Compar
 from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.model.observations.images.points import quadrature_of, require_overlap, seen_points, visibility
 from bayesreg.model.observations.images.pointwise import Intensities, StudentT
-from bayesreg.model.observations.images.self_similarity import InTurn, describe_self_similarity
+from bayesreg.model.observations.images.self_similarity import AlternatingImages, describe_self_similarity
 from bayesreg.model.observations.observation import Placed, Recorded
 from bayesreg.model.state import State
 from bayesreg.settings import is_inferred
@@ -60,7 +60,7 @@ class PreparedPair:
         """Return the compared values of the fixed image at all quadrature points, mm."""
         return self.fixed.interpolate(positions, self.options.interpolation)
 
-    def moving_function(self) -> Interpolator | InTurn:
+    def moving_function(self) -> Interpolator | AlternatingImages:
         """Return the compared values of the moving image as a function of the places of all quadrature points."""
         return self.moving.interpolator(self.options.interpolation)
 
@@ -83,9 +83,9 @@ class PreparedPair:
         InputError
             If the mesh does not overlap an image, or nothing of it is left to compare.
         """
-        of_pair = "" if self.name == "images" else f" of {self.name!r}"
-        require_overlap(mesh, self.fixed, f"fixed image{of_pair}")
-        require_overlap(mesh, self.moving, f"moving image{of_pair}")
+        pair_suffix = "" if self.name == "images" else f" of {self.name!r}"
+        require_overlap(mesh, self.fixed, f"fixed image{pair_suffix}")
+        require_overlap(mesh, self.moving, f"moving image{pair_suffix}")
         visible = None if self.fixed_ignore is None else visibility(self.fixed, self.fixed_ignore)
         return seen_points(mesh, quadrature_of(mesh, self.fixed, self.options), self.moving, visible)
 
@@ -187,7 +187,7 @@ class PreparedPair:
 
     # For the search for the mode
 
-    def eased(self, term: ComparedImages, sd: float) -> ComparedImages:
+    def smoothed_term(self, term: ComparedImages, sd: float) -> ComparedImages:
         """Return the term with further smoothed images, sd in mm."""
         smooth = self._smoothed_by_options().smoothed(sd)
         return term._replace(moving=smooth.moving_function(), fixed_values=smooth.fixed_at(np.asarray(term.positions)))
@@ -237,11 +237,11 @@ class SelfSimilarPair(PreparedPair):
     def fixed_at(self, positions: Float[np.ndarray, "points 3"]) -> Float[AnyArray, "points"]:
         """Return the descriptors of f, one at each point."""
         functions = [fixed.interpolator(self.options.interpolation) for fixed, _ in self.descriptors]
-        return InTurn.of(functions)(jnp.asarray(positions))
+        return AlternatingImages.of(functions)(jnp.asarray(positions))
 
-    def moving_function(self) -> InTurn:
+    def moving_function(self) -> AlternatingImages:
         """Return the descriptors of m, one at each point."""
-        return InTurn.of([moving.interpolator(self.options.interpolation) for _, moving in self.descriptors])
+        return AlternatingImages.of([moving.interpolator(self.options.interpolation) for _, moving in self.descriptors])
 
     def smoothed(self, sd: float) -> SelfSimilarPair:
         """Return the pair with smoothed descriptors, sd in mm."""

@@ -56,7 +56,7 @@ def check_table(name: str, summary: Arrays) -> ReportTable:
         "Neighbouring cells share a face."
     )
     header = ["", "Images", "Model", "How often more", "Residual"]
-    return ReportTable(f"Posterior predictive checks{of_pair(name)}", caption, header, rows)
+    return ReportTable(f"Posterior predictive checks{pair_suffix(name)}", caption, header, rows)
 
 
 def residual_figure(
@@ -74,10 +74,10 @@ def residual_figure(
         caption += f" The residual is {residual}."
     alt = f"Histograms of the residual; its sd is {float(z.std()):.3g}."
     draw = partial(_draw_residual, summary, tissues, expected)
-    return ReportFigure(f"residual-{name}", f"The residual{of_pair(name)}", caption, alt, 2.6, draw)
+    return ReportFigure(f"residual-{name}", f"The residual{pair_suffix(name)}", caption, alt, 2.6, draw)
 
 
-def of_pair(name: str) -> str:
+def pair_suffix(name: str) -> str:
     """Return the part of a title that names the pair; empty for the main pair."""
     return "" if name == "images" else f" of {name}"
 

@@ -58,8 +58,8 @@ class ImagesSection(ObservationSection, ImageOptions):
     @classmethod
     def log_density(cls, name: str) -> str:
         """Return −E_s / T_s in HTML, with the name of the pair if it is not the main pair."""
-        of_pair = "" if name == "images" else f"({name})"
-        return f" − <var>E</var><sub>s</sub>{of_pair} / <var>T</var><sub>s</sub>{of_pair}"
+        pair_suffix = "" if name == "images" else f"({name})"
+        return f" − <var>E</var><sub>s</sub>{pair_suffix} / <var>T</var><sub>s</sub>{pair_suffix}"
 
     @classmethod
     def explain(cls, name: str, described: Mapping[str, Any]) -> str:

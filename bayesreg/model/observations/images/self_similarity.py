@@ -71,7 +71,7 @@ def _patch_distance(image: Image, voxels: np.ndarray, sd: float, shift: np.ndarr
     return np.asarray(ndimage.gaussian_filter((voxels - shifted) ** 2, sd / image.voxel_sizes))
 
 
-class InTurn(NamedTuple):
+class AlternatingImages(NamedTuple):
     """Several images as one function of places: point q uses image q modulo their number (a pytree).
 
     Attributes
@@ -83,7 +83,7 @@ class InTurn(NamedTuple):
     images: Interpolator
 
     @classmethod
-    def of(cls, images: list[Interpolator]) -> InTurn:
+    def of(cls, images: list[Interpolator]) -> AlternatingImages:
         """Combine these images; their grids have one shape."""
         return cls(jax.tree.map(lambda *arrays: jnp.stack(arrays), *images))
 
