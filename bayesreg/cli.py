@@ -295,9 +295,9 @@ def reproduce(folder: RunFolder, out: OutFolder, quiet: Quiet = False) -> None:
     """Run again what a run's folder holds, and tell whether the draws are the same, bit for bit."""
     from bayesreg.workflow.reproduce import reproduce
 
-    found = reproduce(folder, out, progress=not quiet)
-    typer.echo("\n".join(found.lines))
-    if not found.same:
+    comparison = reproduce(folder, out, progress=not quiet)
+    typer.echo("\n".join(comparison.lines))
+    if not comparison.same:
         raise typer.Exit(1)
 
 

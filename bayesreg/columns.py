@@ -26,13 +26,13 @@ def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
             raise NotImplementedError(f"what {function.__name__} shares among chains cannot differ from chain to chain")
         shapes = [(size, *array.shape[own:]) for array, own in zip(arrays, batched[1:], strict=True)]
         longer = [_join(jnp.broadcast_to(x, shape)) for x, shape in zip(arrays, shapes, strict=True)]
-        found, chains = decorated(shared, *longer), shapes[0][-1]
-        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], chains, size), -1, 0), found)
-        return parted, jax.tree.map(lambda _: True, found)
+        results, chains = decorated(shared, *longer), shapes[0][-1]
+        parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], chains, size), -1, 0), results)
+        return parted, jax.tree.map(lambda _: True, results)
 
     return decorated
 
 
 def _join(x: Float[AnyArray, "size *rows chains"]) -> Float[AnyArray, "*rows all_chains"]:
-    moved = jnp.moveaxis(x, 0, -1)
-    return moved.reshape(*moved.shape[:-2], moved.shape[-2] * moved.shape[-1])
+    chains_last = jnp.moveaxis(x, 0, -1)
+    return chains_last.reshape(*chains_last.shape[:-2], chains_last.shape[-2] * chains_last.shape[-1])

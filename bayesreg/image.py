@@ -151,8 +151,8 @@ class Image:
 
     def blocks(self, length: int = 500_000) -> Iterator[tuple[slice, Float[np.ndarray, "k 3"]]]:
         """Yield blocks of up to `length` voxels, in the order of memory, with their world coordinates, mm."""
-        for some in slices(int(np.prod(self.shape)), length):
-            yield some, self.centres(np.arange(some.start, some.stop))
+        for block in slices(int(np.prod(self.shape)), length):
+            yield block, self.centres(np.arange(block.start, block.stop))
 
     def contains(self, points: Float[AnyArray, "*batch 3"]) -> Bool[AnyArray, "*batch"]:
         """Decide which world points (mm) lie on the grid, the extent of its voxels included."""

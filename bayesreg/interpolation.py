@@ -86,8 +86,8 @@ def _with_gradient_jvp(
 
 def _of_one_chain(function: Callable[..., Any], coefficients: AnyArray, *indices: AnyArray) -> Any:
     """Call a function of indices (points, chains) by axis with the indices of one chain, of any shape."""
-    found = function(coefficients, *(index.reshape(-1, 1) for index in indices))
-    return jax.tree.map(lambda x: x.reshape(indices[0].shape), found)
+    results = function(coefficients, *(index.reshape(-1, 1) for index in indices))
+    return jax.tree.map(lambda x: x.reshape(indices[0].shape), results)
 
 
 def _together() -> int:
@@ -105,8 +105,8 @@ def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
         batches = max(-(-count * chains // _together()), 1)
         size = -(-count // batches)
         filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
-        found = jax.lax.map(lambda batch: jax.vmap(partial(at, coefficients))(*batch), filled)
-        return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(found))
+        results = jax.lax.map(lambda batch: jax.vmap(partial(at, coefficients))(*batch), filled)
+        return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(results))
 
     return interpolation
 
@@ -154,13 +154,13 @@ def _taps(spline: _Spline, coefficients: AnyArray, index: tuple[AnyArray, ...]) 
     nearest = [jnp.clip(i, 0.0, end) for i, end in zip(index, last, strict=True)]
     corner = [jax.lax.stop_gradient(jnp.floor(i)) for i in nearest]
     taps = jax.lax.dynamic_slice(coefficients, [first.astype(int) for first in corner], (spline.width,) * 3)
-    places = [i - first for i, first in zip(nearest, corner, strict=True)]
+    offsets = [i - first for i, first in zip(nearest, corner, strict=True)]
     slopes = [
-        tuple(jnp.where((i >= 0) & (i <= end), slope, 0.0) for slope in spline.slopes(place))
-        for i, end, place in zip(index, last, places, strict=True)
+        tuple(jnp.where((i >= 0) & (i <= end), slope, 0.0) for slope in spline.slopes(offset))
+        for i, end, offset in zip(index, last, offsets, strict=True)
     ]
     # Without the barriers XLA fuses the stages and gathers every tap anew for each of the four results.
-    return jax.lax.optimization_barrier((taps, [spline.weights(place) for place in places], slopes))
+    return jax.lax.optimization_barrier((taps, [spline.weights(offset) for offset in offsets], slopes))
 
 
 def _sum_taps(taps: AnyArray, weights: tuple[AnyArray, ...]) -> AnyArray:

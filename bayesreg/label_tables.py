@@ -70,9 +70,9 @@ def recognise_tables(values: Iterable[int]) -> list[str]:
 
     The likeliest table comes first.
     """
-    found = set(values) - {0}
+    labels = set(values) - {0}
     listed = {name: {value for entry in table.values() for value in entry} for name, table in TABLES.items()}
-    return [name for name in TABLES if _MARKS[name] <= found <= listed[name]]
+    return [name for name in TABLES if _MARKS[name] <= labels <= listed[name]]
 
 
 def as_range(text: str) -> list[int]:
@@ -97,20 +97,20 @@ def read_label_names(path: str | Path) -> dict[str, int]:
     ValueError
         If the file has no label names.
     """
-    found: dict[str, int] = {}
+    labels: dict[str, int] = {}
     for line in Path(path).read_text(encoding="utf-8", errors="replace").splitlines():
         quoted = re.fullmatch(r'\s*(\d+)\s.*"([^"]+)"\s*', line)
         plain = re.match(r"\s*(\d+)\s+([^\s\d#]\S*)", line)
         if entry := quoted or plain:
-            found[entry[2]] = int(entry[1])
-    if not found:
+            labels[entry[2]] = int(entry[1])
+    if not labels:
         raise ValueError(
             f"{path} holds no label names; expected lines such as: 2 Left-Cerebral-White-Matter 245 245 245 0"
         )
-    return found
+    return labels
 
 
 def name_values(entry: object, known: Mapping[str, int]) -> object:
     """Replace the names of labels in an entry of a table by their values."""
     several = entry if isinstance(entry, list | tuple) else [entry]
-    return [known.get(one, one) if isinstance(one, str) else one for one in several]
+    return [known.get(label, label) if isinstance(label, str) else label for label in several]

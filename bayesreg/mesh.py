@@ -131,9 +131,9 @@ def boundary_faces_of(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "fac
 
 def faces_across(cells: Int[np.ndarray, "cells 4"]) -> Int[np.ndarray, "cells 4"]:
     """Find the neighbour of each tetrahedron across the face opposite to each corner; −1 if there is none."""
-    one, other = _shared_faces(cells).T
+    face, same_face = _shared_faces(cells).T
     across = np.full(4 * len(cells), -1)
-    across[one], across[other] = other // 4, one // 4
+    across[face], across[same_face] = same_face // 4, face // 4
     return across.reshape(-1, 4)
 
 

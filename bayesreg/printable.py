@@ -18,8 +18,8 @@ NONE = "–"
 
 def find_unprintable(text: str) -> str | None:
     """Find the first character that cannot be printed, such as U+0085; None if all can be printed."""
-    found = _UNPRINTABLE.search(text)
-    return None if found is None else f"U+{ord(found[0]):04X}"
+    match = _UNPRINTABLE.search(text)
+    return None if match is None else f"U+{ord(match[0]):04X}"
 
 
 def require_printable(names: Iterable[str], where: str) -> None:

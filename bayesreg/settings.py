@@ -40,15 +40,15 @@ def _find(value: object, info: ValidationInfo, serves: Callable[[Path], bool]) -
     if is_stored(info):
         return Path(value)
     folders = (info.context or {}).get("folders", ()) or search_folders()
-    places = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
-    for place in places:
+    paths = list(dict.fromkeys((folder / Path(value).expanduser()).absolute() for folder in folders))
+    for path in paths:
         try:
-            if serves(place):
-                return place
+            if serves(path):
+                return path
         except (OSError, ValueError) as error:
             raise ValueError(f"no path of a file: {getattr(error, 'strerror', None) or error}") from None
     hint = "" if Path(value).is_absolute() or os.environ.get(DATA_FOLDER) else f" (and {DATA_FOLDER} is not set)"
-    raise ValueError(f"no such file; looked for {' and '.join(map(str, places))}{hint}")
+    raise ValueError(f"no such file; looked for {' and '.join(map(str, paths))}{hint}")
 
 
 def search_folders(*beside: Path) -> list[Path]:

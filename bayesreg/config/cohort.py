@@ -111,7 +111,7 @@ def load_cohort(path: str | Path) -> Cohort:
         raise ConfigError(f"the cohort {path}: sweep.{empty[0]} has no value")
     if (count := len(rows) * prod(map(len, cohort.sweep.values()))) > MOST_TASKS:
         raise ConfigError(f"the cohort {path} has {count:,} runs, more than the {MOST_TASKS:,} of one batch")
-    tasks = [task for subject, given in rows.items() for task in _tasks(subject, given, cohort.sweep)]
+    tasks = [task for subject, row in rows.items() for task in _tasks(subject, row, cohort.sweep)]
     names: set[str] = set()
     for task in tasks:
         if task.name in names:
@@ -135,7 +135,7 @@ def _of_table(path: Path) -> dict[str, dict[str, str]]:
         raise ConfigError(f"subjects: {path} has the column {twice[0]!r} twice")
     if SUBJECT not in header:
         raise ConfigError(f"subjects: {path} has no column {SUBJECT}; its columns are {', '.join(header) or 'none'}")
-    found: dict[str, dict[str, str]] = {}
+    rows: dict[str, dict[str, str]] = {}
     for number, line in enumerate(lines[1:], start=2):
         if len(line) != len(header):
             raise ConfigError(f"{path}, row {number}: {len(line)} cells under {len(header)} columns")
@@ -148,11 +148,11 @@ def _of_table(path: Path) -> dict[str, dict[str, str]]:
                 f"{path}, row {number}: a subject is named by letters, digits, . _ -, up to 100 of them, and not as a "
                 f"table of the batch; got {subject!r:.120}"
             )
-        if subject in found:
+        if subject in rows:
             raise ConfigError(f"{path}, row {number}: subject {subject} is there twice")
-        given = {key: cell for key, cell in row.items() if cell}
-        found[subject] = {key: _beside(path.parent, cell) if _names_file(key) else cell for key, cell in given.items()}
-    return found
+        cells = {key: cell for key, cell in row.items() if cell}
+        rows[subject] = {key: _beside(path.parent, cell) if _names_file(key) else cell for key, cell in cells.items()}
+    return rows
 
 
 def _names_file(key: str) -> bool:
@@ -162,28 +162,28 @@ def _names_file(key: str) -> bool:
 def _beside(folder: Path, value: str) -> str:
     """Make a path relative to the table absolute if it exists; return any other value unchanged."""
     try:
-        place = folder / value
-        return str(place) if place.exists() else value
+        path = folder / value
+        return str(path) if path.exists() else value
     except (OSError, ValueError):
         return value
 
 
 def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[str, str]]:
     """Find the files of every subject that matches at least one of the patterns."""
-    found: dict[str, dict[str, str]] = {}
+    files: dict[str, dict[str, str]] = {}
     for key, pattern in patterns.items():
         if "{subject}" not in pattern:
             raise ConfigError(f"subjects: {key}: the pattern {pattern!r} does not hold {{subject}}")
         for subject, path in _matches(pattern, folder):
-            if key in found.setdefault(subject, {}):
-                raise ConfigError(f"subjects: {key}: {found[subject][key]} and {path} are both of subject {subject}")
-            found[subject][key] = str(path)
+            if key in files.setdefault(subject, {}):
+                raise ConfigError(f"subjects: {key}: {files[subject][key]} and {path} are both of subject {subject}")
+            files[subject][key] = str(path)
     # A subject that lacks a file gets the path of the pattern: the run then reports this path as missing, and does not
     # use a file of the shared configuration.
     return {
         subject: {key: str(folder / pattern.replace("{subject}", subject)) for key, pattern in patterns.items()}
-        | found[subject]
-        for subject in sorted(found)
+        | files[subject]
+        for subject in sorted(files)
     }
 
 

@@ -56,12 +56,12 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
         The file and line of each key ("run.yaml:3"), by the key's path.
     """
     errors = error.errors(include_url=False)
-    found = [(_path(details, data, model), details) for details in errors[:MOST_ERRORS]]
+    entries = [(_path(details, data, model), details) for details in errors[:MOST_ERRORS]]
     messages: dict[Keys, list[str]] = {}
-    for path, details in found:
-        if not any(_explains(*other, path, details["type"]) for other in found):
+    for path, details in entries:
+        if not any(_explains(*other, path, details["type"]) for other in entries):
             messages.setdefault(path, []).append(_message(details, model))
-    lines = [f"  {_head(path, data, origins)}: {_join(some)}" for path, some in messages.items()]
+    lines = [f"  {_head(path, data, origins)}: {_join(texts)}" for path, texts in messages.items()]
     more = len({details["loc"] for details in errors}) - MOST_ERRORS
     return "\n".join([*lines, *([f"  and {more:,} more"] if more > 0 else [])])
 
@@ -115,8 +115,8 @@ def _head(path: Keys, data: Any, origins: dict[Keys, str]) -> str:
     origin = next((origins[path[:n]] for n in range(present, 0, -1) if path[:n] in origins), None)
     shown = json.dumps(value, default=str, ensure_ascii=False)
     name = ".".join(map(str, path)) or "the whole"
-    found = f" = {shown}" if present == len(path) and len(shown) <= 60 else ""
-    return f"{origin}: {name}{found}" if origin else name + found
+    value_text = f" = {shown}" if present == len(path) and len(shown) <= 60 else ""
+    return f"{origin}: {name}{value_text}" if origin else name + value_text
 
 
 def _message(details: ErrorDetails, model: type[BaseModel]) -> str:
@@ -153,7 +153,7 @@ def _fields_at(location: Keys, model: type[BaseModel]) -> dict[str, FieldInfo]:
 
 def _models(field: FieldInfo) -> list[type[BaseModel]]:
     models = [m for m in _leaves(field.annotation) if isinstance(m, type) and issubclass(m, BaseModel)]
-    return [m for one in models for m in (kinds().values() if one is ObservationSection else (one,))]
+    return [m for model in models for m in (kinds().values() if model is ObservationSection else (model,))]
 
 
 def _tags(model: type[BaseModel]) -> set[object]:

@@ -171,8 +171,8 @@ def _lines(node: Node, path: Keys = ()) -> Iterator[tuple[Keys, int]]:
         children = [(index, value, value) for index, value in enumerate(node.value)]
     else:
         children = []
-    for key, place, value in children:
-        yield (*path, key), place.start_mark.line + 1
+    for key, first_node, value in children:
+        yield (*path, key), first_node.start_mark.line + 1
         yield from _lines(value, (*path, key))
 
 
@@ -210,7 +210,7 @@ def _with_value(data: Any, keys: Sequence[str], value: Any, text: str) -> Any:
         if not (first.isdecimal() and int(first) < len(data)):
             raise ConfigError(f"--set {text}: {first} is no entry of a list of {len(data)}; they are numbered from 0")
         changed = _with_value(data[int(first)], rest, value, text) if rest else value
-        return [changed if index == int(first) else one for index, one in enumerate(data)]
+        return [changed if index == int(first) else entry for index, entry in enumerate(data)]
     if not isinstance(data, dict):
         raise ConfigError(f"--set {text}: {first} would lie under {data!r:.60}, which has no keys")
     return {**data, first: _with_value(data.get(first), rest, value, text) if rest else value}

@@ -55,8 +55,8 @@ class StartConfig(Section):
 
     def entries(self, name: Literal["lam", "mu"], names: Iterable[str]) -> dict[str, float] | None:
         """Return the start value of every named entry of λ or μ; None if the model chooses them."""
-        given = getattr(self, name)
-        return dict.fromkeys(names, given) if isinstance(given, float) else given
+        start = getattr(self, name)
+        return dict.fromkeys(names, start) if isinstance(start, float) else start
 
 
 class StopConfig(Section):
@@ -168,17 +168,17 @@ def complete(given: Mapping[str, Any]) -> dict[str, Any]:
     The default preset is `registration` for data from files, and `paper` for a synthetic pair or a known boundary. The
     default observation is the pair of images, if there is one.
     """
-    data, found = given.get("data"), dict(given)
+    data, completed = given.get("data"), dict(given)
     if not isinstance(data, Mapping):
-        return found
+        return completed
     from_files = data.get("source") == "files"
     if given.get("observations") is None:
-        found["observations"] = [] if from_files and data.get("fixed") is None else [{"kind": "images"}]
+        completed["observations"] = [] if from_files and data.get("fixed") is None else [{"kind": "images"}]
     model = given.get("model") or {}
     if isinstance(model, Mapping) and "preset" not in model:
         registers = from_files and given.get("known_boundary") is None
-        found["model"] = {"preset": "registration" if registers else "paper", **model}
-    return found
+        completed["model"] = {"preset": "registration" if registers else "paper", **model}
+    return completed
 
 
 def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -187,12 +187,14 @@ def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
     preset = model.get("preset") if isinstance(model, Mapping) else getattr(model, "preset", None)
     if preset not in ("paper", "registration") or not isinstance(observations, list):
         return dict(given)
-    are_images = [isinstance(one, Mapping) and one.get("kind") == "images" for one in observations]
+    are_images = [
+        isinstance(observation, Mapping) and observation.get("kind") == "images" for observation in observations
+    ]
     return {
         **given,
         "observations": [
-            with_preset(preset, one) if is_images else one
-            for one, is_images in zip(observations, are_images, strict=True)
+            with_preset(preset, observation) if is_images else observation
+            for observation, is_images in zip(observations, are_images, strict=True)
         ],
     }
 
@@ -271,7 +273,7 @@ class Config(Section):
     @classmethod
     def _are_there(cls, observations: Observations, info: ValidationInfo) -> Observations:
         data = info.data.get("data")
-        names = [one.name for one in observations if isinstance(one, ImagesSection)]
+        names = [observation.name for observation in observations if isinstance(observation, ImagesSection)]
         if names and data is not None and not _has_images(data):
             raise ValueError("images are observed, and data has none; expected data.fixed and data.moving")
         if names and "images" not in names:
@@ -288,7 +290,7 @@ class Config(Section):
     @property
     def pairs_of_images(self) -> list[ImagesSection]:
         """The pairs of images among the observations; the pair of the section data comes first."""
-        pairs = [one for one in self.observations if isinstance(one, ImagesSection)]
+        pairs = [observation for observation in self.observations if isinstance(observation, ImagesSection)]
         return sorted(pairs, key=lambda pair: pair.fixed is not None)
 
     @property
@@ -310,8 +312,8 @@ class Config(Section):
             return model
         names = info.data["data"].tissues
         for key, section in (("fixed", model.fixed or {}), ("priors", model.priors)):
-            for parameter, given in section.items():
-                _require_tissues(f"{key}.{parameter}", given, names)
+            for parameter, values in section.items():
+                _require_tissues(f"{key}.{parameter}", values, names)
         if info.data.get("known_boundary") is not None:
             _require_nothing_else(model)
             if names is not None:

@@ -32,10 +32,10 @@ def _as_list(value: object) -> object:
     several = (value,) if isinstance(value, int | str) and not isinstance(value, bool) else value
     if not isinstance(several, Sequence):
         return value
-    found: list[object] = []
-    for one in several:
-        found += as_range(one) if isinstance(one, str) else [one]
-    return tuple(found)
+    labels: list[object] = []
+    for label in several:
+        labels += as_range(label) if isinstance(label, str) else [label]
+    return tuple(labels)
 
 
 def _ascending(pair: tuple[float, float]) -> tuple[float, float]:

@@ -78,15 +78,17 @@ def _require_tree(node: Node | None, name: str) -> None:
     # Each waiting node has the identities of its ancestors; a node among them forms a cycle.
     waiting: list[tuple[Node, frozenset[int]]] = [] if node is None else [(node, frozenset())]
     while waiting:
-        one, above = waiting.pop()
+        current_node, above = waiting.pop()
         count += 1
-        if id(one) in above:
-            raise ConfigError(f"{name}, line {one.start_mark.line + 1}: an anchor that holds itself")
+        if id(current_node) in above:
+            raise ConfigError(f"{name}, line {current_node.start_mark.line + 1}: an anchor that holds itself")
         if count > MOST_ENTRIES:
             raise ConfigError(f"{name}: aliases make more than {MOST_ENTRIES:,} entries")
-        if isinstance(one, MappingNode) and (odd := [key for key, _ in one.value if not isinstance(key, ScalarNode)]):
+        if isinstance(current_node, MappingNode) and (
+            odd := [key for key, _ in current_node.value if not isinstance(key, ScalarNode)]
+        ):
             raise ConfigError(f"{name}, line {odd[0].start_mark.line + 1}: a key that is no text")
-        waiting += [(child, above | {id(one)}) for child in _children(one)]
+        waiting += [(child, above | {id(current_node)}) for child in _children(current_node)]
 
 
 def _children(node: Node) -> Iterator[Node]:

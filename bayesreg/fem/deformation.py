@@ -96,12 +96,12 @@ class Displaced:
 
     def displacement(self, points: Float[np.ndarray, "k 3"], location: Location) -> Float[np.ndarray, "k 3"]:
         """Compute the displacement of points, mm; `location` is the result of `Deformer.locate` for them."""
-        found = _interpolate(self._everywhere, self.deformer.surroundings.cells, location)
+        displacements = _interpolate(self._everywhere, self.deformer.surroundings.cells, location)
         far = location.cell < 0
         if far.any():
-            around = self.deformer.surroundings
-            found[far] = around.move_rigidly(around.rigid_motion(self.u), points[far])
-        return found
+            surroundings = self.deformer.surroundings
+            displacements[far] = surroundings.move_rigidly(surroundings.rigid_motion(self.u), points[far])
+        return displacements
 
     @cached_property
     def _to_barycentric(self) -> Float[np.ndarray, "all_cells 4 4"]:
@@ -139,8 +139,8 @@ class Displaced:
         the inverse is exact up to rounding. If tetrahedra are folded, one of several sources is returned.
         """
         location = self._locate(places) if near is None else self._step(places, near)
-        around = self.deformer.surroundings
-        points = _interpolate(around.points, around.cells, location)
+        surroundings = self.deformer.surroundings
+        points = _interpolate(surroundings.points, surroundings.cells, location)
         far = location.cell < 0
         if far.any():
             points[far] = self._rigid_sources(places[far])
@@ -156,11 +156,11 @@ class Displaced:
     def _try_all(self, places: Float[np.ndarray, "k 3"]) -> Location:
         """Find a few points by trying all tetrahedra, without the preparation of a `CellSearch`."""
         maps = self._to_barycentric
-        found = np.einsum("mai,ki->kma", maps[:, :, 1:], places) + maps[:, :, 0]
-        least = np.nan_to_num(found.min(axis=2), nan=-np.inf)
+        coordinates = np.einsum("mai,ki->kma", maps[:, :, 1:], places) + maps[:, :, 0]
+        least = np.nan_to_num(coordinates.min(axis=2), nan=-np.inf)
         cell = np.where((least >= -TOLERANCE).any(axis=1), (least >= -TOLERANCE).argmax(axis=1), least.argmax(axis=1))
         rows = np.arange(len(places))
-        barycentric = found[rows, cell]
+        barycentric = coordinates[rows, cell]
         cell[least[rows, cell] < -GAP] = -1
         return Location(cell, barycentric)
 
@@ -170,15 +170,15 @@ class Displaced:
         barycentric, left = np.full((len(places), 4), np.nan), np.flatnonzero(cell >= 0)
         lost = [np.flatnonzero(cell < 0)]
         for _ in range(MOST_STEPS):
-            here = cell[left]
-            maps = self._to_barycentric[here]
-            found = np.einsum("kai,ki->ka", maps[:, :, 1:], places[left]) + maps[:, :, 0]
-            barycentric[left] = found
-            least = found.argmin(axis=1)
+            current = cell[left]
+            maps = self._to_barycentric[current]
+            coordinates = np.einsum("kai,ki->ka", maps[:, :, 1:], places[left]) + maps[:, :, 0]
+            barycentric[left] = coordinates
+            least = coordinates.argmin(axis=1)
             # In a tetrahedron that is turned inside out all coordinates are NaN: its points are left to the search.
-            outside = ~(found[np.arange(len(left)), least] >= -TOLERANCE)
-            left, onwards = left[outside], across[here[outside], least[outside]]
-            stuck = (onwards < 0) | np.isnan(found[outside]).any(axis=1)
+            outside = ~(coordinates[np.arange(len(left)), least] >= -TOLERANCE)
+            left, onwards = left[outside], across[current[outside], least[outside]]
+            stuck = (onwards < 0) | np.isnan(coordinates[outside]).any(axis=1)
             lost.append(left[stuck])
             left, onwards = left[~stuck], onwards[~stuck]
             cell[left] = onwards
@@ -191,10 +191,10 @@ class Displaced:
 
     def _rigid_sources(self, places: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
         """Compute the sources of points beyond the sphere, where y = x + a + ω × (x − c)."""
-        around = self.deformer.surroundings
-        motion = around.rigid_motion(self.u)
+        surroundings = self.deformer.surroundings
+        motion = surroundings.rigid_motion(self.u)
         linear = np.eye(3) + np.cross(motion[3:], np.eye(3)).T
-        return around.centre + np.linalg.solve(linear, (places - around.centre - motion[:3]).T).T
+        return surroundings.centre + np.linalg.solve(linear, (places - surroundings.centre - motion[:3]).T).T
 
 
 def _interpolate(
@@ -202,10 +202,10 @@ def _interpolate(
 ) -> Float[np.ndarray, "k 3"]:
     """Interpolate nodal values at points; the result is NaN for points in no tetrahedron."""
     corners = cells[location.cell]
-    found = location.barycentric[:, :1] * values[corners[:, 0]]
+    interpolated = location.barycentric[:, :1] * values[corners[:, 0]]
     for corner in range(1, 4):
-        found += location.barycentric[:, corner : corner + 1] * values[corners[:, corner]]
-    return found
+        interpolated += location.barycentric[:, corner : corner + 1] * values[corners[:, corner]]
+    return interpolated
 
 
 def _search_twice(search: CellSearch, points: Float[np.ndarray, "k 3"]) -> Location:

@@ -93,14 +93,14 @@ def schur_determinant(
     supported = unknowns_of(np.setdiff1d(np.arange(len(mesh.points)), held))
     supported = np.setdiff1d(supported, unknowns_of(sampled)[isostatic])
     free = unknowns_of(np.setdiff1d(np.arange(len(mesh.points)), prescribed))
-    found = SchurDeterminant(
+    determinant = SchurDeterminant(
         supported=band_layout(mesh, supported),
         free=band_layout(mesh, free) if len(free) else None,
         log_null=jnp.asarray(2 * np.linalg.slogdet(null[isostatic])[1]),
         rank=jnp.asarray(float(3 * len(sampled) - null.shape[1])),
     )
-    _require_definite(mesh, found)
-    return found
+    _require_definite(mesh, determinant)
+    return determinant
 
 
 def rigid_freedom(
@@ -164,8 +164,8 @@ def bandwidth(graph: scipy.sparse.csr_matrix, order: Int[np.ndarray, "nodes"]) -
 
 def _require_definite(mesh: TetMesh, determinant: SchurDeterminant) -> None:
     """Raise InputError if a pivot is zero compared with the diagonal of K: K then has other null vectors than N."""
-    one = jnp.ones(len(mesh.cells))
-    band = _assemble(elements_of(mesh), one, one, determinant.supported)
+    ones = jnp.ones(len(mesh.cells))
+    band = _assemble(elements_of(mesh), ones, ones, determinant.supported)
     pivots = jnp.diagonal(_factorise(band)[0], axis1=1, axis2=2) ** 2 / jnp.diagonal(band[:, 0], axis1=1, axis2=2)
     if not (pivots > 1e-12).all():
         raise InputError(
@@ -242,8 +242,8 @@ def _factorise(
         return found.at[k + BLOCKS_BELOW].set(jnp.concatenate([factor, panel]).reshape(column.shape))
 
     nothing = jnp.zeros((BLOCKS_BELOW + columns, *band.shape[1:]), band.dtype)
-    found = jax.lax.fori_loop(0, columns, eliminate, nothing)[BLOCKS_BELOW:]
-    return found[:, 0], found[:, 1:].reshape(columns, -1, width)
+    cholesky_factor = jax.lax.fori_loop(0, columns, eliminate, nothing)[BLOCKS_BELOW:]
+    return cholesky_factor[:, 0], cholesky_factor[:, 1:].reshape(columns, -1, width)
 
 
 def _inverse_in_band(
@@ -260,9 +260,9 @@ def _inverse_in_band(
         factor, panel = column
         gain = solve_triangular(factor, panel.T, lower=True, trans=1)
         below = -window @ gain.T
-        here = cho_solve((factor, True), jnp.eye(width)) - gain @ below
+        diagonal = cho_solve((factor, True), jnp.eye(width)) - gain @ below
         kept = below[:-width]
-        window = jnp.block([[here, kept.T], [kept, window[:-width, :-width]]])
-        return window, jnp.concatenate([here, below])
+        window = jnp.block([[diagonal, kept.T], [kept, window[:-width, :-width]]])
+        return window, jnp.concatenate([diagonal, below])
 
     return jax.lax.scan(ascend, jnp.zeros((height, height)), (factors, panels), reverse=True)[1]

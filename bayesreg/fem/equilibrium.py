@@ -127,8 +127,8 @@ def _response(
     start = () if guess is None else (guess[system.free],)
 
     def solve(_: LinearMap, load: AnyArray) -> tuple[AnyArray, SolverInfo]:
-        found = conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
-        return jax.tree.map(lambda x: x[..., 0], found)
+        solution = conjugate_gradients((system, tolerance), *(x[..., None] for x in (lam, mu, load, *start)))
+        return jax.tree.map(lambda x: x[..., 0], solution)
 
     apply = partial(_force, system, system.free_derivative, system.free_derivative, lam, mu)
     if start:

@@ -137,10 +137,10 @@ def _search(
     left = np.flatnonzero(first < last)
     while left.size:
         trial = bins.cells[first[left]]
-        found = np.einsum("kai,ki->ka", to_barycentric[trial], query[left] - origin[trial])
-        found[:, 0] += 1
-        inside = found.min(axis=1) >= -tolerance
-        cell[left[inside]], barycentric[left[inside]] = trial[inside], found[inside]
+        coordinates = np.einsum("kai,ki->ka", to_barycentric[trial], query[left] - origin[trial])
+        coordinates[:, 0] += 1
+        inside = coordinates.min(axis=1) >= -tolerance
+        cell[left[inside]], barycentric[left[inside]] = trial[inside], coordinates[inside]
         first[left] += 1
         left = left[~inside]
         left = left[first[left] < last[left]]
@@ -242,8 +242,8 @@ def _in_threads(
     cell, barycentric = np.empty(len(query), int), np.empty((len(query), corners))
     parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
     with ThreadPoolExecutor(max_workers=_THREADS) as pool:
-        for part, found in zip(parts, pool.map(search, (query[part] for part in parts)), strict=True):
-            cell[part], barycentric[part] = found
+        for part, location in zip(parts, pool.map(search, (query[part] for part in parts)), strict=True):
+            cell[part], barycentric[part] = location
     return Location(cell, barycentric)
 
 

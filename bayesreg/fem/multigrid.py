@@ -131,8 +131,8 @@ def _scale(
     rows: Float[np.ndarray, "rows"],
     columns: Float[np.ndarray, "columns"],
 ) -> scipy.sparse.csr_array:
-    found = scipy.sparse.csr_array(matrix)
-    return scipy.sparse.csr_array(scipy.sparse.diags_array(rows) @ found @ scipy.sparse.diags_array(columns))
+    sparse_matrix = scipy.sparse.csr_array(matrix)
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(rows) @ sparse_matrix @ scipy.sparse.diags_array(columns))
 
 
 def _above_the_eigenvalues(matrix: scipy.sparse.csr_array) -> float:

@@ -107,9 +107,9 @@ def _multiply_in_batches(operands: Sequence[AnyArray], axes: Sequence[int | None
     *of_matrices, axis = axes
     if axis is None or any(each is not None for each in of_matrices):
         raise NotImplementedError("the matrix of a sparse product cannot differ from chain to chain")
-    moved = jnp.moveaxis(x, axis, -1)
-    found = _product.bind(*matrices, moved.reshape(len(moved), -1))
-    return found.reshape(len(found), *moved.shape[1:]), 2
+    chains_last = jnp.moveaxis(x, axis, -1)
+    product = _product.bind(*matrices, chains_last.reshape(len(chains_last), -1))
+    return product.reshape(len(product), *chains_last.shape[1:]), 2
 
 
 def _transpose(cotangent: Any, *operands: Any) -> list[Any]:

@@ -72,10 +72,10 @@ def reference_inverse(matrix: scipy.sparse.csr_matrix) -> ReferenceInverse:
     InputError
         If the matrix is not positive definite, because the prescribed nodes do not fix the mesh.
     """
-    found = _scaled_factor(matrix)
-    if found is None:
+    scaled_factor = _scaled_factor(matrix)
+    if scaled_factor is None:
         raise InputError(SINGULAR)
-    scale, factor = found
+    scale, factor = scaled_factor
     inverse = scipy.linalg.cho_solve(factor, np.eye(len(scale)))
     return ReferenceInverse(jnp.asarray(scale), jnp.asarray((inverse + inverse.T) / 2, jnp.float32))
 
@@ -93,9 +93,9 @@ def solve(
     InputError
         If the matrix is singular or not finite.
     """
-    found = _scaled_factor(matrix) if matrix.shape[0] <= DENSE_LIMIT else None
-    if found is not None:
-        scale, factor = found
+    scaled_factor = _scaled_factor(matrix) if matrix.shape[0] <= DENSE_LIMIT else None
+    if scaled_factor is not None:
+        scale, factor = scaled_factor
         return scale[:, None] * scipy.linalg.cho_solve(factor, scale[:, None] * right)
     try:
         return scipy.sparse.linalg.splu(matrix.tocsc()).solve(right)

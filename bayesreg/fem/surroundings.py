@@ -70,8 +70,8 @@ class Surroundings:
         """Extend a displacement of the mesh's nodes, mm, to the nodes around the mesh."""
         motion, boundary = self.rigid_motion(u), self.mesh.boundary
         rest = u[boundary] - self.move_rigidly(motion, self.mesh.points[boundary])
-        around = self.points[len(self.mesh.points) :]
-        return np.concatenate([u, self.move_rigidly(motion, around) + self.harmonic @ rest])
+        outer_points = self.points[len(self.mesh.points) :]
+        return np.concatenate([u, self.move_rigidly(motion, outer_points) + self.harmonic @ rest])
 
 
 def surround(mesh: TetMesh) -> Surroundings:
@@ -88,15 +88,15 @@ def surround(mesh: TetMesh) -> Surroundings:
     """
     centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
     surface = _Surface.of(mesh)
-    around = np.concatenate([_lattice(mesh, centre), _sphere(mesh, centre)])
-    cells = Delaunay(np.concatenate([surface.points, around])).simplices
+    outer_points = np.concatenate([_lattice(mesh, centre), _sphere(mesh, centre)])
+    cells = Delaunay(np.concatenate([surface.points, outer_points])).simplices
     for _ in range(MOST_ROUNDS):
         refined = surface.refined(surface.missing(cells))
         if not len(surface.points) < len(refined.points) < MOST_NODES * len(mesh.boundary):
             break
         surface = refined
-        cells = Delaunay(np.concatenate([surface.points, around])).simplices
-    points = np.concatenate([surface.points, around])
+        cells = Delaunay(np.concatenate([surface.points, outer_points])).simplices
+    points = np.concatenate([surface.points, outer_points])
     cells = _outside(mesh, points, cells)
     count = len(surface.points)
     harmonic = _harmonic(points, cells, surface.weights, count, len(points) - ON_SPHERE)
@@ -200,19 +200,19 @@ def _lattice(mesh: TetMesh, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray,
     The nodes have small random shifts, so that no five of them lie on one sphere.
     """
     edge, radius, rng = mesh.boundary_edge, _radius(mesh, centre), np.random.default_rng(0)
-    search, boundary, found = CellSearch(mesh.points, mesh.cells), _samples(mesh), []
-    for nearest, furthest, apart in SHELLS:
-        spacing = 1.25 * apart * edge
+    search, boundary, shells = CellSearch(mesh.points, mesh.cells), _samples(mesh), []
+    for nearest, furthest, separation in SHELLS:
+        spacing = 1.25 * separation * edge
         reach = np.minimum(np.ptp(mesh.points, axis=0).max() / 2 + furthest * edge, radius)
         ticks = np.arange(-reach, reach + spacing, spacing)
         grid = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
         points = centre + np.concatenate([grid, grid + spacing / 2])
         points = points + 0.1 * spacing * rng.uniform(-1, 1, points.shape)
         distance = boundary.query(points)[0] / edge
-        within = np.linalg.norm(points - centre, axis=1) < radius - 0.6 * apart * edge
+        within = np.linalg.norm(points - centre, axis=1) < radius - 0.6 * separation * edge
         points = points[(distance >= nearest) & (distance < furthest) & within]
-        found.append(points[search(points).cell < 0])
-    return np.concatenate(found)
+        shells.append(points[search(points).cell < 0])
+    return np.concatenate(shells)
 
 
 def _samples(mesh: TetMesh) -> cKDTree:
@@ -247,16 +247,16 @@ def _harmonic(
     even if tetrahedra are flat. The Laplacian of finite elements does not have this property.
     """
     pairs = np.array(list(combinations(range(4), 2)))
-    one, other = np.unique(np.sort(cells[:, pairs].reshape(-1, 2), axis=1), axis=0).T
-    length = np.linalg.norm(points[one] - points[other], axis=1)
+    start, end = np.unique(np.sort(cells[:, pairs].reshape(-1, 2), axis=1), axis=0).T
+    length = np.linalg.norm(points[start] - points[end], axis=1)
     count = len(points)
-    links = scipy.sparse.coo_array((length, (one, other)), (count, count))
+    links = scipy.sparse.coo_array((length, (start, end)), (count, count))
     links = (links + links.T).tocsr()
     laplacian = (scipy.sparse.diags_array(links.sum(axis=1)) - links).tocsr()
-    found = np.zeros((count, surface.shape[1]))
-    found[:first] = surface.toarray()
+    extension = np.zeros((count, surface.shape[1]))
+    extension[:first] = surface.toarray()
     # A node that belongs to no tetrahedron outside the mesh, for instance within a crease, is not needed.
     used = np.setdiff1d(cells, [*range(first), *range(last, count)])
     inner = laplacian[used]
-    found[used] = splu(inner[:, used].tocsc()).solve(-(inner[:, :first] @ found[:first]))
-    return found
+    extension[used] = splu(inner[:, used].tocsc()).solve(-(inner[:, :first] @ extension[:first]))
+    return extension

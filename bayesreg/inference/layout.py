@@ -45,12 +45,12 @@ def slices(target: Placed) -> dict[str, slice]:
     """Find the entries of a flat position that hold each part of a position, by name."""
     # Shapes are enough: this function may be called while JAX traces another one.
     shapes = jax.eval_shape(lambda: _at_rest(target))
-    found, first = {}, 0
+    entries, first = {}, 0
     # `ravel_pytree` concatenates the leaves in this order.
     for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
-        found[path[0].key] = slice(first, first + math.prod(leaf.shape))
+        entries[path[0].key] = slice(first, first + math.prod(leaf.shape))
         first += math.prod(leaf.shape)
-    return found
+    return entries
 
 
 def dimension(target: Placed) -> int:

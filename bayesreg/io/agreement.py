@@ -53,7 +53,10 @@ def require_agreement(mesh: TetMesh, tissue: Image, path: str | Path) -> None:
     own = float(np.trace(_volumes(mesh, tissue, 1.0, (1, 1, 1))))
     readings = [_best_order(mesh, tissue, unit, signs) for unit in UNITS for signs in product((1, -1), repeat=3)]
     highest = max(reading.share for reading in readings)
-    best = min((one for one in readings if one.share >= highest - BETTER), key=lambda one: (_cost(one), -one.share))
+    best = min(
+        (reading for reading in readings if reading.share >= highest - BETTER),
+        key=lambda reading: (_cost(reading), -reading.share),
+    )
     if best.share > own + BETTER and 1 - best.share < LESS * (1 - own):
         parts = []
         if best.unit != 1:
@@ -94,6 +97,6 @@ def _volumes(mesh: TetMesh, tissue: Image, unit: float, signs: tuple[int, ...]) 
     """
     centres = mesh.points[mesh.cells].mean(axis=1) * unit * np.array(signs)
     labels = tissue.nearest(centres).astype(int)
-    found = np.zeros((len(mesh.names), len(mesh.names) + 1))
-    np.add.at(found, (mesh.tissue, labels), mesh.volumes / mesh.volumes.sum())
-    return found[:, 1:]
+    shares = np.zeros((len(mesh.names), len(mesh.names) + 1))
+    np.add.at(shares, (mesh.tissue, labels), mesh.volumes / mesh.volumes.sum())
+    return shares[:, 1:]

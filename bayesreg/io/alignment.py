@@ -80,20 +80,20 @@ def find_pose(
     The same images give the same pose, since a fixed seed chooses the points that are sampled.
     """
     size = relative_size(np.asarray(organ.voxels) != 0, organ.voxel_volume)
-    around = _around(organ, size * SURROUNDINGS)
+    region = _around(organ, size * SURROUNDINGS)
     kept = None if moving_ignore is None else moving.with_voxels(~ignored_voxels(moving, moving_ignore))
     if fixed_ignore is not None:
-        around = around.with_voxels(np.asarray(around.voxels) * ~ignored_voxels(around, fixed_ignore))
+        region = region.with_voxels(np.asarray(region.voxels) * ~ignored_voxels(region, fixed_ignore))
     # Smoothing and the centre of mass must not use ignored voxels, either.
     fixed, moving = fill_ignored(fixed, fixed_ignore), fill_ignored(moving, moving_ignore)
     headers = _euler(Pose.identity(), _centre_of(organ))
-    starts, given, best = list(_starts(fixed, moving, organ)), headers, headers
+    starts, near_headers, best = list(_starts(fixed, moving, organ)), headers, headers
     for edge, share, most in LEVELS:
-        level = _Level.of(fixed, moving, around, kept, size * edge, share)
+        level = _Level.of(fixed, moving, region, kept, size * edge, share)
         # The start from the headers stays at every level: if the headers are right, no other start is nearer.
-        given, *others = (level.improve(start) for start in (given, *starts[:most]))
+        near_headers, *others = (level.improve(start) for start in (near_headers, *starts[:most]))
         # A step of the optimiser can also make a pose worse, so that the headers stay among the candidates.
-        starts = sorted((headers, given, *others), key=level.value, reverse=True)
+        starts = sorted((headers, near_headers, *others), key=level.value, reverse=True)
         best = starts[0]
     information, as_given = level.value(best), level.value(headers)
     if information <= 0:
@@ -115,12 +115,14 @@ def find_demons(fixed: Image, moving: Image) -> tuple[Image, Image, Image]:
     tuple of Image
         The x, y and z components of the displacement, mm, world RAS.
     """
-    one, other = (to_itk(image, "float32") for image in (fixed.on_orthogonal_grid(), moving.on_orthogonal_grid()))
-    other = SimpleITK.Resample(other, one, SimpleITK.Transform(), SimpleITK.sitkLinear, 0.0)
-    other = SimpleITK.HistogramMatching(other, one, 256, 15, True)
+    fixed_image, moving_image = (
+        to_itk(image, "float32") for image in (fixed.on_orthogonal_grid(), moving.on_orthogonal_grid())
+    )
+    moving_image = SimpleITK.Resample(moving_image, fixed_image, SimpleITK.Transform(), SimpleITK.sitkLinear, 0.0)
+    moving_image = SimpleITK.HistogramMatching(moving_image, fixed_image, 256, 15, True)
     field = None
     for factor, iterations in DEMONS:
-        level = [_thinned(image, factor) for image in (one, other)]
+        level = [_thinned(image, factor) for image in (fixed_image, moving_image)]
         method = SimpleITK.DiffeomorphicDemonsRegistrationFilter()
         method.SetNumberOfIterations(iterations)
         method.SetSmoothDisplacementField(True)
@@ -162,10 +164,10 @@ class _Level(NamedTuple):
 
     @classmethod
     def of(cls, fixed: Image, moving: Image, around: Image, kept: Image | None, edge: float, share: float) -> _Level:
-        masks = [None if one is None else to_itk(_coarser(one, edge, 0), "uint8") for one in (around, kept)]
-        one, other = (to_itk(_coarser(image, edge, 1), "float32") for image in (fixed, moving))
+        masks = [None if mask is None else to_itk(_coarser(mask, edge, 0), "uint8") for mask in (around, kept)]
+        fixed_image, moving_image = (to_itk(_coarser(image, edge, 1), "float32") for image in (fixed, moving))
         assert masks[0] is not None
-        return cls(one, other, edge, share, masks[0], masks[1])
+        return cls(fixed_image, moving_image, edge, share, masks[0], masks[1])
 
     def method(self) -> SimpleITK.ImageRegistrationMethod:
         method = SimpleITK.ImageRegistrationMethod()
@@ -184,15 +186,15 @@ class _Level(NamedTuple):
 
     def improve(self, start: SimpleITK.Euler3DTransform) -> SimpleITK.Euler3DTransform:
         """Find the best pose near a start; return the start if the images do not overlap."""
-        method, found = self.method(), SimpleITK.Euler3DTransform(start)
+        method, transform = self.method(), SimpleITK.Euler3DTransform(start)
         method.SetOptimizerAsRegularStepGradientDescent(self.edge / 2, 1e-3 * self.edge, ITERATIONS, 0.6)
         method.SetOptimizerScalesFromPhysicalShift()
-        method.SetInitialTransform(found, inPlace=True)
+        method.SetInitialTransform(transform, inPlace=True)
         try:
             method.Execute(self.fixed, self.moving)
         except RuntimeError:
             return start
-        return found
+        return transform
 
     def value(self, transform: SimpleITK.Euler3DTransform) -> float:
         """Compute the mutual information, nats; 0 if the images do not overlap."""
@@ -238,17 +240,17 @@ def _mass_centre(image: Image) -> Float[np.ndarray, "3"]:
 def _euler(pose: Pose, centre: Float[np.ndarray, "3"]) -> SimpleITK.Euler3DTransform:
     """Convert a motion in RAS to ITK's transform in LPS with a given centre of rotation."""
     lps, about = convert_motion(pose.matrix), centre * LPS
-    found = SimpleITK.Euler3DTransform()
-    found.SetCenter(about.tolist())
-    found.SetMatrix(lps[:3, :3].ravel().tolist())
-    found.SetTranslation((lps[:3, :3] @ about + lps[:3, 3] - about).tolist())
-    return found
+    transform = SimpleITK.Euler3DTransform()
+    transform.SetCenter(about.tolist())
+    transform.SetMatrix(lps[:3, :3].ravel().tolist())
+    transform.SetTranslation((lps[:3, :3] @ about + lps[:3, 3] - about).tolist())
+    return transform
 
 
 def _pose(transform: SimpleITK.Euler3DTransform) -> Pose:
     """Convert ITK's transform in LPS to a motion in RAS."""
-    found = np.eye(4)
-    found[:3, :3] = np.array(transform.GetMatrix()).reshape(3, 3)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(transform.GetMatrix()).reshape(3, 3)
     centre = np.array(transform.GetCenter())
-    found[:3, 3] = np.array(transform.GetTranslation()) + centre - found[:3, :3] @ centre
-    return Pose(convert_motion(found))
+    matrix[:3, 3] = np.array(transform.GetTranslation()) + centre - matrix[:3, :3] @ centre
+    return Pose(convert_motion(matrix))

@@ -32,10 +32,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def save_arrays(path: str | Path, arrays: Mapping[str, AnyArray]) -> None:
+def save_arrays(path: str | Path, arrays: Mapping[str, AnyArray], *, compressed: bool = False) -> None:
     """Write arrays to an .npz file in one step."""
+    save = np.savez_compressed if compressed else np.savez
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
+        save(file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
 def load_arrays(path: str | Path, advice: str) -> dict[str, np.ndarray]:

@@ -72,8 +72,14 @@ def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
     return load_arrays(require_file(folder, STATE), ANEW) if is_listed(folder, STATE) else None
 
 
-def remove_blocks(folder: str | Path) -> None:
-    """Remove draws/ of a run whose results are complete; keep state.npz, from which the run can continue."""
+def close(folder: str | Path) -> None:
+    """Remove draws/ of a run whose results are complete, and compress state.npz, from which the run can continue.
+
+    Half of a triangular factor is zero. Compression takes too long for the state of a run that goes on.
+    """
+    state = load_arrays(require_file(folder, STATE), ANEW)
+    with writing(folder) as place:
+        save_arrays(place(STATE), state, compressed=True)
     drop(folder, DRAWS)
     shutil.rmtree(Path(folder) / DRAWS, ignore_errors=True)
 

@@ -75,11 +75,11 @@ def mni152() -> Anatomy:
     tissue = np.where(brain, likelihood.argmax(axis=0) + 1, 0)
     inside = edt.edt(~brain, anisotropy=tuple(t1.voxel_sizes)) <= MNI152_SKULL
     # Beyond the margin the image is zero.
-    some = _box_about(inside, MNI152_MARGIN)
+    box = _box_about(inside, MNI152_MARGIN)
     return Anatomy(
-        t1.part(some),
-        t1.with_voxels(tissue.astype(np.int8)).part(some),
-        t1.with_voxels(inside.astype(np.uint8)).part(some),
+        t1.part(box),
+        t1.with_voxels(tissue.astype(np.int8)).part(box),
+        t1.with_voxels(inside.astype(np.uint8)).part(box),
     )
 
 
@@ -168,8 +168,8 @@ def from_files(
         tissue = _on_grid(image, image_path, tissue, labels_path, ("fixed", "label"), anywhere=rest is not None)
     mask = None
     if intracranial_path is not None:
-        given, grid_path = load_mask(intracranial_path), labels_path if image_path is None else image_path
-        mask = _on_grid(tissue, grid_path, given, intracranial_path, ("label", "intracranial"))
+        intracranial, grid_path = load_mask(intracranial_path), labels_path if image_path is None else image_path
+        mask = _on_grid(tissue, grid_path, intracranial, intracranial_path, ("label", "intracranial"))
     if rest is not None and mask is None:
         raise InputError(
             f"{rest} is what has no label in {labels_path}, and nothing says where it ends; give a mask of the organ "
@@ -248,10 +248,10 @@ def _outstanding(image: Image) -> np.ndarray:
     bright = SimpleITK.OtsuThreshold(SimpleITK.Median(voxels, [1] * 3), 0, 1)
     parts = SimpleITK.RelabelComponent(SimpleITK.ConnectedComponent(bright))
     closed = SimpleITK.BinaryMorphologicalClosing(parts == 1, radius, SimpleITK.sitkBall, 1.0, True)
-    found = SimpleITK.GetArrayFromImage(SimpleITK.BinaryFillhole(closed)).transpose(2, 1, 0) != 0
-    if not found.any():
+    mask = SimpleITK.GetArrayFromImage(SimpleITK.BinaryFillhole(closed)).transpose(2, 1, 0) != 0
+    if not mask.any():
         raise InputError("nothing stands out in the fixed image; give labels of it, or a mask of the organ as labels")
-    return found
+    return mask
 
 
 def _on_grid(
@@ -266,9 +266,9 @@ def require_forms_taken(
     grid: Image, grid_path: str | Path, image: Image, path: str | Path, names: tuple[str, str]
 ) -> None:
     """Raise InputError if two images share a grid only by the form of a header (q-form) that is not used."""
-    for one, source, taken in ((grid, grid_path, image), (image, path, grid)):
+    for candidate, source, taken in ((grid, grid_path, image), (image, path, grid)):
         other = read_grid(source).other
-        if other is not None and is_same_grid(Image(one.voxels, other), taken):
+        if other is not None and is_same_grid(Image(candidate.voxels, other), taken):
             raise InputError(
                 f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "
                 "s-form, which is taken; write the right one of the two forms into both"

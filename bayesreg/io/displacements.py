@@ -49,8 +49,10 @@ def read_start(path: Path, mesh: TetMesh, pose: Pose) -> Float[np.ndarray, "node
     """
     if not _is_volume(path):
         return read_displacement(path, mesh)
-    there = np.stack([np.asarray(one.interpolate(mesh.points)) for one in load_displacement(path)], axis=1)
-    return pose.inverse.place(mesh.points + there) - mesh.points
+    displacement = np.stack(
+        [np.asarray(component.interpolate(mesh.points)) for component in load_displacement(path)], axis=1
+    )
+    return pose.inverse.place(mesh.points + displacement) - mesh.points
 
 
 def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarray, "nodes 3"]:
@@ -68,18 +70,18 @@ def read_displacement(path: Path, mesh: TetMesh | None = None) -> Float[np.ndarr
         If the file holds no displacement, or one for another mesh.
     """
     data = load_arrays(path, "give another file") if path.suffix == ".npz" else _point_data(path)
-    found = [data[name] for name in ("u", "u_mean") if name in data]
-    if not found:
+    displacements = [data[name] for name in ("u", "u_mean") if name in data]
+    if not displacements:
         raise InputError(f"{path} holds no displacement: expected an array named 'u', got {', '.join(data) or 'none'}")
-    shape = np.shape(found[0])
+    shape = np.shape(displacements[0])
     if shape[1:] != (3,) or (mesh is not None and len(mesh.points) != shape[0]):
         rows = "n" if mesh is None else len(mesh.points)
         raise InputError(
             f"the displacement in {path} has shape {shape}; expected ({rows}, 3), one row per node of the run's mesh"
         )
-    if found[0].dtype.kind not in "fiu" or not np.isfinite(found[0]).all():
+    if displacements[0].dtype.kind not in "fiu" or not np.isfinite(displacements[0]).all():
         raise InputError(f"the displacement in {path} must consist of finite numbers")
-    return np.asarray(found[0], float)
+    return np.asarray(displacements[0], float)
 
 
 def require_displacement(path: Path, mesh: TetMesh | None = None) -> None:
@@ -114,19 +116,21 @@ def read_boundary(path: Path, mesh: TetMesh, pose: Pose = IDENTITY) -> Float[np.
             f"the displacement field {path} does not reach {int(off_grid.sum())} of the {len(places)} boundary nodes: "
             f"they lie off its grid, the first at {places[off_grid][0].round(1).tolist()} mm"
         )
-    defined = components[0].with_voxels(np.any([np.asarray(one.voxels) != 0 for one in components], axis=0) * 1.0)
-    found = np.stack([np.asarray(one.interpolate(places)) for one in components], axis=1)
+    defined = components[0].with_voxels(
+        np.any([np.asarray(component.voxels) != 0 for component in components], axis=0) * 1.0
+    )
+    displacement = np.stack([np.asarray(component.interpolate(places)) for component in components], axis=1)
     # Zeros beside a point reduce the interpolated value by the share of nonzero voxels; a field that decreases
     # smoothly to zero has small values there.
     share = np.maximum(np.asarray(defined.interpolate(places)), 1e-9)
-    ends = np.linalg.norm(found, axis=1) * (1 - share) / share > ENDS
+    ends = np.linalg.norm(displacement, axis=1) * (1 - share) / share > ENDS
     if ends.any():
         raise InputError(
             f"the displacement field {path} ends at {int(ends.sum())} of the {len(places)} boundary nodes: it is zero "
             f"in voxels beside them, first at {places[ends][0].round(1).tolist()} mm, as where it is known inside the "
             "organ alone; give one that goes on beyond the boundary, or a run's mesh.vtu"
         )
-    return pose.inverse.place(places + found) - places
+    return pose.inverse.place(places + displacement) - places
 
 
 def _is_volume(path: Path) -> bool:

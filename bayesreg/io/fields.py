@@ -106,12 +106,12 @@ def _whole_field(transform: SimpleITK.Transform) -> SimpleITK.Image:
     if transform.GetName() != "CompositeTransform":
         return SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
     parts = SimpleITK.CompositeTransform(transform)
-    every = [parts.GetNthTransform(k) for k in range(parts.GetNumberOfTransforms())]
-    inner = [one for one in every if one.GetName() == "DisplacementFieldTransform"]
+    transforms = [parts.GetNthTransform(k) for k in range(parts.GetNumberOfTransforms())]
+    inner = [part for part in transforms if part.GetName() == "DisplacementFieldTransform"]
     if len(inner) != 1:
         raise RuntimeError(f"a composite of {len(inner)} fields")
     grid = SimpleITK.DisplacementFieldTransform(inner[0]).GetDisplacementField()
-    if len(every) == 1:
+    if len(transforms) == 1:
         return grid
     where = grid.GetSize(), grid.GetOrigin(), grid.GetSpacing(), grid.GetDirection()
     return SimpleITK.TransformToDisplacementField(transform, SimpleITK.sitkVectorFloat64, *where)

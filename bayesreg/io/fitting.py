@@ -125,8 +125,8 @@ def _smooth(
 ) -> None:
     """Move nodes to the centre of their neighbours, in place, if that improves their worst tetrahedron."""
     for node in nodes:
-        around = cells[(cells == node).any(axis=1)]
-        before, old = mean_ratio(points, around).min(), points[node].copy()
-        points[node] = (points[around].sum(axis=(0, 1)) - len(around) * old) / (3 * len(around))
-        if mean_ratio(points, around).min() <= before:
+        star = cells[(cells == node).any(axis=1)]
+        before, old = mean_ratio(points, star).min(), points[node].copy()
+        points[node] = (points[star].sum(axis=(0, 1)) - len(star) * old) / (3 * len(star))
+        if mean_ratio(points, star).min() <= before:
             points[node] = old

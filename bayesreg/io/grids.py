@@ -80,8 +80,8 @@ def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]
 
 def is_same_grid(a: Image, b: Image) -> bool:
     """Check whether two images have the same grid (corners within a tenth of a voxel)."""
-    apart = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
-    return a.shape == b.shape and bool(apart <= SAME_GRID * a.voxel_sizes.min())
+    distance = corners_apart(np.asarray(a.affine), np.asarray(b.affine), a.shape)
+    return a.shape == b.shape and bool(distance <= SAME_GRID * a.voxel_sizes.min())
 
 
 def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "second")) -> None:
@@ -91,11 +91,11 @@ def check_same_grid(a: Image, b: Image, names: tuple[str, str] = ("first", "seco
             f"the {names[0]} and the {names[1]} image must share one grid, but have shapes {a.shape} and {b.shape}; "
             "resample one onto the other"
         )
-    apart = corners_apart(a.affine, b.affine, a.shape)
+    distance = corners_apart(a.affine, b.affine, a.shape)
     if not is_same_grid(a, b):
         raise InputError(
             f"the {names[0]} and the {names[1]} image must share one grid, but their affines place corners up to "
-            f"{apart:.3g} mm apart; resample one onto the other"
+            f"{distance:.3g} mm apart; resample one onto the other"
         )
 
 
@@ -126,19 +126,19 @@ def on_grid_of(
     if not anywhere:
         check_same_space(grid, image, names)
     between = image.to_voxel @ grid.affine
-    found = grid.with_voxels(
+    resampled = grid.with_voxels(
         ndimage.affine_transform(
             np.asarray(image.voxels), between[:3, :3], between[:3, 3], grid.shape, order=0, mode="grid-constant"
         )
     )
-    before, after = (np.count_nonzero(one.voxels) * one.voxel_volume / 1e3 for one in (image, found))
+    before, after = (np.count_nonzero(labels.voxels) * labels.voxel_volume / 1e3 for labels in (image, resampled))
     reordered = np.allclose(between, np.rint(between), atol=SAME_GRID / max(grid.shape)) and np.isclose(before, after)
     if not (reordered and round(abs(np.linalg.det(between))) == 1):
         _log.warning(
             "the %s image lies on another grid than the %s one; the nearest voxel is taken, and of %.4g ml that are "
             "not zero %.4g remain", names[1], names[0], before, after,
         )  # fmt: skip
-    return found
+    return resampled
 
 
 def check_same_space(a: Image, b: Image, names: tuple[str, str] = ("first", "second"), least: float = 0.1) -> None:

@@ -150,9 +150,9 @@ def from_itk(image: Any) -> Volume:
 
 def to_itk(image: Image, dtype: str) -> SimpleITK.Image:
     """Convert an image with orthogonal axes to SimpleITK."""
-    found = SimpleITK.GetImageFromArray(np.asarray(image.voxels).astype(dtype).transpose(2, 1, 0))
+    itk_image = SimpleITK.GetImageFromArray(np.asarray(image.voxels).astype(dtype).transpose(2, 1, 0))
     affine = convert_affine(image.affine)
-    found.SetSpacing(image.voxel_sizes.tolist())
-    found.SetDirection((affine[:3, :3] / image.voxel_sizes).ravel().tolist())
-    found.SetOrigin(affine[:3, 3].tolist())
-    return found
+    itk_image.SetSpacing(image.voxel_sizes.tolist())
+    itk_image.SetDirection((affine[:3, :3] / image.voxel_sizes).ravel().tolist())
+    itk_image.SetOrigin(affine[:3, 3].tolist())
+    return itk_image

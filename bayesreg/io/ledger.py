@@ -116,11 +116,11 @@ def require_file(folder: str | Path, name: str) -> Path:
     if status is None:
         raise InputError(f"{folder} holds no run of bayesreg: {STATUS} is missing")
     path = _path_of(folder, name)
-    found = digest_of(path) if name in status.files else None
-    if found is None:
+    digest = digest_of(path) if name in status.files else None
+    if digest is None:
         state = "no finished run" if status.stage != "finished" else "no whole run"
         raise InputError(f"{folder} holds {state}: {name} is missing")
-    if found not in status.files[name]:
+    if digest not in status.files[name]:
         raise InputError(f"{path} is damaged, or was changed after the run had written it; {ANEW}")
     return path
 
@@ -194,8 +194,8 @@ def _standing(folder: Path, name: str, digests: tuple[str, ...]) -> tuple[str, .
     """Find which of the listed digests the file has; the first one if it has none of them."""
     if len(digests) == 1:
         return digests
-    found = digest_of(folder / name)
-    return tuple(digest for digest in digests if digest == found) or digests[:1]
+    current = digest_of(folder / name)
+    return tuple(digest for digest in digests if digest == current) or digests[:1]
 
 
 def drop(folder: str | Path, within: str) -> None:
@@ -204,7 +204,9 @@ def drop(folder: str | Path, within: str) -> None:
     status = read_status(folder)
     if status is not None:
         names = [name for name in status.files if name.startswith(f"{within}/")]
-        _write(folder, Status(status.stage, {name: it for name, it in status.files.items() if name not in names}))
+        _write(
+            folder, Status(status.stage, {name: digests for name, digests in status.files.items() if name not in names})
+        )
         for name in names:
             _path_of(folder, name).unlink(missing_ok=True)
 
@@ -245,11 +247,11 @@ def _half_written(folder: Path) -> list[Path]:
 
     Folders of other runs within it are excluded, since another process may be writing to them.
     """
-    found = []
-    for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not (Path(place, name, LOCK).exists())]
-        found += [Path(place, name) for name in files if name.startswith(PARTIAL)]
-    return found
+    paths = []
+    for parent, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not (Path(parent, name, LOCK).exists())]
+        paths += [Path(parent, name) for name in files if name.startswith(PARTIAL)]
+    return paths
 
 
 def digest_of(path: Path) -> str | None:
@@ -269,9 +271,9 @@ def _digest_of_file(path: Path, _inode: int, _size: int, _changed: int) -> str:
 
 
 def _require_digest(path: Path) -> str:
-    found = digest_of(path)
-    assert found is not None
-    return found
+    digest = digest_of(path)
+    assert digest is not None
+    return digest
 
 
 def _write(folder: Path, status: Status) -> None:

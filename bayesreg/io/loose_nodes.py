@@ -43,7 +43,7 @@ def without_loose_nodes(
     points, cells
         The renumbered mesh. The remaining points keep their coordinates.
     """
-    given = cells
+    original_cells = cells
     while True:
         before = len(cells)
         holding = np.bincount(cells.ravel(), minlength=len(points))
@@ -51,8 +51,8 @@ def without_loose_nodes(
             cells = _contract(points, cells, int(node))
         if len(cells) == before:
             break
-    if len(cells) == len(given):
-        return points, given
+    if len(cells) == len(original_cells):
+        return points, original_cells
     used, kept = np.unique(cells, return_inverse=True)
     return points[used], kept.reshape(-1, 4)
 
@@ -67,11 +67,11 @@ def _contract(
         return cells
     best, least = cells, LEAST_MEAN_RATIO
     for neighbour in neighbours.tolist():
-        moved = np.where(star == node, neighbour, star)[~(star == neighbour).any(axis=1)]
-        shape = mean_ratio(points, moved).min(initial=np.inf)
+        contracted = np.where(star == node, neighbour, star)[~(star == neighbour).any(axis=1)]
+        shape = mean_ratio(points, contracted).min(initial=np.inf)
         if shape >= least and may_be_contracted(cells, node, neighbour):
             others = cells[~(cells == node).any(axis=1)]
-            best, least = np.vstack([others, moved]), shape
+            best, least = np.vstack([others, contracted]), shape
     return best
 
 

@@ -25,10 +25,10 @@ def read_points(path: str | Path) -> Points:
     InputError
         If the file is missing or of an unknown kind, or its content is invalid.
     """
-    found = _read(Path(path))
-    if isinstance(found, PointPairs):
+    points = _read(Path(path))
+    if isinstance(points, PointPairs):
         raise InputError(f"{path} holds pairs of points; expected points of one space")
-    return found
+    return points
 
 
 def read_side(path: str | Path, side: Literal["fixed", "moving"], space: Space | None = None) -> Points:
@@ -47,8 +47,8 @@ def read_side(path: str | Path, side: Literal["fixed", "moving"], space: Space |
         As in `read_points`; also if the file states another space, or if it has the columns of ANTs, which writes
         points in LPS, and no space is given.
     """
-    found = _read(Path(path), space)
-    return Points(getattr(found, side), found.names, found.sd) if isinstance(found, PointPairs) else found
+    points = _read(Path(path), space)
+    return Points(getattr(points, side), points.names, points.sd) if isinstance(points, PointPairs) else points
 
 
 def write_table(path: str | Path, columns: Mapping[str, Sequence[Any]]) -> None:
@@ -78,19 +78,23 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
     InputError
         If a file is missing or of an unknown kind, its content is invalid, or the files do not fit each other.
     """
-    found = _read(Path(path))
-    if isinstance(found, PointPairs):
+    points = _read(Path(path))
+    if isinstance(points, PointPairs):
         if moving is not None:
             raise InputError(f"{path} holds both points of each pair; expected no second file, got {moving}")
-        return found
+        return points
     if moving is None:
         raise InputError(f"{path} holds points of one space; give the points of the moving image, too")
     other = read_points(moving)
     if other.sd is not None:
         raise InputError(f"{moving} gives an sd; expected it in the file of the fixed points, {path}, for each pair")
-    if len(other.points) != len(found.points):
-        raise InputError(f"{path} holds {len(found.points)} points and {moving} {len(other.points)}: they are no pairs")
-    return PointPairs(found.points, other.points[_order(found, other, f"{path} and {moving}")], found.names, found.sd)
+    if len(other.points) != len(points.points):
+        raise InputError(
+            f"{path} holds {len(points.points)} points and {moving} {len(other.points)}: they are no pairs"
+        )
+    return PointPairs(
+        points.points, other.points[_order(points, other, f"{path} and {moving}")], points.names, points.sd
+    )
 
 
 def _order(found: Points, other: Points, files: str) -> list[int]:
@@ -116,9 +120,9 @@ def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not UTF-8 text ({error.reason} at byte {error.start})") from None
-    found = READERS[suffix](text, str(path), space)
-    _require_sound(found, path)
-    return found
+    points = READERS[suffix](text, str(path), space)
+    _require_sound(points, path)
+    return points
 
 
 def _require_sound(found: Points | PointPairs, path: Path) -> None:

@@ -207,9 +207,9 @@ def _check_tissues(quality: MeshQuality) -> None:
         raise MeshError(
             f"no tetrahedron is {' or '.join(absent)}: the tissue is too thin for this edge length, or is not there"
         )
-    found = {**quality.tissue_volumes, "all": sum(quality.tissue_volumes.values())}
+    volumes = {**quality.tissue_volumes, "all": sum(quality.tissue_volumes.values())}
     expected = {**quality.label_volumes, "all": sum(quality.label_volumes.values())}
-    for name, volume in found.items():
+    for name, volume in volumes.items():
         if abs(volume - expected[name]) > quality.volume_tolerance:
             raise MeshError(
                 f"the mesh holds {volume / 1000:.1f} ml of {name}, the labels {expected[name] / 1000:.1f} ml; "

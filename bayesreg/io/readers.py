@@ -120,8 +120,8 @@ def _grid_of(source: SpatialImage) -> Grid:
     if not (header["sform_code"] or header["qform_code"]):
         remarks.append(f"it says nothing of its orientation (sform and qform code 0); centred, and {_x_runs(affine)}")
     elif header["sform_code"] and header["qform_code"]:
-        affine, other, told = _choose_form(affine, _qform(header), shape)
-        remarks += told
+        affine, other, messages = _choose_form(affine, _qform(header), shape)
+        remarks += messages
     unit, known = _unit(header)
     if not known:
         remarks.append("its header has an unknown unit; taken to be mm")
@@ -142,10 +142,10 @@ def _unit(header: Any) -> tuple[str, bool]:
 def _qform(header: Any) -> Float[np.ndarray, "4 4"] | None:
     """Read the q-form; return None if it has no inverse."""
     try:
-        found = np.asarray(header.get_qform(), float)
+        affine = np.asarray(header.get_qform(), float)
     except ValueError:
         return None
-    return found if _is_regular(found) else None
+    return affine if _is_regular(affine) else None
 
 
 def _is_regular(affine: Float[np.ndarray, "4 4"]) -> bool:
@@ -164,11 +164,11 @@ def _choose_form(
         return sform, None, []
     if not _is_regular(sform):
         return qform, None, ["its s-form has no inverse, and its q-form is taken"]
-    apart = corners_apart(sform, qform, shape)
-    if apart <= SAME_FORM * np.linalg.norm(sform[:3, :3], axis=0).min():
+    distance = corners_apart(sform, qform, shape)
+    if distance <= SAME_FORM * np.linalg.norm(sform[:3, :3], axis=0).min():
         return sform, None, []
-    told = f"its s-form and its q-form place corners up to {apart:.3g} mm apart; the s-form is taken"
-    return sform, qform, [f"{told}. If the q-form is right, write it into both"]
+    message = f"its s-form and its q-form place corners up to {distance:.3g} mm apart; the s-form is taken"
+    return sform, qform, [f"{message}. If the q-form is right, write it into both"]
 
 
 def _x_runs(affine: Float[np.ndarray, "4 4"]) -> str:

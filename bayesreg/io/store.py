@@ -29,10 +29,10 @@ RESULTS = (
 def require_fresh(folder: str | Path) -> None:
     """Raise InputError if a path is a file, or a folder that holds a run, lies in a run's folder or is not writable."""
     folder = Path(folder)
-    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if folder.is_symlink() and not folder.exists():
         raise InputError(f"the output folder {folder} is a link that leads nowhere")
-    if within := [place for place in folder.absolute().parents if holds_run(place)]:
+    if within := [parent for parent in folder.absolute().parents if holds_run(parent)]:
         raise InputError(f"the output folder {folder} lies in that of another run, {within[0]}; name another one")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"the output folder {folder} is a file; name a folder that is new or empty")
@@ -59,12 +59,12 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
         images |= {f"channel-{name}-fixed": channel.fixed, f"channel-{name}-moving": channel.moving}
     # Compression releases the interpreter's lock, so that threads run in parallel.
     with ThreadPoolExecutor() as pool:
-        for save, given in ((save_image, labels), (save_in_levels, images)):
-            for name, image in given.items():
+        for save, named_images in ((save_image, labels), (save_in_levels, images)):
+            for name, image in named_images.items():
                 if image is not None:
                     saved.append(pool.submit(save, image, place(f"inputs/{name}.nii.gz")))
-    for one in saved:
-        one.result()
+    for future in saved:
+        future.result()
     if inputs.truth is not None:
         known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
         save_arrays(place("inputs/truth.npz"), known)
@@ -99,13 +99,13 @@ def read_inputs(folder: str | Path) -> Inputs:
         None if (path := _file(folder, f"inputs/{name}.nii.gz")) is None else in_levels(load_image(path))
         for name in ("fixed", "moving")
     )
-    known, given, arrays = (
+    truth_arrays, boundary_arrays, observed_arrays = (
         None if (path := _file(folder, f"inputs/{name}.npz")) is None else load_arrays(path, ANEW)
         for name in ("truth", "boundary", "observed")
     )
-    truth = None if known is None else Truth(**known)
-    boundary = None if given is None else given["u_boundary"]
-    observed = {} if arrays is None else _observed_of(arrays)
+    truth = None if truth_arrays is None else Truth(**truth_arrays)
+    boundary = None if boundary_arrays is None else boundary_arrays["u_boundary"]
+    observed = {} if observed_arrays is None else _observed_of(observed_arrays)
     known_of_images = read_json(require_file(folder, "inputs/matching.json"))
     channels = {name: _channel(folder, name, alike) for name, alike in known_of_images["channels"].items()}
     return Inputs(
@@ -121,11 +121,11 @@ def _channel(folder: str | Path, name: str, one_contrast: bool) -> Channel:
 
 
 def _observed_of(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-    found: dict[str, dict[str, np.ndarray]] = {}
+    observed: dict[str, dict[str, np.ndarray]] = {}
     for key, value in arrays.items():
         name, field = key.split("/")
-        found.setdefault(name, {})[field] = value
-    return found
+        observed.setdefault(name, {})[field] = value
+    return observed
 
 
 def write_results(

@@ -109,11 +109,13 @@ def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
     points = np.asarray(surface.points, float)
     if not np.isfinite(points).all():
         raise InputError(f"{path} holds points that are not finite")
-    told = _named_space(path, surface)
-    if told and space and told != space:
-        raise InputError(f"{path} says that its coordinates are {told}, and {space} is given: leave the space out")
-    chosen: Space = told or space or "RAS"
-    return SurfaceFile(surface, points * TO_RAS[chosen], chosen, (space or told) is not None)
+    stated_space = _named_space(path, surface)
+    if stated_space and space and stated_space != space:
+        raise InputError(
+            f"{path} says that its coordinates are {stated_space}, and {space} is given: leave the space out"
+        )
+    chosen: Space = stated_space or space or "RAS"
+    return SurfaceFile(surface, points * TO_RAS[chosen], chosen, (space or stated_space) is not None)
 
 
 READERS = {".vtk": read_legacy, ".ply": read_ply, ".obj": read_obj}
@@ -207,16 +209,16 @@ def write_surface(
     values : mapping
         Arrays of shape (k, …) by name.
     """
-    moved, path = surface.content.copy(), Path(path)
-    moved.points = points * TO_RAS[surface.space]
-    for arrays in (moved.point_data, moved.cell_data):
+    dataset, path = surface.content.copy(), Path(path)
+    dataset.points = points * TO_RAS[surface.space]
+    for arrays in (dataset.point_data, dataset.cell_data):
         if "Normals" in arrays:
             del arrays["Normals"]
     for name, value in values.items():
-        moved.point_data[name] = np.asarray(value)
-    moved.field_data["SPACE"] = [surface.space]
+        dataset.point_data[name] = np.asarray(value)
+    dataset.field_data["SPACE"] = [surface.space]
     with replacing(path) as temporary:
-        save_dataset(moved, temporary)
+        save_dataset(dataset, temporary)
         _say_space(temporary, surface.space)
 
 
@@ -248,10 +250,10 @@ def save_ellipsoids(
 
     ball = pyvista.Icosphere(radius=1.0, nsub=2)
     points, faces = np.asarray(ball.points, float), np.asarray(ball.regular_faces).astype(np.int64)
-    every = centres[:, None] + np.einsum("pa,ka,kai->kpi", points, half_axes, directions)
+    vertices = centres[:, None] + np.einsum("pa,ka,kai->kpi", points, half_axes, directions)
     number = np.repeat(np.arange(len(centres)), len(points))
     shift = len(points) * np.arange(len(centres))[:, None, None]
-    save_surface(path, every.reshape(-1, 3), (faces + shift).reshape(-1, 3), {"number": number})
+    save_surface(path, vertices.reshape(-1, 3), (faces + shift).reshape(-1, 3), {"number": number})
 
 
 def save_surface(
@@ -274,25 +276,25 @@ def save_surface(
 def _named_space(path: Path, surface: Any) -> Space | None:
     """Read the space of the coordinates from the dataset's field SPACE or the head of a file."""
     with path.open("rb") as file:
-        found = re.search(rb"SPACE\s*=\s*(RAS|LPS)", file.read(512))
-    named = str(surface.field_data["SPACE"][0]) if "SPACE" in surface.field_data else found and found[1].decode()
+        match = re.search(rb"SPACE\s*=\s*(RAS|LPS)", file.read(512))
+    named = str(surface.field_data["SPACE"][0]) if "SPACE" in surface.field_data else match and match[1].decode()
     return "LPS" if named == "LPS" else "RAS" if named == "RAS" else None
 
 
 def _say_space(path: Path, space: Space) -> None:
     """Write the space into the head of a file, as 3D Slicer does; XML files already have it as a field."""
-    content, said = path.read_bytes(), f"bayesreg SPACE={space}".encode()
+    content, statement = path.read_bytes(), f"bayesreg SPACE={space}".encode()
     suffix = path.suffix.lower()
     if suffix == ".vtk":
         # The second line is a title, whose text is free.
         first, _, rest = content.split(b"\n", 2)
-        content = b"\n".join([first, said, rest])
+        content = b"\n".join([first, statement, rest])
     elif suffix == ".stl":
         # VTK writes binary STL, whose first 80 bytes are free.
-        content = said.ljust(80) + content[80:]
+        content = statement.ljust(80) + content[80:]
     elif suffix == ".ply":
         first, kind, rest = content.split(b"\n", 2)
-        content = b"\n".join([first, kind, b"comment " + said, rest])
+        content = b"\n".join([first, kind, b"comment " + statement, rest])
     elif suffix == ".obj":
-        content = b"# " + said + b"\n" + content
+        content = b"# " + statement + b"\n" + content
     path.write_bytes(content)

@@ -73,13 +73,13 @@ class _Cursor:
         """
         if self.is_text:
             return [unquote(" ".join(self.line())) for _ in range(count)]
-        found = []
+        texts = []
         for _ in range(count):
             size = 2 ** (3 - (int(self.values("u1", 1)[0]) >> 6))
             self.at -= 1
             length = int(self.values(f"u{size}", 1)[0]) & (2 ** (8 * size - 2) - 1)
-            found.append(self.values("u1", length).tobytes().decode("utf-8"))
-        return found
+            texts.append(self.values("u1", length).tobytes().decode("utf-8"))
+        return texts
 
     def cells(self, first: int, second: int, has_offsets: bool) -> Int[np.ndarray, "n"]:
         """Read cells as one array in which the number of points of each cell precedes their indices."""
@@ -89,8 +89,8 @@ class _Cursor:
         return join_cells(offsets, self.values(_legacy_type(self.line()[1]), second).astype(np.int64))
 
     def skip(self, pattern: bytes) -> None:
-        if (found := re.compile(pattern, re.DOTALL).match(self.content, self.at)) is not None:
-            self.at = found.end()
+        if (match := re.compile(pattern, re.DOTALL).match(self.content, self.at)) is not None:
+            self.at = match.end()
 
 
 def join_cells(offsets: Int[np.ndarray, "c"], points: Int[np.ndarray, "k"]) -> Int[np.ndarray, "n"]:
@@ -111,17 +111,17 @@ def split_cells(cells: Shaped[np.ndarray, "n"], count: int) -> list[np.ndarray]:
 
     Raise ValueError if a cell has an index of `count` or more, or does not end within the array.
     """
-    found, start = [], 0
+    indices, start = [], 0
     while start < len(cells):
         end = start + 1 + int(cells[start])
         if not start < end <= len(cells):
             raise ValueError("a cell does not end where it says")
-        found.append(cells[start + 1 : end])
+        indices.append(cells[start + 1 : end])
         start = end
-    points = np.concatenate([np.zeros(0, np.int64), *found])
+    points = np.concatenate([np.zeros(0, np.int64), *indices])
     if len(points) and not 0 <= points.min() <= points.max() < count:
         raise ValueError(f"a cell has the point {points.max()} of {count} points")
-    return found
+    return indices
 
 
 def read_legacy(content: bytes) -> Any:
@@ -132,7 +132,7 @@ def read_legacy(content: bytes) -> Any:
     cursor = _Cursor(content, head.end(), head[2].upper() == b"ASCII", ">")
     parts: dict[str, np.ndarray] = {}
     arrays: dict[str, dict[str, Any]] = {"": {}, "POINT_DATA": {}, "CELL_DATA": {}}
-    place, rows = "", 0
+    section, rows = "", 0
     while words := cursor.line():
         key = words[0].upper()
         if key == "POINTS":
@@ -142,12 +142,12 @@ def read_legacy(content: bytes) -> Any:
         elif key == "CELL_TYPES":
             parts["types"] = cursor.values("i4", int(words[1]))
         elif key in arrays:
-            place, rows = key, int(words[1])
+            section, rows = key, int(words[1])
         elif key == "FIELD":
             for _ in range(int(words[2])):
                 name, width, length, kind = cursor.line()
                 size = int(width) * int(length)
-                arrays[place][unquote(name)] = (
+                arrays[section][unquote(name)] = (
                     cursor.texts(size)
                     if kind == "string"
                     else _rows(cursor.values(_legacy_type(kind), size), int(width))
@@ -156,15 +156,15 @@ def read_legacy(content: bytes) -> Any:
             components = int(words[3]) if key == "SCALARS" and len(words) > 3 else _COMPONENTS[key]
             cursor.skip(rb"\s*LOOKUP_TABLE\s+\S+[ \r]*\n" if key == "SCALARS" else b"")
             values = cursor.values(_legacy_type(words[2]), components * rows)
-            arrays[place][unquote(words[1])] = _rows(values, components)
+            arrays[section][unquote(words[1])] = _rows(values, components)
         elif key == "TEXTURE_COORDINATES":
             values = cursor.values(_legacy_type(words[3]), int(words[2]) * rows)
-            arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
+            arrays[section][unquote(words[1])] = _rows(values, int(words[2]))
         elif key == "COLOR_SCALARS":
             values = cursor.values("f4" if cursor.is_text else "u1", int(words[2]) * rows)
             # In text files colours are in [0, 1].
             values = np.rint(255 * values).astype(np.uint8) if cursor.is_text else values
-            arrays[place][unquote(words[1])] = _rows(values, int(words[2]))
+            arrays[section][unquote(words[1])] = _rows(values, int(words[2]))
         elif key == "LOOKUP_TABLE":
             cursor.values("f4" if cursor.is_text else "u1", 4 * int(words[2]))
         elif key == "METADATA":

@@ -66,7 +66,7 @@ def tetrahedralize(
     points = np.concatenate([surface.points for surface in surfaces])
     offsets = np.cumsum([0, *(len(surface.points) for surface in surfaces[:-1])])
     faces = np.concatenate([surface.faces + offset for surface, offset in zip(surfaces, offsets, strict=True)])
-    given: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         "vertices": points,
         "faces": faces.astype(np.int32),
         "edge_length_abs": float(sizing.values.max()),
@@ -77,7 +77,7 @@ def tetrahedralize(
         "bg_tets": sizing.cells.astype(np.int32),
         "bg_values": sizing.values,
     }
-    return without_cavities(*_run(given, quiet))
+    return without_cavities(*_run(arguments, quiet))
 
 
 def _run(given: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -50,11 +50,11 @@ def save_transform(
         _write_text(file, "OSVersion", "")
         _write_text(file, "TransformGroup/0/TransformType", "CompositeTransform_double_3_3")
         for number, (kind, known, parameters) in enumerate(parts[::-1] if pose_first else parts, start=1):
-            place = f"TransformGroup/{number}"
-            _write_text(file, f"{place}/TransformType", f"{kind}_double_3_3")
-            file[f"{place}/TransformFixedParameters"] = known
+            group = f"TransformGroup/{number}"
+            _write_text(file, f"{group}/TransformType", f"{kind}_double_3_3")
+            file[f"{group}/TransformFixedParameters"] = known
             packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if parameters.size > 100 else {}
-            file.create_dataset(f"{place}/TransformParameters", data=parameters, **packed)
+            file.create_dataset(f"{group}/TransformParameters", data=parameters, **packed)
 
 
 def _write_text(file: h5py.File, name: str, text: str) -> None:

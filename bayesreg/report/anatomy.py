@@ -100,17 +100,19 @@ def _difference(view: View, image: Image, plane: Plane) -> np.ndarray:
 
 def _explain(study: Study) -> list[str]:
     run = study.run
-    said = ["Planes through the node of greatest displacement."]
+    sentences = ["Planes through the node of greatest displacement."]
     if study.image_differences is not None:
         before, after = study.image_differences
-        said.append(
+        sentences.append(
             f"The root mean square of the difference falls from {before:.3f} to {after:.3f} (scaled intensity)."
         )
     if not run.matching.one_contrast or not run.matching.pose.is_identity:
-        said.append("Lines: borders of the tissues in the fixed image, which should lie on those of the warped one.")
+        sentences.append(
+            "Lines: borders of the tissues in the fixed image, which should lie on those of the warped one."
+        )
     if run.fixed_ignore is not None or run.moving_ignore is not None:
-        said.append("What is hatched is ignored.")
-    return [*said, CONVENTION]
+        sentences.append("What is hatched is ignored.")
+    return [*sentences, CONVENTION]
 
 
 def displacement(study: Study) -> Drawing:

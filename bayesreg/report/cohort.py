@@ -94,11 +94,11 @@ def _stiffness(finished: pd.DataFrame) -> Drawing:
         axes = grid.ravel()
         for panel in axes[len(names) :]:
             panel.remove()
-        place = np.arange(len(finished))[::-1]
+        heights = np.arange(len(finished))[::-1]
         for panel, name in zip(axes, names, strict=False):
             low, middle, high = (finished[f"{name}{end}"].to_numpy(float) for end in ("_low", "", "_high"))
-            panel.hlines(place, low, high, color=style.ACCENT, lw=1.0)
-            panel.plot(middle, place, "o", ms=3, color=style.ACCENT)
+            panel.hlines(heights, low, high, color=style.ACCENT, lw=1.0)
+            panel.plot(middle, heights, "o", ms=3, color=style.ACCENT)
             panel.set(title=style.literal(name.replace("_", " ").replace("lam", "λ").replace("mu", "μ")))
             if high.max() > DECADES * low.min() > 0:
                 panel.set_xscale("log")
@@ -106,7 +106,7 @@ def _stiffness(finished: pd.DataFrame) -> Drawing:
                 panel.xaxis.set_major_locator(MaxNLocator(3))
         labels = [style.literal(name) for name in finished["folder"]]
         for panel in grid[:, 0]:
-            panel.set_yticks(place if named else [], labels if named else [])
+            panel.set_yticks(heights if named else [], labels if named else [])
         uri = style.data_uri(figure)
     caption = "Median and 95 % interval of λ and μ by tissue, relative; a line for each run, in the order of the table."
     return Drawing("stiffness", "λ and μ", caption, f"Stiffness of {len(finished)} runs.", uri)

@@ -68,13 +68,13 @@ def _names(studies: Sequence[Study]) -> list[str]:
 def _warnings(named: dict[str, Study]) -> list[str]:
     """Write sentences about differences that make the comparison unfair."""
     first, *others = [study.run for study in named.values()]
-    said = []
+    warnings = []
     if not all(_same(first.fixed, run.fixed) and _same(first.moving, run.moving) for run in others):
-        said.append("These runs are not of one pair of images: their errors and maps cannot be compared directly.")
+        warnings.append("These runs are not of one pair of images: their errors and maps cannot be compared directly.")
     if any(run.mesh.digest != first.mesh.digest for run in others):
-        said.append("These runs are on different meshes.")
+        warnings.append("These runs are on different meshes.")
     doubts = {name: approximation(study.manifest) for name, study in named.items()}
-    return said + [f"{name} is approximate. {text}" for name, text in doubts.items() if text]
+    return warnings + [f"{name} is approximate. {text}" for name, text in doubts.items() if text]
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -76,12 +76,12 @@ def estimands(mesh: TetMesh, diagnosed: Diagnosed, posterior: xr.Dataset) -> lis
     that never moved within its chain is listed, and so is a displacement that never moved at all. Derived quantities
     (the ratios) are left out.
     """
-    found = []
+    entries = []
     for variable in diagnosed.rhat.data_vars:
         name = str(variable)
         if name in posterior and name != "ratio":
-            found += _entries(mesh, diagnosed, posterior[name])
-    return found
+            entries += _entries(mesh, diagnosed, posterior[name])
+    return entries
 
 
 def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[Estimand]:
@@ -100,11 +100,11 @@ def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[E
     known = [place for place in places if place is not None]
     words = iter(regions(mesh, np.array(known).reshape(-1, 3)))
     where = ["" if place is None else next(words) for place in places]
-    found = []
+    entries = []
     for index, place, region in zip(indices, places, where, strict=True):
         rhat, bulk, tail = (float(value) for value in figures[index])
-        found.append(Estimand(name, index, naming.name(index), place, rhat, bulk, tail, region))
-    return found
+        entries.append(Estimand(name, index, naming.name(index), place, rhat, bulk, tail, region))
+    return entries
 
 
 def _coordinates(draws: xr.DataArray, dims: list) -> tuple[np.ndarray | None, np.ndarray | None]:

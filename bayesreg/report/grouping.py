@@ -46,10 +46,10 @@ def grouping(posterior: xr.Dataset) -> Grouping:
     """Group chains whose means lie close together, relative to the standard deviation within chains."""
     values = _values(posterior)
     means, variances = values.mean(axis=1), values.var(axis=1)
-    apart = np.array(
+    distances = np.array(
         [[_distance(_separation(means, variances, i, j)) for j in range(len(means))] for i in range(len(means))]
     )
-    _, label = connected_components(apart < SEPARATION_SD, directed=False)
+    _, label = connected_components(distances < SEPARATION_SD, directed=False)
     return Grouping(_renumber(label), np.array([_drifts(chain) for chain in values]))
 
 

@@ -128,16 +128,16 @@ def _point_out(axes: Axes, edges: np.ndarray, marks: Sequence[Mark], logarithmic
     first, last = scale(edges[0]), scale(edges[-1])
     for index, mark in enumerate(marks):
         at = scale(mark.value) if mark.value > 0 or not logarithmic else -np.inf
-        place: dict[str, Any] = {"color": mark.colour, "fontsize": 7, "va": "top"}
+        settings: dict[str, Any] = {"color": mark.colour, "fontsize": 7, "va": "top"}
         if first - FAR * (last - first) <= at <= last + FAR * (last - first):
             axes.axvline(mark.value, color=mark.colour, ls=(0, (4, 2)), lw=1.2)
-            place |= {"transform": axes.get_xaxis_transform(), "rotation": 90, "ha": "right"}
-            axes.text(mark.value, 0.99, f"{mark.label} ", **place)
+            settings |= {"transform": axes.get_xaxis_transform(), "rotation": 90, "ha": "right"}
+            axes.text(mark.value, 0.99, f"{mark.label} ", **settings)
         else:
             below = at < first
             text = f"← {mark.label} {number(mark.value)}" if below else f"{mark.label} {number(mark.value)} →"
-            place |= {"transform": axes.transAxes, "ha": "left" if below else "right"}
-            axes.text(0.0 if below else 1.0, 0.98 - 0.09 * index, text, **place)
+            settings |= {"transform": axes.transAxes, "ha": "left" if below else "right"}
+            axes.text(0.0 if below else 1.0, 0.98 - 0.09 * index, text, **settings)
 
 
 def _density(values: np.ndarray, edges: np.ndarray, logarithmic: bool) -> np.ndarray:

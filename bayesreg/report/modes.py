@@ -29,13 +29,15 @@ def explain(study: Study) -> Sentences:
 def explanation(groups: Grouping) -> list[str]:
     """Explain which groups there are, and their possible meaning."""
     listed = "; ".join(f"group {k + 1}: {_chain_list(groups.chains(k))}" for k in range(groups.groups))
-    apart = f"The chains lie in {groups.groups} groups ({listed}), {SEPARATION_SD:g} or more standard deviations apart."
+    sentence = (
+        f"The chains lie in {groups.groups} groups ({listed}), {SEPARATION_SD:g} or more standard deviations apart."
+    )
     moving = np.flatnonzero(groups.drifting)
     if len(moving):
         verb = "is" if len(moving) == 1 else "are"
-        return [apart, f"But {_chain_list(moving)} {verb} still moving: they have not arrived yet. Run longer."]
+        return [sentence, f"But {_chain_list(moving)} {verb} still moving: they have not arrived yet. Run longer."]
     return [
-        apart,
+        sentence,
         "Each chain is steady in its place, which speaks for several modes. How many chains lie in a mode says nothing "
         "of its probability; the mean over all chains may be a displacement that no mode has.",
     ]
@@ -50,8 +52,8 @@ def modes(study: Study) -> Drawing:
     """Draw |ū| of each group side by side at the greatest difference, and the distances between the groups."""
     groups, mesh = study.groups, study.mesh
     means = group_means(study.predicted.chain_mean, groups)
-    apart = np.linalg.norm(means[:, None] - means[None], axis=-1).max(axis=(0, 1))
-    where = mesh.points[apart.argmax()]
+    distances = np.linalg.norm(means[:, None] - means[None], axis=-1).max(axis=(0, 1))
+    where = mesh.points[distances.argmax()]
     view = View.of(study.run, where)
     plane, shown = view.main, min(groups.groups, MOST_SHOWN)
     pictures = [view.norm(plane, mean) for mean in means[:shown]]
@@ -63,7 +65,7 @@ def modes(study: Study) -> Drawing:
             drawn = panels.field_panel(panel, picture, plane, norm, style.MAGNITUDE)
             panel.set_title(f"|ū| of group {k + 1} ({_chain_list(groups.chains(k))})")
         panels.colourbar(figure, drawn, axes, "mm", location="bottom", shrink=0.6, aspect=40)
-        picture = view.scalar(plane, apart)
+        picture = view.scalar(plane, distances)
         drawn = panels.field_panel(last, picture, plane, panels.from_zero(picture), style.ERROR)
         panels.colourbar(figure, drawn, last, "mm", location="bottom")
         last.set_title("greatest distance between them")
@@ -72,7 +74,7 @@ def modes(study: Study) -> Drawing:
         uri = style.data_uri(figure)
     more = "" if shown == groups.groups else f" The first {shown} of {groups.groups} groups are shown."
     caption = (
-        f"Plane: {plane.title}, near the node where the groups lie farthest apart: {number(apart.max())} mm at "
+        f"Plane: {plane.title}, near the node where the groups lie farthest apart: {number(distances.max())} mm at "
         f"{place_text(where)}, {regions(mesh, where[None])[0]}.{more}"
     )
     return Drawing("modes", "One picture for each group of chains", caption, f"|ū| of {shown} groups of chains.", uri)

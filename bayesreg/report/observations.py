@@ -38,7 +38,9 @@ def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
         " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": normalised and not loads,
         " + log p(rigid motion of <var>u</var>)": part(manifest, "model", "rigid_sd") is not None,
     }
-    observed = [_kind(one).log_density(str(escape(name))) for name, one in observations_of(manifest).items()]
+    observed = [
+        _kind(observation).log_density(str(escape(name))) for name, observation in observations_of(manifest).items()
+    ]
     prior = "".join(text for text, holds in priors.items() if holds and not elastography)
     scales = [f" + log p({_symbol(name)})" for name in part(manifest, "scales") or {}]
     total = "".join(observed) + prior + " + log p(λ) + log p(μ)" + "".join(scales)
@@ -53,8 +55,8 @@ def _symbol(name: str) -> str:
 
 def explanations(manifest: Mapping[str, Any]) -> list[Markup]:
     """Explain the terms of the observations, in a sentence for each term that has an explanation."""
-    found = [_kind(one).explain(name, one) for name, one in observations_of(manifest).items()]
-    return [Markup(text) for text in found if text]
+    texts = [_kind(observation).explain(name, observation) for name, observation in observations_of(manifest).items()]
+    return [Markup(text) for text in texts if text]
 
 
 def observation_table(manifest: Mapping[str, Any]) -> Table | None:
@@ -63,12 +65,12 @@ def observation_table(manifest: Mapping[str, Any]) -> Table | None:
     rows = [
         [
             name.replace("_", " "),
-            one["title"],
-            f"{one['values']:,}" if "values" in one else NONE,
-            number(one.get("residual_rms")),
-            number(one["log"]),
+            observation["title"],
+            f"{observation['values']:,}" if "values" in observation else NONE,
+            number(observation.get("residual_rms")),
+            number(observation["log"]),
         ]
-        for name, one in observed.items()
+        for name, observation in observed.items()
     ]
     caption = (
         "At the posterior mean. Residual over sd: the root mean square of the residuals in units of the sd that the "
@@ -84,10 +86,10 @@ def shown_by_kinds(manifest: Mapping[str, Any], mesh: TetMesh, predicted: Predic
     if predicted is None:
         return []
     shown: list[Drawing | Table] = []
-    for name, one in observations_of(manifest).items():
+    for name, observation in observations_of(manifest).items():
         summary = {key: np.asarray(value) for key, value in predicted.of_observation(name).items()}
-        shown += [_drawing(figure) for figure in _kind(one).figures(name, summary, mesh.names, one)]
-        shown += [_table(table, mesh) for table in _kind(one).tables(name, summary)]
+        shown += [_drawing(figure) for figure in _kind(observation).figures(name, summary, mesh.names, observation)]
+        shown += [_table(table, mesh) for table in _kind(observation).tables(name, summary)]
     return shown
 
 

@@ -168,8 +168,8 @@ def ignored(view: View, plane: Plane) -> tuple[np.ndarray, np.ndarray, np.ndarra
         Pixels of the plane.
     """
     run, points = view.run, plane.points()
-    moved = points + np.nan_to_num(view.slice(plane).nodal(run.u_mean))
-    masks = (run.fixed_ignore, points), (run.moving_ignore, points), (run.moving_ignore, moved)
+    displaced_points = points + np.nan_to_num(view.slice(plane).nodal(run.u_mean))
+    masks = (run.fixed_ignore, points), (run.moving_ignore, points), (run.moving_ignore, displaced_points)
     nothing = np.zeros(points.shape[:-1], bool)
     fixed, moving, warped = (nothing if mask is None else mask.nearest(places) != 0 for mask, places in masks)
     return fixed, moving, warped
@@ -222,11 +222,11 @@ def arrows(axes: Axes, view: View, plane: Plane, u: np.ndarray) -> None:
     """Draw the in-plane displacement at true length, every few millimetres."""
     picture = view.slice(plane).nodal(u)
     stride = max(1, picture.shape[1] // 16)
-    some = (slice(stride // 2, None, stride),) * 2
+    slices = (slice(stride // 2, None, stride),) * 2
     across, up = IN_PLANE[plane.axis]
-    at, moved = plane.points()[some], picture[some]
+    at, displacement = plane.points()[slices], picture[slices]
     axes.quiver(
-        *(at[..., across], at[..., up], moved[..., across], moved[..., up]),
+        *(at[..., across], at[..., up], displacement[..., across], displacement[..., up]),
         angles="xy",
         scale_units="xy",
         scale=1,

@@ -93,13 +93,13 @@ def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> 
     name : str
     tissue : str, optional
     """
-    given = (model.get("priors") or {}).get(name) or {}
-    if "alpha" not in given:
-        given = given.get(tissue) or (next(iter(given.values()), {}) if tissue == "uniform" else {})
-    high = given.get("high")
+    prior = (model.get("priors") or {}).get(name) or {}
+    if "alpha" not in prior:
+        prior = prior.get(tissue) or (next(iter(prior.values()), {}) if tissue == "uniform" else {})
+    high = prior.get("high")
     if high is None or math.isinf(high):
         return None
-    low, alpha, beta = (float(given.get(key, default)) for key, default in (("low", 0), ("alpha", 1), ("beta", 1)))
+    low, alpha, beta = (float(prior.get(key, default)) for key, default in (("low", 0), ("alpha", 1), ("beta", 1)))
     return Interval(*(float(x) for x in stats.beta(alpha, beta, low, high - low).ppf((0.025, 0.975))))
 
 

@@ -19,10 +19,10 @@ def regions(mesh: TetMesh, places: Float[AnyArray, "places 3"]) -> list[str]:
     """Describe each place in words, as "right anterior, tumour"; the tissue of the nearest tetrahedron's centre."""
     places = np.asarray(places, float)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    offset = (places - (low + high) / 2) / ((high - low) / 2)
+    offsets = (places - (low + high) / 2) / ((high - low) / 2)
     _, nearest = cKDTree(mesh.points[mesh.cells].mean(axis=1)).query(places)
     labels = [label_of(mesh.names[k]) for k in mesh.tissue[nearest]]
-    return [f"{_sides(place)}, {label}" for place, label in zip(offset, labels, strict=True)]
+    return [f"{_sides(offset)}, {label}" for offset, label in zip(offsets, labels, strict=True)]
 
 
 def _sides(offset: np.ndarray) -> str:

@@ -104,8 +104,8 @@ class Study:
         judged = verdict(self.manifest, self.entries)
         if self.groups.groups == 1:
             return judged
-        apart = f" The chains lie in {self.groups.groups} groups, each shown under “Chains that disagree”."
-        return judged._replace(detail=(judged.detail + apart).strip())
+        sentence = f" The chains lie in {self.groups.groups} groups, each shown under “Chains that disagree”."
+        return judged._replace(detail=(judged.detail + sentence).strip())
 
     @cached_property
     def metrics(self) -> dict[str, Any] | None:

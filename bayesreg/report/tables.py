@@ -44,20 +44,20 @@ def error_tables(
     metrics: Mapping[str, Mapping[str, Any]], tissues: Sequence[str], with_paper: bool = False
 ) -> list[Table]:
     """Make Tables 1 and 2 and the coverage of runs (name -> metrics), and add the paper's values on request."""
-    one, two = ("Table 1. ", "Table 2. ") if with_paper else ("", "")
+    first_prefix, second_prefix = ("Table 1. ", "Table 2. ") if with_paper else ("", "")
     columns = ("median", "q95", "max")
     ours = _stages(metrics, "boundary_error", lambda error: [fixed(error.get(key)) for key in columns])
     paper = [[name, *map(fixed, row)] for name, row in PAPER_TABLE_1.items()]
     caption = "Distance between estimated and true displacement of the boundary nodes, mm."
     first = Table(
-        one + "Error on the boundary", caption, ["", "Median", "95 %", "Max"], _beside(ours, paper, with_paper)
+        first_prefix + "Error on the boundary", caption, ["", "Median", "95 %", "Max"], _beside(ours, paper, with_paper)
     )
     regions = (WHOLE, *tissues)
     ours = _stages(metrics, "mean_squared_error", lambda error: [number(error.get(key)) for key in regions])
     paper = [[name, *(fixed(row.get(key), 3) for key in regions)] for name, row in PAPER_TABLE_2.items()]
     caption = "Mean squared error of the displacement over the domain Ω and each tissue, mm²."
     header = ["", "Ω", *(f"Ω {label_of(name)}" for name in tissues)]
-    second = Table(two + "Mean squared error", caption, header, _beside(ours, paper, with_paper))
+    second = Table(second_prefix + "Mean squared error", caption, header, _beside(ours, paper, with_paper))
     return [first, second, *_coverage(metrics)]
 
 

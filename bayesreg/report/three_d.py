@@ -161,8 +161,8 @@ def _fluid_faces(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:
     deep = np.flatnonzero(fluid & ~np.isin(mesh.cells, mesh.boundary).any(axis=1))
     if not len(deep):
         return np.zeros((0, 3), int)
-    one, other = mesh.neighbours[np.isin(mesh.neighbours, deep).all(axis=1)].T
-    graph = scipy.sparse.coo_array((np.ones(len(one)), (one, other)), (len(mesh.cells), len(mesh.cells)))
+    cell, neighbour = mesh.neighbours[np.isin(mesh.neighbours, deep).all(axis=1)].T
+    graph = scipy.sparse.coo_array((np.ones(len(cell)), (cell, neighbour)), (len(mesh.cells), len(mesh.cells)))
     piece = connected_components(graph, directed=False)[1][deep]
     largest = deep[piece == np.bincount(piece).argmax()]
     faces = mesh.cells[largest][:, FACES].reshape(-1, 3)

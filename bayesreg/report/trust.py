@@ -13,8 +13,8 @@ from bayesreg.report.verdict import number, part
 
 def explain(study: Study) -> Sentences | None:
     """Write sentences on the intervals of a run; None if there is nothing to report."""
-    said = explain_intervals(study.manifest)
-    return Sentences("How far the intervals can be trusted", said) if said else None
+    sentences = explain_intervals(study.manifest)
+    return Sentences("How far the intervals can be trusted", sentences) if sentences else None
 
 
 def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
@@ -23,18 +23,18 @@ def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _correlated(manifest: Mapping[str, Any]) -> list[str]:
-    said = []
+    sentences = []
     for name, count in (part(manifest, "independent_points") or {}).items():
         points = part(manifest, "observations", name, "values")
         if not points or count > 0.99 * points:
             continue
         wider = math.sqrt(points / count)
-        said.append(
+        sentences.append(
             f"Neighbouring residuals are alike. Their correlation leaves {number(count)} of the {points:,} points that "
             f"are compared independent, by which the intervals are {number(wider, 2)} times as wide as if all were. "
             "What the model does not explain in the images has its share in that."
         )
-    return said
+    return sentences
 
 
 def _outliers(manifest: Mapping[str, Any]) -> list[str]:
@@ -43,7 +43,7 @@ def _outliers(manifest: Mapping[str, Any]) -> list[str]:
         for name in part(manifest, "observations") or {}
         if (similarity := part(manifest, "observations", name, "options", "similarity"))
     ]
-    forgiving = [one["degrees_of_freedom"] for one in similarities if one["kind"] == "student_t"]
+    forgiving = [settings["degrees_of_freedom"] for settings in similarities if settings["kind"] == "student_t"]
     if not forgiving:
         return []
     return [

@@ -167,8 +167,8 @@ def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterio
 
 def _threshold_text(manifest: Mapping[str, Any]) -> str:
     threshold, unsplit = part(manifest, "stopped", "rhat_threshold"), _unsplit(manifest)
-    asked = f" (asked for {threshold:g}" if threshold else " (none asked for"
-    return asked + (")" if unsplit == NONE else f"; unsplit, as in the paper, {unsplit})")
+    text = f" (asked for {threshold:g}" if threshold else " (none asked for"
+    return text + (")" if unsplit == NONE else f"; unsplit, as in the paper, {unsplit})")
 
 
 def _count(value: float | int | None) -> str:

@@ -104,11 +104,11 @@ def apply(
     InputError
         If nothing is given to transform, or a file is invalid.
     """
-    given = {"points": points, "image": image, "labels": labels, "mesh": mesh}
-    _require_sense(given, around, far, draws, margins)
+    inputs = {"points": points, "image": image, "labels": labels, "mesh": mesh}
+    _require_sense(inputs, around, far, draws, margins)
     result, out = load_result(folder), require_folder(out)
     how = _How(out, "fixed" if inverse else "moving", around, tuple(far))
-    _require_own_names(how, given, like)
+    _require_own_names(how, inputs, like)
     # All input is read before the long computation, so that errors appear early.
     tasks: list[Callable[[Transform], list[Path]]] = []
     if points is not None:
@@ -119,13 +119,13 @@ def apply(
     if image is not None:
         tasks.append(partial(_carry_image, load_image(image), _grid(result, like, inverse), Path(image), how))
     if labels is not None:
-        found = load_whole_numbers(labels)
-        if not np.asarray(found.voxels).any():
+        label_image = load_whole_numbers(labels)
+        if not np.asarray(label_image.voxels).any():
             raise InputError(f"{labels} holds no label: all its voxels are zero")
-        if absent := sorted(set(margins) - set(np.unique(found.voxels).tolist())):
+        if absent := sorted(set(margins) - set(np.unique(label_image.voxels).tolist())):
             raise InputError(f"label {absent[0]}, of which a margin is wanted, is not in {labels}")
         grid, most = _grid(result, like, inverse), draws or LABEL_DRAWS
-        tasks.append(partial(_carry_labels, found, grid, Path(labels), how, margins, most))
+        tasks.append(partial(_carry_labels, label_image, grid, Path(labels), how, margins, most))
     how.out.mkdir(parents=True, exist_ok=True)
     transform = transform_of(result, draws or (LABEL_DRAWS if points is None and mesh is None else POINT_DRAWS))
     transform = transform.inverse if inverse else transform
@@ -161,7 +161,7 @@ def require_distances(far: Sequence[float]) -> None:
 def require_folder(out: str | Path) -> Path:
     """Return the path of an output folder; raise InputError if it is a file or is not writable."""
     out = Path(out)
-    nearest = next(place for place in (out, *out.absolute().parents) if place.exists())
+    nearest = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         raise InputError(f"nothing can be written to {out}: {nearest} is no folder that you may write")
     return out
@@ -237,10 +237,10 @@ def _grid(result: Result, like: str | Path | None, inverse: bool) -> Image:
 
 
 def _carry_points(points: Points, path: Path, how: _How, transform: Transform) -> list[Path]:
-    found = spread(transform, points.points, how.far)
-    how.tell_of_outside(found.inside, f"points of {path}")
+    posterior = spread(transform, points.points, how.far)
+    how.tell_of_outside(posterior.inside, f"points of {path}")
     columns: dict[str, Any] = {"name": points.names}
-    for name, values in _values(found, how).items():
+    for name, values in _values(posterior, how).items():
         axes = [name] if values.ndim == 1 else [f"{name}{end}" for end in ENDS[name]]
         columns |= dict(zip(axes, values.reshape(len(values), -1).T, strict=True))
     write_table(target := how.target("points", path), columns)
@@ -250,13 +250,13 @@ def _carry_points(points: Points, path: Path, how: _How, transform: Transform) -
 def _carry_surface(surface: SurfaceFile, path: Path, how: _How, transform: Transform) -> list[Path]:
     if not surface.is_said:
         _log.info("%s does not say whether its coordinates are RAS or LPS (--space); they are taken as RAS", path)
-    found = spread(transform, surface.points, how.far)
-    how.tell_of_outside(found.inside, f"points of {path}")
+    posterior = spread(transform, surface.points, how.far)
+    how.tell_of_outside(posterior.inside, f"points of {path}")
     if how.around == "missing":
-        if not found.inside.any():
+        if not posterior.inside.any():
             raise InputError(f"no point of {path} lies in the mesh, and what lies around it is to be left out")
-        surface, found = surface.part(found.inside), found.part(found.inside)
-    values = _values(found, how)
+        surface, posterior = surface.part(posterior.inside), posterior.part(posterior.inside)
+    values = _values(posterior, how)
     write_surface(target := how.target("mesh", path), surface, values.pop(""), values)
     return [target]
 
@@ -273,9 +273,9 @@ ENDS = {
 def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
     """Collect the coordinates of every point and the measures of its uncertainty, by column name."""
     lengths, directions = found.ellipsoids()
-    one, other = np.triu_indices(3)
+    row, column = np.triu_indices(3)
     places = found.places if how.around == "harmonic" else np.where(found.inside[:, None], found.places, np.nan)
-    values = {"": places, "cov_": found.covariance[:, one, other], "radius95": distances_of(found.covariance).radius}
+    values = {"": places, "cov_": found.covariance[:, row, column], "radius95": distances_of(found.covariance).radius}
     values |= {"half_axis95_": lengths, "axis": directions.reshape(-1, 9)}
     values |= {f"p_over_{distance:g}mm": share for distance, share in zip(how.far, found.far, strict=True)}
     return values | {"in_mesh": found.inside.astype(float)}
@@ -284,14 +284,14 @@ def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
 def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Transform) -> list[Path]:
     """Transform an image by the posterior mean with linear interpolation; voxels from beyond its grid are zero."""
     back, voxels = transform.inverse, np.empty(int(np.prod(grid.shape)), np.float32)
-    inside, given = np.empty(len(voxels), bool), np.asarray(image.voxels, float)
-    for some, places in grid.blocks():
+    inside, intensities = np.empty(len(voxels), bool), np.asarray(image.voxels, float)
+    for block, places in grid.blocks():
         source, location = back.place(places)
         # As in ITK, the outermost half voxel takes the nearest value; beyond it the result is zero.
         index = image.world_to_voxel(source).T
-        values = ndimage.map_coordinates(given, index, order=1, mode="nearest")
-        voxels[some] = np.where(image.contains(source), values, 0.0)
-        inside[some] = back.deformer.is_inside(location) & image.contains(source)
+        values = ndimage.map_coordinates(intensities, index, order=1, mode="nearest")
+        voxels[block] = np.where(image.contains(source), values, 0.0)
+        inside[block] = back.deformer.is_inside(location) & image.contains(source)
     _tell_of_nothing(inside, path, how)
     if how.around == "missing":
         voxels[~inside] = np.nan
@@ -308,18 +308,18 @@ def _carry_labels(
     labels: Image, grid: Image, path: Path, how: _How, margins: Sequence[int], most: int, transform: Transform
 ) -> list[Path]:
     count = min(len(transform.draws), most)
-    some = replace(transform, draws=transform.draws[np.linspace(0, len(transform.draws) - 1, count).astype(int)])
-    _log.info("labels of %s, by %d draws", path, len(some.draws))
-    found = carry_labels(some, labels, grid, keep_around=how.around == "harmonic")
-    _tell_of_nothing(np.asarray(found.most_probable.voxels).ravel() != 0, path, how)
-    save_image(found.most_probable, target := how.target("labels", path))
+    thinned = replace(transform, draws=transform.draws[np.linspace(0, len(transform.draws) - 1, count).astype(int)])
+    _log.info("labels of %s, by %d draws", path, len(thinned.draws))
+    carried = carry_labels(thinned, labels, grid, keep_around=how.around == "harmonic")
+    _tell_of_nothing(np.asarray(carried.most_probable.voxels).ravel() != 0, path, how)
+    save_image(carried.most_probable, target := how.target("labels", path))
     folder = how.name(path, "_probability")
     folder.mkdir(exist_ok=True)
     # An earlier call with a file of this name may have left probabilities of other labels.
     for stale in folder.glob("label-*.nii.gz"):
         stale.unlink()
     written = [target]
-    for value, probability in found.probabilities():
+    for value, probability in carried.probabilities():
         write_nifti(probability, grid.affine, part := folder / f"label-{value}.nii.gz")
         written.append(part)
         if value in margins and not (np.nan_to_num(probability) > 1 - MARGIN).any():

@@ -33,10 +33,12 @@ def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
     """
     entities = f"sub-{names.subject}" + ("" if names.session is None else f"_ses-{names.session}")
     within = f"{FOLDER}/{entities.replace('_', '/')}/anat"
-    there, back = (f"from-{a}_to-{b}_mode-image" for a, b in ((names.moving, names.fixed), (names.fixed, names.moving)))
+    forward, back = (
+        f"from-{a}_to-{b}_mode-image" for a, b in ((names.moving, names.fixed), (names.fixed, names.moving))
+    )
     units, space = {"Units": "mm"}, f"space-{names.fixed}"
     known = {
-        MEAN: (f"{there}_xfm.h5", "Posterior mean transform, ITK composite: a displacement field, then a pose.", {}),
+        MEAN: (f"{forward}_xfm.h5", "Posterior mean transform, ITK composite: a displacement field, then a pose.", {}),
         MEAN_INVERSE: (f"{back}_xfm.h5", "Its inverse.", {}),
         "warped_mean.nii.gz": (f"{space}_desc-warped_{names.suffix}.nii.gz", "Resampled by the posterior mean.", {}),
         "displacement_mean.nii.gz": (

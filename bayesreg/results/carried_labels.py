@@ -51,19 +51,19 @@ class CarriedLabels:
     @property
     def most_probable(self) -> Image:
         """The most frequent label of each voxel over the draws; zero if it is unknown."""
-        found = np.where(self.certain < 0, 0, self.values[self.certain])
+        labels = np.where(self.certain < 0, 0, self.values[self.certain])
         known = self.certain[self.open] >= 0
-        found[self.open[known]] = self.values[self.counts[:, known].argmax(axis=0)]
-        return self.grid.with_voxels(found.reshape(self.grid.shape).astype(np.int32))
+        labels[self.open[known]] = self.values[self.counts[:, known].argmax(axis=0)]
+        return self.grid.with_voxels(labels.reshape(self.grid.shape).astype(np.int32))
 
     def probabilities(self) -> Iterator[tuple[int, Float[np.ndarray, "X Y Z"]]]:
         """Yield every label except zero with its probability in each voxel; NaN where the label is unknown."""
         for index, value in enumerate(self.values):
             if value:
-                found = (self.certain == index).astype(np.float32)
-                found[self.open] = self.counts[index] / self.draws
-                found[self.certain < 0] = np.nan
-                yield int(value), found.reshape(self.grid.shape)
+                probability = (self.certain == index).astype(np.float32)
+                probability[self.open] = self.counts[index] / self.draws
+                probability[self.certain < 0] = np.nan
+                yield int(value), probability.reshape(self.grid.shape)
 
 
 def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: bool = True) -> CarriedLabels:
@@ -98,27 +98,27 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
     reach = _reach(back)
     certain, unsure = (np.empty(int(np.prod(grid.shape)), kind) for kind in (np.int16, bool))
     nearby, unresolved = [], []
-    for some, places in grid.blocks():
+    for block, places in grid.blocks():
         source, near = back.place(places)
-        certain[some] = numbers.nearest(source)
+        certain[block] = numbers.nearest(source)
         if not keep_around:
-            certain[some][~back.deformer.is_inside(near)] = -1
+            certain[block][~back.deformer.is_inside(near)] = -1
         sd = back.unresolved_sd(near)
-        apart = np.where(numbers.contains(source), distance.nearest(source), _distance_to_box(numbers, box, source))
-        unsure[some] = (apart <= reach[near.cell] + FURTHEST * sd.max(axis=1)) & (certain[some] >= 0)
-        nearby.append(Location(near.cell[unsure[some]], near.barycentric[unsure[some]]))
-        unresolved.append(sd[unsure[some]].astype(np.float32))
+        clearance = np.where(numbers.contains(source), distance.nearest(source), _distance_to_box(numbers, box, source))
+        unsure[block] = (clearance <= reach[near.cell] + FURTHEST * sd.max(axis=1)) & (certain[block] >= 0)
+        nearby.append(Location(near.cell[unsure[block]], near.barycentric[unsure[block]]))
+        unresolved.append(sd[unsure[block]].astype(np.float32))
     open_voxels, unresolved_sd = np.flatnonzero(unsure), np.concatenate(unresolved)
     cell, barycentric = (np.concatenate(parts) for parts in zip(*nearby, strict=True))
     counts = np.zeros((len(values), len(open_voxels)), np.uint16)
-    for some in slices(len(open_voxels), max(MOST_COUNTS // len(values), 1)):
-        part = counts[:, some]
+    for block in slices(len(open_voxels), max(MOST_COUNTS // len(values), 1)):
+        part = counts[:, block]
         _count(
             back,
             numbers,
-            grid.centres(open_voxels[some]),
-            Location(cell[some], barycentric[some]),
-            unresolved_sd[some],
+            grid.centres(open_voxels[block]),
+            Location(cell[block], barycentric[block]),
+            unresolved_sd[block],
             part,
         )
     return CarriedLabels(grid, values[order], certain, open_voxels, counts, len(transform.draws))
@@ -139,16 +139,16 @@ def _count(
         return numbers.nearest(sources)
 
     columns = np.arange(len(places))
-    for found in back.for_each_draw(labels_of):
-        counts[found, columns] += 1
+    for labels in back.for_each_draw(labels_of):
+        counts[labels, columns] += 1
 
 
 def _distance_to_others(numbers: Image) -> Image:
     """Compute a lower bound, mm, of the distance of any point in a voxel from other labels."""
     # Zero counts as a label, also beyond the grid.
     shifted = np.pad(np.asarray(numbers.voxels).astype(np.uint32) + 1, 1, constant_values=1)
-    found = edt.edt(shifted, anisotropy=tuple(numbers.voxel_sizes), black_border=False, parallel=0)[1:-1, 1:-1, 1:-1]
-    return numbers.with_voxels(np.maximum(found - np.linalg.norm(numbers.voxel_sizes), 0))
+    distance = edt.edt(shifted, anisotropy=tuple(numbers.voxel_sizes), black_border=False, parallel=0)[1:-1, 1:-1, 1:-1]
+    return numbers.with_voxels(np.maximum(distance - np.linalg.norm(numbers.voxel_sizes), 0))
 
 
 def _box(numbers: Image) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
@@ -173,15 +173,15 @@ def _reach(back: Transform) -> Float[np.ndarray, "cells"]:
 
     There is one bound for each tetrahedron of the mesh and its surroundings; the last one holds beyond these.
     """
-    around = back.deformer.surroundings
-    mean = around.extend(back.u_mean)
+    surroundings = back.deformer.surroundings
+    mean = surroundings.extend(back.u_mean)
     away = np.zeros(len(mean))
     for u in back.draws:
-        away = np.maximum(away, np.linalg.norm(around.extend(u) - mean, axis=1))
-    corners = around.points[around.cells]
-    moved = corners + mean[around.cells]
-    edges, moved_edges = (x[:, 1:] - x[:, :1] for x in (corners, moved))
+        away = np.maximum(away, np.linalg.norm(surroundings.extend(u) - mean, axis=1))
+    corners = surroundings.points[surroundings.cells]
+    moved_corners = corners + mean[surroundings.cells]
+    edges, moved_edges = (x[:, 1:] - x[:, :1] for x in (corners, moved_corners))
     # A displacement changes the source by up to the norm of (I + ∇u)⁻¹ times its length.
     stretch = np.linalg.norm(np.linalg.solve(moved_edges, edges), ord=2, axis=(1, 2))
-    reach = MARGIN * stretch * away[around.cells].max(axis=1)
+    reach = MARGIN * stretch * away[surroundings.cells].max(axis=1)
     return np.append(reach, away.max())

@@ -102,11 +102,11 @@ def jacobians(mesh: TetMesh, draws: Float[np.ndarray, "draws nodes 3"]) -> dict[
 
 def _distances(transform: Transform, covered: Covered, far: Sequence[float]) -> dict[str, Float[np.ndarray, "k"]]:
     names = ["radius95", *(f"p_over_{distance:g}mm" for distance in far)]
-    found = np.empty((len(names), len(covered.cell)), np.float32)
-    for some in slices(len(covered.cell), CHUNK):
-        at = distances_of(transform.covariance(Location(covered.cell[some], covered.barycentric[some])), far)
-        found[:, some] = np.concatenate([at.radius[None], at.far])
-    return dict(zip(names, found, strict=True))
+    values = np.empty((len(names), len(covered.cell)), np.float32)
+    for chunk in slices(len(covered.cell), CHUNK):
+        distances = distances_of(transform.covariance(Location(covered.cell[chunk], covered.barycentric[chunk])), far)
+        values[:, chunk] = np.concatenate([distances.radius[None], distances.far])
+    return dict(zip(names, values, strict=True))
 
 
 def _write(path: Path, grid: Image, covered: Covered, values: Float[np.ndarray, "k"]) -> Path:

@@ -43,23 +43,23 @@ def nodal_draws(
     if not most:
         return np.empty((0, *inputs.mesh.points.shape))
     chains = draws.sizes["chain"]
-    some = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], chains * -(-most // chains))
+    thinned = thin(draws, [str(name) for name in draws.data_vars if name != "ratio"], chains * -(-most // chains))
     # Every chain gave the same number of draws, so that there are too many if `most` is no multiple of the chains.
-    count = some["u_boundary"].shape[1]
+    count = thinned["u_boundary"].shape[1]
     draw, chain = np.divmod(evenly_spaced(chains * count, most), chains)
-    some = {name: values[chain, draw][None] for name, values in some.items()}
-    u = some["u_boundary"]
+    selected = {name: values[chain, draw][None] for name, values in thinned.items()}
+    u = selected["u_boundary"]
     if u.shape[2] == len(inputs.mesh.points):
         return u[0]
     body, blocks = body_of(inputs.mesh, with_known_boundary(model, inputs))
-    known = {name: values for name, values in some.items() if name in blocks}
+    known = {name: values for name, values in selected.items() if name in blocks}
 
     def displacement(draw: dict[str, AnyArray], given: tuple[Body, Blocks]) -> AnyArray:
         body, blocks = given
         return state_of(body, blocks, fill(blocks, draw)).u
 
-    every = np.concatenate(list(push_forward(displacement, known, (body, blocks))), axis=1)
-    return every.reshape(-1, *every.shape[2:])
+    displacements = np.concatenate(list(push_forward(displacement, known, (body, blocks))), axis=1)
+    return displacements.reshape(-1, *displacements.shape[2:])
 
 
 def with_known_boundary(model: ModelConfig, inputs: Inputs | Run) -> ModelConfig:

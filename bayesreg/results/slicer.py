@@ -78,9 +78,9 @@ def _write_images(result: Result, out: Path) -> list[Item]:
 def _write_mesh(transform: Transform, out: Path) -> list[Item]:
     """Write the surface of the organ, moved by the posterior mean."""
     mesh = transform.mesh
-    found = spread(transform, mesh.points[mesh.boundary])
+    posterior = spread(transform, mesh.points[mesh.boundary])
     faces = np.searchsorted(mesh.boundary, mesh.boundary_faces)
-    save_surface(out / "surface.vtk", found.places, faces, {"radius95": distances_of(found.covariance).radius})
+    save_surface(out / "surface.vtk", posterior.places, faces, {"radius95": distances_of(posterior.covariance).radius})
     return [Item("model", "organ", "surface.vtk", colour=(0.9, 0.75, 0.65, 0.3))]
 
 
@@ -99,9 +99,9 @@ def _write_places(result: Result, transform: Transform, out: Path) -> list[Item]
         if inside.any():
             kinds["held_out"] = (predicted.evaluation_names[inside], np.asarray(predicted.evaluation_points)[inside])
     for name, (labels, points) in kinds.items():
-        found = spread(transform, np.asarray(points))
-        write_markups(out / f"{name}.mrk.json", [str(label) for label in labels], found.places)
-        save_ellipsoids(out / f"{name}_95.vtk", found.places, *found.ellipsoids())
+        posterior = spread(transform, np.asarray(points))
+        write_markups(out / f"{name}.mrk.json", [str(label) for label in labels], posterior.places)
+        save_ellipsoids(out / f"{name}_95.vtk", posterior.places, *posterior.ellipsoids())
         items += [
             Item("markups", name, f"{name}.mrk.json"),
             Item("model", f"{name}, 95 %", f"{name}_95.vtk", colour=(0.9, 0.5, 0.1, 0.5)),

@@ -137,9 +137,9 @@ class Transform:
         The notes of `Transform` define it. It is NaN around the mesh, where nothing is observed.
         """
         drawn = self._drawn_covariance(near)
-        found = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
-        found[~self.deformer.is_inside(near)] = np.nan
-        return found
+        covariance = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
+        covariance[~self.deformer.is_inside(near)] = np.nan
+        return covariance
 
     def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
         """Compute the posterior covariance of u at the nodes, mm², plus the variance that the mesh cannot resolve.
@@ -147,38 +147,38 @@ class Transform:
         The latter is the mean over the tetrahedra at a node, weighted by their volumes.
         """
         away = self.draws - self.draws.mean(axis=0)
-        found = np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
-        total, volume = np.zeros((len(found), 3)), np.zeros(len(found))
+        covariance = np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
+        total, volume = np.zeros((len(covariance), 3)), np.zeros(len(covariance))
         for corner in self.mesh.cells.T:
             np.add.at(total, corner, self.mesh.volumes[:, None] * self._submesh_variance)
             np.add.at(volume, corner, self.mesh.volumes)
-        return found + (total / volume[:, None])[:, :, None] * np.eye(3)
+        return covariance + (total / volume[:, None])[:, :, None] * np.eye(3)
 
     def _drawn_covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
         """Compute the covariance of the draws at points, mm²; zero around the mesh.
 
         The draws are linear in every tetrahedron.
         """
-        found = np.zeros((len(near.cell), 3, 3))
+        covariance = np.zeros((len(near.cell), 3, 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
         total = np.zeros((len(cell), 3, 3))
         for a, b in product(range(4), repeat=2):
             total += (share[:, a] * share[:, b])[:, None, None] * self._cell_covariance[cell, a, b]
-        found[inside] = total
-        return found
+        covariance[inside] = total
+        return covariance
 
     def _unresolved_variance(self, near: Location, drawn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 3"]:
         """Compute the variance of u minus the variance of the draws at points, mm²; zero around the mesh.
 
         The variance of u is that of the nodes, interpolated, plus the variance that the mesh cannot resolve.
         """
-        found = np.zeros((len(near.cell), 3))
+        variance = np.zeros((len(near.cell), 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
         nodal = np.einsum("ka,kai->ki", share, self._corner_sd[cell]) ** 2
-        found[inside] = np.maximum(nodal + self._submesh_variance[cell] - np.einsum("kii->ki", drawn[inside]), 0)
-        return found
+        variance[inside] = np.maximum(nodal + self._submesh_variance[cell] - np.einsum("kii->ki", drawn[inside]), 0)
+        return variance
 
     @cached_property
     def _corner_sd(self) -> Float[np.ndarray, "cells 4 3"]:
@@ -192,14 +192,14 @@ class Transform:
     def _cell_covariance(self) -> Float[np.ndarray, "cells 4 4 3 3"]:
         """The covariance of u between the corners of every tetrahedron, mm²."""
         away, cells = self.draws - self.draws.mean(axis=0), self.mesh.cells
-        found = np.empty((len(cells), 4, 4, 3, 3))
+        covariance = np.empty((len(cells), 4, 4, 3, 3))
         # Blocks of tetrahedra limit the memory for all draws of their corners.
-        for some in slices(len(cells), 500):
-            corners = np.moveaxis(away[:, cells[some]], 0, 2)
+        for block in slices(len(cells), 500):
+            corners = np.moveaxis(away[:, cells[block]], 0, 2)
             for a, b in combinations_with_replacement(range(4), 2):
-                found[some, a, b] = np.swapaxes(corners[:, a], 1, 2) @ corners[:, b] / max(len(away) - 1, 1)
-                found[some, b, a] = np.swapaxes(found[some, a, b], 1, 2)
-        return found
+                covariance[block, a, b] = np.swapaxes(corners[:, a], 1, 2) @ corners[:, b] / max(len(away) - 1, 1)
+                covariance[block, b, a] = np.swapaxes(covariance[block, a, b], 1, 2)
+        return covariance
 
 
 class Spread(NamedTuple):
@@ -256,11 +256,11 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
     places, near = transform.place(points)
     inside = transform.deformer.is_inside(near)
     known = np.flatnonzero(inside)
-    here = Location(near.cell[known], near.barycentric[known])
+    location = Location(near.cell[known], near.barycentric[known])
     square, beyond_far = np.zeros((len(known), 3, 3)), np.zeros((len(far), len(known)))
-    sd = transform.unresolved_sd(here)
-    for there in transform.for_each_draw(lambda draw: transform.place_by(draw, points[known], here, sd)):
-        away = there - places[known]
+    sd = transform.unresolved_sd(location)
+    for drawn_places in transform.for_each_draw(lambda draw: transform.place_by(draw, points[known], location, sd)):
+        away = drawn_places - places[known]
         square += away[:, :, None] * away[:, None]
         distance = np.linalg.norm(away, axis=1)
         beyond_far += distance > np.reshape(far, (-1, 1))
@@ -295,10 +295,10 @@ def distances_of(covariance: Float[np.ndarray, "k 3 3"], far: Sequence[float] = 
     radius, probability = np.full(len(covariance), np.nan), np.full((len(far), len(covariance)), np.nan)
     known = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
     for first in range(0, len(known), 20_000):
-        some = known[first : first + 20_000]
-        square = np.maximum(np.linalg.eigvalsh(covariance[some]), 0) @ squares.T
+        block = known[first : first + 20_000]
+        square = np.maximum(np.linalg.eigvalsh(covariance[block]), 0) @ squares.T
         for index, distance in enumerate(far):
-            probability[index, some] = (square > distance**2).mean(axis=1)
-        place = int(np.ceil(level * square.shape[1])) - 1
-        radius[some] = np.sqrt(np.partition(square, place, axis=1)[:, place])
+            probability[index, block] = (square > distance**2).mean(axis=1)
+        rank = int(np.ceil(level * square.shape[1])) - 1
+        radius[block] = np.sqrt(np.partition(square, rank, axis=1)[:, rank])
     return Distances(radius, probability)

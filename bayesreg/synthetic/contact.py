@@ -143,11 +143,11 @@ class ContactProblem:
     ) -> tuple[_State, int]:
         """Step until a step is shorter than the tolerance (mm) or longer than the body; also return the step count."""
         for count in range(1, limit + 1):
-            after, moved = self._step(state, floor, load)
-            if not moved < self._size:
+            after, step_length = self._step(state, floor, load)
+            if not step_length < self._size:
                 return state, count
             state = after
-            if moved < tolerance:
+            if step_length < tolerance:
                 return state, count
         return state, limit
 
@@ -189,8 +189,10 @@ class ContactProblem:
             index = np.flatnonzero(working)
             matrix = np.einsum("ai,aibj,bj->ab", normal[index], self._compliance.among(index), normal[index])
             force[index] = complementarity(matrix, -offset[index], state.force[index] > 0)
-            moved = (normal * self._compliance.response(index, force[index, None] * normal[index])).sum(axis=1)
-            crossed = steep & ~working & (offset + moved < -1e-9)
+            normal_displacement = (normal * self._compliance.response(index, force[index, None] * normal[index])).sum(
+                axis=1
+            )
+            crossed = steep & ~working & (offset + normal_displacement < -1e-9)
             if not crossed.any():
                 return force
             working |= crossed
@@ -260,9 +262,9 @@ class _Compliance:
 
     def response(self, index: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Compute the displacement (o, 3) of every node that may touch, by forces (k, 3) on the nodes of `index`."""
-        every = np.zeros((self.columns.shape[1] // 3, 3))
-        every[self.position[index]] = force
-        return (self.columns @ every.ravel()).reshape(-1, 3)
+        all_forces = np.zeros((self.columns.shape[1] // 3, 3))
+        all_forces[self.position[index]] = force
+        return (self.columns @ all_forces.ravel()).reshape(-1, 3)
 
     def _add(self, index: np.ndarray) -> None:
         """Compute the columns of the compliance for forces on the nodes of `index`."""

@@ -116,11 +116,11 @@ def push_patch(
     stiff = stiffness(mesh, lam, mu)
     for chosen in DIRECTIONS if direction is None else (direction,):
         patch = surface_patch(mesh, patch_nodes, np.asarray(chosen, float))
-        found = _push(mesh, stiff, obstacle, patch, displacement, margin)
-        if found.volume_ratio.min() > 0:
-            return found
-        _log.info("a push along %s inverts %d tetrahedra", chosen, (found.volume_ratio <= 0).sum())
-    raise InputError(_inversion(mesh, found.volume_ratio, displacement))
+        deformation = _push(mesh, stiff, obstacle, patch, displacement, margin)
+        if deformation.volume_ratio.min() > 0:
+            return deformation
+        _log.info("a push along %s inverts %d tetrahedra", chosen, (deformation.volume_ratio <= 0).sum())
+    raise InputError(_inversion(mesh, deformation.volume_ratio, displacement))
 
 
 def _push(
@@ -189,11 +189,11 @@ def _settle(problem: ContactProblem, obstacle: SmoothObstacle, margin: float) ->
     floor = np.full(len(problem.points), margin)
     minimum = problem.solve(floor, tolerance=1e-3)
     for _ in range(_ROUNDS_OF_FLOORS):
-        place = (problem.points + minimum.u)[problem.nodes]
-        missing = margin - obstacle.distance(place)
+        positions = (problem.points + minimum.u)[problem.nodes]
+        missing = margin - obstacle.distance(positions)
         if missing.max() <= _SLIP * margin or not minimum.converged:
             break
-        raised = np.where(missing > _SLIP * margin, obstacle(place)[0] + missing, -np.inf)
+        raised = np.where(missing > _SLIP * margin, obstacle(positions)[0] + missing, -np.inf)
         floor[problem.nodes] = np.maximum(floor[problem.nodes], raised)
         minimum = problem.solve(floor, start=minimum, tolerance=1e-3)
     if minimum.converged:

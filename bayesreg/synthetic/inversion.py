@@ -76,8 +76,8 @@ def residuals(
     quadrature = gauss_quadrature(mesh, rule)
     nodal = u[mesh.cells[np.asarray(quadrature.cells)]]
     rest = quadrature.positions(mesh)
-    moved = rest + np.einsum("qa,qai->qi", np.asarray(quadrature.barycentric), nodal)
-    return np.asarray(fixed.interpolate(rest, interpolation) - moving.interpolate(moved, interpolation))
+    displaced = rest + np.einsum("qa,qai->qi", np.asarray(quadrature.barycentric), nodal)
+    return np.asarray(fixed.interpolate(rest, interpolation) - moving.interpolate(displaced, interpolation))
 
 
 def _surface_displacement(

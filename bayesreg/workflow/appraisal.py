@@ -53,8 +53,8 @@ class Appraisal(NamedTuple):
     def as_json(self) -> dict[str, Any]:
         """Convert the appraisal to mappings and lists, for files."""
         likeness = None if self.likeness is None else self.likeness._asdict()
-        told = {"beware": list(self.beware), "notes": list(self.notes)}
-        return {"millilitres": dict(self.millilitres), "likeness": likeness, **told}
+        remarks = {"beware": list(self.beware), "notes": list(self.notes)}
+        return {"millilitres": dict(self.millilitres), "likeness": likeness, **remarks}
 
 
 class Likeness(NamedTuple):
@@ -106,29 +106,29 @@ class Likeness(NamedTuple):
         one_scale : bool
             Whether both images share one scale of intensities.
         """
-        found = []
+        warnings = []
         if self.on_grid < 1 - BEYOND:
-            found.append(
+            warnings.append(
                 f"{1 - self.on_grid:.0%} of the organ lies beyond the grid of the moving image, where nothing is seen."
             )
         if one_contrast and self.correlation < -ALIKE / 2:
-            found.append(
+            warnings.append(
                 f"Bright and dark change places between the images (correlation {self.correlation:.2f}): they are not "
                 "of one contrast; data.same_contrast: null or false compares them through a map of intensities."
             )
         elif one_contrast and not self.correlation >= ALIKE:
-            found.append(
+            warnings.append(
                 f"The images are hardly alike as they lie: correlation {self.correlation:.2f}, normalised mutual "
                 f"information {self.mutual_information:.2f}. If they are of one contrast, they are not aligned, or the "
                 "axes of one are mistaken; if they are not, data.same_contrast: false compares them through a map of "
                 "intensities, and similarity: lncc window by window."
             )
         if one_scale and not self.is_one_scale:
-            found.append(
+            warnings.append(
                 f"The intensities of the moving image range {self.scale_ratio:.2g} times as far as those of the fixed "
                 f"one, and lie {self.offset:+.2g} ranges from them; data.same_contrast: false scales each on its own."
             )
-        return found
+        return warnings
 
 
 def appraise(
@@ -142,9 +142,9 @@ def appraise(
 ) -> Appraisal:
     """Appraise the labels and, if there is a pair of images, their likeness; see `Likeness.sentences`."""
     millilitres = measure_tissues(tissue, domain, names)
-    told = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
+    warnings = [] if likeness is None else likeness.sentences(one_contrast, one_scale)
     return Appraisal(
-        millilitres, likeness, (*explain_left_out(millilitres), *explain_mask(tissue, intracranial), *told)
+        millilitres, likeness, (*explain_left_out(millilitres), *explain_mask(tissue, intracranial), *warnings)
     )
 
 
@@ -153,7 +153,7 @@ def explain_mask(tissue: Image, intracranial: Image | None) -> list[str]:
     if intracranial is None:
         return []
     labelled, inside = np.asarray(tissue.voxels) != 0, np.asarray(intracranial.voxels) != 0
-    filled, all_of_it = (np.count_nonzero(one) * tissue.voxel_volume / 1e3 for one in (labelled & inside, inside))
+    filled, all_of_it = (np.count_nonzero(mask) * tissue.voxel_volume / 1e3 for mask in (labelled & inside, inside))
     if filled >= FILLED * all_of_it:
         return []
     return [
@@ -175,18 +175,23 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
     inside = np.argwhere(np.asarray(domain.voxels) != 0)
     inside = inside[:: max(1, len(inside) // VOXELS)]
     places = domain.voxel_to_world(inside)
-    seen = np.asarray(moving.contains(places))
-    if seen.sum() < 2:
-        return Likeness(0.0, 0.0, 1.0, 0.0, float(seen.mean()))
-    one = np.asarray(fixed.interpolate(places[seen]))
-    other = np.asarray(moving.interpolate(places[seen]))
-    ranges = [np.subtract(*np.quantile(values, (0.995, 0.005))) for values in (one, other)]
+    on_grid = np.asarray(moving.contains(places))
+    if on_grid.sum() < 2:
+        return Likeness(0.0, 0.0, 1.0, 0.0, float(on_grid.mean()))
+    fixed_values = np.asarray(fixed.interpolate(places[on_grid]))
+    moving_values = np.asarray(moving.interpolate(places[on_grid]))
+    ranges = [np.subtract(*np.quantile(values, (0.995, 0.005))) for values in (fixed_values, moving_values)]
     if min(ranges) <= 0:
-        return Likeness(0.0, 0.0, 1.0, 0.0, float(seen.mean()))
-    correlation = float(np.corrcoef(one, other)[0, 1])
-    offset = (np.median(other) - np.median(one)) / ranges[0]
-    information, shares = _mutual_information(one, other), explained_shares(one, other)
-    return Likeness(correlation, information, float(ranges[1] / ranges[0]), float(offset), float(seen.mean()), *shares)
+        return Likeness(0.0, 0.0, 1.0, 0.0, float(on_grid.mean()))
+    correlation = float(np.corrcoef(fixed_values, moving_values)[0, 1])
+    offset = (np.median(moving_values) - np.median(fixed_values)) / ranges[0]
+    information, shares = (
+        _mutual_information(fixed_values, moving_values),
+        explained_shares(fixed_values, moving_values),
+    )
+    return Likeness(
+        correlation, information, float(ranges[1] / ranges[0]), float(offset), float(on_grid.mean()), *shares
+    )
 
 
 def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:

@@ -37,7 +37,7 @@ def posterior_of(
     likelihood.
     """
     model, reference = with_known_boundary(config.model, inputs), _references(config, inputs.mesh)
-    observed = [one for section in config.observations for one in section.observe(inputs)]
+    observed = [observation for section in config.observations for observation in section.observe(inputs)]
     posterior = build_posterior(inputs.mesh, [*observed, *observations], model, inputs.skull, reference)
     return posterior.with_independent_points(independent_points) if independent_points else posterior
 
@@ -49,10 +49,10 @@ def _references(config: Config, mesh: TetMesh) -> dict[str, AnyArray]:
 def _reference(name: Lame, config: Config, mesh: TetMesh) -> Float[np.ndarray, "entries"]:
     """Return all entries of λ or μ at the start: the configuration's values, else those that the model chooses."""
     values = np.array(lame_parameter(name, mesh, config.model, None).reference())
-    given, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
+    start_values, entry = config.start.entries(name, mesh.names) or {}, cell_entries(mesh, config.model)
     for index, tissue in enumerate(mesh.names):
-        if tissue in given:
-            values[entry[mesh.tissue == index]] = given[tissue]
+        if tissue in start_values:
+            values[entry[mesh.tissue == index]] = start_values[tissue]
     return values
 
 

@@ -74,20 +74,20 @@ def batch(
     """
     from bayesreg.report.cohort import write_cohort
 
-    given, out = load_cohort(cohort), Path(out).absolute()
+    loaded_cohort, out = load_cohort(cohort), Path(out).absolute()
     try:
         out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{out} cannot be a folder: {error.strerror}; name another one") from None
     rows: dict[str, dict[str, Any]] = {}
     # Only workers that run on this machine share its cores.
-    shares = given.cluster.workers if scheduler is None and given.cluster.slurm is None else None
-    with _client(given.cluster, scheduler) as client, _Board(given, progress) as board:
+    shares = loaded_cohort.cluster.workers if scheduler is None and loaded_cohort.cluster.slurm is None else None
+    with _client(loaded_cohort.cluster, scheduler) as client, _Board(loaded_cohort, progress) as board:
         client.subscribe_topic(TOPIC, board.show)
-        for task, found in _submit(client, given, out, shares):
-            rows[task.name] = {"subject": task.subject, **task.settings, "folder": task.name, **found}
-            board.end(task, found)
-    table = pd.DataFrame([rows[task.name] for task in given.tasks])
+        for task, row in _submit(client, loaded_cohort, out, shares):
+            rows[task.name] = {"subject": task.subject, **task.settings, "folder": task.name, **row}
+            board.end(task, row)
+    table = pd.DataFrame([rows[task.name] for task in loaded_cohort.tasks])
     write_cohort(table, out)
     return table
 
@@ -117,7 +117,7 @@ def summarise(result: Result) -> dict[str, Any]:
     manifest, mesh = result.run.manifest, result.mesh
     share = mesh.nodal_volumes / mesh.nodal_volumes.sum()
     length = np.linalg.norm(result.u_mean, axis=1)
-    found = {
+    row = {
         "converged": result.converged,
         "rhat_max": manifest["convergence"]["rhat_max"],
         "ess_min": manifest["convergence"]["ess_bulk_min"],
@@ -126,12 +126,12 @@ def summarise(result: Result) -> dict[str, Any]:
         "minutes": manifest["timings"]["total"] / 60,
     }
     if result.run.predicted is not None:
-        found["radius95_mean_mm"] = float(share @ np.asarray(result.run.predicted.reach))
+        row["radius95_mean_mm"] = float(share @ np.asarray(result.run.predicted.reach))
     for group in parameter_groups(mesh, dataset(result.idata, "posterior")):
         for name, draws in (("lam", group.lam), ("mu", group.mu)):
             low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
-            found |= {f"{name}_{group.name}{end}": x for end, x in (("", median), ("_low", low), ("_high", high))}
-    return found
+            row |= {f"{name}_{group.name}{end}": x for end, x in (("", median), ("_low", low), ("_high", high))}
+    return row
 
 
 class _Reporter(NoProgress):
@@ -170,9 +170,9 @@ _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 @cache
 def _devices() -> tuple[str, ...]:
     """List the NVIDIA devices that were available before `_take_share`, by their names in CUDA_VISIBLE_DEVICES."""
-    given = os.environ.get(VISIBLE)
-    if given is not None:
-        return tuple(name for name in given.split(",") if name)
+    visible = os.environ.get(VISIBLE)
+    if visible is not None:
+        return tuple(name for name in visible.split(",") if name)
     try:
         listed = subprocess.run(["nvidia-smi", "--list-gpus"], capture_output=True, text=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
@@ -201,13 +201,13 @@ def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Itera
     for future in as_completed(futures):
         task = futures.pop(future)
         try:
-            found = future.result()
+            row = future.result()
         except Exception as error:
             # Its workers died more than `DEATHS` times, or were not reachable.
-            found = {"state": "failed", "message": f"{type(error).__name__}: {error}"}
+            row = {"state": "failed", "message": f"{type(error).__name__}: {error}"}
         # A released result is not computed again if its worker dies.
         future.release()
-        yield task, found
+        yield task, row
 
 
 def _stage_of(folder: Path) -> str | None:
@@ -286,12 +286,14 @@ class _Board:
 
     def show(self, event: tuple[float, dict[str, Any]]) -> None:
         """Update the line of a run from its progress report."""
-        _, said = event
-        if said["name"] not in self._lines:
-            self._lines[said["name"]] = self._bar.add_task(said["name"], total=100, figures="")
-        rhat = "" if said["rhat"] is None else f"R̂ {said['rhat']:.2f}"
-        left = "" if said["minutes"] is None else f"  {said['minutes']:.1f} min to the budget"
-        self._bar.update(self._lines[said["name"]], completed=round(100 * min(said["spent"], 1)), figures=rhat + left)
+        _, report = event
+        if report["name"] not in self._lines:
+            self._lines[report["name"]] = self._bar.add_task(report["name"], total=100, figures="")
+        rhat = "" if report["rhat"] is None else f"R̂ {report['rhat']:.2f}"
+        left = "" if report["minutes"] is None else f"  {report['minutes']:.1f} min to the budget"
+        self._bar.update(
+            self._lines[report["name"]], completed=round(100 * min(report["spent"], 1)), figures=rhat + left
+        )
 
     def end(self, task: Task, found: dict[str, Any]) -> None:
         """Count a run that ended, and print the message of a failed run."""

@@ -40,7 +40,7 @@ def evaluate_landmarks(pairs: PointPairs, transform: Transform, sd: float | None
     sd : float or None
         Standard deviation of the localisation error of each coordinate, mm; None takes the file's value, else zero.
     """
-    found = spread(transform, pairs.fixed)
+    predicted = spread(transform, pairs.fixed)
     own = pairs.sd if sd is None else np.full(len(pairs.fixed), sd)
     variance = np.zeros(len(pairs.fixed)) if own is None else np.square(own)
     return {
@@ -48,7 +48,7 @@ def evaluate_landmarks(pairs: PointPairs, transform: Transform, sd: float | None
         "evaluation_points": pairs.fixed,
         "evaluation_before": np.linalg.norm(pairs.moving - pairs.fixed, axis=1),
         "evaluation_posed": np.linalg.norm(pairs.moving - transform.pose.place(pairs.fixed), axis=1),
-        "evaluation_residual": pairs.moving - found.places,
-        "evaluation_covariance": found.covariance + variance[:, None, None] * np.eye(3),
-        "evaluation_inside": found.inside,
+        "evaluation_residual": pairs.moving - predicted.places,
+        "evaluation_covariance": predicted.covariance + variance[:, None, None] * np.eye(3),
+        "evaluation_inside": predicted.inside,
     }

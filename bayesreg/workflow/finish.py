@@ -83,7 +83,7 @@ def finish(
         if config.results.bids is not None:
             write_bids(out, config.results.bids, place)
         write_report(finished, idata, *judged, place(REPORT))
-    checkpoints.remove_blocks(out)
+    checkpoints.close(out)
     return Result(out, finished)
 
 

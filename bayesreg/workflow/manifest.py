@@ -66,7 +66,7 @@ def manifest(
     greatest = _extreme(judged.rhat, np.nanmax)
     observations = describe_observations(posterior, mean)
     # Only pairs of images have these figures; the first pair stands for the run.
-    of_images = next((one for one in observations.values() if "noise_sd" in one), {})
+    of_images = next((observation for observation in observations.values() if "noise_sd" in observation), {})
     return {
         "name": config.description,
         "versions": _versions(),

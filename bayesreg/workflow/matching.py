@@ -85,10 +85,10 @@ def match_images(
     moving = pose.aligned(moving)
     moving_ignore = None if moving_ignore is None else pose.aligned(moving_ignore)
     ignored = {"fixed": fixed_ignore, "moving": moving_ignore}
-    seen = _seen(domain, ignored.values())
+    region = _seen(domain, ignored.values())
     # The scales come before the comparison, because their error names an image that is constant in Ω.
-    scales = _scale_of("fixed", fixed, seen.voxels != 0), _scale_of("moving", moving, within(seen, moving))
-    likeness = compare_images(fixed, moving, seen)
+    scales = _scale_of("fixed", fixed, region.voxels != 0), _scale_of("moving", moving, within(region, moving))
+    likeness = compare_images(fixed, moving, region)
     alike = likeness.is_one_contrast if data.same_contrast is None else data.same_contrast
     one_scale = alike and (data.same_contrast is True or likeness.is_one_scale)
     scale = scales[0] if one_scale else scales[1]
@@ -116,11 +116,11 @@ def match_channel(
         If an image does not overlap the organ, or is constant there.
     """
     moving = matched.matching.pose.aligned(moving)
-    seen = _seen(domain, (fixed_ignore, matched.moving_ignore))
+    region = _seen(domain, (fixed_ignore, matched.moving_ignore))
     alike = data.same_contrast
     if alike is None:
-        alike = compare_images(fixed, moving, seen).is_one_contrast
-    return Channel(_scaled(f"{name} fixed", fixed, seen), _scaled(f"{name} moving", moving, seen), alike)
+        alike = compare_images(fixed, moving, region).is_one_contrast
+    return Channel(_scaled(f"{name} fixed", fixed, region), _scaled(f"{name} moving", moving, region), alike)
 
 
 def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
@@ -131,13 +131,13 @@ def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
     InputError
         If the masks ignore all of Ω.
     """
-    seen = np.asarray(domain.voxels) != 0
+    region = np.asarray(domain.voxels) != 0
     for mask in masks:
         if mask is not None:
-            seen &= ~ignored_voxels(domain, mask)
-    if not seen.any():
+            region &= ~ignored_voxels(domain, mask)
+    if not region.any():
         raise InputError("all of the organ is ignored; check fixed_ignore and moving_ignore")
-    return domain.with_voxels(seen.astype(np.uint8))
+    return domain.with_voxels(region.astype(np.uint8))
 
 
 def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple[list[str], list[str]]:
@@ -176,15 +176,15 @@ def _find_pose(
     if data.pose == "fixed":
         check_same_space(fixed, moving, ("fixed", "moving"))
         return Pose.identity(), "Pose: as the headers say (data.pose: fixed)."
-    found = find_pose(fixed, moving, domain, fixed_ignore, moving_ignore)
-    told = f"mutual information {found.as_given:.2f} as the headers say"
-    if found.information <= GAIN * found.as_given:
-        return Pose.identity(), f"Pose: as the headers say, since no other brings much: {told}."
+    alignment = find_pose(fixed, moving, domain, fixed_ignore, moving_ignore)
+    header_information = f"mutual information {alignment.as_given:.2f} as the headers say"
+    if alignment.information <= GAIN * alignment.as_given:
+        return Pose.identity(), f"Pose: as the headers say, since no other brings much: {header_information}."
     centre = domain.voxel_to_world(np.argwhere(np.asarray(domain.voxels) != 0).mean(axis=0))
-    motion = found.pose.about(centre)
-    return found.pose, (
-        f"Pose: {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the headers: {told}, "
-        f"{found.information:.2f} so (data.pose: fixed keeps the headers')."
+    motion = alignment.pose.about(centre)
+    return alignment.pose, (
+        f"Pose: {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the headers: {header_information}, "
+        f"{alignment.information:.2f} so (data.pose: fixed keeps the headers')."
     )
 
 

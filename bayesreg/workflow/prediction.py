@@ -75,12 +75,14 @@ def predict(
         If a place lies outside the mesh.
     """
     mesh = posterior.mesh
-    checked = {name: one for name, one in posterior.observations.items() if isinstance(one, Checked)}
+    checked = {
+        name: observation for name, observation in posterior.observations.items() if isinstance(observation, Checked)
+    }
     places = places or default_places(mesh, u_mean, u_sd)
     nodes, weights = _interpolation(mesh, places)
     centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
     arrays = (u_mean, nodes, weights, projection, pose.rotation)
-    given = posterior.data, *(jnp.asarray(array) for array in arrays)
+    shared = posterior.data, *(jnp.asarray(array) for array in arrays)
     key = jax.random.key(seed)
 
     def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
@@ -89,48 +91,50 @@ def predict(
         state = state_of(data.body, data.blocks, coordinates.fill(data.blocks, draw))
         u = state.u
         distance, stiffness = jnp.linalg.norm(u - u_mean, axis=1), data.body.stiffness_factor(draw)
-        found = {"u": u, "distance": distance, "far": (distance > FAR).astype(float),
-                 "places": jnp.einsum("la,lai->li", weights, u[nodes]),
-                 "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
-                 "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
+        predictions = {"u": u, "distance": distance, "far": (distance > FAR).astype(float),
+                       "places": jnp.einsum("la,lai->li", weights, u[nodes]),
+                       "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
+                       "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         of_draw = jax.random.fold_in(key, number.astype(int))
         for name, observation in checked.items():
             # The noise depends on the name, so that other observations of the run do not change it.
             noise = jax.random.fold_in(of_draw, crc32(name.encode()))
             figures = observation.check_draw(data.terms[name], state, noise)
-            found |= {f"{name}/{figure}": value for figure, value in figures.items()}
-        return found
+            predictions |= {f"{name}/{figure}": value for figure, value in figures.items()}
+        return predictions
 
-    some = thin(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
-    chains, count = some["u_boundary"].shape[:2]
-    some["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
+    thinned = thin(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
+    chains, count = thinned["u_boundary"].shape[:2]
+    thinned["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
     kept: dict[str, list[np.ndarray]] = {}
-    found = summarise(_keep_aside(push_forward(forward, some, given), kept), (REACH,))
+    summary = summarise(_keep_aside(push_forward(forward, thinned, shared), kept), (REACH,))
     whole = {name: np.concatenate(parts, axis=1) for name, parts in kept.items()}
     return Predicted(
-        chain_mean=found.chain_mean["u"],
+        chain_mean=summary.chain_mean["u"],
         far_mm=np.array(FAR),
-        far=found.mean["far"],
-        reach=found.quantiles["distance"][0],
+        far=summary.mean["far"],
+        reach=summary.quantiles["distance"][0],
         place_names=np.array(list(places)),
         place_points=np.array(list(places.values()), float),
         place_draws=whole.pop("places"),
         motion=np.concatenate(compose(pose, centre, whole.pop("motion")), axis=-1),
         centre=centre,
-        total_sd=None if pose.is_identity else found.sd["turned"],
+        total_sd=None if pose.is_identity else summary.sd["turned"],
         observations=whole | _summaries(posterior, mean),
-        **(_stiffness(found) if posterior.data.body.field is not None else {}),
+        **(_stiffness(summary) if posterior.data.body.field is not None else {}),
     )
 
 
 def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, np.ndarray]:
     """Collect the arrays that the observations compute for the report, by "<observation>/<array>"."""
     state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(mean))
-    summarised = {name: one for name, one in posterior.observations.items() if isinstance(one, Summarised)}
+    summarised = {
+        name: observation for name, observation in posterior.observations.items() if isinstance(observation, Summarised)
+    }
     return {
         f"{name}/{key}": value
-        for name, one in summarised.items()
-        for key, value in one.summarise(posterior, state).items()
+        for name, observation in summarised.items()
+        for key, value in observation.summarise(posterior, state).items()
     }
 
 
@@ -184,7 +188,7 @@ def default_places(
     """
     depth, _ = cKDTree(mesh.points[mesh.boundary]).query(mesh.points)
     centres = mesh.points[mesh.cells].mean(axis=1)
-    found = {
+    places = {
         "largest shift": mesh.points[np.linalg.norm(u_mean, axis=1).argmax()],
         "largest sd": mesh.points[np.linalg.norm(u_sd, axis=1).argmax()],
         "deepest point": mesh.points[depth.argmax()],
@@ -194,5 +198,5 @@ def default_places(
         if inside.any():
             centroid = np.average(centres[inside], axis=0, weights=mesh.volumes[inside])
             nearest = np.linalg.norm(centres[inside] - centroid, axis=1).argmin()
-            found[f"middle of {label_of(name)}"] = centres[inside][nearest]
-    return {name: (float(x), float(y), float(z)) for name, (x, y, z) in found.items()}
+            places[f"middle of {label_of(name)}"] = centres[inside][nearest]
+    return {name: (float(x), float(y), float(z)) for name, (x, y, z) in places.items()}

@@ -45,25 +45,27 @@ def predictive_groups(posterior: Posterior, draws: xr.Dataset, seed: int) -> Gro
         neighbours of a voxel that is left out predict it.
     """
     recorded = {
-        name: one.recorded(posterior.data.terms[name])
-        for name, one in posterior.observations.items()
-        if isinstance(one, Recordable)
+        name: observation.recorded(posterior.data.terms[name])
+        for name, observation in posterior.observations.items()
+        if isinstance(observation, Recordable)
     }
     if not recorded:
         return {}
     chosen = evenly_spaced(draws.sizes["draw"], max(MOST_DRAWS // draws.sizes["chain"], 1))
-    some = draws.isel(draw=chosen)
+    thinned = draws.isel(draw=chosen)
     replicated = {}
-    for name, values in _replicate(posterior, some, recorded, seed).items():
+    for name, values in _replicate(posterior, thinned, recorded, seed).items():
         like = recorded[name].values
-        coords = {"chain": some["chain"], "draw": some["draw"], **like.coords}
-        replicated[name] = xr.DataArray(values, coords, ("chain", "draw", *like.dims), attrs=like.attrs)
-    found: dict[str, Variables] = {
-        "observed_data": {name: one.values for name, one in recorded.items()},
+        coords = {"chain": thinned["chain"], "draw": thinned["draw"], **like.coords}
+        replicated[name] = xr.DataArray(
+            values.astype(np.float32), coords, ("chain", "draw", *like.dims), attrs=like.attrs
+        )
+    groups: dict[str, Variables] = {
+        "observed_data": {name: record.values for name, record in recorded.items()},
         "posterior_predictive": replicated,
         "log_likelihood": _log_likelihood(posterior, draws, recorded),
     }
-    return {group: xr.Dataset(content) for group, content in found.items() if content}
+    return {group: xr.Dataset(content) for group, content in groups.items() if content}
 
 
 def _replicate(
@@ -77,14 +79,14 @@ def _replicate(
         state = _state(posterior, data, draw)
         keys = jax.random.split(of_draw, len(recorded))
         return {
-            name: data.terms[name].likelihood(state).sample(key)[one.chosen]
-            for (name, one), key in zip(recorded.items(), keys, strict=True)
+            name: data.terms[name].likelihood(state).sample(key)[record.chosen]
+            for (name, record), key in zip(recorded.items(), keys, strict=True)
         }
 
-    every = _all(posterior, draws)
-    chains, count = every["u_boundary"].shape[:2]
-    every["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    blocks = list(push_forward(forward, every, posterior.data))
+    all_draws = _all(posterior, draws)
+    chains, count = all_draws["u_boundary"].shape[:2]
+    all_draws["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
+    blocks = list(push_forward(forward, all_draws, posterior.data))
     return {name: np.concatenate([block[name] for block in blocks], axis=1) for name in recorded}
 
 
@@ -101,13 +103,13 @@ def _log_likelihood(posterior: Posterior, draws: xr.Dataset, recorded: Mapping[s
 
     blocks = list(push_forward(forward, _all(posterior, draws), posterior.data))
     coords = {"chain": draws["chain"].to_numpy(), "draw": draws["draw"].to_numpy()}
-    found = {}
+    log_likelihoods = {}
     for name in names:
         dim = recorded[name].values.dims[0]
         values = np.concatenate([block[name] for block in blocks], axis=1)
         labels = recorded[name].values[dim].to_numpy()
-        found[name] = xr.DataArray(values, {**coords, str(dim): labels}, ("chain", "draw", dim))
-    return found
+        log_likelihoods[name] = xr.DataArray(values, {**coords, str(dim): labels}, ("chain", "draw", dim))
+    return log_likelihoods
 
 
 def _state(posterior: Posterior, data: Any, draw: dict[str, AnyArray]) -> State:

@@ -73,7 +73,7 @@ def prepare(config: Config) -> Prepared:
     """
     clock = _Clock()
     _require_start(config)
-    observed = with_held_out({one.name: one.read() for one in config.observations}, config)
+    observed = with_held_out({section.name: section.read() for section in config.observations}, config)
     if isinstance(config.data, FilesData) and config.data.labels is None and config.data.fixed is None:
         assert config.mesh.file is not None
         mesh = load_mesh(config.mesh.file)
@@ -133,14 +133,14 @@ def prepare(config: Config) -> Prepared:
 def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Image | None) -> dict[str, Channel]:
     """Match the pairs of images after the first, by their names."""
     assert isinstance(config.data, FilesData)
-    found = {}
+    channels = {}
     for section in config.pairs_of_images:
         if section.fixed is not None and section.moving is not None:
             images = load_image(section.fixed), load_image(section.moving)
             channel = match_channel(config.data, domain, matched, section.name, *images, fixed_ignore)
             fixed, moving = _as_stored(channel.fixed), _as_stored(channel.moving)
-            found[section.name] = channel._replace(fixed=fixed, moving=moving)
-    return found
+            channels[section.name] = channel._replace(fixed=fixed, moving=moving)
+    return channels
 
 
 def _ignored(config: Config, which: Literal["fixed", "moving"], image: Image) -> Image | None:
@@ -174,17 +174,17 @@ def _skull(intracranial: Path | None) -> Image | None:
 
 def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, Arrays]:
     """Add the landmarks of the section evaluation to the observed arrays; InputError if one is observed too."""
-    found = {name: arrays for name, arrays in observed.items() if name != NAME and arrays}
+    observations = {name: arrays for name, arrays in observed.items() if name != NAME and arrays}
     if config.evaluation is None:
-        return found
+        return observations
     held_out = read_point_pairs(config.evaluation.landmarks, config.evaluation.moving_landmarks)
     pairs = {
         name: (arrays["fixed"], arrays["moving"])
-        for name, arrays in found.items()
+        for name, arrays in observations.items()
         if {"fixed", "moving"} <= set(arrays)
     }
     require_unseen(held_out, pairs)
-    return found | {NAME: held_out.as_arrays()}
+    return observations | {NAME: held_out.as_arrays()}
 
 
 def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
@@ -193,10 +193,10 @@ def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched 
         return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
     one_contrast = matched.matching.one_contrast and not config.image_options.similarity.serves_any_contrast
     one_scale = one_contrast and config.data.same_contrast is True
-    found = appraise(
+    appraisal = appraise(
         anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale, anatomy.intracranial
     )
-    return found._replace(notes=matched.notes, beware=(*found.beware, *matched.beware))
+    return appraisal._replace(notes=matched.notes, beware=(*appraisal.beware, *matched.beware))
 
 
 def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:
@@ -223,7 +223,9 @@ def require_all_unseen(inputs: Inputs, observations: Sequence[Any]) -> None:
     """Raise InputError if a held-out landmark is also among observations from Python."""
     if NAME in inputs.observed:
         points = {
-            one.name: (one.fixed_points, one.moving_points) for one in observations if hasattr(one, "fixed_points")
+            observation.name: (observation.fixed_points, observation.moving_points)
+            for observation in observations
+            if hasattr(observation, "fixed_points")
         }
         require_unseen(PointPairs.of_arrays(inputs.observed[NAME]), points)
 
@@ -235,9 +237,9 @@ def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:
 
 def store_inputs(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
     """Write the inputs of a run and their provenance into its folder."""
-    with writing(out, "prepared") as place:
-        store.write_json(place(PROVENANCE), provenance)
-        store.write_inputs(place, inputs)
+    with writing(out, "prepared") as temporary_path:
+        store.write_json(temporary_path(PROVENANCE), provenance)
+        store.write_inputs(temporary_path, inputs)
 
 
 def _require_start(config: Config, mesh: TetMesh | None = None) -> None:

@@ -80,7 +80,7 @@ def understand(
     sections: dict[str, Any] = {"data": {"source": "files", "label_table": chosen, **files}}
     sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
     config = make_config(sections, overrides)
-    if any(one.startswith("data.label_table") for one in overrides):
+    if any(override.startswith("data.label_table") for override in overrides):
         how = "as set"
     return Understood(config, tuple(_describe(config, how)))
 

@@ -19,8 +19,8 @@ def report(folder: str | Path) -> Path:
     store.require_finished(folder)
     with locked(folder):
         result = load_result(folder)
-        with writing(folder) as place:
-            write_report(result.run, result.idata, *result.convergence, place(REPORT))
+        with writing(folder) as temporary_path:
+            write_report(result.run, result.idata, *result.convergence, temporary_path(REPORT))
     return result.report
 
 

@@ -49,11 +49,11 @@ class Comparison(NamedTuple):
     @property
     def lines(self) -> list[str]:
         """The comparison in words, one line per difference."""
-        found = [f"{name} was {then or 'none'}, and is {now or 'none'}" for name, (then, now) in self.moved.items()]
+        changes = [f"{name} was {then or 'none'}, and is {now or 'none'}" for name, (then, now) in self.moved.items()]
         if self.same:
-            return ["the draws are the same, bit for bit", *found]
-        told = [f"{name} is up to {distance:.2g} sd apart" for name, distance in self.apart.items()]
-        return ["the draws are not the same", *told, *(found or ["nothing that run.json records tells why"])]
+            return ["the draws are the same, bit for bit", *changes]
+        differences = [f"{name} is up to {distance:.2g} sd apart" for name, distance in self.apart.items()]
+        return ["the draws are not the same", *differences, *(changes or ["nothing that run.json records tells why"])]
 
 
 def reproduce(folder: str | Path, out: str | Path, progress: bool = True) -> Comparison:
@@ -100,16 +100,16 @@ def _as_many(config: Config, steps: int) -> Config:
 
 
 def _compare(first: Result, second: Result) -> Comparison:
-    apart = {}
+    distances = {}
     for group in GROUPS:
-        one, other = dataset(first.idata, group), dataset(second.idata, group)
-        for name in one.data_vars:
-            then, now = one[name].to_numpy(), other[name].to_numpy()
+        first_data, second_data = dataset(first.idata, group), dataset(second.idata, group)
+        for name in first_data.data_vars:
+            then, now = first_data[name].to_numpy(), second_data[name].to_numpy()
             if then.shape != now.shape:
-                apart[str(name)] = np.inf
+                distances[str(name)] = np.inf
             elif not np.array_equal(then, now, equal_nan=True):
                 then, now = then.astype(float), now.astype(float)
-                apart[str(name)] = float(np.nanmax(np.abs(then - now)) / max(np.nanstd(then), np.finfo(float).tiny))
+                distances[str(name)] = float(np.nanmax(np.abs(then - now)) / max(np.nanstd(then), np.finfo(float).tiny))
     pairs = {name: (first.run.manifest.get(name), second.run.manifest.get(name)) for name in WHERE}
-    moved = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    return Comparison(second, not apart, apart, moved)
+    changes = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    return Comparison(second, not distances, distances, changes)

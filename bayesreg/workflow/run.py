@@ -98,9 +98,9 @@ def run(
         If the configuration, a file or an observation is wrong, or the folder holds another run.
     """
     config = config if isinstance(config, Config) else load_config(config)
-    given = require_observations(observations) if observations else []
+    checked_observations = require_observations(observations) if observations else []
     with show_messages() if progress is True else nullcontext():
-        return _run(config, Path(out), resume, progress, given)
+        return _run(config, Path(out), resume, progress, checked_observations)
 
 
 def _run(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
@@ -170,10 +170,10 @@ def _resume(
     reached = _load_reached(config, inputs, posterior, out, progress)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
-    with writing(out) as place:
-        write_text(place("config.yaml"), inputs.config)
-        store.write_observed(place, inputs.observed)
-        store.write_json(place(PROVENANCE), with_unsampled(provenance, began + sampled))
+    with writing(out) as temporary_path:
+        write_text(temporary_path("config.yaml"), inputs.config)
+        store.write_observed(temporary_path, inputs.observed)
+        store.write_json(temporary_path(PROVENANCE), with_unsampled(provenance, began + sampled))
     return _go_on(config, inputs, posterior, reached, provenance, out, began, progress)
 
 
@@ -211,8 +211,8 @@ def _warn(config: Config, result: Result) -> None:
 def _resumed_config(out: Path, config: Config) -> Config:
     """Load the configuration of a begun run; InputError if it differs outside the sections `MAY_CHANGE`."""
     known = load_stored_config(require_file(out, "config.yaml"))
-    given = {name: getattr(config, name) for name in MAY_CHANGE}
-    if resolved_yaml(known.model_copy(update=given)) != resolved_yaml(config):
+    sections = {name: getattr(config, name) for name in MAY_CHANGE}
+    if resolved_yaml(known.model_copy(update=sections)) != resolved_yaml(config):
         raise InputError(
             f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which "
             f"only the sections {', '.join(MAY_CHANGE)} may change, or name another folder"
@@ -225,10 +225,10 @@ def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, flo
     if not observations:
         return {}
     rest = posterior.reference()
-    moved = np.sin(np.arange(rest["u_boundary"].size)).reshape(rest["u_boundary"].shape)
-    logs = posterior.energies(rest | {"u_boundary": moved})
-    found = {one.name: float(logs[one.name]) for one in observations}
-    return {name: log if np.isfinite(log) else None for name, log in found.items()}
+    displacement = np.sin(np.arange(rest["u_boundary"].size)).reshape(rest["u_boundary"].shape)
+    logs = posterior.energies(rest | {"u_boundary": displacement})
+    log_likelihoods = {observation.name: float(logs[observation.name]) for observation in observations}
+    return {name: log if np.isfinite(log) else None for name, log in log_likelihoods.items()}
 
 
 def _require_same_observations(out: Path, provenance: dict[str, Any], posterior: Posterior, given: list[Any]) -> None:
@@ -275,9 +275,11 @@ def _first(
     The `seconds` that were spent before count as sampling.
     """
     options, start = config.sampler, start_of(config, inputs, posterior)
-    found = first_checkpoint(posterior.target, options.name, options.chains, config.seed, start, **options.settings)
-    found = found._replace(seconds=found.seconds + seconds)
-    return found, checkpoints.StoredBlocks(out, 0)
+    checkpoint = first_checkpoint(
+        posterior.target, options.name, options.chains, config.seed, start, **options.settings
+    )
+    checkpoint = checkpoint._replace(seconds=checkpoint.seconds + seconds)
+    return checkpoint, checkpoints.StoredBlocks(out, 0)
 
 
 def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing) -> Reached:

@@ -56,7 +56,7 @@ class Served:
         self, name: str, function: Callable[[Any, Any], list[Any]], data: Problem, inputs: Sequence[int]
     ) -> None:
         self.name, self.data, self.inputs = name, data, list(inputs)
-        self.outputs = [int(np.prod(one.shape)) for one in jax.eval_shape(function, data, jnp.zeros(sum(inputs)))]
+        self.outputs = [int(np.prod(output.shape)) for output in jax.eval_shape(function, data, jnp.zeros(sum(inputs)))]
 
         def pull(data: Any, position: Any, sensitivities: list[Any]) -> Any:
             return jax.vjp(partial(function, data), position)[1](sensitivities)[0]
@@ -95,10 +95,10 @@ class Served:
         InputError
             If an output is not finite. The log posterior is then `IMPOSSIBLE` and raises nothing.
         """
-        found = [np.asarray(one, float).ravel() for one in self._value(self.data, self._position(parameters))]
+        outputs = [np.asarray(output, float).ravel() for output in self._value(self.data, self._position(parameters))]
         if self.name == LOG_POSTERIOR:
-            found = [np.where(np.isfinite(one), one, IMPOSSIBLE) for one in found]
-        return [_finite(one, self.name).tolist() for one in found]
+            outputs = [np.where(np.isfinite(output), output, IMPOSSIBLE) for output in outputs]
+        return [_finite(output, self.name).tolist() for output in outputs]
 
     def gradient(
         self, out_wrt: int, in_wrt: int, parameters: Vectors, sens: Sequence[float], config: Any = None
@@ -114,10 +114,10 @@ class Served:
         sensitivities[out_wrt] = jnp.asarray(sens, float)
         pulled = self._pulled(self.data, self._position(parameters), sensitivities)
         first = sum(self.inputs[:in_wrt])
-        found = np.asarray(pulled[first : first + self.inputs[in_wrt]], float)
-        if self.name == LOG_POSTERIOR and not np.isfinite(found).all():
-            found = np.zeros_like(found)
-        return _finite(found, f"the gradient of {self.name}").tolist()
+        gradient = np.asarray(pulled[first : first + self.inputs[in_wrt]], float)
+        if self.name == LOG_POSTERIOR and not np.isfinite(gradient).all():
+            gradient = np.zeros_like(gradient)
+        return _finite(gradient, f"the gradient of {self.name}").tolist()
 
     def _position(self, parameters: Vectors) -> Any:
         return jnp.concatenate([jnp.asarray(part, float) for part in parameters]) if parameters else jnp.zeros(0)
@@ -143,12 +143,12 @@ def models_of(posterior: Posterior) -> list[Served]:
         return [replace(posterior, data=data).logdensity(back(position))[None]]
 
     def forward(data: Any, position: Any) -> list[Any]:
-        here = replace(posterior, data=data)
-        estimands, images = here.constrain(back(position)), images_of(data)
-        evaluation = here.evaluate(estimands)
+        posterior_with_data = replace(posterior, data=data)
+        estimands, images = posterior_with_data.constrain(back(position)), images_of(data)
+        evaluation = posterior_with_data.evaluate(estimands)
         # The displacement is invalid if the solve failed, or was skipped outside the support.
         u = jnp.where(evaluation.solver_failed | evaluation.outside_support, jnp.nan, evaluation.u)
-        return [u.ravel(), *([] if images is None else [images.predicted(u, here.fill(estimands))])]
+        return [u.ravel(), *([] if images is None else [images.predicted(u, posterior_with_data.fill(estimands))])]
 
     def start(data: Any, _: Any) -> list[Any]:
         at_rest = posterior.target.coordinates.unconstrain(data, posterior.estimands(posterior.reference()))
@@ -180,7 +180,7 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
     posterior = posterior_of_run(config)
     models = models_of(posterior)
     names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior.target).items())
-    served = ", ".join(one.name for one in models)
+    served = ", ".join(model.name for model in models)
     _log.info("inputs: %s; serving %s at http://%s:%d", names, served, LOOPBACK, port)
     # By default umbridge accepts connections from every machine.
     run_app = um.web.run_app

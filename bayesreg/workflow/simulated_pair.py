@@ -30,7 +30,7 @@ def simulate_pair(
     making = mesh
     if isinstance(settings, CalibratedPair):
         making = mesh_of(anatomy, domain, meshed, settings.making_edge_length)
-    given = {} if settings.smoothing_mm is None else {"smoothing_mm": settings.smoothing_mm}
+    smoothing = {} if settings.smoothing_mm is None else {"smoothing_mm": settings.smoothing_mm}
     return make_pair(
         fixed,
         anatomy.tissue,
@@ -43,7 +43,7 @@ def simulate_pair(
         direction=settings.direction,
         noise_sd=settings.noise_sd,
         seed=config.seed,
-        **given,
+        **smoothing,
     )
 
 

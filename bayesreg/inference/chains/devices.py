@@ -18,9 +18,9 @@ _TOGETHER = 16
 
 def devices_for(chains: int) -> Mesh | None:
     """Choose the most devices that can have equal shares of the chains; return None if that is one device."""
-    every = jax.devices()
-    count = max(n for n in range(1, len(every) + 1) if chains % n == 0)
-    return Mesh(np.array(every[:count]), (_AXIS,)) if count > 1 else None
+    devices = jax.devices()
+    count = max(n for n in range(1, len(devices) + 1) if chains % n == 0)
+    return Mesh(np.array(devices[:count]), (_AXIS,)) if count > 1 else None
 
 
 def share(tree: Any, devices: Mesh | None) -> Any:
@@ -58,4 +58,4 @@ def _in_groups(chain: Callable, *each: Any) -> Any:
     size = next((size for size in sizes if chains % size == 0), chains)
     if size == chains:
         return jax.vmap(chain)(*each)
-    return jax.lax.map(lambda one: chain(*one), each, batch_size=size)
+    return jax.lax.map(lambda arguments: chain(*arguments), each, batch_size=size)

@@ -167,8 +167,8 @@ def sample(
     with shown(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
         verdict, ended = _judge(stop, checkpoint, blocks, bar)
-        while not ended and (found := next(advance, None)) is not None:
-            drawn, checkpoint = found
+        while not ended and (block_and_checkpoint := next(advance, None)) is not None:
+            drawn, checkpoint = block_and_checkpoint
             blocks.append(drawn)
             if on_block is not None:
                 on_block(len(blocks) - 1, drawn, checkpoint)
@@ -249,8 +249,8 @@ def _require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks
     if len(blocks) == 0:
         return
     last = blocks[len(blocks) - 1]
-    here = _observe(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
-    if not all(np.allclose(here[name], last[name][:, -1], rtol=1e-3, atol=1e-4) for name in here):
+    estimands = _observe(chosen, chosen.sampler.data(checkpoint.setup), checkpoint.setup, checkpoint.state).estimands
+    if not all(np.allclose(estimands[name], last[name][:, -1], rtol=1e-3, atol=1e-4) for name in estimands):
         raise InputError(
             "the chains do not stand where their last draws were: another version of bayesreg began this run; begin it "
             "anew in another folder"
@@ -286,7 +286,7 @@ def _advance(
     data = chosen.sampler.data(checkpoint.setup)
     while int(checkpoint.draws) < draws:
         length = min(block, draws - int(checkpoint.draws))
-        state, moments, tally, found = run_block(
+        state, moments, tally, block_draws = run_block(
             chosen,
             length,
             thin,
@@ -298,11 +298,11 @@ def _advance(
             checkpoint.setup,
             *share(checkpoint[2:5], devices),
         )
-        found = {name: np.asarray(value) for name, value in found.items()}
+        block_draws = {name: np.asarray(value) for name, value in block_draws.items()}
         seconds = np.array(spent + time.perf_counter() - began)
         drawn = np.array(int(checkpoint.draws) + length)
         checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
-        yield found, checkpoint
+        yield block_draws, checkpoint
 
 
 def _judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:

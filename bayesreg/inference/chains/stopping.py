@@ -68,8 +68,8 @@ def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
 
 def judge_all(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
     """Judge all draws of all estimands by a stop rule with effective sample sizes."""
-    found = figures(blocks)
-    return Verdict(int(checkpoint.draws) >= stop.min_draws and _meets(found.worst, stop), found)
+    all_figures = figures(blocks)
+    return Verdict(int(checkpoint.draws) >= stop.min_draws and _meets(all_figures.worst, stop), all_figures)
 
 
 def _is_due(count: int) -> bool:
@@ -109,8 +109,8 @@ def reason(stop: StopRule, checkpoint: Checkpoint, verdict: Verdict, draws: int)
         state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"it below {stop.rhat}"
     else:
         assert verdict.found is not None
-        found = verdict.found.worst
-        state = f"greatest R̂ {found.rhat:.3f}, least ESS {found.ess_bulk:.0f} (bulk), {found.ess_tail:.0f} (tail)"
+        worst = verdict.found.worst
+        state = f"greatest R̂ {worst.rhat:.3f}, least ESS {worst.ess_bulk:.0f} (bulk), {worst.ess_tail:.0f} (tail)"
         rule = f"R̂ below {stop.rhat} and both ESS above {stop.ess:g}"
     if verdict.holds:
         return f"every estimand has converged: {state}"

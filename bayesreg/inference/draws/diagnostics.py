@@ -83,7 +83,7 @@ def convergence(idata: Any) -> Convergence:
     """
     draws = dataset(idata, "posterior")
     judged = [_judge(values) for name, values in draws.items() if name not in DERIVED]
-    return Convergence(*(xr.merge([found[k] for found in judged]) for k in range(len(Convergence._fields))))
+    return Convergence(*(xr.merge([diagnostics[k] for diagnostics in judged]) for k in range(len(Convergence._fields))))
 
 
 def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
@@ -92,8 +92,8 @@ def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
     like = draws.isel(chain=0, draw=0, drop=True)
     parts = [_diagnose(part.to_numpy().reshape(*part.shape[:2], -1)) for part in _parts(draws)]
     return [
-        xr.DataArray(np.concatenate([np.zeros(0), *found]).reshape(like.shape), like.coords, like.dims, like.name)
-        for found in zip(*parts, strict=True)
+        xr.DataArray(np.concatenate([np.zeros(0), *pieces]).reshape(like.shape), like.coords, like.dims, like.name)
+        for pieces in zip(*parts, strict=True)
     ]
 
 
@@ -174,12 +174,12 @@ def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
 
     def judge(low: int) -> Figures:
         part = draws[..., low : low + width].astype(float)
-        moved = part.min(axis=(0, 1)) != part.max(axis=(0, 1))
+        varying = part.min(axis=(0, 1)) != part.max(axis=(0, 1))
         data = xr.Dataset({"draws": (["chain", "draw", "estimand"], part)})
         # ArviZ divides zero by zero if all draws of an estimand are equal.
         with np.errstate(invalid="ignore"):
-            found = az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail")
-        return Figures(*(np.where(moved, one["draws"].to_numpy(), np.nan) for one in found))
+            diagnostics = az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail")
+        return Figures(*(np.where(varying, diagnostic["draws"].to_numpy(), np.nan) for diagnostic in diagnostics))
 
     # On a shared machine the process may be allowed to use only some of the cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -73,8 +73,8 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
         log-stiffness.
     """
     az, variables = arviz(), target.variables
-    every = list(blocks)
-    draws = {name: np.concatenate([block[name] for block in every], axis=1) for name in every[0]}
+    all_blocks = list(blocks)
+    draws = {name: np.concatenate([block[name] for block in all_blocks], axis=1) for name in all_blocks[0]}
     estimands = {name: value for name, value in draws.items() if name not in STATISTICS}
     groups: dict[str, Any] = {
         "posterior": variables.values(estimands),
@@ -85,14 +85,14 @@ def to_inference_data(target: Target, blocks: Blocks) -> Any:
         "coords": dict(variables.coords),
         "dims": {name: list(dims) for name, dims in variables.dims.items()},
     }
-    found = az.from_dict(**groups, **labels) if _OLD else az.from_dict(groups, **labels)
+    idata = az.from_dict(**groups, **labels) if _OLD else az.from_dict(groups, **labels)
     for group in ("posterior", "constant_data"):
         for name, attributes in variables.attributes.items():
-            if name in getattr(found, group):
-                getattr(found, group)[name].attrs.update(attributes)
+            if name in getattr(idata, group):
+                getattr(idata, group)[name].attrs.update(attributes)
     for name, meaning in MEANINGS.items():
-        found.sample_stats[name].attrs["long_name"] = meaning
-    return found
+        idata.sample_stats[name].attrs["long_name"] = meaning
+    return idata
 
 
 def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
@@ -102,10 +102,10 @@ def to_blocks(target: Target, idata: Any, length: int) -> Iterator[Block]:
     """
     posterior, statistics = dataset(idata, "posterior"), dataset(idata, "sample_stats")
     for first in range(0, posterior.sizes["draw"], length):
-        some = slice(first, first + length)
-        values = {str(name): found.isel(draw=some).to_numpy().astype(float) for name, found in posterior.items()}
+        rows = slice(first, first + length)
+        values = {str(name): variable.isel(draw=rows).to_numpy().astype(float) for name, variable in posterior.items()}
         yield target.variables.estimands(values) | {
-            name: statistics[name].isel(draw=some).to_numpy() for name in STATISTICS
+            name: statistics[name].isel(draw=rows).to_numpy() for name in STATISTICS
         }
 
 
@@ -119,19 +119,19 @@ def arviz() -> Any:
         return sys.modules["arviz"]
     with warnings.catch_warnings(), TemporaryDirectory() as folder:
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-        found, platformdirs.user_cache_dir = platformdirs.user_cache_dir, lambda *_, **__: folder
+        original_cache_dir, platformdirs.user_cache_dir = platformdirs.user_cache_dir, lambda *_, **__: folder
         try:
             import arviz
         finally:
-            platformdirs.user_cache_dir = found
+            platformdirs.user_cache_dir = original_cache_dir
 
     return arviz
 
 
 def dataset(idata: Any, group: str) -> xr.Dataset:
     """Return one group of ArviZ data as an xarray Dataset, for both versions of ArviZ."""
-    found = getattr(idata, group)
-    return found if isinstance(found, xr.Dataset) else found.to_dataset()
+    group_data = getattr(idata, group)
+    return group_data if isinstance(group_data, xr.Dataset) else group_data.to_dataset()
 
 
 def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
@@ -143,10 +143,10 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         with _storing(path):
-            some = _together(blocks)
-            _begin(to_inference_data(target, next(some)), partial)
+            batches = _together(blocks)
+            _begin(to_inference_data(target, next(batches)), partial)
             with netCDF4.Dataset(partial, "a") as file:
-                for following in some:
+                for following in batches:
                     _extend(file, to_inference_data(target, following))
         partial.replace(path)
     finally:
@@ -155,16 +155,16 @@ def save_posterior(target: Target, blocks: Blocks, path: str | Path) -> None:
 
 def _together(blocks: Blocks) -> Iterator[list[Block]]:
     """Yield lists of consecutive blocks; each list is written at once."""
-    some: list[Block] = []
+    batch: list[Block] = []
     held = 0
     for block in blocks:
         size = sum(values.size for values in block.values())
-        if some and held + size > WRITTEN_AT_ONCE:
-            yield some
-            some, held = [], 0
-        some.append(block)
+        if batch and held + size > WRITTEN_AT_ONCE:
+            yield batch
+            batch, held = [], 0
+        batch.append(block)
         held += size
-    yield some
+    yield batch
 
 
 @contextmanager
@@ -201,15 +201,15 @@ def _piece(dim: str, size: int) -> int:
 
 def _extend(file: netCDF4.Dataset, idata: Any) -> None:
     for group in _groups(idata):
-        data, place = dataset(idata, group), file[group]
+        data, file_group = dataset(idata, group), file[group]
         if "draw" not in data.dims:
             continue
-        first = len(place.dimensions["draw"])
+        first = len(file_group.dimensions["draw"])
         rows = slice(first, first + data.sizes["draw"])
         for name, values in data.variables.items():
             if "draw" in values.dims:
                 where = tuple(rows if dim == "draw" else slice(None) for dim in values.dims)
-                place[str(name)][where] = values.to_numpy() + (first if name == "draw" else 0)
+                file_group[str(name)][where] = values.to_numpy() + (first if name == "draw" else 0)
 
 
 def append_groups(path: str | Path, groups: Mapping[str, xr.Dataset]) -> None:

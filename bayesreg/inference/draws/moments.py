@@ -101,5 +101,5 @@ def scale_reduction(moments: Moments) -> Any:
 
 def greatest_rhat(rhat: Mapping[str, AnyArray]) -> float:
     """Find the greatest R̂ of all estimands; NaN if one R̂ is NaN or there is no estimand."""
-    every = np.concatenate([np.zeros(0), *(np.ravel(value) for value in rhat.values())])
-    return float(every.max()) if every.size else np.nan
+    values = np.concatenate([np.zeros(0), *(np.ravel(value) for value in rhat.values())])
+    return float(values.max()) if values.size else np.nan

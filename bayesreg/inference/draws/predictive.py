@@ -68,16 +68,16 @@ def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np
     """
     total = posterior.sizes["draw"]
     chosen = evenly_spaced(total, max(1, most // posterior.sizes["chain"]))
-    given = posterior[list(names)].transpose("chain", "draw", ...)
-    found: dict[str, list[np.ndarray]] = {str(name): [] for name in given.data_vars}
+    variables = posterior[list(names)].transpose("chain", "draw", ...)
+    parts_by_name: dict[str, list[np.ndarray]] = {str(name): [] for name in variables.data_vars}
     # A chunk of the file holds STRETCH draws: one draw costs as much to read as its whole chunk.
     for first in range(0, total, STRETCH):
         within = chosen[(chosen >= first) & (chosen < first + STRETCH)] - first
         if len(within):
-            stretch = given.isel(draw=slice(first, first + STRETCH))
-            for name, parts in found.items():
+            stretch = variables.isel(draw=slice(first, first + STRETCH))
+            for name, parts in parts_by_name.items():
                 parts.append(np.asarray(stretch[name].to_numpy()[:, within], float))
-    return {name: np.concatenate(parts, axis=1) for name, parts in found.items()}
+    return {name: np.concatenate(parts, axis=1) for name, parts in parts_by_name.items()}
 
 
 def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, block: int = BLOCK) -> Iterator[Any]:
@@ -105,9 +105,9 @@ def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, 
     for first in range(0, total, stretch):
         # The last draw fills up the last stretch, because JAX would compile another shape again.
         chosen = np.minimum(np.arange(first, first + stretch), total - 1)
-        found = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, given)
+        outputs = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, given)
         wanted = slice(total - first)
-        yield jax.tree.map(lambda leaf, wanted=wanted: np.asarray(leaf)[:, wanted], found)
+        yield jax.tree.map(lambda leaf, wanted=wanted: np.asarray(leaf)[:, wanted], outputs)
 
 
 def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.5, 0.975)) -> Summary:
@@ -115,13 +115,13 @@ def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.
 
     One block and `MOST_KEPT` draws of each chain are in memory at a time.
     """
-    moments, kept, stride, seen = None, None, 1, 0
+    moments, kept, stride, count = None, None, 1, 0
     for block in blocks:
         moments = extend(_nothing(block) if moments is None else moments, block)
-        every = slice(-seen % stride, None, stride)
-        some = jax.tree.map(lambda leaf, every=every: leaf[:, every], block)
-        kept = some if kept is None else jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), kept, some)
-        seen += jax.tree.leaves(block)[0].shape[1]
+        chosen = slice(-count % stride, None, stride)
+        thinned = jax.tree.map(lambda leaf, part=chosen: leaf[:, part], block)
+        kept = thinned if kept is None else jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), kept, thinned)
+        count += jax.tree.leaves(block)[0].shape[1]
         while jax.tree.leaves(kept)[0].shape[1] > MOST_KEPT:
             kept, stride = jax.tree.map(lambda leaf: leaf[:, ::2], kept), 2 * stride
     if moments is None:

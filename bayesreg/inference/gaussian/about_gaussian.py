@@ -80,14 +80,14 @@ class Walk:
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
         """Make one transition."""
-        state, moved = self.transition(self.target, data, setup, key, state)
+        state, kernel_info = self.transition(self.target, data, setup, key, state)
         info = Info(
-            acceptance_rate=moved.acceptance_rate,
+            acceptance_rate=kernel_info.acceptance_rate,
             outside_support=jnp.zeros((), bool),
             solver_failed=jnp.zeros((), bool),
             solver_iterations=jnp.zeros((), int),
-            diverging=jnp.asarray(moved.diverging),
-            gradients=jnp.asarray(moved.gradients),
+            diverging=jnp.asarray(kernel_info.diverging),
+            gradients=jnp.asarray(kernel_info.gradients),
             densities=jnp.zeros((), int),
         )
         return state, info

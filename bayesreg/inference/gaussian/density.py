@@ -87,7 +87,7 @@ def hessian_rows(
     for entry in entries:
         step = np.zeros(len(flat))
         step[entry] = STEP
-        seen = data if normalised[entry] else plain
-        ahead, behind = (height_and_slope(target, seen, flat + way * step)[1] for way in (1, -1))
+        row_data = data if normalised[entry] else plain
+        ahead, behind = (height_and_slope(target, row_data, flat + way * step)[1] for way in (1, -1))
         rows.append((ahead - behind) / (2 * STEP))
     return np.array(rows)

@@ -108,14 +108,14 @@ def maximise_evidence(
     best: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        height, slope, place = evidence(target, about, flat[entries] + units @ xi)
+        height, slope, position = evidence(target, about, flat[entries] + units @ xi)
         slope = units.T @ slope
         if not (np.isfinite(height) and np.isfinite(slope).all()):
             # A value that makes the line search turn back: it rises with the distance from the best point so far.
-            top, _, at, there = best[-1]
-            return -top + 2 * abs(there @ (xi - at)), there
+            top, _, best_xi, best_slope = best[-1]
+            return -top + 2 * abs(best_slope @ (xi - best_xi)), best_slope
         if not best or height > best[-1][0]:
-            best[:] = [(height, place, xi.copy(), slope)]
+            best[:] = [(height, position, xi.copy(), slope)]
         return -height, -slope
 
     reach = FARTHEST / np.abs(units).max(axis=0)
@@ -137,8 +137,8 @@ def evidence_curvature(
     rows = hessian_rows(target, data, about.flat, about.entries)
     cross = rows[:, marked(target, "field", "u_boundary")]
     volume = volume_at(target, about.flat, regular(curvature))
-    found = volume.curvature - rows[:, about.entries] - cross @ volume.covariance @ cross.T
-    return (found + found.T) / 2
+    minus_hessian = volume.curvature - rows[:, about.entries] - cross @ volume.covariance @ cross.T
+    return (minus_hessian + minus_hessian.T) / 2
 
 
 def evidence(
@@ -147,14 +147,14 @@ def evidence(
     """Compute the log evidence of θ, its slope, and the flat position with θ and the most likely displacements."""
     assert target.mode_search is not None
     data = target.mode_search.quadratic_part(target.data)
-    there = np.array(about.flat)
-    there[about.entries] = theta
+    start = np.array(about.flat)
+    start[about.entries] = theta
     own, rows = marked(target, "u_boundary"), marked(target, "field", "u_boundary")
     # θ is the same at both points, and so is the normaliser, which may be costly.
     plain = without_normaliser(target, data)
-    log_normaliser, push_of_normaliser = normaliser_and_slope(target, there)
-    slope = height_and_slope(target, plain, there)[1]
-    precision = regular(about.images + dense(_curvature(target, there, there)))
+    log_normaliser, push_of_normaliser = normaliser_and_slope(target, start)
+    slope = height_and_slope(target, plain, start)[1]
+    precision = regular(about.images + dense(_curvature(target, start, start)))
     factor = scipy.linalg.cho_factor(precision, lower=True, check_finite=False)
     moving = own[rows]
     push = np.where(moving, (about.slope + slope)[rows], 0.0)
@@ -162,18 +162,18 @@ def evidence(
     inner = factor if moving.all() else scipy.linalg.cho_factor(precision[np.ix_(moving, moving)], lower=True)
     step = np.zeros(len(push))
     step[moving] = scipy.linalg.cho_solve(inner, push[moving])
-    place = np.array(there)
-    place[rows] += step
-    height, slope = height_and_slope(target, plain, place)
+    position = np.array(start)
+    position[rows] += step
+    height, slope = height_and_slope(target, plain, position)
     height, slope = height + log_normaliser, slope + push_of_normaliser
-    gain = about.slope @ (place - about.flat) - step @ (about.images @ step) / 2
+    gain = about.slope @ (position - about.flat) - step @ (about.images @ step) / 2
     covariance, _ = scipy.linalg.lapack.dpotri(factor[0], lower=1)
-    traces = [trace(covariance, first) for first in slopes_of_curvature(target, there, about.entries)]
+    traces = [trace(covariance, first) for first in slopes_of_curvature(target, start, about.entries)]
     log_det = 2 * np.log(np.diag(factor[0])).sum()
     return (
         float(gain + height - log_det / 2),
         about.slope[about.entries] + slope[about.entries] - np.array(traces) / 2,
-        place,
+        position,
     )
 
 
@@ -195,11 +195,11 @@ def slopes_of_curvature(
     target: Target, flat: Float[np.ndarray, "dimension"], entries: Int[np.ndarray, "hyperparameters"]
 ) -> list[Matrix]:
     """Differentiate the curvature in u of all terms but the images by the hyperparameters."""
-    found = []
+    slopes = []
     for entry in entries.tolist():
         ahead, behind = (_curvature(target, _moved(flat, {entry: way * STEP}), flat) for way in (1, -1))
-        found.append((ahead - behind) / (2 * STEP))
-    return found
+        slopes.append((ahead - behind) / (2 * STEP))
+    return slopes
 
 
 def volume_at(
@@ -212,22 +212,22 @@ def volume_at(
     def at(steps: dict[int, float]) -> float:
         return trace(covariance, _curvature(target, _moved(flat, steps), flat))
 
-    here = at({})
+    centre_trace = at({})
     alone = {(k, way): at({k: way * STEP}) for k in entries for way in (1, -1)}
     traces = np.zeros((len(entries), len(entries)))
     for row, k in enumerate(entries):
-        traces[row, row] = alone[k, 1] + alone[k, -1] - 2 * here
+        traces[row, row] = alone[k, 1] + alone[k, -1] - 2 * centre_trace
         for column, other in enumerate(entries[:row]):
             both = at({k: STEP, other: STEP}) + at({k: -STEP, other: -STEP})
-            apart = sum(alone[entry, way] for entry in (k, other) for way in (1, -1))
-            traces[row, column] = traces[column, row] = (both - apart + 2 * here) / 2
+            alone_sum = sum(alone[entry, way] for entry in (k, other) for way in (1, -1))
+            traces[row, column] = traces[column, row] = (both - alone_sum + 2 * centre_trace) / 2
     return Volume(covariance, traces / STEP**2, partial(slopes_of_curvature, target, flat, np.array(entries)))
 
 
 def _inverse(lower: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
     """Compute the inverse of a matrix from its lower Cholesky factor."""
-    found, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
-    return np.tril(found) + np.tril(found, -1).T
+    inverse, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
+    return np.tril(inverse) + np.tril(inverse, -1).T
 
 
 def trace(covariance: Float[np.ndarray, "rows rows"], matrix: Matrix) -> float:
@@ -246,10 +246,10 @@ def dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
 
 
 def _moved(flat: Float[np.ndarray, "dimension"], steps: dict[int, float]) -> Float[np.ndarray, "dimension"]:
-    moved = np.array(flat)
+    position = np.array(flat)
     for entry, step in steps.items():
-        moved[entry] += step
-    return moved
+        position[entry] += step
+    return position
 
 
 def _curvature(target: Target, flat: Float[np.ndarray, "dimension"], near: Float[np.ndarray, "dimension"]) -> Matrix:
@@ -259,5 +259,5 @@ def _curvature(target: Target, flat: Float[np.ndarray, "dimension"], near: Float
     """
     assert target.mode_search is not None
     data = target.mode_search.quadratic_part(target.data)
-    one, other = (estimands_at(target, data, jnp.asarray(place)) for place in (flat, near))
-    return target.mode_search.quadratic_curvature(data, one, other)
+    estimands, near_estimands = (estimands_at(target, data, jnp.asarray(position)) for position in (flat, near))
+    return target.mode_search.quadratic_curvature(data, estimands, near_estimands)

@@ -72,9 +72,9 @@ def balance_field(
     z = flat[components]
     # The 1 comes from the density of log sd, which is that of sd times sd; the half-normal density is flat near zero.
     change = float(np.clip(0.5 * np.log((z @ z + 1) / determined), -_MOST, _MOST))
-    moved = np.array(flat)
-    moved[components], moved[scale] = z * np.exp(-change), flat[scale] + change
-    return moved
+    balanced = np.array(flat)
+    balanced[components], balanced[scale] = z * np.exp(-change), flat[scale] + change
+    return balanced
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +104,12 @@ class Volume:
     def curvature(self) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
         """Minus the second derivatives of −½ log det H in θ."""
         # Dense products are faster: the sparse matrices have too many entries.
-        shares = [(one.toarray() if scipy.sparse.issparse(one) else one) @ self.covariance for one in self.slopes()]
+        shares = [
+            (slope.toarray() if scipy.sparse.issparse(slope) else slope) @ self.covariance for slope in self.slopes()
+        ]
         squares = np.zeros(self.second_traces.shape)
-        for row, one in enumerate(shares):
-            turned = np.ascontiguousarray(one.T)
+        for row, share in enumerate(shares):
+            turned = np.ascontiguousarray(share.T)
             for column, other in enumerate(shares[: row + 1]):
                 squares[row, column] = squares[column, row] = np.vdot(turned, other)
         return (self.second_traces - squares) / 2

@@ -62,7 +62,7 @@ def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimensio
     """
     # A generator keeps one curvature in memory, which holds more than these two arrays.
     curvatures = (_curvature(target, target.data, flat) for flat in flats)
-    pairs = [(found.gauss_newton, found.remainder) for found in curvatures]
+    pairs = [(point_curvature.gauss_newton, point_curvature.remainder) for point_curvature in curvatures]
     approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
     curvature = _add_convexly(regular(approximate), remainder)
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
@@ -177,13 +177,13 @@ def _jointly(
     """
     curved = _mark_curved(target, joint)
     alone = ~curved if not joint else np.zeros(len(flat), bool) if fixed is None else fixed & ~curved
-    found = ALONE * np.eye(len(flat))
+    precision = ALONE * np.eye(len(flat))
     # Without `joint`, the field's part of the given curvature is left out.
     first = len(curvature) - int(curved.sum())
-    found[np.ix_(curved, curved)] = curvature[first:, first:]
+    precision[np.ix_(curved, curved)] = curvature[first:, first:]
     entries = np.flatnonzero(~curved & ~alone)
     if not len(entries):
-        return found
+        return precision
     rows = -hessian_rows(target, data, flat, entries)
     _require_an_end(np.isfinite(rows).all())
     cross, own = rows[:, curved], (rows[:, entries] + rows[:, entries].T) / 2
@@ -191,15 +191,15 @@ def _jointly(
     if len(hyperparameters):
         volume = volume_at(target, flat, curvature)
         own[np.ix_(hyperparameters, hyperparameters)] += volume.excess if at_draws else volume.curvature
-    inner = cross @ scipy.linalg.cho_solve(scipy.linalg.cho_factor(found[np.ix_(curved, curved)]), cross.T)
+    inner = cross @ scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[np.ix_(curved, curved)]), cross.T)
     least = ravel_pytree(target.coordinates.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
     unit = np.sqrt(np.asarray(least)[entries])
     values, vectors = np.linalg.eigh((own - inner) / np.outer(unit, unit))
     vectors *= unit[:, None]
     convex = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
-    found[np.ix_(entries, entries)] = convex + (inner + inner.T) / 2
-    found[np.ix_(entries, curved)], found[np.ix_(curved, entries)] = cross, cross.T
-    return found
+    precision[np.ix_(entries, entries)] = convex + (inner + inner.T) / 2
+    precision[np.ix_(entries, curved)], precision[np.ix_(curved, entries)] = cross, cross.T
+    return precision
 
 
 def _mark_curved(target: Target, joint: bool) -> Bool[np.ndarray, "dimension"]:

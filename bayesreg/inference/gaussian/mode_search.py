@@ -94,9 +94,9 @@ def settle(
     resting, before = mark_hyperparameters(target), flat
     better = Found(flat, np.inf)
     for _ in range(repeats):
-        found = _improve(target, target.data, better.flat, True, iterations)
-        balanced = balance_field(target, found, partial(_factor, target, found))
-        moved = np.abs(balanced - before)[~resting].max()
+        improved = _improve(target, target.data, better.flat, True, iterations)
+        balanced = balance_field(target, improved, partial(_factor, target, improved))
+        shift = np.abs(balanced - before)[~resting].max()
         # Once the hyperparameters have settled, the other coordinates move too little to change them.
         if better.moved < SETTLED_SD:
             better = better._replace(flat=balanced)
@@ -104,7 +104,7 @@ def settle(
             # The units are reused if the last search did not end at its bounds.
             better = _improve_hyperparameters(target, balanced, better.units if better.moved < FARTHEST else None)
         before = balanced
-        if moved < SETTLED and better.moved < SETTLED_SD:
+        if shift < SETTLED and better.moved < SETTLED_SD:
             return better.flat
     if repeats == REPEATS:
         _log.warning("mode: not settled")
@@ -122,11 +122,11 @@ def _improve_hyperparameters(
         return Found(flat, 0.0)
     estimands = estimands_at(target, target.data, jnp.asarray(flat))
     curvature = target.mode_search.curvature(target.data, estimands).gauss_newton
-    found = maximise_evidence(target, flat, curvature, units)
+    maximum = maximise_evidence(target, flat, curvature, units)
     # The expansion is of second order, so the displacements may go too far. If that lowers the density, they stay.
-    data, resting = without_normaliser(target, target.data), np.where(mark_hyperparameters(target), found.flat, flat)
-    higher = height_and_slope(target, data, found.flat)[0] >= height_and_slope(target, data, resting)[0]
-    return found if higher else found._replace(flat=resting)
+    data, resting = without_normaliser(target, target.data), np.where(mark_hyperparameters(target), maximum.flat, flat)
+    higher = height_and_slope(target, data, maximum.flat)[0] >= height_and_slope(target, data, resting)[0]
+    return maximum if higher else maximum._replace(flat=resting)
 
 
 def _factor(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension dimension"]:
@@ -155,24 +155,24 @@ def _improve(
     best: list[tuple[Any, float, Any]] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
-        there = np.asarray(_place(gaussian, moving * xi))
-        height, slope = height_and_slope(target, data, there)
+        position = np.asarray(_place(gaussian, moving * xi))
+        height, slope = height_and_slope(target, data, position)
         value, gradient = -height, -moving * np.asarray(_pull_back(gaussian, slope))
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             if not best:
                 raise InputError("the mode cannot be looked for: the density is not finite at the start field")
             # A value that makes the line search turn back: it rises with the distance from the best point so far.
-            place, least, slope = best[-1]
-            return least + 2 * abs(slope @ (xi - place)), -slope
+            best_xi, least, slope = best[-1]
+            return least + 2 * abs(slope @ (xi - best_xi)), -slope
         if not best or value < best[-1][1]:
             best[:] = [(xi.copy(), value, gradient)]
         return value, gradient
 
     options = {"maxiter": iterations, "maxcor": 20, "ftol": gain, "gtol": 1e-2}
     minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
-    place, least, _ = best[-1]
+    optimum, least, _ = best[-1]
     _log.info("mode: log density %.1f", log_normaliser - least)
-    return np.asarray(_place(gaussian, moving * place))
+    return np.asarray(_place(gaussian, moving * optimum))
 
 
 # These products run on the device, because the threads of NumPy's products stay active for a while and slow down the

@@ -46,11 +46,11 @@ def search_modes(target: Target, points: Any, each: bool) -> Modes:
     chains = len(next(iter(points.values())))
     if not each:
         return Modes([laplace(target, find_mode(target, _middle(target, points)))], [0] * chains)
-    found = []
+    modes = []
     for chain in range(chains):
         _log.info("chain %d:", chain)
-        found.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points))))
-    return report_modes(target, tell_apart(target, np.stack(found)))
+        modes.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points))))
+    return report_modes(target, tell_apart(target, np.stack(modes)))
 
 
 def temper(target: Target, points: Any) -> Target:
@@ -67,11 +67,11 @@ def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> 
     gaussians: list[Gaussian] = []
     chains = [0] * len(found)
     for chain in np.argsort(heights)[::-1]:
-        apart = [distance(gaussian, found[chain]) for gaussian in gaussians]
-        if not apart or min(apart) > SAME:
-            apart = [*apart, 0.0]
+        distances = [distance(gaussian, found[chain]) for gaussian in gaussians]
+        if not distances or min(distances) > SAME:
+            distances = [*distances, 0.0]
             gaussians.append(laplace(target, found[chain]))
-        chains[chain] = int(np.argmin(apart))
+        chains[chain] = int(np.argmin(distances))
     return Modes(gaussians, chains)
 
 
@@ -90,8 +90,8 @@ def report_modes(target: Target, modes: Modes) -> Modes:
     for number, gaussian in enumerate(modes.gaussians):
         centre = np.asarray(gaussian.centre)
         chains = ", ".join(str(chain) for chain, mode in enumerate(modes.chains) if mode == number)
-        apart = distance(modes.gaussians[0], centre)
-        _log.info("  log density %.1f, %.1f sd from the first: chains %s", _height(target, centre), apart, chains)
+        separation = distance(modes.gaussians[0], centre)
+        _log.info("  log density %.1f, %.1f sd from the first: chains %s", _height(target, centre), separation, chains)
     return modes
 
 

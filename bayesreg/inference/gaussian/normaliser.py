@@ -102,34 +102,34 @@ def no_stand_in(target: Target) -> StandIn:
     degrees = range(HIGHEST_DEGREE, 1, -1)
     degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
     factors = np.array(list(combinations_with_replacement(range(count + 1), degree)))
-    nothing, one = jnp.zeros(count), jnp.ones(count)
-    return StandIn(nothing, one, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)))
+    zeros, ones = jnp.zeros(count), jnp.ones(count)
+    return StandIn(zeros, ones, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)))
 
 
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
     """Fit a polynomial to the normaliser and its slopes about a flat position, by least squares."""
-    found = no_stand_in(target)
-    if not has_costly_normaliser(target) or not len(found.centre):
-        return found
+    stand_in = no_stand_in(target)
+    if not has_costly_normaliser(target) or not len(stand_in.centre):
+        return stand_in
     entries, middle = np.flatnonzero(mark_normaliser(target)), np.asarray(middle)
     unit, rng = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), np.random.default_rng(0)
-    seen = []
+    samples = []
     # The 2 makes sure that a linear polynomial is fitted at several points, too.
-    for _ in range(2 + REDUNDANCY * len(found.factors) // (len(entries) + 1)):
+    for _ in range(2 + REDUNDANCY * len(stand_in.factors) // (len(entries) + 1)):
         direction = rng.normal(size=len(entries))
-        there = np.array(middle)
-        there[entries] += unit * REACH * rng.uniform() * direction / np.linalg.norm(direction)
-        value, slope = normaliser_and_slope(target, there)
-        coordinates, change = _coordinates_and_change(target, target.data, jnp.asarray(there), jnp.asarray(entries))
-        seen.append((value, unit * slope[entries], np.asarray(coordinates), np.asarray(change) * unit))
-    values, slopes, coordinates, changes = (np.stack(parts) for parts in zip(*seen, strict=True))
+        position = np.array(middle)
+        position[entries] += unit * REACH * rng.uniform() * direction / np.linalg.norm(direction)
+        value, slope = normaliser_and_slope(target, position)
+        coordinates, change = _coordinates_and_change(target, target.data, jnp.asarray(position), jnp.asarray(entries))
+        samples.append((value, unit * slope[entries], np.asarray(coordinates), np.asarray(change) * unit))
+    values, slopes, coordinates, changes = (np.stack(parts) for parts in zip(*samples, strict=True))
     centre, spread = coordinates.mean(axis=0), coordinates.std(axis=0)
     z, changes = (coordinates - centre) / spread, changes / spread[:, None]
-    rows = [terms_of(found.factors, one)[None] for one in z]
-    rows += [(_slopes_of_terms(found.factors, one) @ change).T for one, change in zip(z, changes, strict=True)]
+    rows = [terms_of(stand_in.factors, point)[None] for point in z]
+    rows += [(_slopes_of_terms(stand_in.factors, point) @ change).T for point, change in zip(z, changes, strict=True)]
     coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate([values, slopes.ravel()]))[0]
     reach = np.linalg.norm(z, axis=1).max()
-    return found._replace(
+    return stand_in._replace(
         centre=jnp.asarray(centre),
         unit=jnp.asarray(spread),
         reach=jnp.asarray(reach),
@@ -180,13 +180,13 @@ def delay_acceptance(
 
         proposed, infos = jax.lax.scan(one, state.kernel, jax.random.split(key_steps, TOGETHER))
         info = together(infos)
-        here, there = flat_of(setup, state.kernel), flat_of(setup, proposed)
-        true = log_normaliser(data, there)
-        gain = true - state.log_normaliser - stand_in(data, setup, there) + stand_in(data, setup, here)
+        current_flat, proposed_flat = flat_of(setup, state.kernel), flat_of(setup, proposed)
+        true = log_normaliser(data, proposed_flat)
+        gain = true - state.log_normaliser - stand_in(data, setup, proposed_flat) + stand_in(data, setup, current_flat)
         probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
         accepted = jax.random.uniform(key_accept) < probability
-        moved = Delayed(proposed, true)
-        kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
+        candidate = Delayed(proposed, true)
+        kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
         return kept, info._replace(acceptance_rate=info.acceptance_rate * probability)
 
     return whole_step

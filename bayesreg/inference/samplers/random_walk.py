@@ -58,8 +58,8 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
         move, proposal, inside = proposed(data, key_proposal, position)
         # A proposal outside the support needs no solve. The current position is evaluated in its place; with its own u
         # as the guess that takes no iteration.
-        place = jax.tree.map(lambda new, old: jnp.where(inside, new, old), proposal, position)
-        evaluation = target.evaluate_estimands(data, place, guess=current.u)
+        feasible = jax.tree.map(lambda new, old: jnp.where(inside, new, old), proposal, position)
+        evaluation = target.evaluate_estimands(data, feasible, guess=current.u)
         logdensity = jnp.where(inside, evaluation.logdensity, -jnp.inf)
         kernel = blackjax.additive_step_random_walk(lambda _: logdensity, lambda *_: move)
         kernel_state, kernel_info = kernel.step(key_accept, state.kernel)

@@ -46,9 +46,9 @@ def smc(target: Target, settings: Smc) -> Sampler:
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         first = spread * jax.random.normal(key_first, (particles, len(setup.middle)))
-        found, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper)
+        tempered_particles, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper)
         chosen = resampling.systematic(key_choose, weights, chains)
-        positions = jax.vmap(lambda xi: whitened_position(target, setup.gaussian, xi))(found[chosen])
+        positions = jax.vmap(lambda xi: whitened_position(target, setup.gaussian, xi))(tempered_particles[chosen])
         return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
 
     return chains_of._replace(prepare=prepare)
