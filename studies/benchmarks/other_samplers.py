@@ -190,7 +190,7 @@ def position(posterior: Any, gaussian: Gaussian | None, x: jax.Array) -> dict[st
 
 def logdensity(posterior: Any, data: Any, gaussian: Gaussian | None, x: jax.Array) -> jax.Array:
     """Of flat coordinates; whitening is linear, and leaves out a constant."""
-    return targets.logdensity(posterior, data, position(posterior, gaussian, x))
+    return targets.logdensity(posterior.target, data, position(posterior, gaussian, x))
 
 
 value = jax.jit(logdensity, static_argnums=0)

@@ -79,10 +79,10 @@ def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -
     keys = jax.random.split(jax.random.key(0), len(state.position))
 
     def begin(data: Any, setup: Any, xi: jax.Array) -> Any:
-        return blackjax.mcmc.hmc.init(xi, whitened_density(posterior, data, setup))
+        return blackjax.mcmc.hmc.init(xi, whitened_density(posterior.target, data, setup))
 
     def trajectory(data: Any, setup: Any, key: jax.Array, state: Any) -> Any:
-        return _quarter_turn(posterior, data, setup, key, state)[0]
+        return _quarter_turn(posterior.target, data, setup, key, state)[0]
 
     shared = data, setup
     timed("all but its energies", lambda *given: sampler.step(*given)[0], shared, keys, state)
@@ -97,10 +97,10 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
     places += APART * jax.random.normal(jax.random.key(2), places.shape)
 
     def density(data: Any, setup: Any, xi: jax.Array) -> jax.Array:
-        return whitened_density(posterior, data, setup)(xi)
+        return whitened_density(posterior.target, data, setup)(xi)
 
     def values_of(xi: jax.Array) -> Any:
-        estimands = estimands_of(posterior.target, data, whitened_position(posterior, setup.gaussian, xi))
+        estimands = estimands_of(posterior.target, data, whitened_position(posterior.target, setup.gaussian, xi))
         values = complete(data.blocks, estimands)
         return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 

@@ -80,7 +80,7 @@ def setups_about(
     """The setups of all replications, stacked."""
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
-    found = [make_stand_in(posterior, *each) for each in zip(references, middles, strict=True)]
+    found = [make_stand_in(posterior.target, *each) for each in zip(references, middles, strict=True)]
     normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
 
     def about(gaussian: Gaussian, middle: Any) -> Setup:

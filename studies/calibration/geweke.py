@@ -110,7 +110,7 @@ def _successive(
 
     def chain(given: Any) -> Any:
         key, first = given
-        evaluation = model.evaluate_estimands(observed(jax.random.fold_in(key, 0), first), first)
+        evaluation = model.target.evaluate_estimands(observed(jax.random.fold_in(key, 0), first), first)
 
         def one(estimands: Any, key: Any) -> Any:
             key_data, key_step = jax.random.split(key)

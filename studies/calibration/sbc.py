@@ -28,6 +28,7 @@ from bayesreg.inference.gaussian.whitened import Setup, whitened_position
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
+from bayesreg.model.target import PosteriorTarget
 from studies.calibration.chains import (
     BATCH,
     Estimands,
@@ -190,14 +191,14 @@ def sample(
     """Sample the posterior of each of the data sets (r, q), one chain each, from draws of the prior."""
     kernel = choose_sampler(sampler, posterior.target).sampler
     say("a mode for each replication")
-    problems = [replace(posterior, data=observing(posterior.data, f)) for f in observed]
-    modes = _modes(problems, starts)
+    targets = [replace(posterior, data=observing(posterior.data, f)).target for f in observed]
+    modes = _modes(targets, starts)
     visited = modes[:, None]
     key, key_flight = jax.random.split(key)
     for stage in range(settings.stages + 1):
         say(f"a Gaussian for each replication, {stage + 1} of {settings.stages + 1}")
         about = visited[:, [0, -1]]
-        references = [average_gaussian(*each) for each in zip(problems, about, strict=True)]
+        references = [average_gaussian(*each) for each in zip(targets, about, strict=True)]
         setup = setups_about(posterior, references, about.mean(axis=1), settings.step_size, settings.steps)
         if stage == 0:
             states = _scattered(posterior, posterior.data, setup, observed, jax.random.split(key_flight, len(modes)))
@@ -210,12 +211,12 @@ def sample(
     return Sampled(quantities, u, acceptance.mean(axis=0))
 
 
-def _modes(problems: list[br.Posterior], starts: Estimands) -> np.ndarray:
+def _modes(targets: list[PosteriorTarget], starts: Estimands) -> np.ndarray:
     """Flat positions (r, d) of the modes of all replications, from draws of the prior."""
     found = []
-    for k, problem in enumerate(problems):
-        start = problem.coordinates.unconstrain(problem.data, {name: x[k] for name, x in starts.items()})
-        found.append(settle(problem, np.asarray(ravel_pytree(start)[0])))
+    for k, target in enumerate(targets):
+        start = target.coordinates.unconstrain(target.data, {name: x[k] for name, x in starts.items()})
+        found.append(settle(target, np.asarray(ravel_pytree(start)[0])))
     return np.stack(found)
 
 
@@ -230,7 +231,7 @@ def _scattered(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, 
         setup, observed, key = given
         xi = jax.random.normal(key, setup.middle.shape)
         return estimands_of(
-            posterior.target, observing(data, observed), whitened_position(posterior, setup.gaussian, xi)
+            posterior.target, observing(data, observed), whitened_position(posterior.target, setup.gaussian, xi)
         )
 
     return jax.lax.map(one, (setup, observed, keys), batch_size=BATCH)

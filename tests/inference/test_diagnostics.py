@@ -37,7 +37,7 @@ def blocks(target, count=2, seed=0):
     for _ in range(count):
         draws = {
             name: np.exp(0.1 * rng.normal(size=shape + np.shape(value)))
-            for name, value in target.estimands(target.reference()).items()
+            for name, value in target.coordinates.reference().items()
         }
         if "t_elastic" in draws:
             draws["t_elastic"] = draws["t_elastic"] + np.arange(CHAINS)[:, None]
@@ -49,7 +49,7 @@ def found():
     priors = {name: {"high": 60.0} for name in ("lam", "mu")}
     target = posterior(
         normalised=True, priors=priors, t_similarity={"median": 5.0}, t_elastic={"median": 100.0}, fixed={"mu": 1.0}
-    )
+    ).target
     given = list(blocks(target))
     return target, given, to_inference_data(target, given)
 
@@ -73,7 +73,7 @@ def test_temperatures_are_judged(found):
 
 
 def test_known_temperatures_are_not_there():
-    target = posterior()
+    target = posterior().target
     idata = to_inference_data(target, list(blocks(target)))
     assert set(idata.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
     assert set(convergence(idata).rhat.data_vars) == {"u_boundary", "lam", "mu"}
@@ -145,7 +145,7 @@ def test_blocks_of_unequal_lengths_come_back_from_the_file(found, tmp_path):
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
     """Keeping, judging and writing ten times the draws, hardly more is held at once: temporaries of one estimand."""
-    target = posterior()
+    target = posterior().target
     monkeypatch.setattr(diagnostics, "AT_ONCE", 2**14)
     monkeypatch.setattr(diagnostics, "READ_AT_ONCE", 2**14)
     # What is imported at the first call is no draw.

@@ -117,11 +117,11 @@ def test_parameters_that_nothing_is_known_of_have_the_prior_s_width():
     posterior = posterior_of(flat, flat, MESH, priors={"lam": {"high": 20.0}, "mu": {"high": 5.0}}, rigid_sd=1.0)
     position = {**posterior.unconstrain(posterior.reference()), "lam": jnp.array([-1.0, 0.0, 2.0])}
     flat = np.asarray(ravel_pytree(position)[0])
-    precision = precision_at(posterior, flat)
+    precision = precision_at(posterior.target, flat)
     count = len(precision) - 3 * len(posterior.sampled)
     assert count == 5
     np.testing.assert_allclose(precision[:count], np.eye(len(precision))[:count], atol=1e-6)
-    rows = hessian_rows(posterior, posterior.data, flat, np.arange(count))
+    rows = hessian_rows(posterior.target, posterior.data, flat, np.arange(count))
     np.testing.assert_allclose(rows, -np.eye(len(flat))[:count], atol=1e-6)
 
 
@@ -146,7 +146,7 @@ def test_a_parameter_that_runs_away_is_told():
     posterior = smooth_posterior()
     away = posterior.unconstrain(posterior.reference() | {"lam": jnp.array([0.01, 1e13, 10.0])})
     with pytest.raises(br.InputError, match="λ, μ or a temperature runs away"):
-        precision_at(posterior, np.asarray(ravel_pytree(away)[0]))
+        precision_at(posterior.target, np.asarray(ravel_pytree(away)[0]))
 
 
 def test_a_search_without_an_end_is_told():

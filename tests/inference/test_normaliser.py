@@ -66,16 +66,16 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
     post = posterior()
     flat = np.array(flat_of(post))
     flat[slices(post.target)["lam"]] = -3.0
-    found = make_stand_in(post, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
-    entries = np.flatnonzero(mark_normaliser(post))
+    found = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
+    entries = np.flatnonzero(mark_normaliser(post.target))
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(20, len(entries)))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     places = np.tile(flat, (21, 1))
     places[:20, entries] += 0.3 * REACH * rng.uniform(size=20)[:, None] * directions
     places[20, np.arange(len(flat))[slices(post.target)["lam"]]] = -8.0
-    expected = np.array([float(log_normaliser_at(post, post.data, place)) for place in places])
-    error = expected - [float(found(smooth_coordinates(post, post.data, jnp.asarray(place)))) for place in places]
+    expected = np.array([float(log_normaliser_at(post.target, post.data, place)) for place in places])
+    error = expected - [float(found(smooth_coordinates(post.target, post.data, jnp.asarray(place)))) for place in places]
     error -= error[:20].mean()
     assert expected[:20].std() > 5
     assert error[:20].std() < 0.1
@@ -85,7 +85,7 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
 def test_beyond_where_it_was_fitted_the_stand_in_is_linear():
     post = posterior()
     flat = flat_of(post)
-    found = make_stand_in(post, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
+    found = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
     direction = found.unit / np.sqrt(len(found.unit))
     near, beyond, far = (float(found(found.centre + scale * found.reach * direction)) for scale in (1, 2, 3))
     assert beyond - near == pytest.approx(far - beyond, rel=1e-9)
@@ -93,18 +93,18 @@ def test_beyond_where_it_was_fitted_the_stand_in_is_linear():
 
 def test_many_parameters_have_a_stand_in_of_lower_degree(monkeypatch):
     post = posterior()
-    count, flat = len(no_stand_in(post).centre), flat_of(post)
+    count, flat = len(no_stand_in(post.target).centre), flat_of(post)
     for degree in (3, 2, 1):
         monkeypatch.setattr("bayesreg.inference.gaussian.normaliser.MOST_TERMS", comb(count + degree, degree))
-        assert no_stand_in(post).factors.shape == (comb(count + degree, degree), degree)
-    found = make_stand_in(post, Gaussian(jnp.asarray(flat), 0.02 * jnp.eye(len(flat))), flat)
+        assert no_stand_in(post.target).factors.shape == (comb(count + degree, degree), degree)
+    found = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.02 * jnp.eye(len(flat))), flat)
     step = np.zeros(len(flat))
-    step[np.flatnonzero(mark_normaliser(post))] = 0.02
+    step[np.flatnonzero(mark_normaliser(post.target))] = 0.02
     true, approximate = (
         float(of(flat + step) - of(flat - step))
         for of in (
-            lambda x: log_normaliser_at(post, post.data, x),
-            lambda x: found(smooth_coordinates(post, post.data, jnp.asarray(x))),
+            lambda x: log_normaliser_at(post.target, post.data, x),
+            lambda x: found(smooth_coordinates(post.target, post.data, jnp.asarray(x))),
         )
     )
     assert approximate == pytest.approx(true, rel=0.02)
@@ -156,12 +156,12 @@ def test_draws_are_of_the_density_with_the_normaliser(coefficients):
 
 def test_a_chain_knows_the_whole_density_where_it_stands():
     post = posterior()
-    sampler = hmc(post, Hmc())
+    sampler = hmc(post.target, Hmc())
     estimands = post.estimands(post.reference())
     flat = jax.flatten_util.ravel_pytree(post.target.coordinates.unconstrain(post.data, estimands))[0]
     gaussian = Gaussian(flat, 0.05 * jnp.eye(len(flat)))
     setup = setup_about(post.target, gaussian, flat)
-    setup = setup._replace(stand_in=make_stand_in(post, gaussian, flat), step_size=jnp.asarray(0.3))
+    setup = setup._replace(stand_in=make_stand_in(post.target, gaussian, flat), step_size=jnp.asarray(0.3))
 
     @jax.jit
     def moved(data, setup, key):
@@ -188,11 +188,11 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     post = posterior()
     points = starting_points(post.target, br.Start(), 2, jax.random.key(0))
-    setup, _ = hmc(post, Hmc(warm_up=2)).prepare(points, jax.random.key(1))
-    sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post)
+    setup, _ = hmc(post.target, Hmc(warm_up=2)).prepare(points, jax.random.key(1))
+    sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post.target)
     places = np.asarray(setup.middle) + sd * np.random.default_rng(0).normal(size=(10, len(sd)))
     true, found = (
-        np.array([float(of(post, post.data, jnp.asarray(place))) for place in places])
+        np.array([float(of(post.target, post.data, jnp.asarray(place))) for place in places])
         for of in (log_normaliser_at, lambda *at: setup.stand_in(smooth_coordinates(*at)))
     )
     assert true.std() > 1

@@ -197,14 +197,14 @@ def test_wrong_options_are_told(wrong, message):
 
 def test_starts_spread_over_the_field_and_stay_out_of_the_skull():
     """The far end of the field crosses the wall: nodes that would enter it stop before it."""
-    target = posterior()
-    field = np.zeros((len(target.sampled), 3))
+    target, sampled = posterior().target, posterior().sampled
+    field = np.zeros((len(sampled), 3))
     field[:, 2] = 2.0
     points = starting_points(target, br.Start(field=field, fraction=(0.0, 1.0)), 3, jax.random.key(0))
     moves = np.asarray(points["u_boundary"])[:, :, 2]
     assert (moves[0] == 0).all()
     assert moves[2].max() == 2.0
-    top = MESH.points[target.sampled, 2] > MESH.points[:, 2].max() - 1e-9
+    top = MESH.points[sampled, 2] > MESH.points[:, 2].max() - 1e-9
     assert (moves[2, top] < 0.06).all()
     assert jax.vmap(partial(target.supports, target.data))(points).all()
 
