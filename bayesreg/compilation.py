@@ -1,4 +1,4 @@
-"""Set the environment variables that control how JAX compiles programs and where it stores them."""
+"""Set the environment variables that control how JAX compiles programs, and where it stores the compiled programs."""
 
 import os
 import platform
@@ -11,19 +11,20 @@ from pathlib import Path
 
 import platformdirs
 
-# Older compiled programs are removed; one mesh has about 5 MB of programs.
+# Compiled programs that are older than this number of days are removed. The programs for one mesh take about 5 MB.
 MOST_DAYS = 30
 # These flags halve the compilation time and do not slow the programs (docs/speed.md#compiling).
 QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
-# XLA ends a process that uses an unknown flag, and new versions of XLA remove flags.
+# The flags are set only if the version of jaxlib starts with this text. XLA ends a process that uses an unknown flag,
+# and new versions of XLA remove flags.
 KNOWN_TO = "0.10."
 
 
 def compile_quickly(flags: str = QUICK) -> None:
     """Reduce the compilation time of XLA, unless the variable XLA_FLAGS is set.
 
-    The flags are set only for the measured version of jaxlib, and only if the processor is JAX's only device: for other
-    devices one of the flags has another meaning.
+    The flags are set only for the versions of jaxlib with which they were measured, and only if no plugin of JAX for
+    another device than the CPU is installed: for other devices one of the flags has another meaning.
     """
     if version("jaxlib").startswith(KNOWN_TO) and find_spec("jax_plugins") is None:
         os.environ.setdefault("XLA_FLAGS", flags)
@@ -32,8 +33,9 @@ def compile_quickly(flags: str = QUICK) -> None:
 def keep_compiled_programs() -> None:
     """Let JAX store compiled programs in the user's cache, unless the variable JAX_COMPILATION_CACHE_DIR is set.
 
-    Each kind of processor has its own folder: clusters share home folders, and a program that was compiled for one kind
-    may not run on another. Without a writable home folder no program is stored.
+    Each kind of processor has its own folder, because the computers of a cluster share home folders, and a program that
+    was compiled for one kind of processor may not run on another kind. No program is stored if there is no writable
+    home folder.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
@@ -59,7 +61,7 @@ def _remove_old(folder: Path) -> None:
 
 
 def _processor() -> str:
-    """Describe the kind of this machine's processor in a text that differs between kinds."""
+    """Return a text that describes the kind of this machine's processor; it differs between kinds."""
     information = Path("/proc/cpuinfo")
     if not information.exists():
         return platform.processor() or platform.machine()

@@ -3,6 +3,7 @@
 A configuration holds no arrays and builds nothing; `bayesreg.workflow.run` does that.
 """
 
+from bayesreg.config.configuration import Config
 from bayesreg.config.errors import ConfigError
 from bayesreg.config.loading import (
     load_config,
@@ -13,7 +14,6 @@ from bayesreg.config.loading import (
     resolved_yaml,
     schema,
 )
-from bayesreg.config.sections import Config
 
 __all__ = [
     "Config",

@@ -15,8 +15,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 from ruamel.yaml.representer import RoundTripRepresenter
 
+from bayesreg.config.configuration import Config, complete
 from bayesreg.config.errors import ConfigError, Keys, explain
-from bayesreg.config.sections import Config, complete
 from bayesreg.config.yaml_text import DEEPEST, parse
 from bayesreg.model.observations.registry import kinds
 from bayesreg.model.options import ModelConfig

@@ -14,12 +14,12 @@ from bayesreg.tissues import BACKGROUND, tissue_names
 
 
 def find_field(value: object, info: ValidationInfo) -> object:
-    """Return the keywords of a displacement field unchanged; find the file of any other value."""
+    """Return the keywords identity, truth and demons unchanged; find the file that any other value names."""
     return value if value in ("identity", "truth", "demons") else find_file(value, info)
 
 
 def find_boundary(value: object, info: ValidationInfo) -> object:
-    """Return the keyword truth and null unchanged; find the file of any other value."""
+    """Return the keyword truth and null (None) unchanged; find the file that any other value names."""
     return value if value in (None, "truth") else find_file(value, info)
 
 
@@ -28,7 +28,10 @@ def _as_pair(value: object) -> object:
 
 
 def _as_list(value: object) -> object:
-    """Convert one label or several to a tuple; a text such as 1000-1035 is a range that includes its ends."""
+    """Convert one label or a list of labels to a tuple; a text such as 1000-1035 includes both ends.
+
+    A value of another type is returned unchanged, for Pydantic to check.
+    """
     several = (value,) if isinstance(value, int | str) and not isinstance(value, bool) else value
     if not isinstance(several, Sequence):
         return value
@@ -49,7 +52,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if length == 0:
         raise ValueError("expected a direction that is not zero")
     if math.isclose(length, 1, rel_tol=1e-12):
-        return vector  # Another division could change the last bit of a stored configuration.
+        return vector  # A division could change the last bit of a direction in a stored configuration.
     x, y, z = (component / length for component in vector)
     return x, y, z
 
@@ -62,7 +65,11 @@ Direction = Annotated[Vector, AfterValidator(_unit)]
 
 
 def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Raise ValueError for an unsuitable table: a wrong name, no tissue or too many, or a label of two tissues."""
+    """Return a table of labels by tissue unchanged, or raise ValueError if it is unsuitable.
+
+    A table is unsuitable if the name of a tissue is not allowed, if there is no tissue besides the background or more
+    than 127, or if a label has more than 32 bits or belongs to two tissues.
+    """
     if not table:
         raise ValueError("expected at least one tissue with its labels, such as liver: 1")
     if not 0 < len(tissue_names(table)) < 128:
@@ -70,11 +77,11 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
     owners: dict[int, str] = {}
     for name, labels in table.items():
         if name.lower() == BACKGROUND and name != BACKGROUND:
-            raise ValueError(f"{name!r} is no name of a tissue; what belongs to none is {BACKGROUND}, in small letters")
+            raise ValueError(f"{name!r} is no name of a tissue; write {BACKGROUND} for labels of no tissue")
         if not name.isidentifier():
             raise ValueError(f"{name!r} is no name of a tissue; expected letters, digits and _, such as left_lobe")
         if name == "all":
-            raise ValueError("all stands for all tissues; expected another name")
+            raise ValueError("the name 'all' stands for all tissues; expected another name for this tissue")
         for label in labels:
             if abs(label) >= 2**31:
                 raise ValueError(f"label {label} of {name} has more than 32 bits")
@@ -84,9 +91,12 @@ def _table(table: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
 
 
 def _named_table(value: object, info: ValidationInfo) -> object:
-    """Replace the name of a program by its label table, and names of labels by their values in the lookup table."""
+    """Return the label table that a text such as freesurfer names, or replace label names in a table by their values.
+
+    The values of label names come from the lookup table `label_names`, if it is given.
+    """
     known = info.data.get("label_names")
-    # A stored table holds only numbers.
+    # The table of a stored configuration holds only numbers, so that the lookup table is not needed.
     if isinstance(value, dict) and known is not None and not is_stored(info):
         names = read_label_names(known)
         return {tissue: name_values(entry, names) for tissue, entry in value.items()}

@@ -1,7 +1,8 @@
 """Smoothed aggregation (Vaněk, Mandel, Brezina 1996) as a preconditioner, for meshes too large for a dense inverse.
 
-PyAMG makes the hierarchy once, on the host. A V-cycle runs on the device, with the chains as columns. The matrices
-belong to *one* reference (λ, μ), so they are the same for all chains.
+It approximates K_II⁻¹, where K_II is the stiffness of the free nodes. PyAMG makes the hierarchy of matrices once, on
+the host. A V-cycle runs on the device; its columns are the chains. The matrices are made for *one* reference (λ, μ), so
+they are the same for all chains.
 """
 
 from __future__ import annotations
@@ -18,15 +19,17 @@ from bayesreg.fem.operators import SparseOperator, sparse_operator, symmetric_op
 from bayesreg.fem.preconditioners import SINGULAR
 from bayesreg.types import AnyArray, InputError, Scalar
 
-# The coarsest matrix has a dense inverse.
+# Coarsening ends at about this number of unknowns; the coarsest matrix is inverted as a dense matrix.
 COARSEST = 600
-# Chebyshev's polynomials damp the eigenvalues above this share of the greatest one.
+# The smoother is Chebyshev's polynomial of this degree. It damps the eigenvalues above this share of the greatest
+# eigenvalue.
 LEAST_SHARE = 0.1
 DEGREE = 2
-# A weaker connection between two nodes does not put them into one aggregate.
+# Two nodes are strongly connected if their block of the matrix has at least this norm, relative to the geometric mean
+# of the norms of their diagonal blocks. Only strong connections put nodes into one aggregate.
 STRENGTH = 0.08
-# The bound of the least eigenvalue of the coarsest matrix, scaled to a unit diagonal. The coarsest matrix represents
-# rigid motions up to rounding.
+# K_II counts as singular if the least eigenvalue of the coarsest matrix, scaled to a unit diagonal, is not greater. The
+# coarsest level represents rigid motions exactly up to rounding, so it shows whether K_II resists them.
 SINGULAR_BELOW = 1e-13
 
 
@@ -40,7 +43,7 @@ class Level(NamedTuple):
     greatest : scalar
         An upper bound of the eigenvalues of the matrix.
     prolongation : SparseOperator
-        The (k, next k) map from the next coarser level to this one.
+        The (k, l) map from the l unknowns of the next coarser level to the k unknowns of this level.
     """
 
     matrix: SparseOperator
@@ -49,16 +52,19 @@ class Level(NamedTuple):
 
 
 class Multigrid(NamedTuple):
-    """A V-cycle for K_II at the reference parameters (a pytree): symmetric and positive definite to single precision.
+    """A V-cycle for K_II at the reference parameters (a pytree).
+
+    It is a symmetric positive definite operator, up to rounding in single precision.
 
     Attributes
     ----------
     scale : (3f,) array
-        diag(K_II)^(−1/2), in double precision. It contains the contrast between tissues.
+        diag(K_II)^(−1/2) for the f free nodes, in double precision. It contains the contrast between tissues.
     levels : tuple of Level
-        The levels, from fine to coarse.
+        The levels, from fine to coarse, without the coarsest one.
     coarsest : (c, c) array
-        The inverse of the last matrix, in double precision: if tissues differ greatly, it is far from the identity.
+        The inverse of the coarsest matrix. It is in double precision, because it is far from the identity if the
+        stiffnesses of tissues differ greatly.
     """
 
     scale: Float[AnyArray, "unknowns"]
@@ -66,21 +72,21 @@ class Multigrid(NamedTuple):
     coarsest: Float[AnyArray, "coarsest coarsest"]
 
     def __call__(self, residual: Float[AnyArray, "free 3 chains"]) -> Float[AnyArray, "free 3 chains"]:
-        """Compute an approximation of K_II⁻¹ r by one V-cycle."""
+        """Compute an approximation of K_II⁻¹ r by one V-cycle, where r is the residual."""
         scale = self.scale.reshape(-1, 3, 1)
         scaled = (scale * residual).astype(jnp.float32).reshape(len(self.scale), -1)
         return scale * _cycle(self.levels, self.coarsest, scaled).reshape(residual.shape)
 
 
 def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "unknowns modes"]) -> Multigrid:
-    """Make the hierarchy of a symmetric positive definite matrix; the result is deterministic.
+    """Make the hierarchy of a symmetric positive definite matrix; the same matrix always gives the same hierarchy.
 
     Parameters
     ----------
     matrix : (3f, 3f) sparse matrix
-        K_II at the reference parameters, axes fastest.
+        K_II at the reference parameters; the three unknowns of a node are adjacent.
     near_kernel : (3f, 6) array
-        The rigid motions of the free nodes.
+        The six rigid motions of the f free nodes, as columns.
 
     Raises
     ------
@@ -101,11 +107,12 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
         # PyAMG's other weightings estimate the greatest eigenvalue with random numbers; this one does not.
         smooth=("jacobi", {"omega": 4 / 3, "weighting": "local"}),
         improve_candidates=None,
-        # PyAMG counts blocks; on coarse levels a block has the six motions of an aggregate.
+        # This limit counts blocks of unknowns. On coarse levels a block has the six motions of an aggregate.
         max_coarse=COARSEST // 6,
         max_levels=20,
     ).levels
-    # An aggregate of one or two nodes has fewer than six independent motions; the other columns are zero.
+    # An aggregate of one or two nodes has fewer than six independent motions. The rows and columns of its other motions
+    # are zero, and are removed.
     kept = [np.flatnonzero(level.A.diagonal() > 1e-12) for level in hierarchy]
     inner = [scipy.sparse.csr_array(level.A)[own][:, own] for level, own in zip(hierarchy, kept, strict=True)]
     scales = [1 / np.sqrt(each.diagonal()) for each in inner]
@@ -136,9 +143,9 @@ def _scale(
 
 
 def _above_the_eigenvalues(matrix: scipy.sparse.csr_array) -> float:
-    """Compute an upper bound of the eigenvalues: 1.1 times Lanczos' estimate of the greatest one.
+    """Compute an upper bound of the eigenvalues: 1.1 times Lanczos' estimate of the greatest eigenvalue.
 
-    The estimate is at most a few percent too low.
+    The factor is sufficient because the estimate is at most a few percent too low.
     """
     start = np.random.default_rng(0).normal(size=matrix.shape[0])
     return 1.1 * float(scipy.sparse.linalg.eigsh(matrix, 1, v0=start, tol=0.05, return_eigenvectors=False)[0])
@@ -149,7 +156,10 @@ def _cycle(
     coarsest: Float[AnyArray, "coarsest coarsest"],
     load: Float[AnyArray, "unknowns chains"],
 ) -> Float[AnyArray, "unknowns chains"]:
-    """Run one V-cycle from zero; the same polynomial smooths before and after, so that the cycle is symmetric."""
+    """Run one V-cycle that starts from zero.
+
+    The same polynomial smooths before and after the correction by the coarser levels, so that the cycle is symmetric.
+    """
     if not levels:
         return (coarsest @ load.astype(coarsest.dtype)).astype(load.dtype)
     level, *coarser = levels
@@ -162,7 +172,7 @@ def _cycle(
 def _smooth(
     level: Level, x: Float[AnyArray, "unknowns chains"], residual: Float[AnyArray, "unknowns chains"]
 ) -> Float[AnyArray, "unknowns chains"]:
-    """Apply `DEGREE` steps of Chebyshev's iteration (Saad 2003, algorithm 12.1) to x, given its residual."""
+    """Apply `DEGREE` steps of Chebyshev's iteration (Saad 2003, algorithm 12.1) to x, given the residual of x."""
     centre, half = (level.greatest * (1 + way * LEAST_SHARE) / 2 for way in (1, -1))
     ratio = half / centre
     step = residual / centre

@@ -28,18 +28,21 @@ def describe_observations(posterior: Posterior, values: Values) -> dict[str, dic
     """
     filled = posterior.fill(values)
     state = state_of(posterior.data.body, posterior.data.blocks, filled)
-    return {name: _describe(one, posterior.data.terms[name], state) for name, one in posterior.observations.items()}
+    return {
+        name: _describe(observation, posterior.data.terms[name], state)
+        for name, observation in posterior.observations.items()
+    }
 
 
 def _describe(observation: Any, term: Any, state: State) -> dict[str, Any]:
     kind = getattr(observation, "kind", "own")
     title = kinds().get(kind, ObservationSection).title
-    found: dict[str, Any] = {"kind": kind, "title": title, "log": float(term.log(state))}
+    description: dict[str, Any] = {"kind": kind, "title": title, "log": float(term.log(state))}
     if isinstance(options := getattr(observation, "options", None), Section):
-        found["options"] = options.model_dump(mode="json")
+        description["options"] = options.model_dump(mode="json")
     # An observation from outside the package may provide nothing but its log.
-    standardised = next((one for one in (term, observation) if isinstance(one, Standardised)), None)
+    standardised = next((candidate for candidate in (term, observation) if isinstance(candidate, Standardised)), None)
     if standardised is not None:
         z = np.asarray(standardised.standardised_residual(state))
-        found |= {"values": z.size, "residual_rms": float(np.sqrt(np.mean(z**2)))}
-    return found | (observation.describe(term, state) if hasattr(observation, "describe") else {})
+        description |= {"values": z.size, "residual_rms": float(np.sqrt(np.mean(z**2)))}
+    return description | (observation.describe(term, state) if hasattr(observation, "describe") else {})

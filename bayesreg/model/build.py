@@ -64,7 +64,10 @@ def build_posterior(
         raise InputError(f"build_posterior needs a mesh: a TetMesh; got {type(mesh).__name__}")
     model = model or ModelConfig()
     problem, sampled, prepared = problem_of(mesh, require_observations(observations), model, skull, reference)
-    tempered = not any(isinstance(one, Correlated) and one.is_tempered_by_residuals for one in prepared.values())
+    tempered = not any(
+        isinstance(observation, Correlated) and observation.is_tempered_by_residuals
+        for observation in prepared.values()
+    )
     posterior = Posterior(problem, mesh, model, sampled, prepared, tempered=tempered)
     _require_bounded(posterior)
     _require_numbers(posterior)
@@ -77,12 +80,12 @@ def require_observations(given: Any) -> list[Any]:
         raise InputError(f"observations must be a list, got {type(given).__name__}; put one observation in a list, too")
     if not len(given):
         raise InputError("there is nothing observed: give observations, such as ImagePair(fixed, moving) or Landmarks")
-    for one in given:
-        name = getattr(one, "name", None)
-        known = isinstance(one, Observation) or callable(getattr(one, "log", None))
+    for observation in given:
+        name = getattr(observation, "name", None)
+        known = isinstance(observation, Observation) or callable(getattr(observation, "log", None))
         if not (known and isinstance(name, str) and name):
             raise InputError(
-                f"an observation needs a name (text) and a function log(state); got {type(one).__name__}: use "
+                f"an observation needs a name (text) and a function log(state); got {type(observation).__name__}: use "
                 "ImagePair, Landmarks, or an object of your own with both"
             )
         # The name becomes part of variable names in files.
@@ -93,7 +96,7 @@ def require_observations(given: Any) -> list[Any]:
 
 def _require_bounded(posterior: Posterior) -> None:
     """Raise InputError if nothing bounds the rigid motions: too few landmarks, no image, no skull and no prior."""
-    bounding = [bounding_points(one) for one in posterior.observations.values()]
+    bounding = [bounding_points(observation) for observation in posterior.observations.values()]
     bounded = not len(posterior.sampled) or {"rigid", "skull"} & set(posterior.data.terms)
     if bounded or any(points is None for points in bounding):
         return
@@ -114,15 +117,19 @@ def _require_numbers(posterior: Posterior) -> None:
         if not isinstance(term, ExternalTerm):
             continue
         log = partial(_log_at, term, rest)
-        found = jax.eval_shape(log, rest.u)
-        if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
-            got = f"shape {found.shape} of {found.dtype}" if hasattr(found, "shape") else type(found).__name__
+        abstract_value = jax.eval_shape(log, rest.u)
+        if getattr(abstract_value, "shape", None) != () or not jnp.issubdtype(abstract_value.dtype, jnp.floating):
+            got = (
+                f"shape {abstract_value.shape} of {abstract_value.dtype}"
+                if hasattr(abstract_value, "shape")
+                else type(abstract_value).__name__
+            )
             raise InputError(f"log(state) of the observation {name!r} must give one real number, got {got}")
         value, slope = jax.value_and_grad(log)(rest.u)
         if jnp.isnan(value) or jnp.isnan(slope).any():
-            what = "is not a number" if jnp.isnan(value) else "has a derivative that is not a number"
+            defect = "is not a number" if jnp.isnan(value) else "has a derivative that is not a number"
             raise InputError(
-                f"log(state) of the observation {name!r} {what} where nothing has moved, and chains may start there; "
+                f"log(state) of the observation {name!r} {defect} where nothing has moved, and chains may start there; "
                 "avoid, for instance, the root of a sum of squares that may be zero"
             )
 

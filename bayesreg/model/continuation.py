@@ -51,11 +51,11 @@ def _prefetch(makers: Sequence[Callable[[], Made]]) -> Iterator[Made]:
     """Yield the result of each maker, while a background thread computes the next one."""
     pool = ThreadPoolExecutor(max_workers=1)
     try:
-        coming = pool.submit(makers[0])
-        for following in makers[1:]:
-            made, coming = coming.result(), pool.submit(following)
-            yield made
-        yield coming.result()
+        future = pool.submit(makers[0])
+        for maker in makers[1:]:
+            result, future = future.result(), pool.submit(maker)
+            yield result
+        yield future.result()
     finally:
         # A caller that stops early must not wait for problems that are still being made.
         pool.shutdown(wait=False, cancel_futures=True)

@@ -74,8 +74,8 @@ def estimands_of(blocks: Blocks, values: Values) -> dict[str, AnyArray]:
 
 def constrain(blocks: Blocks, position: Values) -> tuple[dict[str, AnyArray], Scalar]:
     """Return the estimands of a position, and the logarithm of the Jacobian."""
-    found = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
-    return {name: estimand for name, (estimand, _) in found.items()}, sum(log for _, log in found.values())
+    constrained = {name: block.constrain(position[name]) for name, block in sampled_blocks(blocks).items()}
+    return {name: estimand for name, (estimand, _) in constrained.items()}, sum(log for _, log in constrained.values())
 
 
 def unconstrain(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
@@ -85,7 +85,7 @@ def unconstrain(blocks: Blocks, estimands: Values) -> dict[str, AnyArray]:
 
 def is_in_range(blocks: Blocks, values: Values) -> Bool[AnyArray, ""]:
     """Check whether every value lies in the range of its prior."""
-    found = jnp.array(True)
+    in_range = jnp.array(True)
     for name, block in blocks.items():
-        found &= block.allows(values[name])
-    return found
+        in_range &= block.allows(values[name])
+    return in_range

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
@@ -17,17 +16,14 @@ from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
 from bayesreg.fem.preconditioners import DENSE_LIMIT, solve
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Values
+from bayesreg.model.external_curvature import external_curvature
 from bayesreg.model.program import Problem
-from bayesreg.model.state import Body, State, StaticMesh
-from bayesreg.model.term import ExternalTerm, HasCurvature, PointCurvature
-from bayesreg.types import AnyArray, Equilibrium, Matrix
+from bayesreg.model.state import Body, StaticMesh
+from bayesreg.model.term import HasCurvature, PointCurvature
+from bayesreg.types import AnyArray, Matrix
 
 # With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
 FEW_ENTRIES = 20
-
-# Number of random displacements at which the dependence of a term from outside is tested, and the sd of their
-# displacements, mm.
-NEARBY, NEARBY_SD = 3, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +72,7 @@ def displacement_curvature(problem: Problem, values: Values, u: Float[AnyArray, 
     response = _Response.at(problem, values, u)
     curved = [term for term in problem.terms.values() if isinstance(term, HasCurvature)]
     summed = partial(_sum, len(u))
-    outside = _outside_curvatures(problem, values, u)
+    outside = external_curvature(problem, values, u)
     gauss_newton = _dense(response.reduce(outside + summed(term.gauss_newton(u, values) for term in curved)))
     gauss_newton += response.place(_prior_curvature(problem, response.schur, values))
     gauss_newton[: response.modes, : response.modes] += np.eye(response.modes)
@@ -106,12 +102,12 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     K = _stiffness(problem.body, values)
     curved = (term for term in problem.terms.values() if isinstance(term, HasCurvature) and is_nearly_quadratic(term))
     observed = _sum(len(u), (term.gauss_newton(u, values) for term in curved))
-    found = response.reduce(observed + _outside_curvatures(problem, values, u))
+    curvature = response.reduce(observed + external_curvature(problem, values, u))
     energy = response.reduce(K, with_field=False)
     prior = _prior_curvature(problem, energy, values)
     if not response.modes and not len(response.free):
-        return scipy.sparse.csr_matrix(found + prior)
-    total = _dense(found) + response.place(_dense(prior))
+        return scipy.sparse.csr_matrix(curvature + prior)
+    total = _dense(curvature) + response.place(_dense(prior))
     total[: response.modes, : response.modes] += np.eye(response.modes)
     return total
 
@@ -127,9 +123,9 @@ def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
     if body.field is not None or max(entries) >= FEW_ENTRIES:
         return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
     pattern, parts = _stiffness_parts(body.mesh, entries)
-    found = pattern.copy()
-    found.data = parts @ np.concatenate([np.asarray(values[name]) for name in LAME])
-    return found
+    K = pattern.copy()
+    K.data = parts @ np.concatenate([np.asarray(values[name]) for name in LAME])
+    return K
 
 
 @lru_cache(maxsize=2)
@@ -141,8 +137,8 @@ def _stiffness_parts(
     nothing = np.zeros(len(entries))
     pattern = stiffness(mesh.mesh, np.ones(len(entries)), np.ones(len(entries)))
     pattern.sort_indices()
-    parts = [stiffness(mesh.mesh, one, nothing) for one in owned] + [
-        stiffness(mesh.mesh, nothing, one) for one in owned
+    parts = [stiffness(mesh.mesh, indicator, nothing) for indicator in owned] + [
+        stiffness(mesh.mesh, nothing, indicator) for indicator in owned
     ]
     # All parts must have the same pattern, so zeros are stored.
     for part in parts:
@@ -195,11 +191,11 @@ class _Response(NamedTuple):
             return nodal[self.sampled][:, self.sampled]
         modes = W.shape[1] - len(self.sampled)
         cross = nodal[self.sampled][:, self.free] @ W
-        found = W.T @ (nodal[self.free][:, self.free] @ W)
-        found[modes:] += cross
-        found[:, modes:] += cross.T
-        found[modes:, modes:] += nodal[self.sampled][:, self.sampled].toarray()
-        return (found + found.T) / 2
+        reduced = W.T @ (nodal[self.free][:, self.free] @ W)
+        reduced[modes:] += cross
+        reduced[:, modes:] += cross.T
+        reduced[modes:, modes:] += nodal[self.sampled][:, self.sampled].toarray()
+        return (reduced + reduced.T) / 2
 
     def place(self, curvature: Matrix) -> Float[np.ndarray, "rows rows"]:
         """Expand a curvature in u_B to (z, u_B)."""
@@ -208,21 +204,12 @@ class _Response(NamedTuple):
 
 def _prior_curvature(problem: Problem, energy: Matrix, values: Values) -> Matrix:
     """Compute the curvature of the elastic and rigid priors in u_B; `energy` is the Hessian of the elastic energy."""
-    found = scipy.sparse.csr_matrix(energy.shape)
+    curvature = scipy.sparse.csr_matrix(energy.shape)
     if "elastic" in problem.terms:
-        found = problem.terms["elastic"].curvature(energy, values)
+        curvature = problem.terms["elastic"].curvature(energy, values)
     if "rigid" in problem.terms:
-        found = _dense(found) + np.asarray(problem.terms["rigid"].precision())
-    return found
-
-
-def _outside_curvatures(problem: Problem, values: Values, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
-    """Sum the curvatures of all terms from outside the package, in all nodes."""
-    lam, mu = problem.body.lame_by_cell(values)
-    seen = FixedState(problem, dict(values), lam, mu)
-    found = scipy.sparse.csr_matrix((3 * len(u), 3 * len(u)))
-    terms = (term for term in problem.terms.values() if isinstance(term, ExternalTerm))
-    return sum((_outside_curvature(term, seen, jnp.asarray(u)) for term in terms), found)
+        curvature = _dense(curvature) + np.asarray(problem.terms["rigid"].precision())
+    return curvature
 
 
 def _dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
@@ -233,65 +220,6 @@ def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix
     """Sum the curvatures in displacements of points into one in all nodes, with row 3 · node + axis."""
     empty = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
     return sum((_assemble(nodes, part) for part in parts), empty)
-
-
-class FixedState(NamedTuple):
-    """The state, without its displacements, at which a term from outside is differentiated (a pytree)."""
-
-    problem: Problem
-    values: dict[str, AnyArray]
-    lam: AnyArray
-    mu: AnyArray
-
-
-def _outside_curvature(term: ExternalTerm, seen: FixedState, u: Float[AnyArray, "nodes 3"]) -> scipy.sparse.csr_matrix:
-    """Compute the convex part of the Hessian of −log in all nodes, for a term that provides only its log."""
-    touched = _find_touched(term, seen, u)
-    found = scipy.sparse.csr_matrix((u.size, u.size))
-    if not len(touched):
-        return found
-    eigenvalues, vectors = np.linalg.eigh(_hessian(term, seen, u, touched))
-    convex = (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T
-    rows, columns = np.repeat(touched, len(touched)), np.tile(touched, len(touched))
-    return scipy.sparse.csr_matrix((convex.ravel(), (rows, columns)), shape=found.shape)
-
-
-def _find_touched(term: ExternalTerm, seen: FixedState, u: Float[AnyArray, "nodes 3"]) -> Int[np.ndarray, "touched"]:
-    """Find the unknowns on which a term depends: its gradient is not zero there at some random displacement near u."""
-    steps = NEARBY_SD * np.random.default_rng(0).normal(size=(NEARBY, *u.shape))
-    slopes = [np.asarray(_slope(term, seen, (u + step).ravel())) for step in steps]
-    return np.flatnonzero((np.stack(slopes) != 0).any(axis=0))
-
-
-def _hessian(
-    term: ExternalTerm, seen: FixedState, u: Float[AnyArray, "nodes 3"], touched: Int[np.ndarray, "touched"]
-) -> Float[np.ndarray, "touched touched"]:
-    """Compute the Hessian of −log in some unknowns by one Hessian-vector product for each of them."""
-    found = np.asarray(_products(term, seen, u.ravel(), jnp.asarray(touched)))[:, touched]
-    return (found + found.T) / 2
-
-
-@jax.jit
-def _products(
-    term: ExternalTerm, seen: FixedState, flat: Float[AnyArray, "unknowns"], directions: Int[AnyArray, "k"]
-) -> Float[AnyArray, "k unknowns"]:
-    def row(unknown: AnyArray) -> AnyArray:
-        direction = jnp.zeros_like(flat).at[unknown].set(1.0)
-        return jax.jvp(partial(_slope, term, seen), (flat,), (direction,))[1]
-
-    return jax.lax.map(row, directions, batch_size=64)
-
-
-@jax.jit
-def _slope(term: ExternalTerm, seen: FixedState, flat: Float[AnyArray, "unknowns"]) -> Float[AnyArray, "unknowns"]:
-    """Compute ∇(−log) in the displacements of all nodes."""
-    body = seen.problem.body
-
-    def energy(flat: AnyArray) -> AnyArray:
-        solved = Equilibrium(flat.reshape(-1, 3), jnp.zeros(()), jnp.zeros((), int), jnp.array(True))
-        return -term.log(State(seen.values, seen.lam, seen.mu, solved, body.system.elements, body.mesh.mesh))
-
-    return jax.grad(energy)(flat)
 
 
 def _response(
@@ -344,10 +272,10 @@ def _assemble(nodes: int, points: PointCurvature) -> scipy.sparse.csr_matrix:
     shape, starts = (3 * count, 3 * nodes), np.arange(0, 12 * count + 1, 4)
     P = scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=shape)
     C = scipy.sparse.bsr_matrix((curvature, np.arange(count), np.arange(count + 1)))
-    found = P.T @ (C.tocsr() @ P)
+    nodal_curvature = P.T @ (C.tocsr() @ P)
     if points.shared is not None:
         groups, rows = np.repeat(np.asarray(points.shared.groups), 3), np.arange(3 * count)
         for vectors, sign in zip(np.asarray(points.shared.vectors), np.asarray(points.shared.signs), strict=True):
             forces = P.T @ scipy.sparse.csr_matrix((vectors.ravel(), (rows, groups)))
-            found = found + sign * (forces @ forces.T)
-    return found.tocsr()
+            nodal_curvature = nodal_curvature + sign * (forces @ forces.T)
+    return nodal_curvature.tocsr()

@@ -47,10 +47,12 @@ def evaluate(
     """Evaluate the log density at some values; a `guess` of u saves iterations but removes the derivative."""
     total, trace = log_density(registration, (problem, guess), {}, values)
     names = ("u", "strain_energy", "solver_iterations", "solver_failed", "outside_support")
-    found = {name: trace[name]["value"] for name in names}
+    quantities = {name: trace[name]["value"] for name in names}
     # Any NaN counts as a failure and becomes −∞, so that no sampler can move there.
     return Evaluation(
-        logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total), similarity_energy=_similarity_energy(trace), **found
+        logdensity=jnp.where(jnp.isnan(total), -jnp.inf, total),
+        similarity_energy=_similarity_energy(trace),
+        **quantities,
     )
 
 
@@ -58,13 +60,13 @@ def evaluate(
 def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
     """Return every factor of the density by name, and the energies."""
     _, trace = log_density(registration, (problem,), {}, values)
-    found = {"similarity_energy": _similarity_energy(trace), "strain_energy": trace["strain_energy"]["value"]}
+    factors = {"similarity_energy": _similarity_energy(trace), "strain_energy": trace["strain_energy"]["value"]}
     for name in (*problem.terms, "support", "solved"):
-        found[name] = trace[name]["fn"].log_prob(trace[name]["value"]).sum()
+        factors[name] = trace[name]["fn"].log_prob(trace[name]["value"]).sum()
     for name, block in problem.blocks.items():
         if block.is_sampled and name != "u_boundary":
-            found[f"prior_{name}"] = trace[name]["fn"].log_prob(values[name])
-    return found
+            factors[f"prior_{name}"] = trace[name]["fn"].log_prob(values[name])
+    return factors
 
 
 def _similarity_energy(trace: dict[str, Any]) -> Scalar:

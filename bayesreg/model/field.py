@@ -110,15 +110,15 @@ def precision(mesh: TetMesh, correlation: float) -> scipy.sparse.csr_matrix:
 
 def face_laplacian(mesh: TetMesh) -> scipy.sparse.csr_matrix:
     """Compute G: sᵀGs = Σ w_ef (s_e − s_f)² over pairs of elements that share a face ≈ ∫|∇s|², in mm."""
-    one, other = mesh.neighbours.T
-    corners = mesh.cells[one]
-    shared = (corners[:, :, None] == mesh.cells[other][:, None, :]).any(axis=2)
+    cells, neighbours = mesh.neighbours.T
+    corners = mesh.cells[cells]
+    shared = (corners[:, :, None] == mesh.cells[neighbours][:, None, :]).any(axis=2)
     faces = mesh.points[corners[shared].reshape(-1, 3)]
     areas = np.linalg.norm(np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), axis=1) / 2
     centres = mesh.points[mesh.cells].mean(axis=1)
-    weights = areas / np.linalg.norm(centres[one] - centres[other], axis=1)
+    weights = areas / np.linalg.norm(centres[cells] - centres[neighbours], axis=1)
     size = len(mesh.cells)
-    coupling = scipy.sparse.coo_matrix((weights, (one, other)), shape=(size, size)).tocsr()
+    coupling = scipy.sparse.coo_matrix((weights, (cells, neighbours)), shape=(size, size)).tocsr()
     coupling = coupling + coupling.T
     return (scipy.sparse.diags(np.asarray(coupling.sum(axis=1)).ravel()) - coupling).tocsr()
 

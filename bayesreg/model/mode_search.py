@@ -86,7 +86,7 @@ class ModeSearch:
         The equilibrium depends on the sampled nodes as at the estimands `near`. The result is sparse if every node is
         sampled.
         """
-        values, others = (complete(data.blocks, one) for one in (estimands, near))
+        values, others = (complete(data.blocks, point) for point in (estimands, near))
         return quadratic_curvature(data, values, others, _equilibrium(data, others))
 
 

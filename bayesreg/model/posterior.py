@@ -150,9 +150,12 @@ class Posterior:
         """
         filled = self.fill(values)
         u = self.evaluate(filled).u
-        correlated = {name: one for name, one in self.observations.items() if isinstance(one, Correlated)}
+        correlated = {
+            name: observation for name, observation in self.observations.items() if isinstance(observation, Correlated)
+        }
         return {
-            name: one.count_independent_points(self.data.terms[name], u, filled) for name, one in correlated.items()
+            name: observation.count_independent_points(self.data.terms[name], u, filled)
+            for name, observation in correlated.items()
         }
 
     def with_independent_points(self, counts: Mapping[str, float]) -> Posterior:
@@ -165,7 +168,7 @@ class Posterior:
     @property
     def independent_points(self) -> dict[str, float]:
         """The number of independent quadrature points that the likelihood assumes, by name of the pair of images."""
-        names = [name for name, one in self.observations.items() if isinstance(one, Correlated)]
+        names = [name for name, observation in self.observations.items() if isinstance(observation, Correlated)]
         return {name: float(self.data.terms[name].independent_points) for name in names}
 
     @property

@@ -66,11 +66,11 @@ def problem_of(
     body, blocks = body_of(mesh, model, reference)
     # The observations come first, so that errors in them are reported before any long computation.
     placed = place_observations(mesh, observations, model.preset)
-    for one in placed.values():
-        blocks |= one.blocks
-    terms: Terms = {name: one.term for name, one in placed.items()}
+    for entry in placed.values():
+        blocks |= entry.blocks
+    terms: Terms = {name: placement.term for name, placement in placed.items()}
     terms |= _priors(mesh, model, sampled, held, skull)
-    return Problem(body, blocks, terms), sampled, {name: one.observation for name, one in placed.items()}
+    return Problem(body, blocks, terms), sampled, {name: placement.observation for name, placement in placed.items()}
 
 
 def place_observations(mesh: TetMesh, observations: Sequence[Any], preset: str) -> dict[str, Placed]:
@@ -87,8 +87,8 @@ def place_observations(mesh: TetMesh, observations: Sequence[Any], preset: str) 
             raise InputError(f"the name {observation.name!r} of an observation is taken; give another one")
         placed[observation.name] = place(observation, mesh, preset)
     owners: dict[str, str] = {}
-    for name, one in placed.items():
-        for block in one.blocks:
+    for name, placement in placed.items():
+        for block in placement.blocks:
             if block in owners or block in placed or is_reserved_name(block):
                 raise InputError(f"the name {block!r} of an unknown of {name!r} is taken; rename the latter")
             owners[block] = name
@@ -313,5 +313,5 @@ def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: 
     if model.elasticity == "uniform" and len(set(given.values())) > 1:
         raise InputError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
     tissues = {"uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
-    found = (of_tissue(model, given, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
-    return [default if value is None else value for value in found]
+    options = (of_tissue(model, given, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
+    return [default if value is None else value for value in options]

@@ -68,8 +68,8 @@ def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = No
 
 def is_allowed(problem: Problem, values: Values) -> Bool[AnyArray, ""]:
     """Check, without a solve, whether the density may be positive: parameters physical and in range, each `Support`."""
-    found = problem.body.is_physical(values) & coordinates.is_in_range(problem.blocks, values)
+    allowed = problem.body.is_physical(values) & coordinates.is_in_range(problem.blocks, values)
     for term in problem.terms.values():
         if isinstance(term, Support):
-            found &= term.allows(values)
-    return found
+            allowed &= term.allows(values)
+    return allowed

@@ -78,11 +78,11 @@ class Body(NamedTuple):
     def is_physical(self, values: Values) -> Bool[AnyArray, ""]:
         """Check whether K is positive definite up to rigid motions: finite λ ≥ 0, μ > 0 and field factor > 0."""
         lam, mu = values["lam"], values["mu"]
-        found = ((lam >= 0) & jnp.isfinite(lam)).all() & ((mu > 0) & jnp.isfinite(mu)).all()
+        physical = ((lam >= 0) & jnp.isfinite(lam)).all() & ((mu > 0) & jnp.isfinite(mu)).all()
         if self.field is not None:
             factor = self.stiffness_factor(values)
-            found &= (jnp.isfinite(factor) & (factor > 0)).all()
-        return found
+            physical &= (jnp.isfinite(factor) & (factor > 0)).all()
+        return physical
 
     def lame_by_cell(self, values: Values) -> tuple[Float[AnyArray, "cells"], Float[AnyArray, "cells"]]:
         """Return λ and μ of every cell."""
@@ -154,8 +154,8 @@ def state_of(body: Body, blocks: Blocks, values: Values, guess: Float[AnyArray, 
     has no derivative.
     """
     lam, mu = physical_lame_by_cell(body, blocks, values)
-    found = equilibrium(body.system, lam, mu, body.prescribed(values["u_boundary"]), guess)
-    return State(values, lam, mu, found, body.system.elements, body.mesh.mesh)
+    solution = equilibrium(body.system, lam, mu, body.prescribed(values["u_boundary"]), guess)
+    return State(values, lam, mu, solution, body.system.elements, body.mesh.mesh)
 
 
 def physical_lame_by_cell(

@@ -90,22 +90,22 @@ class Variables:
 
         NumPy computes them on the host because there may be many draws.
         """
-        found = {"u_boundary": np.asarray(estimands["u_boundary"])}
-        leading = found["u_boundary"].shape[:-2]
+        values = {"u_boundary": np.asarray(estimands["u_boundary"])}
+        leading = values["u_boundary"].shape[:-2]
         for name in LAME:
             block = self.blocks[name]
-            found[name] = np.tile(np.asarray(block.reference()), (*leading, 1))
+            values[name] = np.tile(np.asarray(block.reference()), (*leading, 1))
             if block.is_sampled:
-                found[name][..., block.free.index] = estimands[name]
+                values[name][..., block.free.index] = estimands[name]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found["ratio"] = found["lam"] / found["mu"]
-        others = (name for name in self.blocks if name in estimands and name not in found)
-        return found | {name: np.asarray(estimands[name]) for name in others}
+            values["ratio"] = values["lam"] / values["mu"]
+        others = (name for name in self.blocks if name in estimands and name not in values)
+        return values | {name: np.asarray(estimands[name]) for name in others}
 
     def estimands(self, values: Values) -> dict[str, np.ndarray]:
         """Return the sampled entries of values that `values` made."""
-        found = {}
+        estimands = {}
         for name, block in sampled_blocks(self.blocks).items():
             value = np.asarray(values[name])
-            found[name] = value[..., block.free.index] if name in LAME else value
-        return found
+            estimands[name] = value[..., block.free.index] if name in LAME else value
+        return estimands

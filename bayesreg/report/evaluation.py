@@ -1,4 +1,4 @@
-"""Held-out landmarks: target registration error before and after, and its expected size."""
+"""Target registration error at held-out landmarks, before and after the registration, and its expected size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ LEVELS = (0.5, 0.9, 0.95)
 
 
 def evaluation_table(study: Study) -> Table | None:
-    """Make a table of distances by the headers, the pose, and the posterior mean; None without held-out landmarks."""
+    """Make the table of the target registration errors, mm, at the held-out landmarks; None if there are none.
+
+    Its rows are the errors if the images are aligned by their headers, by the pose alone, and by the posterior mean.
+    """
     predicted = study.predicted
     if predicted.evaluation_residual is None:
         return None
@@ -26,7 +29,7 @@ def evaluation_table(study: Study) -> Table | None:
     outside = int((~inside).sum())
     if not inside.any():
         caption = (
-            f"None of the {outside} landmarks that were held out lies in the mesh, where alone displacements are known."
+            f"None of the {outside} landmarks that were held out lies in the mesh; displacements are known only there."
         )
         return Table("Target registration error", caption, [""], [])
     rows = [
@@ -38,10 +41,11 @@ def evaluation_table(study: Study) -> Table | None:
         }.items()
     ]
     probability = _surprise(predicted)
-    shares = [f"{(probability <= level).mean():.0%} lie in the regions of {level:.0%}" for level in LEVELS]
+    shares = [f"{(probability <= level).mean():.0%} lie in their regions of {level:.0%}" for level in LEVELS]
     caption = (
-        f"Distance from where {len(probability)} landmarks lie in the moving image, mm; the sampler never saw them. "
-        f"Of these landmarks {', '.join(shares).replace('%', ' %')} that the posterior gives them."
+        f"Distances, mm, of predicted places from where {len(probability)} landmarks lie in the moving image. The "
+        "sampler never saw these landmarks. The posterior gives every landmark a region of each probability. Of the "
+        f"landmarks, {', '.join(shares).replace('%', ' %')}."
     )
     if outside:
         caption += f" {outside} more lie outside the mesh, where nothing is known, and are left out."
@@ -49,7 +53,10 @@ def evaluation_table(study: Study) -> Table | None:
 
 
 def evaluation(study: Study) -> Drawing | None:
-    """Draw errors before and after, the expected errors, and a calibration curve; None without held-out landmarks."""
+    """Draw the errors against their expected 95 % radii, mm, and a calibration curve.
+
+    Return None if no landmark in the mesh was held out.
+    """
     predicted = study.predicted
     if predicted.evaluation_residual is None or predicted.evaluation_posed is None:
         return None
@@ -85,16 +92,17 @@ def evaluation(study: Study) -> Drawing | None:
         )
         uri = style.data_uri(figure)
     caption = (
-        "Left: error of each landmark beside the radius that should hold it with 95 %; below the line is inside. "
-        "Right: share of landmarks in the regions of each probability; grey: where 95 % of such curves lie if the "
-        "probabilities are right."
+        "Left: the error of each landmark against the radius that the error should not exceed with a probability of "
+        "95 %. Landmarks below the line have a smaller error. Right: the share of landmarks that lie in their regions "
+        "of each probability. At each probability, 95 % of such curves lie in the grey band if the probabilities are "
+        "right."
     )
-    alt = f"Errors of {len(after)} landmarks that were held out, and how often they lie in their regions."
+    alt = f"Errors of {len(after)} landmarks that were held out, and how often the landmarks lie in their regions."
     return Drawing("held-out", "Landmarks that were held out", caption, alt, uri)
 
 
 def _surprise(predicted: Predicted) -> np.ndarray:
-    """Return the probability of the smallest region that holds each landmark in the mesh."""
+    """Return, for each held-out landmark in the mesh, the probability of the smallest region that contains it."""
     inside = np.asarray(predicted.evaluation_inside)
     residual, covariance = (
         np.asarray(x)[inside] for x in (predicted.evaluation_residual, predicted.evaluation_covariance)

@@ -1,4 +1,4 @@
-"""Match the moving image to the fixed image before the registration: pose, contrast and scale of intensities."""
+"""Match the moving image to the fixed image before the registration, in pose, contrast and scale of intensities."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from bayesreg.pose import Pose
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Likeness, compare_images
 
-# A pose is used if it multiplies the mutual information of the headers' placement by more than this factor.
+# The found pose replaces the headers' pose if its mutual information is more than this many times as great.
 GAIN = 1.05
-# A mask that ignores a greater share of the organ may have zero and nonzero interchanged.
+# The user is warned if a mask ignores a greater share of the organ: zero and nonzero may be interchanged in it.
 MOST_IGNORED = 0.5
 
 
 class Matched(NamedTuple):
-    """Two images in one world, with scaled intensities.
+    """The fixed and the moving image in one world, with scaled intensities.
 
     Attributes
     ----------
     matching : Matching
+        The pose, whether both images have one contrast, and the intensity scale of the moving image.
     fixed, moving : Image
         The scaled images in the world of the fixed image.
     moving_ignore : Image or None
-        The mask of the moving image, in the same world.
+        The mask of ignored voxels of the moving image, in the world of the fixed image.
     likeness : Likeness
         Measures of the likeness of the two images.
     notes : tuple of str
-        Findings, one sentence each.
+        Findings about pose, contrast and masks, one sentence each.
     beware : tuple of str
         Warnings about the masks, one sentence each.
     """
@@ -60,23 +61,26 @@ def match_images(
     fixed_ignore: Image | None = None,
     moving_ignore: Image | None = None,
 ) -> Matched:
-    """Find the pose, decide whether both images have one contrast, and scale them, as far as `data` leaves this open.
+    """Find the pose, decide whether both images have one contrast, and scale the intensities of both images.
 
     Parameters
     ----------
     data : FilesData
+        The settings; they can prescribe the pose of the headers and whether both images have one contrast.
     similarity : settings of a similarity
         The similarity by which the model compares the images.
     domain : Image
-        Not zero in Ω, on the grid of the fixed image.
+        Nonzero in Ω, on the grid of the fixed image.
     fixed, moving : Image
+        Each image lies in its own world.
     fixed_ignore, moving_ignore : Image, optional
-        Not zero where the fixed or the moving image is ignored, on any grid in the world of this image.
+        Masks that are nonzero where the fixed or the moving image is ignored. Each mask lies in the world of its image,
+        and may have another grid.
 
     Raises
     ------
     InputError
-        If the images do not overlap, one is constant in Ω, or all of Ω is ignored.
+        If the images do not overlap, an image is constant in Ω, or the masks ignore all of Ω.
     """
     for name, image in (("fixed", fixed), ("moving", moving)):
         if np.ptp(image.voxels) == 0:
@@ -86,7 +90,7 @@ def match_images(
     moving_ignore = None if moving_ignore is None else pose.aligned(moving_ignore)
     ignored = {"fixed": fixed_ignore, "moving": moving_ignore}
     region = _seen(domain, ignored.values())
-    # The scales come before the comparison, because their error names an image that is constant in Ω.
+    # The scales are computed before the comparison: if an image is constant in Ω, they raise an error that names it.
     scales = _scale_of("fixed", fixed, region.voxels != 0), _scale_of("moving", moving, within(region, moving))
     likeness = compare_images(fixed, moving, region)
     alike = likeness.is_one_contrast if data.same_contrast is None else data.same_contrast
@@ -108,12 +112,26 @@ def match_channel(
     moving: Image,
     fixed_ignore: Image | None = None,
 ) -> Channel:
-    """Match a further pair of images in the pose of the first pair; each image has its own scale.
+    """Match a further pair of images with the pose of the first pair; each image gets its own intensity scale.
+
+    Parameters
+    ----------
+    data : FilesData
+    domain : Image
+        Nonzero in Ω, on the grid of the first fixed image.
+    matched : Matched
+        The first pair. The mask of its moving image is applied to the further pair, too.
+    name : str
+        The name of the further pair in error messages.
+    fixed, moving : Image
+        The images of the further pair, in the worlds of the first fixed and the first moving image.
+    fixed_ignore : Image, optional
+        The mask of the first fixed image.
 
     Raises
     ------
     InputError
-        If an image does not overlap the organ, or is constant there.
+        If an image does not overlap Ω or is constant in Ω, or the masks ignore all of Ω.
     """
     moving = matched.matching.pose.aligned(moving)
     region = _seen(domain, (fixed_ignore, matched.moving_ignore))
@@ -124,7 +142,7 @@ def match_channel(
 
 
 def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
-    """Return the part of Ω that no mask ignores.
+    """Return an image on the grid of `domain` that is 1 in the part of Ω that no mask ignores, and 0 elsewhere.
 
     Raises
     ------
@@ -141,7 +159,7 @@ def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
 
 
 def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple[list[str], list[str]]:
-    """Describe how much of Ω each mask ignores (notes), and warn of unusual shares."""
+    """Return notes on how much of Ω each mask ignores, and warnings about masks that ignore nothing or most of Ω."""
     notes, beware = [], []
     inside = np.asarray(domain.voxels) != 0
     for name, mask in masks.items():
@@ -152,10 +170,12 @@ def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple
         notes.append(f"Ignored: {millilitres:.3g} ml of the organ in the {name} image.")
         if not ignored:
             beware.append(
-                f"data.{name}_ignore ignores nothing of the organ: it lies elsewhere in the world, or is empty."
+                f"data.{name}_ignore ignores nothing of the organ: the mask lies elsewhere in the world, or is empty."
             )
         elif share > MOST_IGNORED:
-            beware.append(f"data.{name}_ignore ignores {share:.0%} of the organ; what is not zero in it is ignored.")
+            beware.append(
+                f"data.{name}_ignore ignores {share:.0%} of the organ; what is not zero in the mask is ignored."
+            )
     return notes, beware
 
 
@@ -172,28 +192,31 @@ def _find_pose(
     fixed_ignore: Image | None,
     moving_ignore: Image | None,
 ) -> tuple[Pose, str]:
-    """Find the pose, and describe it in a sentence."""
+    """Return the pose and a sentence that describes the pose."""
     if data.pose == "fixed":
         check_same_space(fixed, moving, ("fixed", "moving"))
-        return Pose.identity(), "Pose: as the headers say (data.pose: fixed)."
+        return Pose.identity(), "Pose: as the headers say (because of data.pose: fixed)."
     alignment = find_pose(fixed, moving, domain, fixed_ignore, moving_ignore)
-    header_information = f"mutual information {alignment.as_given:.2f} as the headers say"
+    header_information = f"mutual information {alignment.as_given:.2f} with the headers' pose"
     if alignment.information <= GAIN * alignment.as_given:
-        return Pose.identity(), f"Pose: as the headers say, since no other brings much: {header_information}."
+        return Pose.identity(), f"Pose: as the headers say, since no other pose is much better: {header_information}."
     centre = domain.voxel_to_world(np.argwhere(np.asarray(domain.voxels) != 0).mean(axis=0))
     motion = alignment.pose.about(centre)
     return alignment.pose, (
         f"Pose: {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the headers: {header_information}, "
-        f"{alignment.information:.2f} so (data.pose: fixed keeps the headers')."
+        f"{alignment.information:.2f} with this pose (data.pose: fixed keeps the headers' pose)."
     )
 
 
 def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: bool, similarity: AnySimilarity) -> str:
     how = "found" if found else "as data.same_contrast says"
-    shares = f"a straight line explains {likeness.line_share:.0%} of the moving image, any map {likeness.map_share:.0%}"
+    shares = (
+        f"a straight line explains {likeness.line_share:.0%} of the variance of the moving image, the best map "
+        f"{likeness.map_share:.0%}"
+    )
     if similarity.serves_any_contrast:
         what = "the same" if alike else "unlike"
-        return f"Contrast: {what} ({how}; {shares}); compared by {similarity.kind}, which serves any."
+        return f"Contrast: {what} ({how}; {shares}); compared by {similarity.kind}, which serves any contrast."
     if not alike:
         return f"Contrast: unlike ({how}; {shares}); compared through a map of the fixed image's intensities."
     scale = "on one scale" if one_scale else "each on a scale of its own"

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesreg.config import load_stored_config, resolved_yaml
-from bayesreg.config.sections import Config, StopConfig
+from bayesreg.config.configuration import Config
+from bayesreg.config.sections import StopConfig
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io import store
 from bayesreg.io.ledger import locked, require_file

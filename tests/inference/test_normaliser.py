@@ -75,7 +75,9 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
     places[:20, entries] += 0.3 * REACH * rng.uniform(size=20)[:, None] * directions
     places[20, np.arange(len(flat))[slices(post.target)["lam"]]] = -8.0
     expected = np.array([float(log_normaliser_at(post.target, post.data, place)) for place in places])
-    error = expected - [float(found(smooth_coordinates(post.target, post.data, jnp.asarray(place)))) for place in places]
+    error = expected - [
+        float(found(smooth_coordinates(post.target, post.data, jnp.asarray(place)))) for place in places
+    ]
     error -= error[:20].mean()
     assert expected[:20].std() > 5
     assert error[:20].std() < 0.1

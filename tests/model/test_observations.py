@@ -15,7 +15,8 @@ from bayesreg.fem.location import interpolation_at
 from bayesreg.model import curvature
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.build import require_observations
-from bayesreg.model.curvature import FixedState, _assemble, _outside_curvature
+from bayesreg.model.curvature import _assemble
+from bayesreg.model.external_curvature import FixedState, _curvature_of_term
 from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.state import State
 from bayesreg.model.term import ExternalTerm, PointCurvature, SharedCurvature
@@ -272,7 +273,7 @@ def test_curvature_of_a_term_from_outside_is_the_dense_hessian():
     assert eigenvalues.min() < -0.1 < 0.1 < eigenvalues.max()
     convex = (vectors * np.maximum(eigenvalues, 0)) @ vectors.T
     seen = FixedState(post.data, {}, jnp.zeros(len(mesh.cells)), jnp.zeros(len(mesh.cells)))
-    found = _outside_curvature(ExternalTerm(term), seen, jnp.asarray(u)).toarray()
+    found = _curvature_of_term(ExternalTerm(term), seen, jnp.asarray(u)).toarray()
     np.testing.assert_allclose(found, convex, atol=1e-10 * eigenvalues.max())
 
 

@@ -72,8 +72,8 @@ class Barrier(NamedTuple):
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Return zero: the remainder is smaller than the Gauss–Newton part by the factor J, below the least share."""
-        found = self.gauss_newton(u, values)
-        return found._replace(shared=None)
+        curvature = self.gauss_newton(u, values)
+        return curvature._replace(shared=None)
 
 
 def cost(share: AnyArray) -> AnyArray:

@@ -67,7 +67,7 @@ class Landmarks:
         name: str = "landmarks",
         labels: Sequence[str] | None = None,
     ) -> None:
-        self.fixed_points, self.moving_points = (_points(given, name) for given in (fixed_points, moving_points))
+        self.fixed_points, self.moving_points = (_points(points, name) for points in (fixed_points, moving_points))
         shapes = self.fixed_points.shape, self.moving_points.shape
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3 or not shapes[0][0]:
             raise InputError(f"{name}: fixed_points and moving_points must both have shape (k, 3), got {shapes}")
@@ -99,16 +99,16 @@ class Landmarks:
     def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
         """Summarise the residuals at a state, and for few landmarks their predictions by all other observations."""
         term = posterior.data.terms[self.name]
-        found = {
+        summary = {
             "names": np.array(self.labels),
             "points": self.fixed_points,
             "sd": np.asarray(term.sd(state.values)),
             "residual": np.asarray(term.shift - term.predicted(state)),
         }
         if len(self.labels) > MOST_LEFT_OUT or not len(posterior.sampled) or 3 * len(posterior.sampled) > MOST_UNKNOWNS:
-            return found
+            return summary
         left_out = leave_out(posterior, term, posterior.estimands(state.values))
-        return found | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
+        return summary | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""
@@ -131,12 +131,12 @@ def _known_sd(sd: Any, count: int, name: str) -> Float[np.ndarray, "k"]:
         raise InputError(f"{name}: sd must be a number, {count} numbers or a ScalePrior; got {sd!r}") from None
     if np.ndim(sd) and np.shape(sd) != (count,):
         raise InputError(f"{name}: sd must be one number or {count}, one for each point; got {np.shape(sd)}")
-    found = np.broadcast_to(sd, (count,)).copy()
-    if np.isnan(found).all():
+    known_sd = np.broadcast_to(sd, (count,)).copy()
+    if np.isnan(known_sd).all():
         raise InputError(f"{name}: sd is not a number; give one, mm, or a ScalePrior to have it inferred")
-    if not (np.isfinite(found) & (found > 0)).all():
-        raise InputError(f"{name}: every sd must be positive, mm; got {found.tolist()}")
-    return found
+    if not (np.isfinite(known_sd) & (known_sd > 0)).all():
+        raise InputError(f"{name}: every sd must be positive, mm; got {known_sd.tolist()}")
+    return known_sd
 
 
 class ComparedPoints(NamedTuple):

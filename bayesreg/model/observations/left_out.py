@@ -59,12 +59,12 @@ def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -
     # The components of a field come first in the rows.
     components = len(curvature) - 3 * len(posterior.sampled)
     H = curvature[components:, components:]
-    predicted, response = (np.asarray(found) for found in _predicted_with_response(data, term, values))
+    predicted, response = (np.asarray(array) for array in _predicted_with_response(data, term, values))
     A = response.reshape(3 * len(predicted), -1)
     residual, sd = np.asarray(term.shift) - predicted, np.asarray(term.sd(values))
     shares = [_shares(H + trace * np.trace(H) * np.eye(len(H)), A, sd) for trace in (TRACE, MORE * TRACE)]
-    found = [_without(*one) for one in zip(residual, *shares, sd, strict=True)]
-    return LeftOut(*(np.stack(parts) for parts in zip(*found, strict=True)))
+    left_out = [_without(*landmark) for landmark in zip(residual, *shares, sd, strict=True)]
+    return LeftOut(*(np.stack(parts) for parts in zip(*left_out, strict=True)))
 
 
 def _shares(
@@ -81,7 +81,7 @@ def _without(
     residual: Float[np.ndarray, "3"], share: Float[np.ndarray, "3 3"], less: Float[np.ndarray, "3 3"], sd: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Compute the residual without the landmark, and its covariance; `less` is its share with more regularisation."""
-    others, kept = (np.linalg.eigvalsh(np.eye(3) - one).min() for one in (share, less))
+    others, kept = (np.linalg.eigvalsh(np.eye(3) - own_share).min() for own_share in (share, less))
     if kept > 2 * others:
         return np.full(3, np.nan), np.full((3, 3), np.inf)
     left = np.linalg.inv(np.eye(3) - share)

@@ -63,7 +63,7 @@ def _as_section(value: object, info: Any) -> ObservationSection:
 
 
 def _require_different_names(given: list[Any]) -> list[Any]:
-    names = [one.name for one in given]
+    names = [section.name for section in given]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"two observations are named {name}; give one of them another name")

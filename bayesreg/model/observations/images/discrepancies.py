@@ -35,8 +35,8 @@ def discrepancies(
     """
     points = jax.ops.segment_sum(jnp.ones_like(z), cells, count)
     means = jax.ops.segment_sum(z, cells, count) / jnp.sqrt(jnp.maximum(points, 1))
-    one, other = means[neighbours].T
+    mean, neighbour_mean = means[neighbours].T
     # A cell without points (quadrature by voxels) is left out.
     both = (points[neighbours] > 0).all(axis=1)
-    correlation = (both * one * other).sum() / (both * (one**2 + other**2) / 2).sum()
+    correlation = (both * mean * neighbour_mean).sum() / (both * (mean**2 + neighbour_mean**2) / 2).sum()
     return jnp.stack([jnp.sqrt(jnp.mean(z**2)), jnp.abs(z).max(), correlation])

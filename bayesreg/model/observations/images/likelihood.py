@@ -212,23 +212,23 @@ class ImageLikelihood(dist.Distribution):
         similarity, pair = self.term.similarity, self.compared
         key_seen, key_hidden, key_choice = jax.random.split(key, 3)
         scale = jnp.sqrt(self.temperature / (2 * pair.weights))
-        seen = pair.fixed - similarity.residuals(pair) + scale * similarity.draw(key_seen, pair)
+        replicate = pair.fixed - similarity.residuals(pair) + scale * similarity.draw(key_seen, pair)
         if pair.share is None:
-            return seen
+            return replicate
         hidden = self._hidden_pair(pair)
         scale = jnp.sqrt(self.temperature / (2 * hidden.weights))
-        elsewhere = hidden.moving + scale * similarity.of_one_point().draw(key_hidden, hidden)
-        return jnp.where(jax.random.uniform(key_choice, seen.shape) < pair.share, seen, elsewhere)
+        hidden_replicate = hidden.moving + scale * similarity.of_one_point().draw(key_hidden, hidden)
+        return jnp.where(jax.random.uniform(key_choice, replicate.shape) < pair.share, replicate, hidden_replicate)
 
     def log_prob(self, value: Float[AnyArray, "points"]) -> Scalar:
         """Return the tempered log density, with its normaliser if T_s is inferred or a part of m is ignored."""
         pair = self.compared._replace(fixed=value)
-        found = -self.energy(value) / self.temperature
+        log_density = -self.energy(value) / self.temperature
         if self.term.comparison.normalised or pair.share is not None:
-            found += self.term.similarity.log_normaliser(pair, self.temperature)
+            log_density += self.term.similarity.log_normaliser(pair, self.temperature)
         if pair.share is not None:
-            found += self._log_hidden(pair)
-        return self.term.independent_share * found
+            log_density += self._log_hidden(pair)
+        return self.term.independent_share * log_density
 
     def _hidden_pair(self, pair: Intensities) -> Intensities:
         """Pair an ignored m with f: replace m by the mean of f in the organ, and add the variance of f to the noise."""
@@ -247,33 +247,35 @@ class ImageLikelihood(dist.Distribution):
 
 @jax.jit
 def _scores(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "points 3"]:
-    moved = term.places(u)
-    pair = term.compared(moved, values)
+    displaced_points = term.places(u)
+    pair = term.compared(displaced_points, values)
     slope = jax.grad(term.similarity.energy)(pair, term.temperature(values)).moving
-    return -slope[:, None] * _slope(term, moved)
+    return -slope[:, None] * _slope(term, displaced_points)
 
 
 @jax.jit
 def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
     """Compute the Gauss–Newton curvature at every point x_q + u(x_q), with fixed shares of comparison."""
-    moved = term.places(u)
-    pair = term.compared(moved, values)
+    displaced_points = term.places(u)
+    pair = term.compared(displaced_points, values)
     convexity = term.similarity.convexity(pair, term.temperature(values))
-    return _chain(term, convexity, _slope(term, moved), term.temperature(values))
+    return _chain(term, convexity, _slope(term, displaced_points), term.temperature(values))
 
 
 @jax.jit
 def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
     """Compute ∇m E″ ∇mᵀ + E′ ∇²m, with the exact E″ in the values m_q, minus the Gauss–Newton curvature."""
-    moved, similarity, t_similarity = term.places(u), term.similarity, term.temperature(values)
+    displaced_points, similarity, t_similarity = term.places(u), term.similarity, term.temperature(values)
     slope = partial(_slope, term)
-    columns = [jax.jvp(slope, (moved,), (jnp.broadcast_to(axis, moved.shape),))[1] for axis in jnp.eye(3)]
-    pair = term.compared(moved, values)
+    columns = [
+        jax.jvp(slope, (displaced_points,), (jnp.broadcast_to(axis, displaced_points.shape),))[1] for axis in jnp.eye(3)
+    ]
+    pair = term.compared(displaced_points, values)
     first = jax.grad(similarity.energy)(pair, t_similarity).moving
     second = _subtract(similarity.curvature(pair, t_similarity), similarity.convexity(pair, t_similarity))
-    found = _chain(term, second, slope(moved), t_similarity)
+    curvature = _chain(term, second, slope(displaced_points), t_similarity)
     bent = first[:, None, None] * jnp.stack(columns, axis=-1)
-    return found._replace(matrices=found.matrices + term.independent_share / t_similarity * bent)
+    return curvature._replace(matrices=curvature.matrices + term.independent_share / t_similarity * bent)
 
 
 def _chain(

@@ -142,8 +142,8 @@ class WindowCorrelation(NamedTuple):
 
         It is the derivative of the gradient −2 w a r, where r and a depend on m.
         """
-        found = self.fit(pair)
-        return self._curvature(found, pair.weights * pair.shares, found.residuals)
+        fit = self.fit(pair)
+        return self._curvature(fit, pair.weights * pair.shares, fit.residuals)
 
     def _curvature(
         self, found: LocalFit, weights: Float[AnyArray, "points"], residuals: Float[AnyArray, "points"]
@@ -171,18 +171,18 @@ class WindowCorrelation(NamedTuple):
 
 @jax.custom_jvp
 def _energy(similarity: WindowCorrelation, pair: Intensities) -> Scalar:
-    found = similarity.fit(pair)
-    return pair.weights @ (found.fixed * found.residuals)
+    fit = similarity.fit(pair)
+    return pair.weights @ (fit.fixed * fit.residuals)
 
 
 @_energy.defjvp
 def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
     """Compute the derivative with a and b fixed, since E_s is minimal in them; the second derivative varies them."""
     (similarity, pair), (_, change) = primals, tangents
-    found = similarity.fit(pair)
-    slope = 2 * (pair.weights * found.residuals) @ (change.fixed - found.gain * change.moving)
-    slope += (found.residuals**2 + similarity.ridge * found.gain**2) @ change.weights
-    return pair.weights @ (found.fixed * found.residuals), slope
+    fit = similarity.fit(pair)
+    slope = 2 * (pair.weights * fit.residuals) @ (change.fixed - fit.gain * change.moving)
+    slope += (fit.residuals**2 + similarity.ridge * fit.gain**2) @ change.weights
+    return pair.weights @ (fit.fixed * fit.residuals), slope
 
 
 def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Windows:
@@ -195,13 +195,13 @@ def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Window
     width : float
         Longest side, mm; more where a box would have fewer than `LEAST` points.
     """
-    label, found, boxes = np.zeros(len(positions), int), 0, [np.arange(len(positions))]
+    label, window, boxes = np.zeros(len(positions), int), 0, [np.arange(len(positions))]
     while boxes:
         box = boxes.pop()
         sides = np.ptp(positions[box], axis=0)
         if sides.max() <= width or len(box) < 2 * LEAST:
-            label[box] = found
-            found += 1
+            label[box] = window
+            window += 1
         else:
             along = np.argsort(positions[box, sides.argmax()], kind="stable")
             boxes += np.array_split(box[along], 2)

@@ -84,27 +84,27 @@ class JointInformation(NamedTuple):
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return the energy −T_s N I."""
-        found = self.histogram(pair)
-        information = (found.joint * (found.surprise() - jnp.log(found.joint.sum(axis=1))[:, None])).sum()
-        return -self.temperature * found.count * information
+        histogram = self.histogram(pair)
+        information = (histogram.joint * (histogram.surprise() - jnp.log(histogram.joint.sum(axis=1))[:, None])).sum()
+        return -self.temperature * histogram.count * information
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return Σ_q log p(f_q), with which the likelihood is a density of f."""
-        found = self.histogram(pair)
+        histogram = self.histogram(pair)
         width = (self.fixed_range[1] - self.fixed_range[0]) / (BINS - 3)
-        return pair.shares @ (found.fixed @ jnp.log(found.joint.sum(axis=1) / width))
+        return pair.shares @ (histogram.fixed @ jnp.log(histogram.joint.sum(axis=1) / width))
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """Return f minus its mean given m."""
-        found = self.histogram(pair)
-        given = found.moving @ found.joint.T
-        return pair.fixed - given @ _centres(self.fixed_range) / given.sum(axis=1)
+        histogram = self.histogram(pair)
+        conditional = histogram.moving @ histogram.joint.T
+        return pair.fixed - conditional @ _centres(self.fixed_range) / conditional.sum(axis=1)
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Return T_s times the observed Fisher information: the square of each point's ∂ log p(f_q | m_q) / ∂m_q."""
-        found = self.histogram(pair)
+        histogram = self.histogram(pair)
         slope = jax.jvp(lambda m: _bins(m, self.moving_range), (pair.moving,), (jnp.ones_like(pair.moving),))[1]
-        score = ((found.fixed @ found.surprise()) * slope).sum(axis=1)
+        score = ((histogram.fixed @ histogram.surprise()) * slope).sum(axis=1)
         return ValueCurvature(self.temperature * pair.weights / pair.weights.mean() * pair.shares * score**2)
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
@@ -117,13 +117,13 @@ class JointInformation(NamedTuple):
 
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Draw residuals of f from p(f | m)."""
-        found = self.histogram(pair)
-        given, centres = found.moving @ found.joint.T, _centres(self.fixed_range)
-        one, other = jax.random.split(key)
-        within = (centres[1] - centres[0]) * (jax.random.uniform(other, pair.fixed.shape) - 0.5)
-        drawn = centres[jax.random.categorical(one, jnp.log(given))] + within
+        histogram = self.histogram(pair)
+        conditional, centres = histogram.moving @ histogram.joint.T, _centres(self.fixed_range)
+        key_bin, key_within = jax.random.split(key)
+        within = (centres[1] - centres[0]) * (jax.random.uniform(key_within, pair.fixed.shape) - 0.5)
+        drawn = centres[jax.random.categorical(key_bin, jnp.log(conditional))] + within
         scale = jnp.sqrt(self.temperature / (2 * pair.weights))
-        return (drawn - given @ centres / given.sum(axis=1)) / scale
+        return (drawn - conditional @ centres / conditional.sum(axis=1)) / scale
 
     def of_one_point(self) -> SumOfSquaredDifferences:
         """Return Gaussian noise, the noise of one point."""

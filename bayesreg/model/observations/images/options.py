@@ -13,7 +13,7 @@ from bayesreg.model.observations.images.similarity import SIMILARITIES, AnySimil
 from bayesreg.settings import NotNegative, Positive, Section, by_kind, wrong
 
 # The kinds of similarities that include a map of intensities.
-OF_ANY_CONTRAST = [kind for kind, one in SIMILARITIES.items() if one.serves_any_contrast]
+OF_ANY_CONTRAST = [kind for kind, similarity in SIMILARITIES.items() if similarity.serves_any_contrast]
 
 # Defaults by the name of the model's preset. The options of "paper" are the defaults of `ImageOptions`.
 PRESETS: Mapping[str, Mapping[str, Any]] = {

@@ -82,12 +82,12 @@ def seen_points(
         If none is left.
     """
     positions = quadrature.positions(mesh)
-    seen = moving.contains(positions)
+    mask = moving.contains(positions)
     if visible is not None:
-        seen &= np.asarray(visible(jnp.asarray(positions))) > 0.5
-    if not seen.any():
+        mask &= np.asarray(visible(jnp.asarray(positions))) > 0.5
+    if not mask.any():
         raise InputError("nothing is left to compare: all of the mesh lies in fixed_ignore, or beyond the moving image")
-    if seen.all():
+    if mask.all():
         return quadrature
-    kept = (np.asarray(part)[seen] for part in (quadrature.cells, quadrature.barycentric, quadrature.weights))
+    kept = (np.asarray(part)[mask] for part in (quadrature.cells, quadrature.barycentric, quadrature.weights))
     return quadrature_at(mesh, *kept)

@@ -125,10 +125,10 @@ class PreparedPair:
     def _shading(
         self, fixed_values: Float[np.ndarray, "points"], positions: Float[np.ndarray, "points 3"]
     ) -> Float[AnyArray, "points coefficients"] | None:
-        degree, more = self.options.intensity_map, self.functions(positions, self._smoothing_sd)
-        if degree is None and not more.shape[1]:
+        degree, functions = self.options.intensity_map, self.functions(positions, self._smoothing_sd)
+        if degree is None and not functions.shape[1]:
             return None
-        return jnp.asarray(shading_basis(fixed_values, positions, degree or 0, more))
+        return jnp.asarray(shading_basis(fixed_values, positions, degree or 0, functions))
 
     @property
     def _smoothing_sd(self) -> float:
@@ -179,9 +179,11 @@ class PreparedPair:
     def recorded(self, term: ComparedImages) -> Recorded:
         """Return the compared intensities of f at up to 1,000 evenly spaced quadrature points."""
         points = np.linspace(0, len(term.positions) - 1, min(len(term.positions), MOST_POINTS)).round().astype(int)
-        where = {"units": "mm", "long_name": "position of the point in the fixed image, world RAS"}
-        dim, places = f"{self.name}_point", zip("xyz", np.asarray(term.positions)[points].T, strict=True)
-        coords = {dim: points} | {f"{self.name}_{axis}": (dim, place, where) for axis, place in places}
+        position_attributes = {"units": "mm", "long_name": "position of the point in the fixed image, world RAS"}
+        dim, positions = f"{self.name}_point", zip("xyz", np.asarray(term.positions)[points].T, strict=True)
+        coords = {dim: points} | {
+            f"{self.name}_{axis}": (dim, position, position_attributes) for axis, position in positions
+        }
         attributes = {"units": "1", "long_name": "intensity of the fixed image, as it is compared"}
         return Recorded(xr.DataArray(np.asarray(term.fixed_values)[points], coords, [dim], attrs=attributes), points)
 

@@ -59,10 +59,11 @@ def describe_self_similarity(
     variance = np.mean(distances, axis=0)
     variance = np.maximum(variance, LEAST * variance.mean() or 1.0)
     least = np.min(distances, axis=0)
-    one, two, three, four, five, six = (
-        image.with_voxels(np.exp((least - found) / variance).astype(np.float32)) for found in distances
+    plus_first, minus_first, plus_second, minus_second, plus_third, minus_third = (
+        image.with_voxels(np.exp((least - patch_distance) / variance).astype(np.float32))
+        for patch_distance in distances
     )
-    return one, two, three, four, five, six
+    return plus_first, minus_first, plus_second, minus_second, plus_third, minus_third
 
 
 def _patch_distance(image: Image, voxels: np.ndarray, sd: float, shift: np.ndarray) -> np.ndarray:
@@ -92,8 +93,10 @@ class AlternatingImages(NamedTuple):
         count, images = len(points), len(self.images.to_voxel)
         turns = -(-count // images)
         filled = jnp.pad(points, ((0, turns * images - count), (0, 0)), mode="edge").reshape(turns, images, 3)
-        found = jax.lax.map(lambda one: one[0](one[1]), (self.images, jnp.moveaxis(filled, 1, 0)))
-        return found.T.reshape(-1)[:count]
+        values = jax.lax.map(
+            lambda image_and_points: image_and_points[0](image_and_points[1]), (self.images, jnp.moveaxis(filled, 1, 0))
+        )
+        return values.T.reshape(-1)[:count]
 
 
 class SelfSimilarity(SimilaritySettings):

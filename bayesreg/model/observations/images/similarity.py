@@ -54,4 +54,4 @@ AnySimilarity = SquaredDifferences | StudentT | LocalCorrelation | MutualInforma
 """The settings of a similarity. Its method `on(positions, rest)` makes the `Similarity` at some points (q, 3), mm, of
 images with the `Intensities` `rest` there where nothing has moved."""
 
-SIMILARITIES = {one.model_fields["kind"].default: one for one in get_args(AnySimilarity)}
+SIMILARITIES = {settings.model_fields["kind"].default: settings for settings in get_args(AnySimilarity)}
