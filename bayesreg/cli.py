@@ -91,8 +91,8 @@ Channel = Annotated[
     ),
 ]
 OutFolder = Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for the results.")]
-RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
-RunFolders = Annotated[list[Path], typer.Argument(metavar="DIR DIR...", help="Folders of two or more runs.")]
+FolderOfRun = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
+FoldersOfRuns = Annotated[list[Path], typer.Argument(metavar="DIR DIR...", help="Folders of two or more runs.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override an entry, e.g. sampler.chains=4; may be repeated."),
@@ -237,7 +237,7 @@ def simulate(config: ConfigFile, out: OutFolder, overrides: Overrides = None) ->
 
 @app.command()
 def apply(
-    folder: RunFolder,
+    folder: FolderOfRun,
     out: OutFolder,
     points: PointsFile = None,
     image: ImageFile = None,
@@ -274,7 +274,7 @@ def apply(
 
 
 @app.command()
-def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: MapsLike = None, quiet: Quiet = False) -> None:
+def maps(folder: FolderOfRun, out: OutFolder, far: Far = None, like: MapsLike = None, quiet: Quiet = False) -> None:
     """Write maps of a run: how sure every point is, how volume changes, how stiff the tissue is."""
     from bayesreg.results.maps import maps
 
@@ -283,7 +283,7 @@ def maps(folder: RunFolder, out: OutFolder, far: Far = None, like: MapsLike = No
 
 
 @app.command()
-def slicer(folder: RunFolder, out: OutFolder) -> None:
+def slicer(folder: FolderOfRun, out: OutFolder) -> None:
     """Write a run as a scene of 3D Slicer, in the world of MOVING."""
     from bayesreg.results.slicer import slicer
 
@@ -291,7 +291,7 @@ def slicer(folder: RunFolder, out: OutFolder) -> None:
 
 
 @app.command()
-def reproduce(folder: RunFolder, out: OutFolder, quiet: Quiet = False) -> None:
+def reproduce(folder: FolderOfRun, out: OutFolder, quiet: Quiet = False) -> None:
     """Run again what a run's folder holds, and tell whether the draws are the same, bit for bit."""
     from bayesreg.workflow.reproduce import reproduce
 
@@ -335,7 +335,7 @@ def batch(
 
 
 @app.command()
-def report(folder: RunFolder) -> None:
+def report(folder: FolderOfRun) -> None:
     """Write the report of a run once more."""
     from bayesreg.workflow.reports import report
 
@@ -343,7 +343,7 @@ def report(folder: RunFolder) -> None:
 
 
 @app.command()
-def compare(folders: RunFolders, out: Page = Path("compare.html")) -> None:
+def compare(folders: FoldersOfRuns, out: Page = Path("compare.html")) -> None:
     """Put runs side by side, as the paper does with three tissues and one."""
     if len(folders) < 2:
         raise typer.BadParameter("expected the folders of at least two runs", param_hint="DIR DIR...")

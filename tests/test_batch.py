@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 import bayesreg as br
 from bayesreg.config.cohort import load_cohort
-from bayesreg.io.ledger import digest_of
+from bayesreg.io.run_folder import digest_of
 from bayesreg.workflow.batch import batch, share_of_devices
 from studies.endurance.damage import quick_reports
 from studies.endurance.small_run import write_pair

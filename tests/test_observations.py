@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.inference.draws.inference_data import arviz
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import prepared_inputs
 from bayesreg.workflow.run import _fingerprint, _require_same_observations
@@ -88,7 +89,7 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
     assert result.run.warped is None
     assert (tmp_path / "out" / "displacement_mean.nii.gz").exists()
     assert not (tmp_path / "out" / "warped_mean.nii.gz").exists()
-    predicted = store.read_run(tmp_path / "out").predicted
+    predicted = store.read_run(RunFolder(tmp_path / "out")).predicted
     found = predicted.of_observation("landmarks")
     assert list(found["names"]) == [f"p{k}" for k in range(8)]
     np.testing.assert_allclose(found["sd"], 0.2)

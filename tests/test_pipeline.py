@@ -19,8 +19,9 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.fem.equilibrium import elastic_system
 from bayesreg.fem.location import interpolation_at
-from bayesreg.io import checkpoints, ledger, store
+from bayesreg.io import checkpoints, store
 from bayesreg.io.datasets import Anatomy
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model import problem
 from bayesreg.workflow import meshing, preparation
 from bayesreg.workflow import run as run_module
@@ -114,7 +115,7 @@ def test_the_run_folder_is_that_of_the_contract(finished, folder):
     assert "Not converged" in (out / "report.html").read_text()
     assert not (out / "draws").exists()
     assert not (out / "metrics.json").exists()
-    read = store.read_run(out).predicted
+    read = store.read_run(RunFolder(out)).predicted
     np.testing.assert_allclose(read.chain_mean.mean(axis=0), finished.u_mean, atol=1e-6)
     assert "Posterior predictive checks" in (out / "report.html").read_text()
     assert not finished.converged
@@ -155,7 +156,7 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
         br.run(br.load_config(folder / "run.yaml", ["seed=4"]), folder / "cut", resume=True, progress=False)
     provenance = store.read_json(folder / "cut" / preparation.PROVENANCE)
     assert 0 < provenance["unsampled"] < 600
-    with ledger.writing(folder / "cut") as place:
+    with RunFolder(folder / "cut").writing() as place:
         store.write_json(place(preparation.PROVENANCE), provenance | {"unsampled": 3600})
     resumed = br.run(folder / "run.yaml", folder / "cut", resume=True, progress=False)
     timings = resumed.run.manifest["timings"]
@@ -231,7 +232,7 @@ def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
     assert found.same
     assert found.lines == ["the draws are the same, bit for bit"]
     shutil.copytree(folder / "out", folder / "doubtful")
-    with ledger.writing(folder / "doubtful") as place:
+    with RunFolder(folder / "doubtful").writing() as place:
         shutil.copy(folder / "out" / "posterior.nc", place("posterior.nc"))
         with netCDF4.Dataset(place("posterior.nc"), "a") as file:
             file["posterior/u_boundary"][1, 3, 5, 0] += 1e-3
@@ -273,7 +274,9 @@ def test_nothing_is_written_where_a_chain_cannot_start(folder):
 def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, monkeypatch, overrides, lam, mu):
     built = []
     monkeypatch.setattr(problem, "elastic_system", lambda *args: built.append(args) or elastic_system(*args))
-    posterior = posterior_of(br.load_config(folder / "run.yaml", overrides), store.read_inputs(folder / "out"))
+    posterior = posterior_of(
+        br.load_config(folder / "run.yaml", overrides), store.read_inputs(RunFolder(folder / "out"))
+    )
     assert len(built) == 1
     np.testing.assert_allclose(posterior.reference()["lam"], lam)
     np.testing.assert_allclose(posterior.reference()["mu"], mu)
@@ -281,7 +284,7 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
 
 @pytest.mark.parametrize(("points", "draws"), [(900, 100), (16_000, 100), (96_000, 20), (2_000_000, 10)])
 def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(finished, folder, points, draws):
-    posterior = posterior_of(br.load_config(folder / "run.yaml"), store.read_inputs(folder / "out"))
+    posterior = posterior_of(br.load_config(folder / "run.yaml"), store.read_inputs(RunFolder(folder / "out")))
     larger = posterior.images._replace(positions=np.ones((points, 3)))
     assert run_module._block(replace(posterior, data=posterior.data.with_term("images", larger))) == draws
     assert run_module._block(replace(posterior, data=posterior.data.without_term("images"))) == 100
@@ -357,7 +360,7 @@ def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
     page = result.report.read_text()
     assert "Elastography: posterior of the elastic parameters" in page
     assert "one node at the skull" not in page
-    np.testing.assert_array_equal(store.read_inputs(out).boundary, truth.u[boundary])
+    np.testing.assert_array_equal(store.read_inputs(RunFolder(out)).boundary, truth.u[boundary])
 
 
 @pytest.mark.slow
@@ -401,7 +404,7 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
 @pytest.mark.usefixtures("no_report")
 def test_simulate_writes_the_pair(synthetic, folder):
     out = simulate(synthetic("paper"), folder / "simulated")
-    inputs = store.read_inputs(out)
+    inputs = store.read_inputs(RunFolder(out))
     assert inputs.truth is not None
     assert inputs.moving.shape == inputs.fixed.shape
     assert json.loads((out / "inputs" / "provenance.json").read_text())["pair"]["residual_sd_at_truth"] > 0

@@ -19,8 +19,8 @@ from ruamel.yaml import YAML
 import bayesreg as br
 from bayesreg.config import make_config
 from bayesreg.io import store
-from bayesreg.io.ledger import writing
 from bayesreg.io.quality import edge_lengths
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.mesh import signed_volumes
 from bayesreg.messages import from_level
 from bayesreg.report.panels import View, ignored
@@ -132,7 +132,7 @@ def test_the_warped_image_is_in_the_units_of_the_file(result):
 
 
 def test_what_was_found_is_kept_with_the_run(result, folder):
-    inputs = store.read_inputs(folder / "out")
+    inputs = store.read_inputs(RunFolder(folder / "out"))
     np.testing.assert_allclose(inputs.matching.pose.matrix, result.run.matching.pose.matrix)
     assert inputs.moving_ignore is not None
     assert set(inputs.channels) == {"flair"}
@@ -168,7 +168,7 @@ def test_what_is_hatched_goes_with_the_displacement(result):
 def test_a_channel_on_another_grid_has_the_tissues_where_they_are(result, folder):
     """The same image stored backwards along its first axis, of the same shape."""
     config = br.load_config(folder / "run.yaml")
-    inputs = store.read_inputs(folder / "out")
+    inputs = store.read_inputs(RunFolder(folder / "out"))
     channel = inputs.channels["flair"]
     affine = channel.fixed.affine.copy()
     affine[:3, 3] = channel.fixed.voxel_to_world(np.array([channel.fixed.shape[0] - 1.0, 0, 0]))
@@ -202,7 +202,7 @@ def test_the_brain_of_a_mouse_is_meshed_as_finely_as_it_is_small(tmp_path):
 
 def test_the_composite_alone_makes_the_warped_image(result):
     """SimpleITK with transform_mean.h5, the moving image of the run and nothing else."""
-    moving = store.read_inputs(result.folder).moving
+    moving = store.read_inputs(RunFolder(result.folder)).moving
     scaled = result.run.matching.scale.undo(result.run.matching.pose.inverse.aligned(moving))
     br.save_image(scaled, result.folder / "own_world.nii.gz")
     fixed = SimpleITK.ReadImage(str(result.folder / "inputs" / "fixed.nii.gz"))
@@ -487,7 +487,7 @@ def test_a_run_that_has_moved_is_carried_on_alone(applied, result, folder, tmp_p
     """None of the files that it was made of is needed; nodes that were not sampled are solved for again."""
     shutil.copytree(result.folder, tmp_path / "copied")
     text = (tmp_path / "copied" / "config.yaml").read_text().replace(str(folder), "/gone")
-    with writing(tmp_path / "copied") as place:
+    with RunFolder(tmp_path / "copied").writing() as place:
         place("config.yaml").write_text(text)
     assert len(result.mesh.interior) > 0
     br.apply(tmp_path / "copied", tmp_path / "there", points=folder / "p.csv", draws=40, far=(0.1, 2.0))

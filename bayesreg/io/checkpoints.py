@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 
 import numpy as np
 
 from bayesreg.io.atomic import load_arrays, save_arrays
-from bayesreg.io.ledger import ANEW, Stage, drop, is_listed, require_file, writing
+from bayesreg.io.run_folder import ANEW, RunFolder, Stage
 from bayesreg.types import AnyArray
 
 STATE, DRAWS = "state.npz", "draws"
 
 
-def save_block(folder: str | Path, index: int, arrays: Mapping[str, AnyArray]) -> None:
+def save_block(folder: RunFolder, index: int, arrays: Mapping[str, AnyArray]) -> None:
     """Write one block of draws in one step; replace a block of the same index."""
-    with writing(folder) as place:
+    with folder.writing() as place:
         save_arrays(place(_block_name(index)), arrays)
 
 
@@ -26,7 +25,7 @@ class StoredBlocks:
 
     Parameters
     ----------
-    folder : path
+    folder : RunFolder
     count : int
 
     Raises
@@ -35,10 +34,10 @@ class StoredBlocks:
         If a block is missing or, when it is read, damaged.
     """
 
-    def __init__(self, folder: str | Path, count: int) -> None:
-        self.folder, self.count = Path(folder), count
+    def __init__(self, folder: RunFolder, count: int) -> None:
+        self.folder, self.count = folder, count
         for index in range(count):
-            require_file(self.folder, _block_name(index))
+            self.folder.file(_block_name(index))
 
     def __len__(self) -> int:
         return self.count
@@ -46,7 +45,7 @@ class StoredBlocks:
     def __getitem__(self, index: int, /) -> dict[str, np.ndarray]:
         if not 0 <= index < self.count:
             raise IndexError(f"block {index} of {self.count}")
-        return load_arrays(require_file(self.folder, _block_name(index)), ANEW)
+        return load_arrays(self.folder.file(_block_name(index)), ANEW)
 
     def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
         return (self[index] for index in range(self.count))
@@ -61,35 +60,35 @@ def _block_name(index: int) -> str:
     return f"{DRAWS}/block_{index:05d}.npz"
 
 
-def save_state(folder: str | Path, arrays: Mapping[str, AnyArray], stage: Stage | None = None) -> None:
+def save_state(folder: RunFolder, arrays: Mapping[str, AnyArray], stage: Stage | None = None) -> None:
     """Replace state.npz, from which the next block starts, in one step; optionally set the run's stage with it."""
-    with writing(folder, stage) as place:
+    with folder.writing(stage) as place:
         save_arrays(place(STATE), arrays)
 
 
-def load_state(folder: str | Path) -> dict[str, np.ndarray] | None:
+def load_state(folder: RunFolder) -> dict[str, np.ndarray] | None:
     """Read state.npz; return None if no chain has started yet."""
-    return load_arrays(require_file(folder, STATE), ANEW) if is_listed(folder, STATE) else None
+    return load_arrays(folder.file(STATE), ANEW) if folder.is_listed(STATE) else None
 
 
-def close(folder: str | Path) -> None:
+def close(folder: RunFolder) -> None:
     """Remove draws/ of a run whose results are complete, and compress state.npz, from which the run can continue.
 
     Half of a triangular factor is zero. Compression takes too long for the state of a run that goes on.
     """
-    state = load_arrays(require_file(folder, STATE), ANEW)
-    with writing(folder) as place:
+    state = load_arrays(folder.file(STATE), ANEW)
+    with folder.writing() as place:
         save_arrays(place(STATE), state, compressed=True)
-    drop(folder, DRAWS)
-    shutil.rmtree(Path(folder) / DRAWS, ignore_errors=True)
+    folder.drop(DRAWS)
+    shutil.rmtree(folder.path / DRAWS, ignore_errors=True)
 
 
-def reopen(folder: str | Path, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
+def reopen(folder: RunFolder, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
     """Turn a finished run into an interrupted run that stopped after these blocks, which hold all its draws.
 
     If the process is killed between two steps, the folder holds either the finished run or the interrupted one.
     """
-    state = load_arrays(require_file(folder, STATE), ANEW)
+    state = load_arrays(folder.file(STATE), ANEW)
     kept = StoredBlocks(folder, 0)
     for block in blocks:
         kept.append(block)

@@ -1,9 +1,8 @@
-"""Writers and readers of a run's folder; readers verify that files have the content that was written (`ledger`)."""
+"""Writers and readers of a run's folder; readers verify that files have the content that was written."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,40 +13,11 @@ from bayesreg.io.atomic import load_arrays, read_json, save_arrays, write_json, 
 from bayesreg.io.displacements import read_point_data
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.intensities import in_levels, save_in_levels
-from bayesreg.io.ledger import ANEW, STATUS, holds_run, is_listed, require_file, stage_of
 from bayesreg.io.meshing import load_mesh, save_mesh
 from bayesreg.io.records import Channel, Inputs, Matching, Predicted, Run, Truth
+from bayesreg.io.run_folder import ANEW, Place, RunFolder
 from bayesreg.io.spaces import LPS
 from bayesreg.io.volumes import load_image, save_image
-from bayesreg.types import InputError
-
-RESULTS = (
-    STATUS, "config.yaml", "run.json", "mesh.vtu", "posterior.nc", "draws", "state.npz", "inputs", "report.html",
-)  # fmt: skip
-
-
-def require_fresh(folder: str | Path) -> None:
-    """Raise InputError if a path is a file, or a folder that holds a run, lies in a run's folder or is not writable."""
-    folder = Path(folder)
-    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if folder.is_symlink() and not folder.exists():
-        raise InputError(f"the output folder {folder} is a link that leads nowhere")
-    if within := [parent for parent in folder.absolute().parents if holds_run(parent)]:
-        raise InputError(f"the output folder {folder} lies in that of another run, {within[0]}; name another one")
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"the output folder {folder} is a file; name a folder that is new or empty")
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"the output folder {folder} cannot be written: {nearest} is no folder that you may write")
-    held = [name for name in RESULTS if (folder / name).exists()]
-    if held:
-        raise InputError(
-            f"the output folder {folder} already holds a run ({', '.join(held)}); "
-            "name another folder, or continue that run with --resume"
-        )
-
-
-# A function from the path of a file, relative to the run's folder, to the temporary path of `ledger.writing`.
-Place = Callable[[str], Path]
 
 
 def write_inputs(place: Place, inputs: Inputs) -> None:
@@ -86,11 +56,11 @@ def write_observed(place: Place, observed: Mapping[str, Mapping[str, np.ndarray]
         save_arrays(place("inputs/observed.npz"), named)
 
 
-def read_inputs(folder: str | Path) -> Inputs:
+def read_inputs(folder: RunFolder) -> Inputs:
     """Read the files of `write_inputs`; raise InputError if a file is missing or damaged."""
-    config = require_file(folder, "config.yaml").read_text(encoding="utf-8")
-    mesh = load_mesh(require_file(folder, "inputs/mesh.vtu"))
-    tissue = load_image(require_file(folder, "inputs/tissue.nii.gz"))
+    config = folder.file("config.yaml").read_text(encoding="utf-8")
+    mesh = load_mesh(folder.file("inputs/mesh.vtu"))
+    tissue = load_image(folder.file("inputs/tissue.nii.gz"))
     skull, fixed_ignore, moving_ignore = (
         None if (path := _file(folder, f"inputs/{name}.nii.gz")) is None else load_image(path)
         for name in ("skull", "fixed_ignore", "moving_ignore")
@@ -106,7 +76,7 @@ def read_inputs(folder: str | Path) -> Inputs:
     truth = None if truth_arrays is None else Truth(**truth_arrays)
     boundary = None if boundary_arrays is None else boundary_arrays["u_boundary"]
     observed = {} if observed_arrays is None else _observed_of(observed_arrays)
-    known_of_images = read_json(require_file(folder, "inputs/matching.json"))
+    known_of_images = read_json(folder.file("inputs/matching.json"))
     channels = {name: _channel(folder, name, alike) for name, alike in known_of_images["channels"].items()}
     return Inputs(
         config, mesh, fixed, moving, tissue, skull, truth, boundary, observed, Matching.of_json(known_of_images),
@@ -114,8 +84,8 @@ def read_inputs(folder: str | Path) -> Inputs:
     )  # fmt: skip
 
 
-def _channel(folder: str | Path, name: str, one_contrast: bool) -> Channel:
-    paths = (require_file(folder, f"inputs/channel-{name}-{which}.nii.gz") for which in ("fixed", "moving"))
+def _channel(folder: RunFolder, name: str, one_contrast: bool) -> Channel:
+    paths = (folder.file(f"inputs/channel-{name}-{which}.nii.gz") for which in ("fixed", "moving"))
     fixed, moving = (in_levels(load_image(path)) for path in paths)
     return Channel(fixed, moving, one_contrast)
 
@@ -139,7 +109,7 @@ def write_results(
     Parameters
     ----------
     place : callable
-        The callable from `ledger.writing`.
+        The callable from `RunFolder.writing`.
     run : Run
     displacement_mean, displacement_sd : (X, Y, Z, 3) arrays
         Posterior mean and standard deviation of u on the grid of `run.background`, world RAS, mm. The mean is written
@@ -161,7 +131,7 @@ def write_results(
     write_json(place("run.json"), run.manifest)
 
 
-def read_run(folder: str | Path) -> Run:
+def read_run(folder: RunFolder) -> Run:
     """Read the files of `write_inputs` and `write_results`.
 
     Raises
@@ -169,11 +139,11 @@ def read_run(folder: str | Path) -> Run:
     InputError
         If the folder holds no finished run, or a file of it is missing or damaged.
     """
-    require_finished(folder)
-    manifest = read_json(require_file(folder, "run.json"))
+    folder.require_finished()
+    manifest = read_json(folder.file("run.json"))
     inputs = read_inputs(folder)
-    u_mean, u_sd = read_point_data(require_file(folder, "mesh.vtu"), "u_mean", "u_sd")
-    warped = None if inputs.moving is None else load_image(require_file(folder, "warped_mean.nii.gz"))
+    u_mean, u_sd = read_point_data(folder.file("mesh.vtu"), "u_mean", "u_sd")
+    warped = None if inputs.moving is None else load_image(folder.file("warped_mean.nii.gz"))
     if warped is not None and inputs.matching.scale is not None:
         warped = inputs.matching.scale(warped)
     metrics = None if (path := _file(folder, "metrics.json")) is None else read_json(path)
@@ -189,15 +159,6 @@ def read_run(folder: str | Path) -> Run:
     )
 
 
-def require_finished(folder: str | Path) -> None:
-    """Raise InputError if a folder holds no finished run."""
-    stage = stage_of(folder)
-    if stage == "prepared":
-        raise InputError(f"the run in {folder} has not ended; bayesreg run --resume goes on with it")
-    if stage is None:
-        raise InputError(f"{folder} holds no run of bayesreg: {STATUS} is missing")
-
-
-def _file(folder: str | Path, name: str) -> Path | None:
+def _file(folder: RunFolder, name: str) -> Path | None:
     """Return the path of an optional file of a run, or None if the run has no such file."""
-    return require_file(folder, name) if is_listed(folder, name) else None
+    return folder.file(name) if folder.is_listed(name) else None

@@ -9,7 +9,7 @@ from pathlib import Path
 from bayesreg import __version__
 from bayesreg.config.sections import BidsConfig
 from bayesreg.io.atomic import write_json
-from bayesreg.io.store import Place
+from bayesreg.io.run_folder import Place
 from bayesreg.results.displacement_fields import MEAN, MEAN_INVERSE
 
 FOLDER = "bids"
@@ -25,7 +25,7 @@ def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
     names : BidsConfig
         Subject, session, and the names of the spaces of both images.
     place : callable
-        The callable from `bayesreg.io.ledger.writing`.
+        The callable from `bayesreg.io.run_folder.RunFolder.writing`.
 
     Notes
     -----

@@ -11,7 +11,7 @@ from bayesreg.fem.deformation import Displaced
 from bayesreg.fem.location import Location
 from bayesreg.image import Image
 from bayesreg.io.fields import save_displacement
-from bayesreg.io.store import Place
+from bayesreg.io.run_folder import Place
 from bayesreg.io.transforms import save_transform
 from bayesreg.mesh import TetMesh
 from bayesreg.model.submesh import submesh_variance
@@ -144,9 +144,9 @@ def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
     Parameters
     ----------
     place : callable
-        The callable from `bayesreg.io.ledger.writing`. Each draw gets three files in transforms/: draw-01.h5 and
-        draw-01_inverse.h5 from `bayesreg.io.transforms.save_transform`, and draw-01.nii.gz, the displacement including
-        the pose.
+        The callable from `bayesreg.io.run_folder.RunFolder.writing`. Each draw gets three files in transforms/:
+        draw-01.h5 and draw-01_inverse.h5 from `bayesreg.io.transforms.save_transform`, and draw-01.nii.gz, the
+        displacement including the pose.
     transform : Transform
         The transform from the fixed image's world.
     grid : Image

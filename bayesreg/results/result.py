@@ -12,8 +12,8 @@ import numpy as np
 from bayesreg.inference.draws.diagnostics import Convergence, convergence
 from bayesreg.inference.draws.inference_data import open_posterior
 from bayesreg.io import store
-from bayesreg.io.ledger import require_file, require_unchanged
 from bayesreg.io.records import Run
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.mesh import TetMesh
 from bayesreg.pose import Motion
 
@@ -37,7 +37,7 @@ class Result:
     @cached_property
     def idata(self) -> Any:
         """The draws as ArviZ's inference data."""
-        return open_posterior(require_file(self.folder, POSTERIOR))
+        return open_posterior(RunFolder(self.folder).file(POSTERIOR))
 
     @cached_property
     def convergence(self) -> Convergence:
@@ -88,7 +88,8 @@ class Result:
 
 def load_result(folder: str | Path) -> Result:
     """Open a finished run; raise InputError if the folder holds none or a file of it is damaged."""
-    run = store.read_run(folder)
-    require_file(folder, POSTERIOR)
-    require_unchanged(folder, but=REPORT)
-    return Result(Path(folder), run)
+    run_folder = RunFolder(Path(folder))
+    run = store.read_run(run_folder)
+    run_folder.file(POSTERIOR)
+    run_folder.require_unchanged(but=REPORT)
+    return Result(run_folder.path, run)

@@ -26,7 +26,7 @@ from bayesreg.config.cohort import ClusterConfig, Cohort, Task, load_cohort
 from bayesreg.inference.chains.progress import NoProgress
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.inference.draws.moments import greatest_rhat
-from bayesreg.io.ledger import STATUS, stage_of
+from bayesreg.io.run_folder import STATUS, RunFolder
 from bayesreg.messages import from_level
 from bayesreg.report.estimands import parameter_groups
 from bayesreg.results.result import Result
@@ -213,7 +213,7 @@ def _submit(client: Any, cohort: Cohort, out: Path, shares: int | None) -> Itera
 def _stage_of(folder: Path) -> str | None:
     """Return the stage of a run; None if there is no run or its status is damaged, which the run itself reports."""
     try:
-        return stage_of(folder)
+        return RunFolder(folder).stage
     except (InputError, OSError):
         return None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,9 @@ from bayesreg.image import Image
 from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
 from bayesreg.io import checkpoints, store
-from bayesreg.io.ledger import drop, writing
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.records import Inputs, Run
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import warp_image
 from bayesreg.report.metrics import compute_metrics
@@ -37,13 +36,13 @@ def finish(
     posterior: Posterior,
     samples: Samples,
     provenance: dict[str, Any],
-    out: Path,
+    folder: RunFolder,
     began: float,
 ) -> Result:
     """Write all results of the draws, and the report, into the folder of the run."""
     from bayesreg.report.html import write_report
 
-    idata = _store_draws(posterior, samples, out, config.seed)
+    idata = _store_draws(posterior, samples, folder, config.seed)
     draws, judged = dataset(idata, "posterior"), samples.convergence
     grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
     metrics = None
@@ -74,29 +73,29 @@ def finish(
         **inputs._asdict(),
     )
     # The run may have finished before, with other files in these folders.
-    for folder in (ENSEMBLE, FOLDER):
-        drop(out, folder)
-    with writing(out) as place:
+    for subfolder in (ENSEMBLE, FOLDER):
+        folder.drop(subfolder)
+    with folder.writing() as place:
         write_transforms(place, transform(config.results.draws), grid)
         store.write_results(place, finished, *moments.rounded)
-    with writing(out, "finished") as place:
+    with folder.writing("finished") as place:
         if config.results.bids is not None:
-            write_bids(out, config.results.bids, place)
+            write_bids(folder.path, config.results.bids, place)
         write_report(finished, idata, *judged, place(REPORT))
-    checkpoints.close(out)
-    return Result(out, finished)
+    checkpoints.close(folder)
+    return Result(folder.path, finished)
 
 
-def _store_draws(posterior: Posterior, samples: Samples, out: Path, seed: int) -> Any:
+def _store_draws(posterior: Posterior, samples: Samples, folder: RunFolder, seed: int) -> Any:
     """Write posterior.nc with the draws and ArviZ's groups of the observations, and open it."""
-    with writing(out) as place:
+    with folder.writing() as place:
         path = place(POSTERIOR)
         save_posterior(posterior.target, samples.blocks, path)
         # Groups cannot be appended to an open file.
         with xr.open_dataset(path, group="posterior") as draws:
             groups = predictive_groups(posterior, draws, seed)
         append_groups(path, groups)
-    return open_posterior(out / POSTERIOR)
+    return open_posterior(folder.path / POSTERIOR)
 
 
 def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:

@@ -21,11 +21,11 @@ from bayesreg.io.datasets import Anatomy, brainweb, from_files, mni152, require_
 from bayesreg.io.displacements import IDENTITY, read_boundary, require_displacement
 from bayesreg.io.domain import without_ridges
 from bayesreg.io.intensities import in_levels
-from bayesreg.io.ledger import writing
 from bayesreg.io.meshing import domain_labels, load_mesh, mesh_domain
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.points import read_point_pairs
 from bayesreg.io.records import Channel, Inputs, Truth
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.io.volumes import load_ignored, load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.observations.section import Arrays
@@ -235,9 +235,9 @@ def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:
     return provenance | {"unsampled": time.perf_counter() - began}
 
 
-def store_inputs(out: Path, inputs: Inputs, provenance: dict[str, Any]) -> None:
+def store_inputs(folder: RunFolder, inputs: Inputs, provenance: dict[str, Any]) -> None:
     """Write the inputs of a run and their provenance into its folder."""
-    with writing(out, "prepared") as temporary_path:
+    with folder.writing("prepared") as temporary_path:
         store.write_json(temporary_path(PROVENANCE), provenance)
         store.write_inputs(temporary_path, inputs)
 

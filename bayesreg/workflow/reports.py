@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bayesreg.io import store
-from bayesreg.io.ledger import locked, writing
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.results.result import REPORT, load_result
 from bayesreg.types import InputError
 
@@ -15,11 +14,12 @@ def report(folder: str | Path) -> Path:
     """Write the report of a finished run again, and return its path."""
     from bayesreg.report.html import write_report
 
+    run_folder = RunFolder(Path(folder))
     # `locked` creates a missing folder; the check before it prevents this.
-    store.require_finished(folder)
-    with locked(folder):
+    run_folder.require_finished()
+    with run_folder.locked():
         result = load_result(folder)
-        with writing(folder) as temporary_path:
+        with run_folder.writing() as temporary_path:
             write_report(result.run, result.idata, *result.convergence, temporary_path(REPORT))
     return result.report
 

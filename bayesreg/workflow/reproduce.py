@@ -13,7 +13,7 @@ from bayesreg.config.configuration import Config
 from bayesreg.config.sections import StopConfig
 from bayesreg.inference.draws.inference_data import dataset
 from bayesreg.io import store
-from bayesreg.io.ledger import locked, require_file
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.results.result import Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.preparation import PROVENANCE, store_inputs
@@ -75,20 +75,20 @@ def reproduce(folder: str | Path, out: str | Path, progress: bool = True) -> Com
     InputError
         If the folder holds no finished run, or one that had observations besides those of its configuration.
     """
-    first, out = load_result(folder), Path(out)
-    provenance = store.read_json(require_file(folder, PROVENANCE))
+    first, first_folder, second_folder = load_result(folder), RunFolder(Path(folder)), RunFolder(Path(out))
+    provenance = store.read_json(first_folder.file(PROVENANCE))
     if provenance.get("observations"):
         raise InputError(
             f"the run in {folder} had the observations {list(provenance['observations'])} from Python, which its "
             "folder does not hold"
         )
-    store.require_fresh(out)
-    config = load_stored_config(require_file(folder, "config.yaml"))
+    second_folder.require_fresh()
+    config = load_stored_config(first_folder.file("config.yaml"))
     config = _as_many(config, int(first.run.manifest["steps_per_chain"]))
-    inputs = store.read_inputs(folder)._replace(config=resolved_yaml(config))
-    with locked(out):
+    inputs = store.read_inputs(first_folder)._replace(config=resolved_yaml(config))
+    with second_folder.locked():
         # No digests of sources: the original files may have changed or be missing.
-        store_inputs(out, inputs, provenance | {"sources": {}})
+        store_inputs(second_folder, inputs, provenance | {"sources": {}})
     steps, chains = first.run.manifest["steps_per_chain"], config.sampler.chains
     _log.info(f"{steps:,} steps of {chains} chains, with seed {config.seed}")
     return _compare(first, run(config, out, resume=True, progress=progress))

@@ -29,8 +29,8 @@ from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_blocks
 from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
-from bayesreg.io.ledger import is_sound, locked, read_status, require_file, stage_of, writing
 from bayesreg.io.records import Inputs
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.memory import memory_of_machine
 from bayesreg.messages import show_messages
 from bayesreg.model.build import require_observations
@@ -100,17 +100,17 @@ def run(
     config = config if isinstance(config, Config) else load_config(config)
     checked_observations = require_observations(observations) if observations else []
     with show_messages() if progress is True else nullcontext():
-        return _run(config, Path(out), resume, progress, checked_observations)
+        return _run(config, RunFolder(Path(out)), resume, progress, checked_observations)
 
 
-def _run(config: Config, out: Path, resume: bool, progress: Showing, observations: list[Any]) -> Result:
+def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, observations: list[Any]) -> Result:
     began = time.perf_counter()
-    if resume and stage_of(out) is not None:
-        with locked(out):
-            return _resume(config, out, progress, observations, began)
+    if resume and folder.stage is not None:
+        with folder.locked():
+            return _resume(config, folder, progress, observations, began)
     # A run that was interrupted before it stored its inputs begins again in the same folder.
-    if not (resume and read_status(out) is not None):
-        store.require_fresh(out)
+    if not (resume and folder.status() is not None):
+        folder.require_fresh()
     _log.info("reading the files, meshing")
     if config.has_images and not config.pairs_of_images:
         _log.info("the images are shown and not compared: observations does not name them ({kind: images})")
@@ -129,52 +129,46 @@ def _run(config: Config, out: Path, resume: bool, progress: Showing, observation
     searching = time.perf_counter()
     posterior = temper(config, inputs, posterior)
     provenance["independent_points"] = posterior.independent_points
-    reached = _first(config, inputs, posterior, out, progress, time.perf_counter() - searching)
+    reached = _first(config, inputs, posterior, folder, time.perf_counter() - searching)
     inputs = with_initial(inputs, config)
-    with locked(out):
-        if stage_of(out) is not None:
-            raise InputError(f"another process has begun a run in {out} meanwhile; name another folder")
+    with folder.locked():
+        if folder.stage is not None:
+            raise InputError(f"another process has begun a run in {folder.path} meanwhile; name another folder")
         provenance = with_unsampled(provenance, began + float(reached[0].seconds))
-        store_inputs(out, inputs, provenance)
-        return _go_on(config, inputs, posterior, reached, provenance, out, began, progress)
+        store_inputs(folder, inputs, provenance)
+        return _go_on(config, inputs, posterior, reached, provenance, folder, began, progress)
 
 
-def _resume(
-    config: Config,
-    out: Path,
-    progress: Showing,
-    observations: list[Any],
-    began: float,
-) -> Result:
-    known = _resumed_config(out, config)
-    provenance = store.read_json(require_file(out, PROVENANCE))
-    require_same_sources(config, provenance.get("sources", {}), MAY_CHANGE, out)
-    finished = stage_of(out) == "finished"
+def _resume(config: Config, folder: RunFolder, progress: Showing, observations: list[Any], began: float) -> Result:
+    known = _resumed_config(folder, config)
+    provenance = store.read_json(folder.file(PROVENANCE))
+    require_same_sources(config, provenance.get("sources", {}), MAY_CHANGE, folder.path)
+    finished = folder.stage == "finished"
     if finished and all(getattr(known, name) == getattr(config, name) for name in MAY_CHANGE):
-        _log.info("%s holds a finished run already; another budget (stop) would continue it", out)
-        if not is_sound(out, REPORT):
-            report(out)
-        return load_result(out)
-    inputs = store.read_inputs(out)
+        _log.info("%s holds a finished run already; another budget (stop) would continue it", folder.path)
+        if not folder.is_sound(REPORT):
+            report(folder.path)
+        return load_result(folder.path)
+    inputs = store.read_inputs(folder)
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
-    _require_same_observations(out, provenance, posterior, observations)
+    _require_same_observations(folder.path, provenance, posterior, observations)
     # A pair that `simulate` stored is not tempered yet.
     posterior = temper(config, inputs, posterior)
     provenance["independent_points"] = posterior.independent_points
     if finished:
-        checkpoints.reopen(out, to_blocks(posterior.target, load_result(out).idata, BLOCK))
+        checkpoints.reopen(folder, to_blocks(posterior.target, load_result(folder.path).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
     if known.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
-    reached = _load_reached(config, inputs, posterior, out, progress)
+    reached = _load_reached(config, inputs, posterior, folder)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
-    with writing(out) as temporary_path:
+    with folder.writing() as temporary_path:
         write_text(temporary_path("config.yaml"), inputs.config)
         store.write_observed(temporary_path, inputs.observed)
         store.write_json(temporary_path(PROVENANCE), with_unsampled(provenance, began + sampled))
-    return _go_on(config, inputs, posterior, reached, provenance, out, began, progress)
+    return _go_on(config, inputs, posterior, reached, provenance, folder, began, progress)
 
 
 def _go_on(
@@ -183,17 +177,17 @@ def _go_on(
     posterior: Posterior,
     reached: Reached,
     provenance: dict[str, Any],
-    out: Path,
+    folder: RunFolder,
     began: float,
     progress: Showing,
 ) -> Result:
     """Sample from the current state of the chains, and write the results."""
-    _save_state(out, *reached)
+    _save_state(folder, *reached)
     _log.info("%s", _describe_mesh(inputs))
     with ending_between_blocks() as require_no_signal:
-        samples = _sample(config, posterior, reached, out, progress, require_no_signal)
+        samples = _sample(config, posterior, reached, folder, progress, require_no_signal)
     _log.info("writing the results")
-    result = finish(config, inputs, posterior, samples, provenance, out, began)
+    result = finish(config, inputs, posterior, samples, provenance, folder, began)
     _log.info("%s", samples.reason)
     _warn(config, result)
     return result
@@ -208,14 +202,15 @@ def _warn(config: Config, result: Result) -> None:
         _log.warning("%s", doubt)
 
 
-def _resumed_config(out: Path, config: Config) -> Config:
+def _resumed_config(folder: RunFolder, config: Config) -> Config:
     """Load the configuration of a begun run; InputError if it differs outside the sections `MAY_CHANGE`."""
-    known = load_stored_config(require_file(out, "config.yaml"))
+    known = load_stored_config(folder.file("config.yaml"))
     sections = {name: getattr(config, name) for name in MAY_CHANGE}
     if resolved_yaml(known.model_copy(update=sections)) != resolved_yaml(config):
         raise InputError(
-            f"{out} holds a run of another configuration; resume it with its own ({out / 'config.yaml'}), of which "
-            f"only the sections {', '.join(MAY_CHANGE)} may change, or name another folder"
+            f"{folder.path} holds a run of another configuration; resume it with its own "
+            f"({folder.path / 'config.yaml'}), of which only the sections {', '.join(MAY_CHANGE)} may change, or name "
+            "another folder"
         )
     return known
 
@@ -267,9 +262,7 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
     return tempered
 
 
-def _first(
-    config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing, seconds: float = 0.0
-) -> Reached:
+def _first(config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder, seconds: float = 0.0) -> Reached:
     """Make the state of the chains before their first step; InputError if a chain cannot start.
 
     The `seconds` that were spent before count as sampling.
@@ -279,33 +272,33 @@ def _first(
         posterior.target, options.name, options.chains, config.seed, start, **options.settings
     )
     checkpoint = checkpoint._replace(seconds=checkpoint.seconds + seconds)
-    return checkpoint, checkpoints.StoredBlocks(out, 0)
+    return checkpoint, checkpoints.StoredBlocks(folder, 0)
 
 
-def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, out: Path, progress: Showing) -> Reached:
+def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder) -> Reached:
     """Load the state of the chains that the interrupted run stored last."""
-    state = checkpoints.load_state(out)
+    state = checkpoints.load_state(folder)
     if state is None:
-        return _first(config, inputs, posterior, out, progress)
-    blocks = checkpoints.StoredBlocks(out, int(state.pop("blocks")))
+        return _first(config, inputs, posterior, folder)
+    blocks = checkpoints.StoredBlocks(folder, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior.target, options.name, options.chains, **options.settings), blocks
 
 
-def _save_state(out: Path, checkpoint: Checkpoint, blocks: Blocks) -> None:
-    checkpoints.save_state(out, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
+def _save_state(folder: RunFolder, checkpoint: Checkpoint, blocks: Blocks) -> None:
+    checkpoints.save_state(folder, {"blocks": np.array(len(blocks)), **checkpoint_to_arrays(checkpoint)})
 
 
 def _sample(
     config: Config,
     posterior: Posterior,
     reached: Reached,
-    out: Path,
+    folder: RunFolder,
     progress: Showing,
     after_block: Callable[[], None] = lambda: None,
 ) -> Samples:
     def keep(_index: int, _block: Block, checkpoint: Checkpoint) -> None:
-        _save_state(out, checkpoint, reached[1])
+        _save_state(folder, checkpoint, reached[1])
         after_block()
 
     options = config.sampler

@@ -20,7 +20,7 @@ import numpy as np
 from bayesreg.config import Config, load_config, load_stored_config
 from bayesreg.inference.layout import slices, unravel
 from bayesreg.io import store
-from bayesreg.io.ledger import require_file, stage_of
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.observations.images.likelihood import images_of
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import Problem
@@ -196,10 +196,11 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
 def posterior_of_run(config: str | Path | Config) -> Posterior:
     """Build the posterior that a run samples, from a configuration or from the folder of a run."""
     if not isinstance(config, Config) and Path(config).is_dir():
-        if stage_of(config) is None:
+        folder = RunFolder(Path(config))
+        if folder.stage is None:
             raise InputError(f"{config} holds no run of bayesreg, and is no configuration")
-        settings, inputs = load_stored_config(require_file(config, "config.yaml")), store.read_inputs(config)
-        independent = store.read_json(require_file(config, PROVENANCE)).get("independent_points")
+        settings, inputs = load_stored_config(folder.file("config.yaml")), store.read_inputs(folder)
+        independent = store.read_json(folder.file(PROVENANCE)).get("independent_points")
         posterior = posterior_of(settings, inputs, (), independent)
     else:
         settings = config if isinstance(config, Config) else load_config(config)

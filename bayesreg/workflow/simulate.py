@@ -9,9 +9,8 @@ import numpy as np
 
 from bayesreg.config import Config, load_config
 from bayesreg.config.data import Scan
-from bayesreg.io import store
-from bayesreg.io.ledger import locked
 from bayesreg.io.records import Inputs
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.io.volumes import save_image
 from bayesreg.pose import Motion, Pose
 from bayesreg.tissues import is_fluid
@@ -30,14 +29,14 @@ def simulate(config: str | Path | Config, out: str | Path) -> Path:
     config = config if isinstance(config, Config) else load_config(config)
     if config.simulate is None:
         raise InputError("the configuration has no section 'simulate': its pair comes from files")
-    began = time.perf_counter()
-    store.require_fresh(out)
+    began, folder = time.perf_counter(), RunFolder(Path(out))
+    folder.require_fresh()
     inputs, provenance = prepared_inputs(config)
-    with locked(out):
-        store_inputs(Path(out), inputs, with_unsampled(provenance, began))
+    with folder.locked():
+        store_inputs(folder, inputs, with_unsampled(provenance, began))
     if config.simulate.scan is not None:
-        _write_scans(Path(out) / SCANS, inputs, config.simulate.scan, config.seed)
-    return Path(out)
+        _write_scans(folder.path / SCANS, inputs, config.simulate.scan, config.seed)
+    return folder.path
 
 
 def _write_scans(folder: Path, inputs: Inputs, scan: Scan, seed: int) -> None:

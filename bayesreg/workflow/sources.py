@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesreg.config import Config
-from bayesreg.io.ledger import digest_of
+from bayesreg.io.run_folder import digest_of
 from bayesreg.types import InputError
 
 

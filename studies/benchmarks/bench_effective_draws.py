@@ -18,6 +18,7 @@ import xarray as xr
 import bayesreg as br
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.workflow.assembly import posterior_of
 from studies.benchmarks.bench_samplers import PAPERS_THIN, block_from
 from studies.benchmarks.bench_sampling import _median
@@ -43,7 +44,7 @@ def compare_kernels(result):
     """Of a run by `CONFIG` that has ended."""
     convergence = result.run.manifest["convergence"]
     seconds = result.run.manifest["timings"]["sampling"]
-    posterior = posterior_of(br.load_config(result.folder / "config.yaml"), store.read_inputs(result.folder))
+    posterior = posterior_of(br.load_config(result.folder / "config.yaml"), store.read_inputs(RunFolder(result.folder)))
     draws = result.idata.posterior.load()
     effective = float(np.median(np.asarray(result.convergence.ess_bulk.u_boundary)))
     nodes, sampled = len(result.mesh.points), len(result.mesh.boundary)

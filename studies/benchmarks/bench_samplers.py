@@ -23,6 +23,7 @@ from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.run import _first, checkpoint_from_arrays
 from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, choose_sampler
 from bayesreg.io import checkpoints, store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
 
@@ -44,9 +45,10 @@ def finished() -> Finished:
     folder = os.environ.get("BAYESREG_RUN")
     if folder is None:
         pytest.skip("BAYESREG_RUN names no run that has ended")
-    config = br.load_config(Path(folder) / "config.yaml")
-    posterior, options = posterior_of(config, store.read_inputs(folder)), config.sampler
-    arrays = checkpoints.load_state(folder)
+    run_folder = RunFolder(Path(folder))
+    config = br.load_config(run_folder.path / "config.yaml")
+    posterior, options = posterior_of(config, store.read_inputs(run_folder)), config.sampler
+    arrays = checkpoints.load_state(run_folder)
     assert arrays is not None
     assert options.name == "hmc"
     arrays.pop("blocks")

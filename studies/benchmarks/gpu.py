@@ -27,6 +27,7 @@ from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.target import logdensity
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.messages import show_messages
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.preparation import PROVENANCE
@@ -45,7 +46,7 @@ def main() -> None:
     parser.add_argument("--sample", type=int, nargs="*", default=(4, 64))
     parser.add_argument("--minutes", type=float, default=3.0, help="of each run that samples")
     given = parser.parse_args()
-    device, inputs = jax.devices()[0], store.read_inputs(given.run)
+    device, inputs = jax.devices()[0], store.read_inputs(RunFolder(given.run))
     # A run knows how many points are independent; a simulated pair has yet to find out.
     known = store.read_json(given.run / PROVENANCE).get("independent_points")
     posterior = posterior_of(br.load_config(given.run / "config.yaml"), inputs, (), known)

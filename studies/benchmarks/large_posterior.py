@@ -29,7 +29,7 @@ from bayesreg.config import load_config
 from bayesreg.inference.chains.checkpoint import no_steps
 from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.blocks import Block
-from bayesreg.io.ledger import locked
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.finish import finish
 from bayesreg.workflow.preparation import prepared_inputs, store_inputs, with_unsampled
@@ -85,7 +85,7 @@ def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
     """Print one line."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        path, out = write_pair(folder), folder / "run"
+        path, out = write_pair(folder), RunFolder(folder / "run")
         br.save_mesh(ball_mesh(38, spacing_of(nodes)), folder / "mesh.vtu")
         settings = YAML(typ="safe").load(path)
         settings["model"]["elastic_prior"] = {"nodes": "all"}
@@ -106,7 +106,7 @@ def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
             what()
             seconds.append(time.perf_counter() - began)
 
-        with locked(out):
+        with out.locked():
             store_inputs(out, inputs, with_unsampled(provenance, time.perf_counter()))
             profiler = cProfile.Profile()
             if profile:
@@ -115,10 +115,10 @@ def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
             if profile:
                 profiler.dump_stats(profile)
         pd.DataFrame(inputs.mesh.points[:100], columns=list("xyz")).to_csv(folder / "points.csv", index=False)
-        timed(lambda: br.apply(out, folder / "carried", points=folder / "points.csv"))
+        timed(lambda: br.apply(out.path, folder / "carried", points=folder / "points.csv"))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         estimands = sum(np.size(value) for value in posterior.reference().values())
-        size = (out / "posterior.nc").stat().st_size / 2**30
+        size = (out.path / "posterior.nc").stat().st_size / 2**30
         print(
             f"{draws} draws × {chains} chains × {estimands} estimands, {size:.2f} GiB: written, judged and reported in "
             f"{seconds[0]:.0f} s, applied in {seconds[1]:.0f} s; at most {peak:.2f} GiB of memory",

@@ -56,6 +56,7 @@ from bayesreg.inference.gaussian.whitened import whiten
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.workflow.assembly import posterior_of, start_of
 from tests.phantoms import ball_mesh, flat_skull, smooth_image
 
@@ -126,7 +127,7 @@ def main() -> None:
 
 
 def _of_run(folder: Path) -> tuple[br.Posterior, Start]:
-    config, inputs = br.load_config(folder / "config.yaml"), store.read_inputs(folder)
+    config, inputs = br.load_config(folder / "config.yaml"), store.read_inputs(RunFolder(folder))
     posterior = posterior_of(config, inputs)
     return posterior, start_of(config, inputs, posterior)
 

@@ -29,6 +29,7 @@ from bayesreg.inference.samplers.hamiltonian import _quarter_turn
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import checkpoints, store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.coordinates import complete
 from bayesreg.model.observations.images.pointwise import SumOfSquaredDifferences
 from bayesreg.workflow.assembly import posterior_of
@@ -44,8 +45,8 @@ def main() -> None:
     parser.add_argument("--chains", type=int, default=16)
     given = parser.parse_args()
     config = br.load_config(given.run / "config.yaml")
-    posterior, options = posterior_of(config, store.read_inputs(given.run)), config.sampler
-    arrays = checkpoints.load_state(given.run)
+    posterior, options = posterior_of(config, store.read_inputs(RunFolder(given.run))), config.sampler
+    arrays = checkpoints.load_state(RunFolder(given.run))
     if (
         options.name != "hmc"
         or not isinstance(posterior.images.similarity, SumOfSquaredDifferences)

@@ -17,13 +17,14 @@ import scipy.linalg
 
 import bayesreg as br
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.blocks import Scale
 from bayesreg.workflow.assembly import posterior_of
 
 
 def eigenvalues(folder: Path) -> np.ndarray:
     """In descending order."""
-    posterior = posterior_of(br.load_config(folder / "config.yaml"), store.read_inputs(folder))
+    posterior = posterior_of(br.load_config(folder / "config.yaml"), store.read_inputs(RunFolder(folder)))
     draws = br.load_result(folder).idata.posterior
     known = posterior.reference()
     last = known | {name: jnp.asarray(draws[name].values[0, -1], float) for name in known if name in draws}

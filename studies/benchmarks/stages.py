@@ -33,6 +33,7 @@ from bayesreg.fem import equilibrium
 from bayesreg.fem.elasticity import stiffness, unknowns_of
 from bayesreg.inference.samplers.random_walk import _normal_step
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.coordinates import complete
 from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
@@ -47,7 +48,7 @@ def main() -> None:
     parser.add_argument("--chains", type=int, default=4)
     parser.add_argument("--proposals", type=int, default=400)
     given = parser.parse_args()
-    posterior = posterior_of(br.load_config(given.run / "config.yaml"), store.read_inputs(given.run))
+    posterior = posterior_of(br.load_config(given.run / "config.yaml"), store.read_inputs(RunFolder(given.run)))
     draws = estimands_of(posterior.target, br.load_result(given.run).idata.posterior.load())
     every = len(draws["u_boundary"]) // given.chains
     places = jax.tree.map(lambda x: x[::every][: given.chains], draws)

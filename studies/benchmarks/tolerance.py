@@ -21,6 +21,7 @@ import numpy as np
 import bayesreg as br
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.model import conditioning
 from bayesreg.workflow.assembly import posterior_of
 from bayesreg.workflow.run import Result
@@ -66,7 +67,7 @@ def compare(first: Result, second: Result) -> None:
 
 def at_draws(folder: Path) -> None:
     """Print a line for each tolerance."""
-    posterior = posterior_of(br.load_config(folder / "config.yaml"), store.read_inputs(folder))
+    posterior = posterior_of(br.load_config(folder / "config.yaml"), store.read_inputs(RunFolder(folder)))
     draws, known = br.load_result(folder).idata.posterior, posterior.reference()
     rng = np.random.default_rng(0)
     places = zip(

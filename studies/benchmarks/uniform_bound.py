@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import bayesreg as br
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.io.store import read_inputs
 from bayesreg.report.metrics import mean_squared_error
 
@@ -21,7 +22,7 @@ RATIOS = np.concatenate([[0.0], np.geomspace(0.1, 1000, 41)])
 
 def least_errors(folder: Path) -> dict[str, tuple[float, float]]:
     """By part of the brain the least mean squared error, mm², and the λ/μ that leaves it."""
-    inputs = read_inputs(folder)
+    inputs = read_inputs(RunFolder(folder))
     mesh, truth = inputs.mesh, inputs.truth
     assert truth is not None
     u_true = np.asarray(truth.u)

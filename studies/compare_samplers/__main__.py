@@ -19,8 +19,8 @@ from bayesreg.config.samplers import sampler_section
 from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.samplers.registry import SAMPLERS
-from bayesreg.io import store
 from bayesreg.io.atomic import write_json, write_text
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.messages import show_messages
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of
@@ -66,7 +66,7 @@ def compare_samplers(
     """
     _require_sound(samplers, minutes)
     config = config if isinstance(config, Config) else load_config(config)
-    store.require_fresh(out)
+    RunFolder(Path(out)).require_fresh()
     console = Console(quiet=not progress, highlight=False)
     console.print("reading the images, meshing")
     inputs = prepared_inputs(config)[0]

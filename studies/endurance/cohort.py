@@ -23,7 +23,7 @@ import pandas as pd
 from ruamel.yaml import YAML
 
 import bayesreg as br
-from bayesreg.io.ledger import digest_of, stage_of
+from bayesreg.io.run_folder import RunFolder, digest_of
 from bayesreg.workflow.batch import batch
 from studies.endurance.damage import quick_reports
 from studies.endurance.kill import contents
@@ -51,7 +51,7 @@ def kill_workers(out: Path, times: int, killed: list[int]) -> None:
     while len(killed) < times:
         time.sleep(1.0)
         for state in out.glob("*/draws"):
-            if stage_of(state.parent) != "prepared" or len(list(state.glob("*.npz"))) < 2:
+            if RunFolder(state.parent).stage != "prepared" or len(list(state.glob("*.npz"))) < 2:
                 continue
             holders = _holders(state.parent / ".lock")
             if holders and holders[0] not in killed:

@@ -22,6 +22,7 @@ import numpy as np
 
 import bayesreg as br
 from bayesreg.io import checkpoints
+from bayesreg.io.run_folder import RunFolder
 from bayesreg.types import InputError
 from bayesreg.workflow.reports import report
 from studies.endurance.kill import contents
@@ -59,7 +60,7 @@ def interrupt(config: Path, out: Path) -> None:
     """Leave a run after some blocks."""
     save = checkpoints.save_state
 
-    def cut_off(where: Path, arrays: dict[str, np.ndarray], *rest: object) -> None:
+    def cut_off(where: RunFolder, arrays: dict[str, np.ndarray], *rest: object) -> None:
         save(where, arrays, *rest)
         if arrays["blocks"] == MIDDLE:
             raise KeyboardInterrupt

@@ -22,7 +22,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 import bayesreg as br
-from bayesreg.io.ledger import read_status
+from bayesreg.io.run_folder import RunFolder
 from studies.endurance.small_run import finish, start, write_pair
 
 
@@ -75,7 +75,7 @@ def main() -> int:
         time.sleep(moment)
         process.send_signal(number)
         _, first = process.communicate()
-        stage = read_status(out) and read_status(out).stage
+        stage = RunFolder(out).stage
         blocks = len(list(out.glob("draws/*.npz")))
         again, second = finish("run", config, "-o", out, "-q", "--resume")
         same = (out / "posterior.nc").exists() and contents(out / "posterior.nc") == expected

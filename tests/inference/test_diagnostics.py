@@ -18,6 +18,7 @@ from bayesreg.inference.draws.inference_data import (
     to_inference_data,
 )
 from bayesreg.io.checkpoints import StoredBlocks
+from bayesreg.io.run_folder import RunFolder
 from tests.options import posterior_of
 from tests.phantoms import ball_mesh, smooth_image
 
@@ -158,7 +159,7 @@ def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
 def _judged_and_written(target, folder, count):
     """The greatest number of bytes at once, in the end and on the way."""
     folder.mkdir()
-    kept = StoredBlocks(folder, 0)
+    kept = StoredBlocks(RunFolder(folder), 0)
     tracemalloc.start()
     for index in range(count):
         kept.append(next(blocks(target, seed=index)))

@@ -6,9 +6,10 @@ import pytest
 import pyvista
 
 from bayesreg.image import Image
-from bayesreg.io import checkpoints, ledger, store
+from bayesreg.io import checkpoints, store
 from bayesreg.io.intensities import in_levels
 from bayesreg.io.records import Inputs, Predicted, Run, Truth
+from bayesreg.io.run_folder import RunFolder
 from tests.phantoms import ball_mesh, rotated_affine
 
 
@@ -40,9 +41,9 @@ def inputs_of(run: Run) -> Inputs:
 def write(folder, run: Run, mean=None, sd=None) -> None:
     """All of a run, as the program writes it; displacements are zero where none are given."""
     zero = np.zeros((*run.fixed.shape, 3))
-    with ledger.writing(folder, "prepared") as place:
+    with RunFolder(folder).writing("prepared") as place:
         store.write_inputs(place, inputs_of(run))
-    with ledger.writing(folder, "finished") as place:
+    with RunFolder(folder).writing("finished") as place:
         store.write_results(place, run, zero if mean is None else mean, zero if sd is None else sd)
 
 
@@ -61,7 +62,7 @@ def assert_same(a: Run, b: Run) -> None:
 def test_a_run_comes_back_as_it_was_written(run, tmp_path):
     folder = tmp_path / "new" / "run"
     write(folder, run)
-    back = store.read_run(folder)
+    back = store.read_run(RunFolder(folder))
     assert_same(run, back)
     for one, other in zip(run.truth, back.truth, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -74,7 +75,7 @@ def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
     left = {"images/residual": np.arange(3.0), "points/names": np.array(["a", "b"])}
     names = {"place_names": np.array(["third ventricle", "λ"]), "observations": left}
     write(tmp_path, replace(run, predicted=Predicted(**arrays | names)))
-    back = store.read_run(tmp_path).predicted
+    back = store.read_run(RunFolder(tmp_path)).predicted
     assert list(back.place_names) == ["third ventricle", "λ"]
     np.testing.assert_array_equal(back.reach, arrays["reach"])
     np.testing.assert_array_equal(back.of_observation("images")["residual"], np.arange(3.0))
@@ -87,7 +88,7 @@ def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
 def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
     run = replace(run, truth=None, skull=None, metrics=None)
     write(tmp_path, run)
-    back = store.read_run(tmp_path)
+    back = store.read_run(RunFolder(tmp_path))
     assert_same(run, back)
     assert back.truth is None
     assert back.skull is None
@@ -97,7 +98,7 @@ def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
 
 def test_a_truth_without_a_start_comes_back_without(run, tmp_path):
     write(tmp_path, replace(run, truth=run.truth._replace(initial=None)))
-    assert store.read_run(tmp_path).truth.initial is None
+    assert store.read_run(RunFolder(tmp_path)).truth.initial is None
 
 
 def test_displacements_are_written_as_lps_transform_and_the_sd_stays_positive(run, tmp_path):
@@ -113,14 +114,14 @@ def test_displacements_are_written_as_lps_transform_and_the_sd_stays_positive(ru
 
 
 def test_inputs_can_be_read_before_the_run_has_finished(run, tmp_path):
-    with ledger.writing(tmp_path, "prepared") as place:
+    with RunFolder(tmp_path).writing("prepared") as place:
         store.write_inputs(place, inputs_of(run))
-    inputs = store.read_inputs(tmp_path)
+    inputs = store.read_inputs(RunFolder(tmp_path))
     assert inputs.config == run.config
     assert inputs.mesh.digest == run.mesh.digest
     np.testing.assert_array_equal(inputs.truth.u, run.truth.u)
     with pytest.raises(ValueError, match=r"has not ended; .*--resume"):
-        store.read_run(tmp_path)
+        store.read_run(RunFolder(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -130,49 +131,28 @@ def test_each_missing_part_is_named(run, tmp_path, name):
     write(tmp_path, run)
     (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=f"holds no whole run: {name} is missing"):
-        store.read_run(tmp_path)
+        store.read_run(RunFolder(tmp_path))
 
 
 def test_a_mesh_without_results_is_no_finished_run(run, tmp_path):
     write(tmp_path, run)
-    with ledger.writing(tmp_path) as place:
+    with RunFolder(tmp_path).writing() as place:
         store.save_mesh(run.mesh, place("mesh.vtu"))
     with pytest.raises(ValueError, match="holds no u_mean and no u_sd"):
-        store.read_run(tmp_path)
-
-
-def test_fresh_folders_are_accepted(tmp_path):
-    store.require_fresh(tmp_path / "not there yet")
-    store.require_fresh(tmp_path)
-    (tmp_path / "notes.txt").write_text("mine")
-    store.require_fresh(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
-@pytest.mark.parametrize("name", ["run.json", "config.yaml", "draws/block_00000.npz", "posterior.nc"])
-def test_a_folder_that_holds_another_run_is_refused(tmp_path, name):
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    (tmp_path / name).touch()
-    with pytest.raises(ValueError, match=r"already holds a run .*--resume"):
-        store.require_fresh(tmp_path)
-
-
-def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
-    (tmp_path / "out").touch()
-    with pytest.raises(ValueError, match="is a file"):
-        store.require_fresh(tmp_path / "out")
+        store.read_run(RunFolder(tmp_path))
 
 
 def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
-    assert list(checkpoints.StoredBlocks(tmp_path, 0)) == []
+    folder = RunFolder(tmp_path)
+    assert list(checkpoints.StoredBlocks(folder, 0)) == []
     for k in range(12):
-        checkpoints.save_block(tmp_path, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
-    checkpoints.save_block(tmp_path, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
-    blocks = checkpoints.StoredBlocks(tmp_path, 12)
+        checkpoints.save_block(folder, k, {"u": np.full((2, 3), float(k)), "step": np.array(k)})
+    checkpoints.save_block(folder, 11, {"u": np.full((2, 3), -1.0), "step": np.array(11)})
+    blocks = checkpoints.StoredBlocks(folder, 12)
     assert [int(block["step"]) for block in blocks] == list(range(12))
     assert (blocks[11]["u"] == -1).all()
     assert len(blocks) == 12
-    fewer = checkpoints.StoredBlocks(tmp_path, 5)
+    fewer = checkpoints.StoredBlocks(folder, 5)
     fewer.append({"step": np.array(50)})
     assert [int(block["step"]) for block in fewer] == [0, 1, 2, 3, 4, 50]
     with pytest.raises(IndexError, match="block 6 of 6"):
@@ -180,8 +160,9 @@ def test_blocks_come_back_in_order_and_can_be_replaced(tmp_path):
 
 
 def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, monkeypatch):
-    checkpoints.save_block(tmp_path, 0, {"u": np.zeros(3)})
-    checkpoints.save_state(tmp_path, {"step": np.array(1)})
+    folder = RunFolder(tmp_path)
+    checkpoints.save_block(folder, 0, {"u": np.zeros(3)})
+    checkpoints.save_state(folder, {"step": np.array(1)})
 
     def killed(file, **_):
         file.write(b"PK half a file")
@@ -189,25 +170,27 @@ def test_a_process_killed_while_writing_a_block_loses_that_block_only(tmp_path, 
 
     monkeypatch.setattr(np, "savez", killed)
     with pytest.raises(KeyboardInterrupt):
-        checkpoints.save_block(tmp_path, 1, {"u": np.ones(3)})
+        checkpoints.save_block(folder, 1, {"u": np.ones(3)})
     with pytest.raises(KeyboardInterrupt):
-        checkpoints.save_state(tmp_path, {"step": np.array(2)})
+        checkpoints.save_state(folder, {"step": np.array(2)})
     assert [path.name for path in (tmp_path / "draws").iterdir()] == ["block_00000.npz"]
-    assert int(checkpoints.load_state(tmp_path)["step"]) == 1
+    assert int(checkpoints.load_state(folder)["step"]) == 1
 
 
 def test_a_gap_among_the_blocks_is_an_error(tmp_path):
+    folder = RunFolder(tmp_path)
     for k in (0, 2):
-        checkpoints.save_block(tmp_path, k, {"u": np.zeros(1)})
+        checkpoints.save_block(folder, k, {"u": np.zeros(1)})
     with pytest.raises(ValueError, match=r"block_00001\.npz is missing"):
-        checkpoints.StoredBlocks(tmp_path, 3)
+        checkpoints.StoredBlocks(folder, 3)
 
 
 @pytest.mark.parametrize("name", ["state.npz", "draws/block_00000.npz", "inputs/truth.npz"])
 def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
+    folder = RunFolder(tmp_path)
     write(tmp_path, run)
-    checkpoints.save_block(tmp_path, 0, {"u": np.zeros(3)})
-    checkpoints.save_state(tmp_path, {"step": np.array(1)})
+    checkpoints.save_block(folder, 0, {"u": np.zeros(3)})
+    checkpoints.save_state(folder, {"step": np.array(1)})
     (tmp_path / name).write_bytes(b"PK half a file")
     read = {
         "state.npz": checkpoints.load_state,
@@ -215,8 +198,8 @@ def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
         "inputs/truth.npz": store.read_inputs,
     }
     with pytest.raises(ValueError, match=f"{name} is damaged, or was changed .*; run anew, into another folder"):
-        read[name](tmp_path)
+        read[name](folder)
 
 
 def test_without_a_checkpoint_there_is_no_state(tmp_path):
-    assert checkpoints.load_state(tmp_path) is None
+    assert checkpoints.load_state(RunFolder(tmp_path)) is None

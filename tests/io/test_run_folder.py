@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from bayesreg.io import ledger
-from bayesreg.io.store import require_fresh
+from bayesreg.io.run_folder import PARTIAL, STATUS, RunFolder, Status
 from bayesreg.types import InputError
 
 
 def write(folder, stage=None, **contents):
     """Write files; None stands for a failure."""
-    with ledger.writing(folder, stage) as place:
+    with RunFolder(folder).writing(stage) as place:
         for name, content in contents.items():
             if content is None:
                 raise ZeroDivisionError
@@ -22,7 +21,7 @@ def write(folder, stage=None, **contents):
 
 
 def read(folder, name):
-    return ledger.require_file(folder, f"{name}.txt").read_text()
+    return RunFolder(folder).file(f"{name}.txt").read_text()
 
 
 def test_files_appear_together_or_not_at_all(tmp_path):
@@ -31,8 +30,8 @@ def test_files_appear_together_or_not_at_all(tmp_path):
     with pytest.raises(ZeroDivisionError):
         write(out, "finished", **{"one": "other", "deep/three": "3", "four": None})
     assert (read(out, "one"), read(out, "two")) == ("1", "2")
-    assert not ledger.is_listed(out, "deep/three.txt")
-    assert ledger.stage_of(out) == "prepared"
+    assert not RunFolder(out).is_listed("deep/three.txt")
+    assert RunFolder(out).stage == "prepared"
     assert not list(out.rglob(".partial*"))
 
 
@@ -61,7 +60,7 @@ def test_killed_between_two_replacements_each_file_is_whole(tmp_path, monkeypatc
         monkeypatch.undo()
         found = [read(tmp_path, name) for name in ("one", "two", "three")]
         assert found == [f"{k}{attempt if k <= replaced else ''}" for k in (1, 2, 3)]
-        assert ledger.stage_of(tmp_path) == ("finished" if replaced == 3 else "prepared")
+        assert RunFolder(tmp_path).stage == ("finished" if replaced == 3 else "prepared")
 
 
 def test_damage_and_loss_are_named(tmp_path):
@@ -70,8 +69,8 @@ def test_damage_and_loss_are_named(tmp_path):
     with pytest.raises(InputError, match=r"one\.txt is damaged, or was changed"):
         read(tmp_path, "one")
     with pytest.raises(InputError, match=r"one\.txt is damaged"):
-        ledger.require_unchanged(tmp_path, but="two.txt")
-    ledger.require_unchanged(tmp_path, but="one.txt")
+        RunFolder(tmp_path).require_unchanged(but="two.txt")
+    RunFolder(tmp_path).require_unchanged(but="one.txt")
     (tmp_path / "two.txt").unlink()
     with pytest.raises(InputError, match=r"holds no whole run: two\.txt is missing"):
         read(tmp_path, "two")
@@ -83,7 +82,7 @@ def test_damage_and_loss_are_named(tmp_path):
 @pytest.mark.parametrize("spoil", ["", "{}", "[1]", "{", '{"stage": "finished", "files": {}, "digest": "0"}', "stage"])
 def test_a_damaged_status_is_not_believed(tmp_path, spoil):
     write(tmp_path, "prepared", one="1")
-    path = tmp_path / ledger.STATUS
+    path = tmp_path / STATUS
     if spoil == "stage":
         spoil = json.dumps(json.loads(path.read_text()) | {"stage": "finished"})
     path.write_text(spoil)
@@ -98,26 +97,27 @@ def test_what_never_stood_is_forgotten(tmp_path):
     """A run that was killed before its inputs stood begins again, with other ones."""
     with pytest.raises(ZeroDivisionError):
         write(tmp_path, "prepared", one="1", two=None)
-    assert ledger.read_status(tmp_path) is None
+    assert RunFolder(tmp_path).status() is None
     write(tmp_path, None, one="1")
-    assert ledger.stage_of(tmp_path) is None
+    assert RunFolder(tmp_path).stage is None
     write(tmp_path, "prepared", two="2")
-    assert list(ledger.read_status(tmp_path).files) == ["two.txt"]
+    assert list(RunFolder(tmp_path).status().files) == ["two.txt"]
 
 
 def test_blocks_are_dropped_from_the_list_before_the_disk(tmp_path):
-    with ledger.writing(tmp_path, "prepared") as place:
+    with RunFolder(tmp_path).writing("prepared") as place:
         place("draws/0.txt").write_text("0")
         place("one.txt").write_text("1")
-    ledger.drop(tmp_path, "draws")
-    assert list(ledger.read_status(tmp_path).files) == ["one.txt"]
+    RunFolder(tmp_path).drop("draws")
+    assert list(RunFolder(tmp_path).status().files) == ["one.txt"]
     assert not list((tmp_path / "draws").iterdir())
 
 
 HOLD = """
 import sys, time
-from bayesreg.io.ledger import locked
-with locked(sys.argv[1]):
+from pathlib import Path
+from bayesreg.io.run_folder import RunFolder
+with RunFolder(Path(sys.argv[1])).locked():
     print("held", flush=True)
     time.sleep(600)
 """
@@ -128,13 +128,13 @@ def test_a_folder_is_one_process_s_until_that_is_dead(tmp_path):
     try:
         assert holder.stdout.readline() == "held\n"
         (tmp_path / ".partial-1-fixed.nii.gz").touch()
-        with pytest.raises(InputError, match="another process is working in"), ledger.locked(tmp_path):
+        with pytest.raises(InputError, match="another process is working in"), RunFolder(tmp_path).locked():
             pass
         assert (tmp_path / ".partial-1-fixed.nii.gz").exists()
     finally:
         holder.kill()
         holder.communicate()
-    with ledger.locked(tmp_path), ledger.locked(tmp_path):
+    with RunFolder(tmp_path).locked(), RunFolder(tmp_path).locked():
         assert not list(tmp_path.glob(".partial*"))
 
 
@@ -144,9 +144,9 @@ def test_a_list_does_not_lead_out_of_its_folder(tmp_path, name):
     out, outside = tmp_path / "run", tmp_path / "outside.txt"
     outside.write_text("mine")
     write(out, "finished", one="1")
-    status = ledger.Status("finished", {**ledger.read_status(out).files, name: ("0" * 64,)})
-    ledger._write(out, status)
-    for act in (lambda: ledger.drop(out, "bids"), lambda: ledger.require_file(out, name)):
+    status = Status("finished", {**RunFolder(out).status().files, name: ("0" * 64,)})
+    RunFolder(out)._write(status)
+    for act in (lambda: RunFolder(out).drop("bids"), lambda: RunFolder(out).file(name)):
         with pytest.raises(InputError, match="damaged"):
             act()
     assert outside.read_text() == "mine"
@@ -161,8 +161,8 @@ def test_a_link_does_not_lead_out_of_its_folder(tmp_path):
     (out / "bids").rmdir()
     (out / "bids").symlink_to(elsewhere)
     for act in (
-        lambda: ledger.drop(out, "bids"),
-        lambda: ledger.require_file(out, "bids/mine.txt"),
+        lambda: RunFolder(out).drop("bids"),
+        lambda: RunFolder(out).file("bids/mine.txt"),
         lambda: write(out, **{"bids/mine": "other"}),
     ):
         with pytest.raises(InputError, match="leads out of its folder by a link"):
@@ -173,11 +173,11 @@ def test_a_link_does_not_lead_out_of_its_folder(tmp_path):
 def test_what_another_run_within_is_writing_stays(tmp_path):
     """As of a folder of runs, which is taken for a run by mistake."""
     inner = tmp_path / "subject"
-    stale = tmp_path / f"{ledger.PARTIAL}7-one.txt"
-    with ledger.locked(inner), ledger.writing(inner, "prepared") as place:
+    stale = tmp_path / f"{PARTIAL}7-one.txt"
+    with RunFolder(inner).locked(), RunFolder(inner).writing("prepared") as place:
         place("one.txt").write_text("1")
         stale.write_text("0")
-        with ledger.locked(tmp_path):
+        with RunFolder(tmp_path).locked():
             assert not stale.exists()
     assert read(inner, "one") == "1"
 
@@ -187,28 +187,50 @@ def test_a_status_that_is_none_is_told(tmp_path, content):
     path = tmp_path / "status.json"
     path.mkdir() if content is None else path.write_text(content)
     with pytest.raises(InputError, match="damaged"):
-        ledger.read_status(tmp_path)
+        RunFolder(tmp_path).status()
 
 
 def test_a_link_that_leads_nowhere_is_told(tmp_path):
     for name in ("round", "gone"):
         (tmp_path / name).symlink_to(tmp_path / ("round" if name == "round" else "nothing"))
-        assert ledger.read_status(tmp_path / name) is None
+        assert RunFolder(tmp_path / name).status() is None
         with pytest.raises(InputError, match="is a link that leads nowhere"):
-            require_fresh(tmp_path / name)
+            RunFolder(tmp_path / name).require_fresh()
 
 
 def test_a_run_within_a_run_is_refused(tmp_path):
     write(tmp_path / "run", "finished", one="1")
     with pytest.raises(InputError, match="lies in that of another run"):
-        require_fresh(tmp_path / "run" / "again")
+        RunFolder(tmp_path / "run" / "again").require_fresh()
     # A file of this name that another program wrote is no run.
     (tmp_path / "status.json").write_text("{}")
-    require_fresh(tmp_path / "other")
+    RunFolder(tmp_path / "other").require_fresh()
 
 
 def test_a_file_in_place_of_a_folder_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    assert ledger.read_status(tmp_path / "file") is None
-    with pytest.raises(InputError, match="nothing can be written"), ledger.locked(tmp_path / "file"):
+    assert RunFolder(tmp_path / "file").status() is None
+    with pytest.raises(InputError, match="nothing can be written"), RunFolder(tmp_path / "file").locked():
         pass
+
+
+def test_fresh_folders_are_accepted(tmp_path):
+    RunFolder(tmp_path / "not there yet").require_fresh()
+    RunFolder(tmp_path).require_fresh()
+    (tmp_path / "notes.txt").write_text("mine")
+    RunFolder(tmp_path).require_fresh()
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("name", ["run.json", "config.yaml", "draws/block_00000.npz", "posterior.nc"])
+def test_a_folder_that_holds_another_run_is_refused(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=r"already holds a run .*--resume"):
+        RunFolder(tmp_path).require_fresh()
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "out").touch()
+    with pytest.raises(ValueError, match="is a file"):
+        RunFolder(tmp_path / "out").require_fresh()
