@@ -142,7 +142,7 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted(caplog):
     caplog.set_level(logging.INFO)
     post = posterior(independent_points="residual")
     assert not post.tempered
-    found = temper_target(post.target, 2, 0)
+    found = temper_target(post.target, 2, 0).posterior
     count = found.independent_points["images"]
     assert found.tempered
     assert caplog.messages
@@ -152,14 +152,14 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted(caplog):
     assert post.count_independent_points(values)["images"] == pytest.approx(count, rel=1e-9)
     same = posterior(independent_points=count)
     assert float(found.logdensity_constrained(values)) == pytest.approx(float(same.logdensity_constrained(values)))
-    assert temper_target(found, 2, 0) is found
+    assert temper_target(found.target, 2, 0) is found.target
 
 
 def test_a_search_goes_on_where_the_tempering_has_led_to():
     found = temper_target(posterior(independent_points="residual").target, 2, 0)
     start, there = (
         np.asarray(flat_position(found, found.data, at))
-        for at in (found.estimands(found.reference()), found.search_start)
+        for at in (found.coordinates.reference(), found.mode_search.search_start)
     )
     np.testing.assert_array_equal(approach(found, start), there)
 
@@ -173,6 +173,6 @@ def test_residuals_tell_of_voxels_alone():
 @pytest.mark.long
 def test_draws_are_resumed_with_the_posterior_that_they_are_of():
     post = posterior(independent_points="residual")
-    checkpoint = first_checkpoint(post.with_independent_points({"images": 20.0}), "hmc", 2, 0, warm_up=2)
+    checkpoint = first_checkpoint(post.with_independent_points({"images": 20.0}).target, "hmc", 2, 0, warm_up=2)
     with pytest.raises(InputError, match="resume them with the posterior of their samples"):
         br.sample(post, "hmc", 2, 4, resume=(checkpoint, []), warm_up=2, progress=False)

@@ -63,7 +63,7 @@ def test_elastic_prior_is_scipys_gaussian(held):
 @pytest.mark.parametrize("elasticity", ["tissue", "uniform", "element"])
 def test_density_is_the_papers_and_the_normaliser(elasticity):
     proper, improper = (posterior(elasticity=elasticity, fixed={}, normalised=which) for which in (True, False))
-    size = len(proper.variables.entry_names)
+    size = len(proper.target.variables.entry_names)
     for state in states(count=2):
         values = state | {name: np.resize(state[name], size) for name in ("lam", "mu")}
         estimands = proper.estimands(values)

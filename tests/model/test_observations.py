@@ -252,8 +252,8 @@ def test_images_and_landmarks_are_one_density():
     parts = both.energies(values)
     expected = float(short.logdensity_constrained(values)) + float(parts["landmarks"])
     assert float(both.logdensity_constrained(values)) == pytest.approx(expected, rel=1e-12)
-    curvature = both.mode_search.curvature(both.data, both.estimands(values))
-    alone = short.mode_search.curvature(short.data, short.estimands(values))
+    curvature = both.target.mode_search.curvature(both.data, both.estimands(values))
+    alone = short.target.mode_search.curvature(short.data, short.estimands(values))
     assert np.linalg.eigvalsh(curvature.gauss_newton - alone.gauss_newton).min() > -1e-8
 
 
