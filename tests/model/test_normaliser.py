@@ -67,16 +67,16 @@ def test_density_is_the_papers_and_the_normaliser(elasticity):
     for state in states(count=2):
         values = state | {name: np.resize(state[name], size) for name in ("lam", "mu")}
         estimands = proper.estimands(values)
-        plain = without_normaliser(proper, proper.data)
-        without = proper.evaluate_estimands(plain, estimands)
+        plain = without_normaliser(proper.target, proper.data)
+        without = proper.target.evaluate_estimands(plain, estimands)
         assert float(without.logdensity) == float(improper.logdensity_constrained(values))
-        both = without.logdensity + proper.normaliser.log(proper.data, estimands)
+        both = without.logdensity + proper.target.normaliser.log(proper.data, estimands)
         assert float(proper.logdensity_constrained(values)) == pytest.approx(float(both), rel=1e-12)
-        assert improper.normaliser is None
-        assert float(proper.normaliser.log(plain, estimands)) == 0
+        assert improper.target.normaliser is None
+        assert float(proper.target.normaliser.log(plain, estimands)) == 0
         position = proper.unconstrain(values)
-        less = proper.logdensity(position) - logdensity(proper, plain, position)
-        assert float(less) == pytest.approx(float(proper.normaliser.log(proper.data, estimands)), rel=1e-9)
+        less = proper.logdensity(position) - logdensity(proper.target, plain, position)
+        assert float(less) == pytest.approx(float(proper.target.normaliser.log(proper.data, estimands)), rel=1e-9)
 
 
 def test_chains_side_by_side():

@@ -12,7 +12,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.fem.location import interpolation_at
-from bayesreg.model import curvature
+from bayesreg.model import external_curvature
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.build import require_observations
 from bayesreg.model.curvature import _assemble
@@ -289,13 +289,13 @@ def test_a_term_from_outside_costs_the_directions_it_looks_at(count, monkeypatch
 
     mesh, asked = box_mesh(4), []
     post = br.build_posterior(mesh, [OfNodes()], model_of(sampled="all"))
-    products = curvature._products
+    products = external_curvature._products
 
     def counted(term, seen, flat, directions):
         asked.append(np.asarray(directions))
         return products(term, seen, flat, directions)
 
-    monkeypatch.setattr(curvature, "_products", counted)
+    monkeypatch.setattr(external_curvature, "_products", counted)
     without = post.data.without_term("nodes")
     at_rest, u = post.data.blocks, jnp.zeros(mesh.points.shape)
     values = {name: block.reference() for name, block in at_rest.items()}
