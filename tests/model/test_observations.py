@@ -15,7 +15,7 @@ from bayesreg.fem.location import interpolation_at
 from bayesreg.model import external_curvature
 from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.build import require_observations
-from bayesreg.model.curvature import _assemble
+from bayesreg.model.curvature import _assemble, displacement_curvature
 from bayesreg.model.external_curvature import FixedState, _curvature_of_term
 from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.state import State
@@ -299,7 +299,7 @@ def test_a_term_from_outside_costs_the_directions_it_looks_at(count, monkeypatch
     without = post.data.without_term("nodes")
     at_rest, u = post.data.blocks, jnp.zeros(mesh.points.shape)
     values = {name: block.reference() for name, block in at_rest.items()}
-    whole, rest = (curvature.displacement_curvature(data, values, u).gauss_newton for data in (post.data, without))
+    whole, rest = (displacement_curvature(data, values, u).gauss_newton for data in (post.data, without))
     expected = (3 * OfNodes.nodes[:, None] + np.arange(3)).ravel()
     np.testing.assert_array_equal(np.concatenate([[], *asked]), expected)
     np.testing.assert_allclose(np.diag(whole - rest), np.isin(np.arange(u.size), expected), atol=1e-9)
