@@ -26,14 +26,13 @@ from bayesreg.model.blocks import (
     Coefficients,
     Displacement,
     FieldScale,
-    FreeEntries,
-    LameParameter,
     scale_block,
 )
 from bayesreg.model.elastic.barrier import Barrier
 from bayesreg.model.elastic.rigid import RigidPrior
 from bayesreg.model.elastic.skull import Skull, SoftSkull, is_allowed
 from bayesreg.model.field import StiffnessField, stiffness_field
+from bayesreg.model.lame_parameter import FreeEntries, LameParameter
 from bayesreg.model.observations.observation import Placed, place
 from bayesreg.model.options import (
     FieldConfig,

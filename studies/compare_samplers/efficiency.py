@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.inference.chains.run import Samples, Targeted, first_checkpoint, sample
+from bayesreg.inference.chains.run import HasTarget, Samples, first_checkpoint, sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block
 from bayesreg.types import InputError
@@ -85,7 +85,7 @@ class Budget(NamedTuple):
 
 
 def measure_efficiency(
-    posterior: Targeted,
+    posterior: HasTarget,
     sampler: str,
     budget: Budget,
     seed: int = 0,

@@ -30,7 +30,7 @@ from bayesreg.types import AnyArray, InputError
 
 
 @runtime_checkable
-class Targeted(Protocol):
+class HasTarget(Protocol):
     """A posterior that samplers can draw from, such as `bayesreg.Posterior`."""
 
     @property
@@ -89,7 +89,7 @@ class Samples:
 
 
 def sample(
-    posterior: Targeted,
+    posterior: HasTarget,
     sampler: str = "hmc",
     chains: int = 4,
     draws: int = 1000,

@@ -79,7 +79,7 @@ class Walk:
         return self.begin(whiten(setup.gaussian, flat), whitened_density(self.target, data, setup))
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
-        """Make one transition."""
+        """Move a chain by one transition of the kernel in whitened coordinates; return its state and what it cost."""
         state, kernel_info = self.transition(self.target, data, setup, key, state)
         info = Info(
             acceptance_rate=kernel_info.acceptance_rate,
