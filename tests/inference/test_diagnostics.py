@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from bayesreg.inference.draws import diagnostics
+from bayesreg.inference.draws import diagnostics, inference_data
 from bayesreg.inference.draws.diagnostics import convergence, figures, labelled, worst
 from bayesreg.inference.draws.inference_data import (
     STATISTICS,
@@ -149,6 +149,7 @@ def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
     target = posterior().target
     monkeypatch.setattr(diagnostics, "AT_ONCE", 2**14)
     monkeypatch.setattr(diagnostics, "READ_AT_ONCE", 2**14)
+    monkeypatch.setattr(inference_data, "WRITTEN_AT_ONCE", 2**14)
     # What is imported at the first call is no draw.
     _judged_and_written(target, tmp_path / "first", 2)
     few, many = (_judged_and_written(target, tmp_path / f"{count}", count) for count in (6, 30))
