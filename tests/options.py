@@ -19,22 +19,22 @@ def model_of(**options: Any) -> br.ModelConfig:
     elastic = _named(options, BOLTZMANN) or {}
     loads = _named(options, LOADS)
     words = (*BOLTZMANN, *LOADS, *SIMILARITY, *ImageOptions.model_fields)
-    own = {name: value for name, value in options.items() if name not in words}
+    model_options = {name: value for name, value in options.items() if name not in words}
     if loads:
-        own["elastic_prior"] = {"kind": "loads", **loads}
+        model_options["elastic_prior"] = {"kind": "loads", **loads}
     elif elastic:
-        own["elastic_prior"] = {"kind": "boltzmann", **elastic}
-    return br.ModelConfig(**own)
+        model_options["elastic_prior"] = {"kind": "boltzmann", **elastic}
+    return br.ModelConfig(**model_options)
 
 
 def image_options_of(**options: Any) -> dict[str, Any]:
     """The options of a pair of images, of which those of the model are left out."""
-    own = {name: options[name] for name in ImageOptions.model_fields if name in options}
+    image_options = {name: options[name] for name in ImageOptions.model_fields if name in options}
     settings = _named(options, SIMILARITY)
-    if settings or "similarity" in own:
-        given = own.get("similarity", "ssd")
-        own["similarity"] = {"kind": given, **settings} if isinstance(given, str) else given
-    return own
+    if settings or "similarity" in image_options:
+        similarity = image_options.get("similarity", "ssd")
+        image_options["similarity"] = {"kind": similarity, **settings} if isinstance(similarity, str) else similarity
+    return image_options
 
 
 def posterior_of(

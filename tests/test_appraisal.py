@@ -70,10 +70,10 @@ def test_likeness_of_what_it_is_known_for():
 
 def test_tissue_outside_the_region_is_told_in_millilitres():
     smaller = DOMAIN.with_voxels((RADIUS < 0.9).astype(np.uint8))
-    found = appraise(TISSUE, smaller, ("gm", "wm"))
-    inside, outside = found.millilitres["gm"]
+    appraisal = appraise(TISSUE, smaller, ("gm", "wm"))
+    inside, outside = appraisal.millilitres["gm"]
     assert inside + outside == pytest.approx((TISSUE.voxels == 1).sum() * 8 / 1000)
-    assert found.millilitres["wm"][1] == 0
-    assert found.beware == (
+    assert appraisal.millilitres["wm"][1] == 0
+    assert appraisal.beware == (
         f"{outside:.3g} of {inside + outside:.3g} ml of GM lie outside the region to mesh, which leaves them out.",
     )

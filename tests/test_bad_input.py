@@ -62,7 +62,7 @@ BALL = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0) < 8
 
 
 @pytest.mark.parametrize(
-    ("key", "make", "part"),
+    ("key", "make", "message"),
     [
         ("moving", not_an_image, "bad.nii.gz cannot be read"),
         ("moving", lambda f: save(f / "bad.nii.gz", np.zeros((*SHAPE, 3))), "expected a 3D image"),
@@ -87,10 +87,10 @@ BALL = np.linalg.norm(np.indices(SHAPE) - 11.5, axis=0) < 8
         ("intracranial", lambda f: f / "gone.nii.gz", "no such file"),
     ],
 )
-def test_a_bad_file_is_named(pair, tmp_path, key, make, part):
+def test_a_bad_file_is_named(pair, tmp_path, key, make, message):
     result = pair(**{key: str(make(tmp_path))})
     assert result.exit_code == 2, result
-    assert part in result.stderr
+    assert message in result.stderr
     assert result.stderr.startswith("bayesreg: ")
 
 
@@ -107,7 +107,7 @@ def lone_array(folder):
 
 
 @pytest.mark.parametrize(
-    ("write", "part"),
+    ("write", "message"),
     [
         (lambda f: (f / "start.npz").write_bytes(b"PK half"), "is damaged or no .npz file"),
         (lone_array, "is damaged or no .npz file"),
@@ -118,11 +118,11 @@ def lone_array(folder):
         (lambda f: np.savez(f / "start.npz", u=np.full((9, 3), "far")), "finite numbers"),
     ],
 )
-def test_a_bad_start_field_is_told_before_meshing(pair, tmp_path, write, part):
+def test_a_bad_start_field_is_told_before_meshing(pair, tmp_path, write, message):
     write(tmp_path)
     result = pair(start={"field": str(tmp_path / "start.npz")})
     assert result.exit_code == 2, result
-    assert part in result.stderr
+    assert message in result.stderr
     assert "start.npz" in result.stderr
     assert "delete" not in result.stderr
 

@@ -33,15 +33,15 @@ def test_a_table_times_a_sweep(write, tmp_path):
     (tmp_path / "a" / "t1.nii.gz").touch()
     rows = "subject\tdata.fixed\tmodel.preset\nanna\ta/t1.nii.gz\tpaper\nbea\ta/t1.nii.gz\t\n"
     (tmp_path / "table.tsv").write_text(rows)
-    found = load_cohort(write(subjects="table.tsv", sweep={"seed": [1, 2], "sampler.name": ["hmc"]}))
-    assert found.config == tmp_path / "run.yaml"
-    assert [task.name for task in found.tasks] == [
+    cohort = load_cohort(write(subjects="table.tsv", sweep={"seed": [1, 2], "sampler.name": ["hmc"]}))
+    assert cohort.config == tmp_path / "run.yaml"
+    assert [task.name for task in cohort.tasks] == [
         f"{subject}/sampler.name-hmc_seed-{seed}" for subject in ("anna", "bea") for seed in (1, 2)
     ]
     fixed = f"data.fixed={tmp_path / 'a' / 't1.nii.gz'}"
-    assert found.tasks[0].overrides == (fixed, "model.preset=paper", 'sampler.name="hmc"', "seed=1")
-    assert found.tasks[3].overrides == (fixed, 'sampler.name="hmc"', "seed=2")
-    assert found.tasks[3].settings == {"seed": 2, "sampler.name": "hmc"}
+    assert cohort.tasks[0].overrides == (fixed, "model.preset=paper", 'sampler.name="hmc"', "seed=1")
+    assert cohort.tasks[3].overrides == (fixed, 'sampler.name="hmc"', "seed=2")
+    assert cohort.tasks[3].settings == {"seed": 2, "sampler.name": "hmc"}
 
 
 def test_patterns_of_bids(write, tmp_path):
@@ -55,15 +55,15 @@ def test_patterns_of_bids(write, tmp_path):
         f"data.{name}": f"bids/sub-{{subject}}/ses-{session}/anat/sub-{{subject}}_*_T1w.nii.gz"
         for name, session in (("fixed", "pre"), ("moving", "post"))
     }
-    one, other = load_cohort(write(subjects=patterns)).tasks
-    assert (one.name, other.name) == ("01", "02")
-    assert [text.partition("=")[0] for text in one.overrides] == ["data.fixed", "data.moving"]
+    first, second = load_cohort(write(subjects=patterns)).tasks
+    assert (first.name, second.name) == ("01", "02")
+    assert [text.partition("=")[0] for text in first.overrides] == ["data.fixed", "data.moving"]
     # What is missing shows when the subject is run: nothing is taken of the configuration that all share.
     with pytest.raises(br.InputError, match=r"sub-02/ses-post/anat/sub-02_\*_T1w.nii.gz.*: no such file"):
-        br.load_config(tmp_path / "run.yaml", [*other.overrides, "data.source=files"])
+        br.load_config(tmp_path / "run.yaml", [*second.overrides, "data.source=files"])
     # The same by absolute patterns.
-    whole = {key: f"{tmp_path}/{pattern}" for key, pattern in patterns.items()}
-    assert load_cohort(write(subjects=whole)).tasks == [one, other]
+    absolute_patterns = {key: f"{tmp_path}/{pattern}" for key, pattern in patterns.items()}
+    assert load_cohort(write(subjects=absolute_patterns)).tasks == [first, second]
 
 
 def test_cells_are_read_as_what_they_are(write, tmp_path):
@@ -72,15 +72,15 @@ def test_cells_are_read_as_what_they_are(write, tmp_path):
     (tmp_path / "b b.nii.gz").touch()
     header = "\ufeffsubject, seed,data.fixed,data.moving,data.label_table.wm,description\n"
     (tmp_path / "table.csv").write_text(f'{header}a,1,1,b b.nii.gz,"[3, 4]",[x: y\nb,2,,,,\n')
-    one, other = load_cohort(write(subjects="table.csv")).tasks
-    assert one.overrides == (
+    first, second = load_cohort(write(subjects="table.csv")).tasks
+    assert first.overrides == (
         "seed=1",
         f"data.fixed={tmp_path / '1'}",
         f"data.moving='{tmp_path / 'b b.nii.gz'}'",
         "data.label_table.wm=[3, 4]",
         "description='[x: y'",
     )
-    assert other.overrides == ("seed=2",)
+    assert second.overrides == ("seed=2",)
 
 
 def test_values_that_are_alike_have_folders_of_their_own(write, tmp_path):
@@ -165,7 +165,7 @@ def test_sound_subjects_finish_and_broken_ones_are_named(tmp_path):
 def test_workers_share_the_devices():
     """Each sees one; where there are more workers, they share its memory."""
     assert share_of_devices(1, 3, ()) == {}
-    seen = [share_of_devices(number, 3, ("0", "GPU-5")) for number in range(3)]
-    assert [one["CUDA_VISIBLE_DEVICES"] for one in seen] == ["0", "GPU-5", "0"]
-    assert {one["XLA_PYTHON_CLIENT_MEM_FRACTION"] for one in seen} == {"0.375"}
+    environments = [share_of_devices(number, 3, ("0", "GPU-5")) for number in range(3)]
+    assert [environment["CUDA_VISIBLE_DEVICES"] for environment in environments] == ["0", "GPU-5", "0"]
+    assert {environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] for environment in environments} == {"0.375"}
     assert share_of_devices(1, 2, ("0", "1"))["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.750"

@@ -161,10 +161,10 @@ def test_version_is_the_packages():
 
 
 def test_programs_are_compiled_quickly(monkeypatch):
-    asked = []
-    monkeypatch.setattr("bayesreg.cli.compile_quickly", lambda: asked.append(True))
+    calls = []
+    monkeypatch.setattr("bayesreg.cli.compile_quickly", lambda: calls.append(True))
     assert CliRunner().invoke(app, ["schema"]).exit_code == 0
-    assert asked == [True]
+    assert calls == [True]
 
 
 def test_help_loads_nothing_heavy_and_comes_at_once():

@@ -17,20 +17,22 @@ def weighted(shared, x, y):
 
 def test_arguments_that_chains_do_not_have_are_repeated():
     shared, x, y = np.arange(3.0), np.ones((3, 1)), RNG.normal(size=(4, 3, 1))
-    found = jax.vmap(lambda y: weighted(jnp.asarray(shared), jnp.asarray(x), y))(y)
-    np.testing.assert_allclose(found, shared[:, None] * y)
+    products = jax.vmap(lambda y: weighted(jnp.asarray(shared), jnp.asarray(x), y))(y)
+    np.testing.assert_allclose(products, shared[:, None] * y)
 
 
 def test_chains_of_chains_are_columns_too():
     shared, x, y = np.arange(3.0), RNG.normal(size=(5, 4, 3, 1)), RNG.normal(size=(4, 3, 1))
-    found = jax.vmap(lambda x: jax.vmap(lambda x, y: weighted(jnp.asarray(shared), x, y))(x, y))(x)
-    np.testing.assert_allclose(found, shared[:, None] * x * y)
+    products = jax.vmap(lambda x: jax.vmap(lambda x, y: weighted(jnp.asarray(shared), x, y))(x, y))(x)
+    np.testing.assert_allclose(products, shared[:, None] * x * y)
 
 
 @pytest.mark.parametrize(("chains", "columns"), [(4, 0), (0, 3)])
 def test_nothing_stays_nothing(chains, columns):
-    found = jax.vmap(lambda y: weighted(jnp.zeros(columns), jnp.ones((columns, 2)), y))(jnp.ones((chains, columns, 2)))
-    assert found.shape == (chains, columns, 2)
+    product = jax.vmap(lambda y: weighted(jnp.zeros(columns), jnp.ones((columns, 2)), y))(
+        jnp.ones((chains, columns, 2))
+    )
+    assert product.shape == (chains, columns, 2)
 
 
 def test_what_chains_share_cannot_differ():

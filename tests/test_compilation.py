@@ -20,19 +20,19 @@ def test_compiled_programs_are_kept_in_the_users_cache_unless_a_folder_is_named(
     )
 
     def named(**variables: str) -> str:
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-        environment = {**kept, **variables}
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+        environment = {**inherited, **variables}
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
         return done.stdout.strip()
 
-    home, own, blocked = tmp_path / "home", tmp_path / "own", tmp_path / "a_file"
+    home, own_folder, blocked = tmp_path / "home", tmp_path / "own", tmp_path / "a_file"
     folder = named(XDG_CACHE_HOME=str(home))
     assert folder.startswith(str(home / "bayesreg"))
-    kept = sorted(path.name for path in Path(folder).glob("*-cache"))
-    assert kept
+    programs = sorted(path.name for path in Path(folder).glob("*-cache"))
+    assert programs
     assert named(XDG_CACHE_HOME=str(home)) == folder
-    assert sorted(path.name for path in Path(folder).glob("*-cache")) == kept
-    assert named(XDG_CACHE_HOME=str(home), JAX_COMPILATION_CACHE_DIR=str(own)) == str(own)
+    assert sorted(path.name for path in Path(folder).glob("*-cache")) == programs
+    assert named(XDG_CACHE_HOME=str(home), JAX_COMPILATION_CACHE_DIR=str(own_folder)) == str(own_folder)
     blocked.touch()
     assert named(XDG_CACHE_HOME=str(blocked)) == "None"
 
@@ -71,7 +71,7 @@ def test_a_run_begins_without_what_judges_and_draws_its_results():
 
 
 @pytest.mark.parametrize(
-    ("jaxlib", "plugins", "given", "expected"),
+    ("jaxlib", "plugins", "flags", "expected"),
     [
         (f"{compilation.KNOWN_TO}9", None, None, compilation.QUICK),
         (f"{compilation.KNOWN_TO}9", None, "--xla_own=1", "--xla_own=1"),
@@ -79,9 +79,9 @@ def test_a_run_begins_without_what_judges_and_draws_its_results():
         (f"{compilation.KNOWN_TO}9", "a plugin", None, None),
     ],
 )
-def test_flags_are_set_only_where_they_are_known(monkeypatch, jaxlib, plugins, given, expected):
-    monkeypatch.setenv("XLA_FLAGS", given or "")
-    if given is None:
+def test_flags_are_set_only_where_they_are_known(monkeypatch, jaxlib, plugins, flags, expected):
+    monkeypatch.setenv("XLA_FLAGS", flags or "")
+    if flags is None:
         monkeypatch.delenv("XLA_FLAGS")
     monkeypatch.setattr(compilation, "version", lambda _: jaxlib)
     monkeypatch.setattr(compilation, "find_spec", lambda _: plugins)

@@ -163,7 +163,7 @@ stop: {rhat: "low", max_steps: 0}
 start: {field: truth}
 """
     message = complaint(write(text), "model.rigid_sd=-3")
-    for part in (
+    for error in (
         "run.yaml:2: seed = -1: expected greater than or equal to 0",
         'run.yaml:6: data.moving = "gone.nii": no such file',
         "run.yaml:7: data.labls",
@@ -176,7 +176,7 @@ start: {field: truth}
         "--set model.rigid_sd=-3: model.rigid_sd = -3: expected greater than 0",
         'run.yaml:13: start.field = "truth": the truth of this pair is not known',
     ):
-        assert part in message
+        assert error in message
     assert len(message.splitlines()) == 11
 
 
@@ -185,7 +185,7 @@ def similar(settings):
 
 
 @pytest.mark.parametrize(
-    ("text", "part"),
+    ("text", "message"),
     [
         ("", "data: missing"),
         ("[1, 2]", "expected keys with values"),
@@ -272,8 +272,8 @@ def similar(settings):
         ("extends: run.yaml", "extends itself"),
     ],
 )
-def test_what_is_refused(write, text, part):
-    assert part in complaint(write(text))
+def test_what_is_refused(write, text, message):
+    assert message in complaint(write(text))
 
 
 def test_a_file_that_is_no_text_and_one_that_is_a_folder(tmp_path):
@@ -346,19 +346,19 @@ def test_the_model_of_a_resolved_configuration_needs_no_files(write):
 
 
 def test_schema_describes_every_section_and_forbids_unknown_keys():
-    found = schema()
-    assert set(found["properties"]) == {*Config.model_fields, "extends"}
-    assert found["additionalProperties"] is False
-    temperature = found["$defs"]["Boltzmann"]["properties"]["temperature"]["anyOf"]
+    json_schema = schema()
+    assert set(json_schema["properties"]) == {*Config.model_fields, "extends"}
+    assert json_schema["additionalProperties"] is False
+    temperature = json_schema["$defs"]["Boltzmann"]["properties"]["temperature"]["anyOf"]
     assert {"$ref": "#/$defs/ScalePrior"} in temperature
-    kinds = found["properties"]["observations"]["items"]["anyOf"]
+    kinds = json_schema["properties"]["observations"]["items"]["anyOf"]
     assert [{"$ref": f"#/$defs/{name}Section"} for name in ("Images", "Landmarks")] == kinds[:2]
-    assert "similarity" in found["$defs"]["ImagesSection"]["properties"]
-    assert found["$defs"]["RandomWalk"]["properties"]["sigma_u"]["description"].endswith("mm.")
+    assert "similarity" in json_schema["$defs"]["ImagesSection"]["properties"]
+    assert json_schema["$defs"]["RandomWalk"]["properties"]["sigma_u"]["description"].endswith("mm.")
 
 
 @pytest.mark.parametrize(
-    ("given", "preset"),
+    ("text", "preset"),
     [
         (FILES, "registration"),
         (FILES + "observations: [{kind: images, smoothing: 0.02}]", "registration"),
@@ -369,8 +369,8 @@ def test_schema_describes_every_section_and_forbids_unknown_keys():
         (SMALL, "paper"),
     ],
 )
-def test_what_comes_from_files_has_the_model_for_real_data(write, given, preset):
-    path = write(given)
+def test_what_comes_from_files_has_the_model_for_real_data(write, text, preset):
+    path = write(text)
     for name in ("mesh.vtu", "points.csv"):
         (path.parent / name).touch()
     config = load_config(path)
@@ -378,7 +378,7 @@ def test_what_comes_from_files_has_the_model_for_real_data(write, given, preset)
     assert config.model.model_dump(exclude={"fixed"}) == expected.model_dump(exclude={"fixed"})
     for pair in config.pairs_of_images:
         usual = ImageOptions(**with_preset(preset, {}))
-        given_smoothing = {"smoothing": 0.02} if "0.02" in given else {}
+        given_smoothing = {"smoothing": 0.02} if "0.02" in text else {}
         assert ImageOptions(**pair.options) == usual.model_copy(update=given_smoothing)
 
 

@@ -218,12 +218,12 @@ FORMATS = {
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
     """The bytes of a sound file of each format, which are read without an error."""
-    folder, found = tmp_path_factory.mktemp("sound"), {}
+    folder, contents = tmp_path_factory.mktemp("sound"), {}
     for name, (write, read) in FORMATS.items():
         write(folder / name)
         read(folder / name)
-        found[name] = (folder / name).read_bytes()
-    return found
+        contents[name] = (folder / name).read_bytes()
+    return contents
 
 
 @st.composite

@@ -148,10 +148,10 @@ class TestInterpolation:
         np.testing.assert_allclose(values[1, 2], image.interpolate(points[1, 2], method), atol=1e-12)
 
     def test_reads_integers_as_numbers(self, image, method):
-        whole = np.rint(10 * image.voxels)
+        integers = np.rint(10 * image.voxels)
         points = image.voxel_to_world(indices_inside())
-        from_integers = image.with_voxels(whole.astype(np.int16)).interpolate(points, method)
-        np.testing.assert_allclose(from_integers, image.with_voxels(whole).interpolate(points, method), atol=1e-12)
+        from_integers = image.with_voxels(integers.astype(np.int16)).interpolate(points, method)
+        np.testing.assert_allclose(from_integers, image.with_voxels(integers).interpolate(points, method), atol=1e-12)
 
     @pytest.mark.parametrize("shape", [(1, 5, 4), (2, 2, 2), (1, 1, 1)])
     def test_works_on_thin_images(self, method, shape):

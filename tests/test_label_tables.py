@@ -80,8 +80,8 @@ SNAP_LINES = """# ITK-SnAP Label Description File
 def test_names_are_those_of_a_lookup_table(tmp_path):
     for name, text in {"freesurfer": FREESURFER_LINES, "snap": SNAP_LINES, "none": "nothing\n"}.items():
         (tmp_path / f"{name}.txt").write_text(text)
-    found = read_label_names(tmp_path / "freesurfer.txt")
-    assert found == {"Unknown": 0, "Left-Cerebral-White-Matter": 2, "Right-Cerebral-White-Matter": 41}
+    label_names = read_label_names(tmp_path / "freesurfer.txt")
+    assert label_names == {"Unknown": 0, "Left-Cerebral-White-Matter": 2, "Right-Cerebral-White-Matter": 41}
     assert read_label_names(tmp_path / "snap.txt")["Left lobe"] == 3
     with pytest.raises(ValueError, match="no label names"):
         read_label_names(tmp_path / "none.txt")
@@ -90,8 +90,8 @@ def test_names_are_those_of_a_lookup_table(tmp_path):
 def test_a_table_may_hold_names_and_ranges(tmp_path):
     (tmp_path / "lut.txt").write_text(FREESURFER_LINES)
     names = ["Left-Cerebral-White-Matter", "Right-Cerebral-White-Matter"]
-    given = {"source": "files", "label_names": str(tmp_path / "lut.txt"), "labels": str(tmp_path / "lut.txt")}
-    found = FilesData(**given, label_table={"wm": names, "gm": ["1000-1002", 3]})
-    assert found.label_table == {"wm": (2, 41), "gm": (1000, 1001, 1002, 3)}
+    options = {"source": "files", "label_names": str(tmp_path / "lut.txt"), "labels": str(tmp_path / "lut.txt")}
+    data = FilesData(**options, label_table={"wm": names, "gm": ["1000-1002", 3]})
+    assert data.label_table == {"wm": (2, 41), "gm": (1000, 1001, 1002, 3)}
     with pytest.raises(ValueError, match="'Left-Cerebellum' is no label"):
-        FilesData(**given, label_table={"wm": ["Left-Cerebellum"]})
+        FilesData(**options, label_table={"wm": ["Left-Cerebellum"]})

@@ -19,10 +19,10 @@ def test_noise_of_an_inferred_temperature_is_that_of_its_mean():
     draws = xr.Dataset({name: (dims, np.ones((2, 3, 3))) for name in ("lam", "mu")})
     drawn = draws.assign(t_similarity=(("chain", "draw"), [[3.0, 3.2, 3.4], [2.8, 3.2, 3.6]]))
     rest = np.zeros((len(mesh.points), 3))
-    told = describe_observations(known, mean_values(known, draws, rest))["images"]
-    assert told["noise_sd"] == known.images.noise_sd(0.8)
-    found = describe_observations(inferred, mean_values(inferred, drawn, rest))["images"]["noise_sd"]
-    assert found == pytest.approx(2 * known.images.noise_sd(0.8))
+    description = describe_observations(known, mean_values(known, draws, rest))["images"]
+    assert description["noise_sd"] == known.images.noise_sd(0.8)
+    noise_sd = describe_observations(inferred, mean_values(inferred, drawn, rest))["images"]["noise_sd"]
+    assert noise_sd == pytest.approx(2 * known.images.noise_sd(0.8))
 
 
 def test_the_share_of_inverted_tetrahedra_is_over_all_draws():

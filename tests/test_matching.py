@@ -34,16 +34,16 @@ def match(fixed=FIXED, moving=FIXED, similarity=STUDENT_T, **ignored):
 
 @pytest.mark.parametrize("which", ["fixed", "moving"])
 def test_metal_that_is_ignored_changes_neither_contrast_nor_scale(which):
-    plain, other = match(), match(**{which: with_metal(FIXED)}, **{f"{which}_ignore": MASK})
-    assert other.matching.one_contrast
+    plain, masked = match(), match(**{which: with_metal(FIXED)}, **{f"{which}_ignore": MASK})
+    assert masked.matching.one_contrast
     for name in ("fixed", "moving"):
-        one, two = (np.asarray(getattr(found, name).voxels) for found in (plain, other))
-        away = np.ones(one.shape, bool)
+        plain_voxels, masked_voxels = (np.asarray(getattr(matched, name).voxels) for matched in (plain, masked))
+        away = np.ones(plain_voxels.shape, bool)
         away[METAL] = False
-        np.testing.assert_allclose(two[away], one[away], atol=0.1)
-    assert other.likeness.correlation > 0.99
-    assert any(f"2.74 ml of the organ in the {which} image" in note for note in other.notes)
-    assert not other.beware
+        np.testing.assert_allclose(masked_voxels[away], plain_voxels[away], atol=0.1)
+    assert masked.likeness.correlation > 0.99
+    assert any(f"2.74 ml of the organ in the {which} image" in note for note in masked.notes)
+    assert not masked.beware
 
 
 def test_metal_that_is_not_ignored_would():
@@ -53,8 +53,10 @@ def test_metal_that_is_not_ignored_would():
 def test_a_channel_is_scaled_by_what_is_seen():
     matched = match(moving_ignore=MASK)
     plain = match_channel(DATA, DOMAIN, matched, "flair", FIXED, FIXED)
-    other = match_channel(DATA, DOMAIN, matched, "flair", FIXED, with_metal(FIXED))
-    assert np.median(np.asarray(other.moving.voxels)) == pytest.approx(np.median(np.asarray(plain.moving.voxels)))
+    metal_channel = match_channel(DATA, DOMAIN, matched, "flair", FIXED, with_metal(FIXED))
+    assert np.median(np.asarray(metal_channel.moving.voxels)) == pytest.approx(
+        np.median(np.asarray(plain.moving.voxels))
+    )
 
 
 @pytest.mark.parametrize(

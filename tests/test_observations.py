@@ -90,11 +90,13 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
     assert (tmp_path / "out" / "displacement_mean.nii.gz").exists()
     assert not (tmp_path / "out" / "warped_mean.nii.gz").exists()
     predicted = store.read_run(RunFolder(tmp_path / "out")).predicted
-    found = predicted.of_observation("landmarks")
-    assert list(found["names"]) == [f"p{k}" for k in range(8)]
-    np.testing.assert_allclose(found["sd"], 0.2)
-    kept, alone = (np.linalg.norm(found[name], axis=1) for name in ("residual", "left_out_residual"))
-    assert (alone > kept).all()
+    landmarks = predicted.of_observation("landmarks")
+    assert list(landmarks["names"]) == [f"p{k}" for k in range(8)]
+    np.testing.assert_allclose(landmarks["sd"], 0.2)
+    fitted_error, left_out_error = (
+        np.linalg.norm(landmarks[name], axis=1) for name in ("residual", "left_out_residual")
+    )
+    assert (left_out_error > fitted_error).all()
     assert list(result.run.manifest["observations"]) == ["landmarks"]
     if not data:
         page = result.report.read_text(encoding="utf-8")
@@ -108,20 +110,20 @@ def test_landmarks_are_held_out(folder, tmp_path):
     table = (folder / "pairs.csv").read_text().splitlines()
     (folder / "six.csv").write_text("\n".join(table[:7]))
     (folder / "two.csv").write_text("\n".join([table[0], *table[7:], "far,200,0,0,201,0,0,0.2"]))
-    seen = [{"kind": "landmarks", "file": "six.csv"}]
+    observations = [{"kind": "landmarks", "file": "six.csv"}]
     with without_reports():
-        plain = br.run(configuration(folder, seen, evaluation=None), tmp_path / "plain", progress=False)
-    file = configuration(folder, seen, evaluation={"landmarks": "two.csv"})
+        plain = br.run(configuration(folder, observations, evaluation=None), tmp_path / "plain", progress=False)
+    file = configuration(folder, observations, evaluation={"landmarks": "two.csv"})
     result = br.run(file, tmp_path / "out", progress=False)
     np.testing.assert_array_equal(result.idata.posterior["u_boundary"], plain.idata.posterior["u_boundary"])
-    found = br.load_result(tmp_path / "out").run.predicted
-    assert list(found.evaluation_names) == ["p6", "p7", "far"]
-    assert found.evaluation_inside.tolist() == [True, True, False]
-    np.testing.assert_allclose(found.evaluation_before[:2], np.linalg.norm(SHIFT), atol=1.0)
-    after = np.linalg.norm(found.evaluation_residual[:2], axis=1)
-    assert (after < found.evaluation_before[:2]).all()
-    assert (np.sqrt(np.einsum("kii->ki", found.evaluation_covariance))[:2] >= 0.2).all()
-    assert np.isnan(found.evaluation_covariance[2]).all()
+    predicted = br.load_result(tmp_path / "out").run.predicted
+    assert list(predicted.evaluation_names) == ["p6", "p7", "far"]
+    assert predicted.evaluation_inside.tolist() == [True, True, False]
+    np.testing.assert_allclose(predicted.evaluation_before[:2], np.linalg.norm(SHIFT), atol=1.0)
+    after = np.linalg.norm(predicted.evaluation_residual[:2], axis=1)
+    assert (after < predicted.evaluation_before[:2]).all()
+    assert (np.sqrt(np.einsum("kii->ki", predicted.evaluation_covariance))[:2] >= 0.2).all()
+    assert np.isnan(predicted.evaluation_covariance[2]).all()
     page = result.report.read_text(encoding="utf-8")
     assert 'id="landmarks-held-out"' in page
     assert "Target registration error" in page
@@ -129,14 +131,16 @@ def test_landmarks_are_held_out(folder, tmp_path):
     # They may be found later.
     with without_reports():
         later = br.run(file, tmp_path / "plain", resume=True, progress=False).run.predicted
-    np.testing.assert_allclose(later.evaluation_residual, found.evaluation_residual, atol=1e-5)
+    np.testing.assert_allclose(later.evaluation_residual, predicted.evaluation_residual, atol=1e-5)
     with pytest.raises(br.InputError, match="6 of the 6 landmarks of evaluation are in the observation"):
-        br.run(configuration(folder, seen, evaluation={"landmarks": "six.csv"}), tmp_path / "never", progress=False)
+        br.run(
+            configuration(folder, observations, evaluation={"landmarks": "six.csv"}), tmp_path / "never", progress=False
+        )
     assert not (tmp_path / "never").exists()
     with pytest.raises(br.InputError, match=r"evaluation.landmarks"):
-        br.load_config(configuration(folder, seen, evaluation={"landmarks": "none.csv"}))
+        br.load_config(configuration(folder, observations, evaluation={"landmarks": "none.csv"}))
     with pytest.raises(br.InputError, match="this name is taken"):
-        br.load_config(configuration(folder, [seen[0] | {"name": "evaluation"}]))
+        br.load_config(configuration(folder, [observations[0] | {"name": "evaluation"}]))
 
 
 def test_arviz_finds_what_it_knows_by_name(folder, tmp_path):
@@ -154,8 +158,8 @@ def test_arviz_finds_what_it_knows_by_name(folder, tmp_path):
     log = idata.log_likelihood["points"]
     assert log.dims == ("chain", "draw", "points_point")
     assert log.max() <= 3 * (-0.5 * np.log(2 * np.pi) - np.log(0.2)) + 1e-9
-    found = arviz().loo(idata, var_name="points")
-    assert np.isfinite(float(getattr(found, "elpd_loo", getattr(found, "elpd", np.nan))))
+    loo = arviz().loo(idata, var_name="points")
+    assert np.isfinite(float(getattr(loo, "elpd_loo", getattr(loo, "elpd", np.nan))))
     assert len(arviz().summary(idata, var_names=["lam", "mu"])) > 0
 
 
@@ -184,7 +188,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
     longer = configuration(folder, observed, IMAGES, "longer.yaml", **sections, stop=stop | {"max_steps": 10})
     with without_reports():
         br.run(short, tmp_path / "out", progress=False)
-        whole = br.run(longer, tmp_path / "whole", progress=False)
+        uninterrupted = br.run(longer, tmp_path / "whole", progress=False)
     result = br.run(longer, tmp_path / "out", resume=True, progress=False)
     require_images_are_predicted(result)
     assert result.idata.posterior["vessel_sd"].shape == (2, 10)
@@ -194,7 +198,7 @@ def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "vessel sd, mm" in page
     assert "Posterior predictive checks" in page
-    np.testing.assert_array_equal(whole.idata.posterior["vessel_sd"], result.idata.posterior["vessel_sd"])
+    np.testing.assert_array_equal(uninterrupted.idata.posterior["vessel_sd"], result.idata.posterior["vessel_sd"])
 
 
 @pytest.mark.parametrize(
@@ -227,7 +231,7 @@ def test_landmarks_without_an_sd_are_refused_before_anything_is_written(folder, 
 def test_an_entry_of_observations_is_overridden_by_its_number(folder):
     path = configuration(folder, [PAIRS, PAIRS | {"name": "other"}], LABELS)
     config = br.load_config(path, ["observations.1.sd=2.5"])
-    assert [one.sd for one in config.observations] == [None, 2.5]
+    assert [section.sd for section in config.observations] == [None, 2.5]
     with pytest.raises(br.InputError, match=r"--set observations.2.sd=1: 2 is no entry of a list of 2"):
         br.load_config(path, ["observations.2.sd=1"])
     with pytest.raises(br.InputError, match=r"--set observations.1.sd=wide: observations.1.sd = "):
@@ -249,12 +253,12 @@ class Near:
 def test_an_observation_that_forbids_is_known_again(tmp_path):
     """Also where its log is −∞ at the displacement at which observations are compared, which JSON writes as null."""
     posterior = {d: br.build_posterior(mesh=box_mesh(2), observations=[Near(d)]) for d in (1e-6, 100.0)}
-    known = {d: _fingerprint(one, [Near(d)]) for d, one in posterior.items()}
-    assert known == {1e-6: {"near": None}, 100.0: {"near": 0.0}}
-    for distance, one in posterior.items():
-        _require_same_observations(tmp_path, {"observations": known[distance]}, one, [Near(distance)])
+    fingerprints = {d: _fingerprint(post, [Near(d)]) for d, post in posterior.items()}
+    assert fingerprints == {1e-6: {"near": None}, 100.0: {"near": 0.0}}
+    for distance, built in posterior.items():
+        _require_same_observations(tmp_path, {"observations": fingerprints[distance]}, built, [Near(distance)])
     with pytest.raises(br.InputError, match=r"another observation 'near' .* are None and 0\.0"):
-        _require_same_observations(tmp_path, {"observations": known[1e-6]}, posterior[100.0], [Near(100.0)])
+        _require_same_observations(tmp_path, {"observations": fingerprints[1e-6]}, posterior[100.0], [Near(100.0)])
 
 
 def test_nothing_observed_is_told(folder, tmp_path):

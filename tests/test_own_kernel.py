@@ -16,8 +16,8 @@ def posterior() -> br.Posterior:
     """Twelve landmarks in a box of known stiffness: u_B is Gaussian."""
     points = np.random.default_rng(0).uniform(2, 18, (12, 3))
     prior = br.Boltzmann(temperature=20.0)
-    known = {"lam": 1.0, "mu": 1.0}
-    model = br.ModelConfig(elasticity="uniform", fixed=known, elastic_prior=prior, rigid_sd=2.0)
+    stiffness = {"lam": 1.0, "mu": 1.0}
+    model = br.ModelConfig(elasticity="uniform", fixed=stiffness, elastic_prior=prior, rigid_sd=2.0)
     return br.build_posterior(box_mesh(2), [br.Landmarks(points, points + 0.5, sd=0.5)], model)
 
 

@@ -83,8 +83,8 @@ stop: {{max_steps: 60}}
 
 def test_the_posterior_follows_what_was_measured(result):
     """Little else holds the box: its rigid motions are free by 5 mm."""
-    found = result.run.predicted.of_observation("region")["found"]
-    np.testing.assert_allclose(found, MEASURED, atol=3 * SD)
+    region_mean = result.run.predicted.of_observation("region")["found"]
+    np.testing.assert_allclose(region_mean, MEASURED, atol=3 * SD)
 
 
 def test_it_has_its_row_and_its_table_in_the_report(result):

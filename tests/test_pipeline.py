@@ -171,15 +171,15 @@ def test_a_run_that_was_cut_off_resumes_to_the_same_draws(finished, folder, monk
 def test_a_finished_run_is_continued_with_more_draws(finished, folder):
     """The draws are those of a run that had the greater budget from the start."""
     more = br.load_config(folder / "run.yaml", [f"stop.max_steps={2 * STOP['max_steps']}"])
-    whole = br.run(more, folder / "whole", progress=False)
+    uninterrupted = br.run(more, folder / "whole", progress=False)
     shutil.copytree(folder / "out", folder / "continued")
     continued = br.run(more, folder / "continued", resume=True, progress=False)
     assert continued.idata.posterior.sizes["draw"] == 2 * finished.idata.posterior.sizes["draw"]
     for group in ("posterior", "sample_stats"):
-        found, expected = (getattr(run.idata, group) for run in (continued, whole))
+        dataset, expected = (getattr(run.idata, group) for run in (continued, uninterrupted))
         for name in expected:
-            np.testing.assert_array_equal(found[name], expected[name])
-    np.testing.assert_allclose(continued.u_sd, whole.u_sd, rtol=1e-12)
+            np.testing.assert_array_equal(dataset[name], expected[name])
+    np.testing.assert_allclose(continued.u_sd, uninterrupted.u_sd, rtol=1e-12)
     assert f"max_steps: {2 * STOP['max_steps']}" in (folder / "continued" / "config.yaml").read_text()
     (folder / "continued" / "state.npz").unlink()
     with pytest.raises(br.InputError, match=r"holds no whole run: state\.npz is missing"):
@@ -191,9 +191,9 @@ def test_a_finished_run_is_continued_with_more_draws(finished, folder):
 def test_a_finished_run_leaves_other_files_when_asked(finished, folder):
     shutil.copytree(folder / "out", folder / "others")
     config = br.load_config(folder / "run.yaml", ["results={draws: 3, bids: {subject: '01'}}"])
-    found = br.run(config, folder / "others", resume=True, progress=False)
-    np.testing.assert_array_equal(found.idata.posterior.u_boundary, finished.idata.posterior.u_boundary)
-    np.testing.assert_allclose(found.u_sd, finished.u_sd, rtol=1e-5)
+    result = br.run(config, folder / "others", resume=True, progress=False)
+    np.testing.assert_array_equal(result.idata.posterior.u_boundary, finished.idata.posterior.u_boundary)
+    np.testing.assert_allclose(result.u_sd, finished.u_sd, rtol=1e-5)
     assert len(list((folder / "others" / "transforms").glob("*.nii.gz"))) == 3
     assert not (folder / "out" / "transforms").exists()
     assert (folder / "others" / "bids" / "dataset_description.json").exists()
@@ -226,11 +226,11 @@ def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
     # What it was made of may be gone.
     (folder / "moving.nii.gz").rename(folder / "gone.nii.gz")
     try:
-        found = reproduce(folder / "out", folder / "again", progress=False)
+        reproduction = reproduce(folder / "out", folder / "again", progress=False)
     finally:
         (folder / "gone.nii.gz").rename(folder / "moving.nii.gz")
-    assert found.same
-    assert found.lines == ["the draws are the same, bit for bit"]
+    assert reproduction.same
+    assert reproduction.lines == ["the draws are the same, bit for bit"]
     shutil.copytree(folder / "out", folder / "doubtful")
     with RunFolder(folder / "doubtful").writing() as place:
         shutil.copy(folder / "out" / "posterior.nc", place("posterior.nc"))
@@ -239,11 +239,11 @@ def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
         manifest = store.read_json(folder / "out" / "run.json")
         manifest["versions"]["jax"] = "0.0.1"
         store.write_json(place("run.json"), manifest)
-    found = reproduce(folder / "doubtful", folder / "once_more", progress=False)
-    assert list(found.apart) == ["u_boundary"]
-    assert found.lines[0] == "the draws are not the same"
-    assert "versions was" in found.lines[-1]
-    assert "0.0.1" in found.lines[-1]
+    reproduction = reproduce(folder / "doubtful", folder / "once_more", progress=False)
+    assert list(reproduction.apart) == ["u_boundary"]
+    assert reproduction.lines[0] == "the draws are not the same"
+    assert "versions was" in reproduction.lines[-1]
+    assert "0.0.1" in reproduction.lines[-1]
 
 
 def test_a_start_field_for_another_mesh_is_told_before_the_pair_is_made(synthetic, folder, monkeypatch):
@@ -382,10 +382,10 @@ def test_the_example_of_the_readme_runs_word_for_word(anatomy, tmp_path, monkeyp
     YAML(typ="safe").dump(extended, tmp_path / "configs" / "quickstart.yaml")
     names: dict = {}
     exec(compile(code, "README.md", "exec"), names)
-    said = capsys.readouterr().out
-    assert "converged: False" in said
-    assert [line.split()[0] for line in said.splitlines() if re.match(r"(csf|gm|wm) +\d", line)] == ["csf", "gm", "wm"]
-    assert len(said.splitlines()[-1].strip("[]").split()) == 3
+    text = capsys.readouterr().out
+    assert "converged: False" in text
+    assert [line.split()[0] for line in text.splitlines() if re.match(r"(csf|gm|wm) +\d", line)] == ["csf", "gm", "wm"]
+    assert len(text.splitlines()[-1].strip("[]").split()) == 3
     out = tmp_path / "runs" / "example"
     assert "Stiffness within the tissues" in (out / "report.html").read_text()
     cells = pyvista.read(out / "mesh.vtu").cell_data
@@ -444,16 +444,16 @@ def test_an_observation_from_outside_goes_through_run_resume_and_report(folder, 
         br.run(config(30), out, resume=True, progress=False)
     with pytest.raises(br.InputError, match="began with another observation 'region' than it is resumed with"):
         br.run(config(30), out, resume=True, progress=False, observations=[MeanDisplacement(3.0)])
-    found = br.run(config(30), out, resume=True, progress=False, observations=observed)
-    u = found.idata.posterior["u_boundary"]
+    result = br.run(config(30), out, resume=True, progress=False, observations=observed)
+    u = result.idata.posterior["u_boundary"]
     assert u.sizes["draw"] == 30
     # Without it the region moves by 0.8 mm, as the images do.
-    nodes, weights = interpolation_at(found.mesh, REGION)
-    moved = np.einsum("ka,kai->i", weights, found.u_mean[nodes]) / len(REGION)
+    nodes, weights = interpolation_at(result.mesh, REGION)
+    moved = np.einsum("ka,kai->i", weights, result.u_mean[nodes]) / len(REGION)
     np.testing.assert_allclose(moved, [0, 4, 0], atol=0.1)
-    told = json.loads((out / "run.json").read_text())["observations"]
-    assert [told[name]["kind"] for name in ("images", "region")] == ["images", "own"]
-    assert told["region"]["residual_rms"] < 10
-    page = found.report.read_text(encoding="utf-8")
+    descriptions = json.loads((out / "run.json").read_text())["observations"]
+    assert [descriptions[name]["kind"] for name in ("images", "region")] == ["images", "own"]
+    assert descriptions["region"]["residual_rms"] < 10
+    page = result.report.read_text(encoding="utf-8")
     assert "an observation of your own" in page
     assert "+ log p(region | <var>u</var>)" in page

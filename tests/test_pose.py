@@ -24,8 +24,8 @@ def test_an_aligned_image_has_at_a_point_what_it_had_where_the_pose_takes_the_po
     pose, rng = motion(0), np.random.default_rng(1)
     image = Image(rng.normal(size=(9, 10, 11)), np.diag([-6.0, 5.0, 7.0, 1.0]))
     inside = pose.inverse.place(image.voxel_to_world(rng.uniform(1, 7, size=(30, 3))))
-    found = pose.aligned(image).interpolate(inside)
-    np.testing.assert_allclose(found, image.interpolate(pose.place(inside)), atol=1e-9)
+    interpolated = pose.aligned(image).interpolate(inside)
+    np.testing.assert_allclose(interpolated, image.interpolate(pose.place(inside)), atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -36,11 +36,11 @@ def test_six_numbers_about_a_point_are_the_motion(seed):
 
 def test_the_rigid_part_of_a_displacement_is_its_least_squares_fit():
     """Least squares by NumPy over six modes, and beside a displacement that is rigid itself."""
-    rng, at = np.random.default_rng(4), points()
-    weights = rng.uniform(0.5, 2, len(at))
-    centre, projection = rigid_projection(at, weights)
-    u = rng.normal(size=at.shape)
-    turns = np.stack([np.cross(axis, at - centre) for axis in np.eye(3)], axis=-1)
+    rng, positions = np.random.default_rng(4), points()
+    weights = rng.uniform(0.5, 2, len(positions))
+    centre, projection = rigid_projection(positions, weights)
+    u = rng.normal(size=positions.shape)
+    turns = np.stack([np.cross(axis, positions - centre) for axis in np.eye(3)], axis=-1)
     modes = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=-1)
     root = np.sqrt(weights)[:, None, None]
     expected = np.linalg.lstsq((root * modes).reshape(-1, 6), (root[..., 0] * u).ravel(), rcond=None)[0]
@@ -53,13 +53,13 @@ def test_a_pose_and_small_motions_before_it_make_one_motion():
     first[:3, :3] = Rotation.from_rotvec(small[0, 3:]).as_matrix()
     first[:3, 3] = centre + small[0, :3] - first[:3, :3] @ centre
     expected = Pose(pose.matrix @ first).about(centre)
-    found = compose(pose, centre, small)
-    np.testing.assert_allclose(found.translation[0], expected.translation, atol=1e-12)
-    np.testing.assert_allclose(found.rotation[0], expected.rotation, atol=1e-9)
+    composed = compose(pose, centre, small)
+    np.testing.assert_allclose(composed.translation[0], expected.translation, atol=1e-12)
+    np.testing.assert_allclose(composed.rotation[0], expected.rotation, atol=1e-9)
 
 
 def test_displacements_count_from_the_fixed_world_to_the_moving_one():
-    pose, at, u = motion(6), points(), np.random.default_rng(7).normal(size=(50, 3))
-    np.testing.assert_allclose(at + pose.displacement(at, u), pose.place(at + u))
+    pose, positions, u = motion(6), points(), np.random.default_rng(7).normal(size=(50, 3))
+    np.testing.assert_allclose(positions + pose.displacement(positions, u), pose.place(positions + u))
     assert pose.about(np.zeros(3)).degrees == pytest.approx(15.0)
     assert pose.about(np.zeros(3)).millimetres == pytest.approx(20.0)

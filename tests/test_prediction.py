@@ -50,8 +50,8 @@ def problem() -> tuple[br.Posterior, xr.Dataset, np.ndarray]:
 def everywhere() -> np.ndarray:
     """u of every node, (chain, draw, n, 3), one draw at a time."""
     posterior, draws, _ = problem()
-    one = [[draws.isel(chain=c, draw=d) for d in range(12)] for c in range(3)]
-    return np.array([[posterior.evaluate({n: x[n].to_numpy() for n in x}).u for x in chain] for chain in one])
+    single_draws = [[draws.isel(chain=c, draw=d) for d in range(12)] for c in range(3)]
+    return np.array([[posterior.evaluate({n: x[n].to_numpy() for n in x}).u for x in chain] for chain in single_draws])
 
 
 @cache
@@ -62,53 +62,53 @@ def predicted():
 
 
 def test_maps_are_those_of_all_draws():
-    u, found = everywhere(), predicted()
+    u, prediction = everywhere(), predicted()
     distance = np.linalg.norm(u - u.mean(axis=(0, 1)), axis=-1)
-    np.testing.assert_allclose(found.chain_mean, u.mean(axis=1), atol=1e-6)
-    np.testing.assert_allclose(found.far, (distance > 2).mean(axis=(0, 1)))
-    np.testing.assert_allclose(found.reach, np.quantile(distance, 0.95, axis=(0, 1)), atol=1e-6)
-    assert found.far.min() > 0.1
+    np.testing.assert_allclose(prediction.chain_mean, u.mean(axis=1), atol=1e-6)
+    np.testing.assert_allclose(prediction.far, (distance > 2).mean(axis=(0, 1)))
+    np.testing.assert_allclose(prediction.reach, np.quantile(distance, 0.95, axis=(0, 1)), atol=1e-6)
+    assert prediction.far.min() > 0.1
 
 
 def test_places_move_as_the_mesh_does():
-    found = predicted()
-    np.testing.assert_allclose(found.place_draws[:, :, 0], everywhere()[:, :, 0], atol=1e-6)
+    prediction = predicted()
+    np.testing.assert_allclose(prediction.place_draws[:, :, 0], everywhere()[:, :, 0], atol=1e-6)
     # The mesh as a function: any other way to interpolate on tetrahedra, here by volumes.
     place = np.array(PLACES["within"])
     shares = np.array([_shares(MESH.points[cell], place) for cell in MESH.cells])
     holding = int(np.argmax(shares.min(axis=1)))
     expected = np.einsum("a,cdai->cdi", shares[holding], everywhere()[:, :, MESH.cells[holding]])
-    np.testing.assert_allclose(found.place_draws[:, :, 1], expected, atol=1e-6)
-    assert list(found.place_names) == ["corner", "within"]
+    np.testing.assert_allclose(prediction.place_draws[:, :, 1], expected, atol=1e-6)
+    assert list(prediction.place_names) == ["corner", "within"]
 
 
 def _shares(corners: np.ndarray, place: np.ndarray) -> np.ndarray:
-    whole = np.linalg.det(corners[1:] - corners[0])
-    parts = []
+    volume = np.linalg.det(corners[1:] - corners[0])
+    shares = []
     for k in range(4):
         moved = corners.copy()
         moved[k] = place
-        parts.append(np.linalg.det(moved[1:] - moved[0]) / whole)
-    return np.array(parts)
+        shares.append(np.linalg.det(moved[1:] - moved[0]) / volume)
+    return np.array(shares)
 
 
 def test_noise_of_the_model_passes_the_checks():
-    found = predicted()
-    near = found.observations["images/observed"][:2], found.observations["images/replicated"][:2]
+    prediction = predicted()
+    near = prediction.observations["images/observed"][:2], prediction.observations["images/replicated"][:2]
     for k in range(len(DISCREPANCIES)):
         assert 0.02 < predictive_p(near[0][..., k], near[1][..., k]) < 0.98, DISCREPANCIES[k]
 
 
 def test_a_wrong_displacement_fails_them():
-    found = predicted()
-    wrong = found.observations["images/observed"][2, :6], found.observations["images/replicated"][2, :6]
+    prediction = predicted()
+    wrong = prediction.observations["images/observed"][2, :6], prediction.observations["images/replicated"][2, :6]
     assert [predictive_p(wrong[0][..., k], wrong[1][..., k]) for k in (0, 2)] == [0.0, 0.0]
 
 
 def test_replications_differ_between_draws_and_follow_the_seed():
     posterior, draws, _ = problem()
-    found = predicted()
-    assert len(np.unique(found.observations["images/replicated"][..., 0])) == 36
+    prediction = predicted()
+    assert len(np.unique(prediction.observations["images/replicated"][..., 0])) == 36
     mean = everywhere().mean(axis=(0, 1))
     again = predict(
         posterior,
@@ -120,7 +120,7 @@ def test_replications_differ_between_draws_and_follow_the_seed():
         seed=1,
         pose=REST,
     )
-    np.testing.assert_array_equal(again.observations["images/replicated"], found.observations["images/replicated"])
+    np.testing.assert_array_equal(again.observations["images/replicated"], prediction.observations["images/replicated"])
 
 
 def test_the_residual_at_the_truth_is_standard_normal():
@@ -135,14 +135,14 @@ def test_a_sampled_temperature_sets_the_unit_of_its_draw():
     posterior = _Heated(**vars(posterior))
     heated = draws.assign(t_similarity=(("chain", "draw"), np.full((3, 12), 0.2)))
     mean = everywhere().mean(axis=(0, 1))
-    found = predict(posterior, heated, mean_values(posterior, heated, mean), mean, mean, PLACES, seed=1, pose=REST)
+    prediction = predict(posterior, heated, mean_values(posterior, heated, mean), mean, mean, PLACES, seed=1, pose=REST)
     np.testing.assert_allclose(
-        found.observations["images/observed"][..., :2],
+        prediction.observations["images/observed"][..., :2],
         predicted().observations["images/observed"][..., :2] / 2,
         rtol=1e-6,
     )
     np.testing.assert_allclose(
-        found.observations["images/residual"], predicted().observations["images/residual"] / 2, rtol=1e-5
+        prediction.observations["images/residual"], predicted().observations["images/residual"] / 2, rtol=1e-5
     )
 
 
@@ -167,8 +167,8 @@ def test_discrepancies_are_those_of_a_plain_loop():
         for b in range(a)
         if len(set(MESH.cells[a]) & set(MESH.cells[b])) == 3 and a in sums and b in sums
     ]
-    one, other = np.array(pairs).T
-    expected = [np.sqrt(np.mean(z**2)), max(abs(z)), (one * other).sum() / ((one**2 + other**2) / 2).sum()]
+    first, second = np.array(pairs).T
+    expected = [np.sqrt(np.mean(z**2)), max(abs(z)), (first * second).sum() / ((first**2 + second**2) / 2).sum()]
     np.testing.assert_allclose(discrepancies(z, cells, MESH.neighbours, len(MESH.cells)), expected, rtol=1e-10)
 
 
@@ -183,15 +183,15 @@ def test_chosen_places_are_where_their_names_say():
     rng = np.random.default_rng(4)
     u_mean, u_sd = rng.normal(size=(2, len(MESH.points), 3))
     u_mean[7], u_sd[9] = 50, 50
-    found = default_places(MESH, u_mean, u_sd)
-    assert found["largest shift"] == tuple(MESH.points[7])
-    assert found["largest sd"] == tuple(MESH.points[9])
+    places = default_places(MESH, u_mean, u_sd)
+    assert places["largest shift"] == tuple(MESH.points[7])
+    assert places["largest sd"] == tuple(MESH.points[9])
     low, high = MESH.points.min(axis=0), MESH.points.max(axis=0)
     depth = np.minimum(MESH.points - low, high - MESH.points).min(axis=1)
-    place = np.array(found["deepest point"])
+    place = np.array(places["deepest point"])
     assert np.minimum(place - low, high - place).min() > 0.7 * depth.max()
-    require_inside(MESH, found)
-    assert [name for name in found if name.startswith("middle")] == ["middle of CSF", "middle of GM", "middle of WM"]
+    require_inside(MESH, places)
+    assert [name for name in places if name.startswith("middle")] == ["middle of CSF", "middle of GM", "middle of WM"]
 
 
 def test_replicates_follow_students_t_where_the_model_does():
@@ -210,8 +210,8 @@ def test_replicates_follow_students_t_where_the_model_does():
         {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
     )
     zero = np.zeros_like(MESH.points)
-    found = predict(posterior, draws, mean_values(posterior, draws, zero), zero, zero, PLACES, seed=0, pose=REST)
-    checked = found.of_observation("images")
+    prediction = predict(posterior, draws, mean_values(posterior, draws, zero), zero, zero, PLACES, seed=0, pose=REST)
+    checked = prediction.of_observation("images")
     for k, name in enumerate(DISCREPANCIES):
         assert 0.01 < predictive_p(checked["observed"][..., k], checked["replicated"][..., k]) < 0.99, name
 

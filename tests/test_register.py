@@ -42,8 +42,8 @@ def register(tmp_path, monkeypatch):
         )
 
     def call(*arguments):
-        given = [str(tmp_path / f"{name}.nii.gz") for name in ("fixed", "moving")]
-        return CliRunner().invoke(app, ["register", *given, *arguments, "-o", str(tmp_path / "out")])
+        paths = [str(tmp_path / f"{name}.nii.gz") for name in ("fixed", "moving")]
+        return CliRunner().invoke(app, ["register", *paths, *arguments, "-o", str(tmp_path / "out")])
 
     return SimpleNamespace(call=call, calls=calls, path=lambda name: str(tmp_path / f"{name}.nii.gz"), folder=tmp_path)
 
@@ -135,7 +135,7 @@ def test_a_table_without_labels_is_a_mistake(register):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "part"),
+    ("arguments", "message"),
     [
         (["odd"], "no label table fits the labels in"),
         (["odd", "--table", "fats"], "--table fats: neither a file nor one of fast, freesurfer, brainweb"),
@@ -143,22 +143,22 @@ def test_a_table_without_labels_is_a_mistake(register):
         (["labels", "--set", "stop.max_hours=3"], "what was asked for cannot be run"),
     ],
 )
-def test_a_mistake_is_one_message(register, arguments, part):
+def test_a_mistake_is_one_message(register, arguments, message):
     result = register.call("--labels", register.path(arguments[0]), *arguments[1:])
     assert result.exit_code == 2, result.output
-    assert part in result.stderr
+    assert message in result.stderr
     assert not register.calls
 
 
 def test_further_images_are_compared_as_well(register):
-    other = [register.path("fixed"), register.path("moving")]
-    result = register.call("--labels", register.path("labels"), *["--channel", ",".join(other)] * 2)
+    channel = [register.path("fixed"), register.path("moving")]
+    result = register.call("--labels", register.path("labels"), *["--channel", ",".join(channel)] * 2)
     assert result.exit_code == 0, result.output
     first, second, third = register.calls[0][0].observations
     assert (first.name, second.name, third.name) == ("images", "channel_2", "channel_3")
-    assert (str(second.fixed), str(second.moving)) == (str(third.fixed), str(third.moving)) == tuple(other)
+    assert (str(second.fixed), str(second.moving)) == (str(third.fixed), str(third.moving)) == tuple(channel)
     assert "channel_2" in result.output
-    assert "expected two paths" in register.call("--channel", other[0]).stderr
+    assert "expected two paths" in register.call("--channel", channel[0]).stderr
 
 
 def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):

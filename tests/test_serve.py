@@ -56,20 +56,20 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
         umbridge.HTTPModel(address, name) for name in ("log_posterior", "forward", "start")
     )
     at_rest = start([])
-    sizes = [part.stop - part.start for part in slices(posterior.target).values()]
-    assert [len(part) for part in at_rest] == log_posterior.get_input_sizes() == sizes
+    sizes = [block.stop - block.start for block in slices(posterior.target).values()]
+    assert [len(block) for block in at_rest] == log_posterior.get_input_sizes() == sizes
     rng = np.random.default_rng(0)
-    position = [(np.array(part) + 0.1 * rng.normal(size=len(part))).tolist() for part in at_rest]
+    position = [(np.array(block) + 0.1 * rng.normal(size=len(block))).tolist() for block in at_rest]
     flat = np.concatenate(position)
-    _, back = ravel_pytree(posterior.unconstrain(posterior.reference()))
-    value, slope = jax.value_and_grad(lambda x: posterior.logdensity(back(x)))(flat)
+    _, unravel = ravel_pytree(posterior.unconstrain(posterior.reference()))
+    value, slope = jax.value_and_grad(lambda x: posterior.logdensity(unravel(x)))(flat)
     # The program compiles for speed of compilation, and rounds in another order.
     assert log_posterior(position)[0][0] == pytest.approx(float(value), rel=1e-8)
-    for k, part in enumerate(slices(posterior.target).values()):
-        found = log_posterior.gradient(0, k, position, [2.0])
-        np.testing.assert_allclose(found, 2 * np.asarray(slope)[part], rtol=1e-6, atol=1e-8)
+    for k, entries in enumerate(slices(posterior.target).values()):
+        gradient = log_posterior.gradient(0, k, position, [2.0])
+        np.testing.assert_allclose(gradient, 2 * np.asarray(slope)[entries], rtol=1e-6, atol=1e-8)
     u, predicted = forward(position)
-    expected = posterior.evaluate(posterior.constrain(back(flat)))
+    expected = posterior.evaluate(posterior.constrain(unravel(flat)))
     np.testing.assert_allclose(np.reshape(u, (-1, 3)), expected.u, atol=1e-9)
     np.testing.assert_allclose(predicted, posterior.images.predicted(expected.u), atol=1e-9)
     # By finite differences, through the client alone.
@@ -87,7 +87,7 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
 
 def test_what_is_impossible_is_a_number(address):
     log_posterior, start = (umbridge.HTTPModel(address, name) for name in ("log_posterior", "start"))
-    position = [np.full(len(part), 1e200).tolist() for part in start([])]
+    position = [np.full(len(block), 1e200).tolist() for block in start([])]
     assert log_posterior(position) == [[serve.IMPOSSIBLE]]
 
 

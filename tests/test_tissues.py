@@ -28,8 +28,8 @@ SHELLS = {
 def test_no_other_place_names_the_tissues_of_a_brain():
     named = re.compile(r"\b(csf|gm|wm)\b", re.IGNORECASE)
     sources = {str(path.relative_to(PACKAGE)): path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
-    found = {path for path, source in sources.items() if named.search(source)}
-    assert found == ALLOWED
+    naming = {path for path, source in sources.items() if named.search(source)}
+    assert naming == ALLOWED
 
 
 def test_what_names_tell():
@@ -55,8 +55,8 @@ def anatomy(names: dict[str, float], seed: int = 0) -> tuple[br.Image, br.Image,
     noise = np.random.default_rng(seed).normal(size=(2, *grid.shape))
     points = grid.grid_points()
     images = [
-        grid.with_voxels(100 + 60.0 * labels_at(points + shift) + 5 * part)
-        for shift, part in zip((np.zeros(3), np.array([0.0, 0.8, 0.0])), noise, strict=True)
+        grid.with_voxels(100 + 60.0 * labels_at(points + shift) + 5 * image_noise)
+        for shift, image_noise in zip((np.zeros(3), np.array([0.0, 0.8, 0.0])), noise, strict=True)
     ]
     index = labels_at(points)
     return *images, grid.with_voxels(np.where(index > 0, 1 + 2 * index, 0).astype(np.int16))
@@ -135,9 +135,9 @@ def test_without_a_fluid_a_hole_is_the_nearest_tissue():
     tissue = br.Image(voxels, np.diag([1.0, 1.0, 3.0, 1.0]))
     domain = mesh_domain(tissue, names=("liver", "vessels"))
     assert domain.voxels.sum() == 7**3
-    found = domain_labels(tissue, domain, ("liver", "vessels"))
+    labels = domain_labels(tissue, domain, ("liver", "vessels"))
     # The vessel beside it is three millimetres away, the liver one.
-    assert found.voxels[4, 4, 4] == 1
+    assert labels.voxels[4, 4, 4] == 1
 
 
 @pytest.mark.parametrize(

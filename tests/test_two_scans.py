@@ -42,13 +42,13 @@ def folder(tmp_path_factory):
     rng = np.random.default_rng(2)
     fixed = np.asarray(FIXED.voxels)
     inside = np.asarray(MASK.voxels) != 0
-    other = np.where(inside, 2 - fixed, 0.0)
+    inverted = np.where(inside, 2 - fixed, 0.0)
     cavity = np.zeros(FIXED.shape, np.uint8)
     cavity[22:27, 30:35, 20:25] = 1
     in_scan = POSE.inverse.aligned(FIXED).affine
     files = {
         "fixed": (SCALE * (fixed + 0.02 * rng.normal(size=FIXED.shape)) + OFFSET, FIXED.affine),
-        "moving": (SCALE * (other + 0.02 * rng.normal(size=FIXED.shape)) + OFFSET, in_scan),
+        "moving": (SCALE * (inverted + 0.02 * rng.normal(size=FIXED.shape)) + OFFSET, in_scan),
         "flair_fixed": (fixed + 0.05 * rng.normal(size=FIXED.shape), FIXED.affine),
         "flair_moving": (3 * fixed + 0.05 * rng.normal(size=FIXED.shape), in_scan),
         "organ": (inside.astype(np.uint8), FIXED.affine),
@@ -57,9 +57,9 @@ def folder(tmp_path_factory):
     for name, (voxels, affine) in files.items():
         kind = np.uint8 if voxels.dtype == np.uint8 else np.float32
         nib.save(nib.Nifti1Image(voxels.astype(kind), affine), folder / f"{name}.nii.gz")
-    whole = ball_mesh(radius=36, spacing=26)
+    ball = ball_mesh(radius=36, spacing=26)
     mesh = br.TetMesh.from_arrays(
-        whole.points - (5.0, -3.0, 8.0), whole.cells, np.zeros(len(whole.cells), int), ("organ",)
+        ball.points - (5.0, -3.0, 8.0), ball.cells, np.zeros(len(ball.cells), int), ("organ",)
     )
     br.save_mesh(mesh, folder / "mesh.vtu")
     compared = {
@@ -87,10 +87,10 @@ def result(folder):
 
 
 def test_the_pose_is_found_and_so_is_the_contrast(result):
-    found = result.run.matching
-    at = result.mesh.points
-    assert np.linalg.norm(found.pose.place(at) - POSE.place(at), axis=1).mean() < 0.3
-    assert not found.one_contrast
+    matching = result.run.matching
+    points = result.mesh.points
+    assert np.linalg.norm(matching.pose.place(points) - POSE.place(points), axis=1).mean() < 0.3
+    assert not matching.one_contrast
     assert result.run.channels["flair"].one_contrast
     notes = " ".join(result.run.manifest["appraisal"]["notes"])
     assert "off the headers" in notes
@@ -103,8 +103,8 @@ def test_the_displacement_counts_from_one_world_to_the_other(result):
     transform = SimpleITK.DisplacementFieldTransform(image)
     flip = np.array([-1.0, -1.0, 1.0])
     for point in ((0.0, 0.0, 0.0), (20.0, -10.0, 5.0), (-60.0, 50.0, 40.0)):
-        there = flip * transform.TransformPoint((flip * point).tolist())
-        np.testing.assert_allclose(there, POSE.place(np.array(point)), atol=0.5)
+        displaced = flip * transform.TransformPoint((flip * point).tolist())
+        np.testing.assert_allclose(displaced, POSE.place(np.array(point)), atol=0.5)
 
 
 def test_the_rigid_part_of_the_draws_is_the_pose(result):
@@ -119,8 +119,8 @@ def test_standard_deviations_are_those_along_the_axes_of_the_moving_world(result
     draws = result.idata.posterior["u_boundary"].to_numpy()
     turned = (draws @ np.asarray(result.run.matching.pose.rotation).T).reshape(-1, *draws.shape[2:])
     nodes = np.asarray(result.idata.posterior["node"])
-    found = np.asarray(result.run.predicted.total_sd)[nodes]
-    np.testing.assert_allclose(found, turned.std(axis=0), rtol=0.05)
+    sd = np.asarray(result.run.predicted.total_sd)[nodes]
+    np.testing.assert_allclose(sd, turned.std(axis=0), rtol=0.05)
 
 
 def test_the_warped_image_is_in_the_units_of_the_file(result):
@@ -136,8 +136,8 @@ def test_what_was_found_is_kept_with_the_run(result, folder):
     np.testing.assert_allclose(inputs.matching.pose.matrix, result.run.matching.pose.matrix)
     assert inputs.moving_ignore is not None
     assert set(inputs.channels) == {"flair"}
-    kept = json.loads((folder / "out" / "inputs" / "matching.json").read_text())
-    assert kept["channels"] == {"flair": True}
+    stored = json.loads((folder / "out" / "inputs" / "matching.json").read_text())
+    assert stored["channels"] == {"flair": True}
 
 
 def test_the_report_shows_it(result):
@@ -160,9 +160,9 @@ def test_what_is_hatched_goes_with_the_displacement(result):
         assert moving.any()
         u = view.slice(plane).nodal(run.u_mean)
         inside = np.isfinite(u).all(axis=-1)
-        there = np.rint(mask.world_to_voxel(plane.points()[inside] + u[inside])).astype(int)
-        there = np.clip(there, 0, np.array(mask.shape) - 1)
-        np.testing.assert_array_equal(warped[inside], np.asarray(mask.voxels)[tuple(there.T)] != 0)
+        voxel = np.rint(mask.world_to_voxel(plane.points()[inside] + u[inside])).astype(int)
+        voxel = np.clip(voxel, 0, np.array(mask.shape) - 1)
+        np.testing.assert_array_equal(warped[inside], np.asarray(mask.voxels)[tuple(voxel.T)] != 0)
 
 
 def test_a_channel_on_another_grid_has_the_tissues_where_they_are(result, folder):
@@ -181,9 +181,9 @@ def test_a_channel_on_another_grid_has_the_tissues_where_they_are(result, folder
 
 def test_the_headers_are_kept_where_one_says_so(folder):
     config = br.load_config(folder / "run.yaml", ["data.pose=fixed"])
-    found = prepare(config)
-    assert found.inputs.matching.pose.is_identity
-    assert any("data.pose: fixed" in note for note in found.appraisal.notes)
+    prepared = prepare(config)
+    assert prepared.inputs.matching.pose.is_identity
+    assert any("data.pose: fixed" in note for note in prepared.appraisal.notes)
 
 
 def test_the_brain_of_a_mouse_is_meshed_as_finely_as_it_is_small(tmp_path):
@@ -208,11 +208,11 @@ def test_the_composite_alone_makes_the_warped_image(result):
     fixed = SimpleITK.ReadImage(str(result.folder / "inputs" / "fixed.nii.gz"))
     image = SimpleITK.ReadImage(str(result.folder / "own_world.nii.gz"), SimpleITK.sitkFloat64)
     transform = SimpleITK.ReadTransform(str(result.folder / "transform_mean.h5"))
-    theirs = SimpleITK.GetArrayFromImage(SimpleITK.Resample(image, fixed, transform, SimpleITK.sitkLinear, np.nan))
-    ours = np.asarray(nib.load(result.folder / "warped_mean.nii.gz").dataobj)
-    known = np.isfinite(theirs.transpose(2, 1, 0))
-    assert known.mean() > 0.5
-    away = np.abs(theirs.transpose(2, 1, 0) - ours)[known]
+    by_itk = SimpleITK.GetArrayFromImage(SimpleITK.Resample(image, fixed, transform, SimpleITK.sitkLinear, np.nan))
+    by_bayesreg = np.asarray(nib.load(result.folder / "warped_mean.nii.gz").dataobj)
+    finite = np.isfinite(by_itk.transpose(2, 1, 0))
+    assert finite.mean() > 0.5
+    away = np.abs(by_itk.transpose(2, 1, 0) - by_bayesreg)[finite]
     assert np.median(away) < 1e-3 * SCALE
     assert away.max() < 0.02 * SCALE
 
@@ -220,12 +220,12 @@ def test_the_composite_alone_makes_the_warped_image(result):
 @contextmanager
 def keeping_messages() -> Iterator[list[str]]:
     """For fixtures of a module, which have no `caplog`."""
-    said: list[str] = []
+    messages: list[str] = []
     handler, log = logging.Handler(), logging.getLogger("bayesreg")
-    handler.emit = lambda record: said.append(record.getMessage())
+    handler.emit = lambda record: messages.append(record.getMessage())
     log.addHandler(handler)
     with from_level(logging.INFO):
-        yield said
+        yield messages
     log.removeHandler(handler)
 
 
@@ -238,26 +238,26 @@ def applied(result, folder):
     ball = pyvista.Sphere(radius=12.0, center=result.mesh.points.mean(axis=0), theta_resolution=12, phi_resolution=12)
     ball.save(folder / "ball.vtk")
     ball.save(folder / "ball.stl")
-    given = {"points": folder / "p.csv", "mesh": folder / "ball.vtk", "image": folder / "fixed.nii.gz",
-             "labels": folder / "organ.nii.gz"}  # fmt: skip
-    with keeping_messages() as said:
-        written = br.apply(result.folder, folder / "there", draws=40, far=(0.1, 2.0), **given)
-    return points, written, said
+    inputs = {"points": folder / "p.csv", "mesh": folder / "ball.vtk", "image": folder / "fixed.nii.gz",
+              "labels": folder / "organ.nii.gz"}  # fmt: skip
+    with keeping_messages() as messages:
+        written = br.apply(result.folder, folder / "there", draws=40, far=(0.1, 2.0), **inputs)
+    return points, written, messages
 
 
 def test_apply_writes_what_it_says(applied, folder):
-    points, written, said = applied
+    points, written, messages = applied
     names = ["points.csv", "ball_in-moving.vtk", "fixed_in-moving.nii.gz", "organ_in-moving.nii.gz", "label-1.nii.gz"]
     assert [path.name for path in written] == names
     assert all(path.is_file() for path in written)
-    assert "by 40 draws" in said[0]
-    assert any("1 of 21 points" in line and "nothing is known" in line for line in said)
-    assert any("RAS or LPS" in line for line in said)
+    assert "by 40 draws" in messages[0]
+    assert any("1 of 21 points" in line and "nothing is known" in line for line in messages)
+    assert any("RAS or LPS" in line for line in messages)
     table = np.genfromtxt(folder / "there" / "points.csv", delimiter=",", names=True, dtype=None, encoding="utf8")
     assert table["name"].tolist()[-2:] == ["p19", "far"]
     assert table["in_mesh"].tolist() == [1.0] * 20 + [0.0]
-    there = np.stack([table[axis] for axis in "xyz"], axis=1)[:20]
-    assert np.linalg.norm(there - POSE.place(points), axis=1).max() < 2.0
+    placed = np.stack([table[axis] for axis in "xyz"], axis=1)[:20]
+    assert np.linalg.norm(placed - POSE.place(points), axis=1).max() < 2.0
     assert ((table["p_over_2mm"] <= table["p_over_01mm"]) & (table["cov_xx"] >= 0))[:20].all()
     # Around the mesh there is a place, and it is not said how sure that is.
     last = table[-1]
@@ -276,27 +276,27 @@ def test_apply_leads_back(applied, result, folder):
 
 def test_apply_carries_the_moving_image_to_the_fixed_one(result, folder):
     written = br.apply(result.folder, folder / "back", image=folder / "moving.nii.gz", inverse=True, draws=4)
-    ours = np.asarray(nib.load(written[0]).dataobj)
+    carried = np.asarray(nib.load(written[0]).dataobj)
     warped = np.asarray(nib.load(result.folder / "warped_mean.nii.gz").dataobj)
     inside = np.asarray(MASK.voxels) != 0
     # What is ignored in the moving image is filled in the run's.
-    assert np.median(np.abs(ours - warped)[inside]) < 1e-3 * SCALE
+    assert np.median(np.abs(carried - warped)[inside]) < 1e-3 * SCALE
 
 
 def test_apply_keeps_the_space_and_the_values_of_a_surface(applied, result, folder):
     surface = pyvista.read(folder / "there" / "ball_in-moving.vtk")
     assert (folder / "there" / "ball_in-moving.vtk").read_bytes().split(b"\n")[1] == b"bayesreg SPACE=RAS"
-    given = pyvista.read(folder / "ball.vtk")
-    assert np.linalg.norm(surface.points - POSE.place(np.asarray(given.points, float)), axis=1).max() < 2.0
+    original = pyvista.read(folder / "ball.vtk")
+    assert np.linalg.norm(surface.points - POSE.place(np.asarray(original.points, float)), axis=1).max() < 2.0
     assert {"cov_", "radius95", "half_axis95_", "p_over_2mm", "in_mesh"} <= set(surface.point_data)
-    mirrored = given.copy()
-    mirrored.points = np.asarray(given.points) * (-1, -1, 1)
+    mirrored = original.copy()
+    mirrored.points = np.asarray(original.points) * (-1, -1, 1)
     mirrored.save(folder / "mirrored.vtk")
     br.apply(result.folder, folder / "there", mesh=folder / "mirrored.vtk", space="LPS", draws=2)
     again = pyvista.read(folder / "there" / "mirrored_in-moving.vtk")
     np.testing.assert_allclose(np.asarray(again.points) * (-1, -1, 1), surface.points, atol=1e-3)
     written = br.apply(result.folder, folder / "there", mesh=folder / "ball.stl", draws=2)
-    assert pyvista.read(written[0]).n_cells == given.n_cells
+    assert pyvista.read(written[0]).n_cells == original.n_cells
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj", ".vtp", ".vtk"])
@@ -305,13 +305,13 @@ def test_a_carried_surface_says_its_space_and_is_read_in_it(applied, result, fol
     start = np.asarray(mirrored.points, float)
     mirrored.points = start * (-1, -1, 1)
     mirrored.save(tmp_path / f"mirrored{suffix}")
-    (there,) = br.apply(result.folder, tmp_path, mesh=tmp_path / f"mirrored{suffix}", space="LPS", draws=2)
-    (back,) = br.apply(result.folder, tmp_path / "back", mesh=there, inverse=True, draws=2)
-    found = np.asarray(pyvista.read(back).points, float) * (-1, -1, 1)
-    np.testing.assert_allclose(found.mean(axis=0), start.mean(axis=0), atol=0.01)
-    assert np.linalg.norm(found[:, None] - start, axis=2).min(axis=1).max() < 1e-3
+    (carried,) = br.apply(result.folder, tmp_path, mesh=tmp_path / f"mirrored{suffix}", space="LPS", draws=2)
+    (returned,) = br.apply(result.folder, tmp_path / "back", mesh=carried, inverse=True, draws=2)
+    returned_points = np.asarray(pyvista.read(returned).points, float) * (-1, -1, 1)
+    np.testing.assert_allclose(returned_points.mean(axis=0), start.mean(axis=0), atol=0.01)
+    assert np.linalg.norm(returned_points[:, None] - start, axis=2).min(axis=1).max() < 1e-3
     with pytest.raises(br.InputError, match="says that its coordinates are LPS"):
-        br.apply(result.folder, tmp_path, mesh=there, space="RAS", draws=2)
+        br.apply(result.folder, tmp_path, mesh=carried, space="RAS", draws=2)
 
 
 def test_a_line_that_leaves_the_mesh_is_cut(applied, result, folder, tmp_path):
@@ -322,9 +322,9 @@ def test_a_line_that_leaves_the_mesh_is_cut(applied, result, folder, tmp_path):
     line.point_data["contact"] = np.arange(9.0)
     line.save(tmp_path / "line.vtk")
     (path,) = br.apply(result.folder, tmp_path, mesh=tmp_path / "line.vtk", around="missing", draws=2)
-    found = pyvista.read(path)
-    assert found.point_data["contact"].tolist() == [0, 1, 2, 5, 6, 8]
-    assert found.lines.tolist() == [3, 0, 1, 2, 2, 3, 4]
+    cut = pyvista.read(path)
+    assert cut.point_data["contact"].tolist() == [0, 1, 2, 5, 6, 8]
+    assert cut.lines.tolist() == [3, 0, 1, 2, 2, 3, 4]
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtk", ".vtu"])
@@ -336,15 +336,15 @@ def test_the_part_of_a_surface_around_the_mesh_can_be_left_out(applied, result, 
     surface.points = points
     (surface.cast_to_unstructured_grid() if suffix == ".vtu" else surface).save(tmp_path / f"half{suffix}")
     (path,) = br.apply(result.folder, tmp_path, mesh=tmp_path / f"half{suffix}", around="missing", draws=2, space="RAS")
-    found = pyvista.read(path)
-    assert 0 < found.n_cells < surface.n_cells
-    assert np.isfinite(np.asarray(found.points)).all()
-    assert np.ptp(np.asarray(found.points)[:, 0]) < 100
+    cut = pyvista.read(path)
+    assert 0 < cut.n_cells < surface.n_cells
+    assert np.isfinite(np.asarray(cut.points)).all()
+    assert np.ptp(np.asarray(cut.points)[:, 0]) < 100
 
 
 def test_what_lies_around_the_mesh_can_be_missing(applied, result, folder):
-    given = {"points": folder / "p.csv", "image": folder / "fixed.nii.gz", "labels": folder / "organ.nii.gz"}
-    br.apply(result.folder, folder / "alone", around="missing", draws=2, **given)
+    inputs = {"points": folder / "p.csv", "image": folder / "fixed.nii.gz", "labels": folder / "organ.nii.gz"}
+    br.apply(result.folder, folder / "alone", around="missing", draws=2, **inputs)
     table = np.genfromtxt(folder / "alone" / "points.csv", delimiter=",", names=True, dtype=None, encoding="utf8")
     assert np.isnan(table["x"][-1])
     assert np.isfinite(table["x"][:-1]).all()
@@ -355,7 +355,7 @@ def test_what_lies_around_the_mesh_can_be_missing(applied, result, folder):
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({}, "nothing to carry"),
         ({"points": "none.csv"}, "no such file"),
@@ -372,14 +372,14 @@ def test_what_lies_around_the_mesh_can_be_missing(applied, result, folder):
         ({"points": "p.csv", "out": "p.csv"}, "is no folder that you may write"),
     ],
 )
-def test_apply_refuses(result, folder, given, message):
+def test_apply_refuses(result, folder, arguments, message):
     (folder / "p.csv").exists() or (folder / "p.csv").write_text("x,y,z\n0,0,0")
     (folder / "broken.vtk").write_text("# vtk DataFile Version 3.0\nnothing\n")
     (folder / "ants.csv").write_text("x,y,z,t,label\n1,2,3,0,1\n")
     (folder / "said.csv").write_text("# CoordinateSystem = LPS\nx,y,z\n1,2,3\n")
     br.save_image(MASK.with_voxels(np.zeros(MASK.shape, np.uint8)), folder / "nothing.nii.gz")
     paths = {"points", "image", "labels", "mesh", "out"}
-    files = {key: folder / value if key in paths else value for key, value in given.items()}
+    files = {key: folder / value if key in paths else value for key, value in arguments.items()}
     with pytest.raises(br.InputError, match=message):
         br.apply(result.folder, files.pop("out", folder / "refused"), **files)
     assert not (folder / "refused").exists()
@@ -393,8 +393,8 @@ def test_apply_does_not_replace_what_it_was_given(result, folder):
 
 
 def test_a_margin_holds_a_label_point_by_point(result, folder):
-    given = {"labels": folder / "organ.nii.gz", "like": folder / "moving.nii.gz"}
-    *_, path = br.apply(result.folder, folder / "margin", margins=[1], draws=20, **given)
+    inputs = {"labels": folder / "organ.nii.gz", "like": folder / "moving.nii.gz"}
+    *_, path = br.apply(result.folder, folder / "margin", margins=[1], draws=20, **inputs)
     assert path.name == "organ_in-moving_margin95_label-1.vtk"
     surface = pyvista.read(path)
     share = br.load_image(folder / "margin" / "organ_in-moving_probability" / "label-1.nii.gz")
@@ -402,7 +402,7 @@ def test_a_margin_holds_a_label_point_by_point(result, folder):
     voxels = share.voxel_volume * (np.asarray(share.voxels) > 0.05).sum()
     assert surface.volume == pytest.approx(voxels, rel=0.1)
     with pytest.raises(br.InputError, match="label 7, of which a margin is wanted"):
-        br.apply(result.folder, folder / "margin", margins=[7], **given)
+        br.apply(result.folder, folder / "margin", margins=[7], **inputs)
     with pytest.raises(br.InputError, match="give labels, too"):
         br.apply(result.folder, folder / "margin", points=folder / "pairs.csv", margins=[1])
 
@@ -411,21 +411,21 @@ def test_maps(result, folder):
     written = br.maps(result.folder, folder / "maps", far=(0.1, 2.0), draws=40)
     names = ["radius95", "p_over_0.1mm", "p_over_2mm", "jacobian_mean", "jacobian_sd", "p_inverted"]
     assert [path.name for path in written] == [f"{name}.nii.gz" for name in names]
-    found = {name: np.asarray(nib.load(path).dataobj) for name, path in zip(names, written, strict=True)}
+    values = {name: np.asarray(nib.load(path).dataobj) for name, path in zip(names, written, strict=True)}
     sd = nib.load(result.folder / "displacement_sd.nii.gz")
     np.testing.assert_allclose(nib.load(written[0]).affine, sd.affine, atol=1e-6)
     total = np.sqrt((np.asarray(sd.dataobj)[..., 0, :] ** 2).sum(axis=-1))
     inside = total > 0
-    np.testing.assert_array_equal(np.isfinite(found["radius95"]), inside)
+    np.testing.assert_array_equal(np.isfinite(values["radius95"]), inside)
     # √(χ² of one degree of freedom) … √(χ² of three): 1.96 … 1.61 times the root of the summed variances.
-    ratio = found["radius95"][inside] / total[inside]
+    ratio = values["radius95"][inside] / total[inside]
     assert 1.3 < np.quantile(ratio, 0.05) < np.quantile(ratio, 0.95) < 2.3
-    assert (found["p_over_2mm"] <= found["p_over_0.1mm"])[inside].all()
+    assert (values["p_over_2mm"] <= values["p_over_0.1mm"])[inside].all()
     mesh = result.mesh
     u = result.u_mean
-    ratio = (signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes).min(), 3 * found["jacobian_sd"][inside].max()
-    assert found["jacobian_mean"][inside].min() > ratio[0] - ratio[1]
-    assert (found["p_inverted"][inside] == 0).all()
+    ratio = (signed_volumes(mesh.points + u, mesh.cells) / mesh.volumes).min(), 3 * values["jacobian_sd"][inside].max()
+    assert values["jacobian_mean"][inside].min() > ratio[0] - ratio[1]
+    assert (values["p_inverted"][inside] == 0).all()
     away = np.eye(4)
     away[:3, 3] = 900.0
     br.save_image(br.Image(np.zeros((3, 3, 3)), away), folder / "far.nii.gz")
@@ -447,8 +447,8 @@ def test_a_scene_for_slicer(result, folder):
     assert "transform:" in named["fixed"].get("references")
     assert "transform:" not in named["moving"].get("references")
     # Everything but what is carried lies in the moving image's world.
-    moving, own = (nib.load(path) for path in (scene.parent / "moving.nii.gz", folder / "moving.nii.gz"))
-    np.testing.assert_allclose(moving.affine, own.affine, atol=1e-4)
+    moving, original = (nib.load(path) for path in (scene.parent / "moving.nii.gz", folder / "moving.nii.gz"))
+    np.testing.assert_allclose(moving.affine, original.affine, atol=1e-4)
     places = br.read_point_pairs(scene.parent / "places.mrk.json", scene.parent / "places.mrk.json")
     predicted = result.run.predicted
     assert list(places.names) == list(predicted.place_names)
@@ -494,13 +494,13 @@ def test_a_run_that_has_moved_is_carried_on_alone(applied, result, folder, tmp_p
     assert (tmp_path / "there" / "points.csv").read_bytes() == (folder / "there" / "points.csv").read_bytes()
 
 
-@pytest.mark.parametrize(("asked", "used"), [(None, 200), (300, 300)])
-def test_labels_are_carried_by_as_many_draws_as_asked_for(result, folder, tmp_path, asked, used, caplog):
+@pytest.mark.parametrize(("draws", "used"), [(None, 200), (300, 300)])
+def test_labels_are_carried_by_as_many_draws_as_asked_for(result, folder, tmp_path, draws, used, caplog):
     caplog.set_level(logging.INFO)
     small = br.Image(np.zeros((4, 4, 4)), POSE.matrix @ MASK.affine @ np.diag([12.0, 12.0, 12.0, 1.0]))
     br.save_image(small, tmp_path / "small.nii.gz")
     # Points ask for more draws than labels do.
-    given = {"points": folder / "p.csv", "labels": folder / "organ.nii.gz", "like": tmp_path / "small.nii.gz"}
+    inputs = {"points": folder / "p.csv", "labels": folder / "organ.nii.gz", "like": tmp_path / "small.nii.gz"}
     (folder / "p.csv").exists() or (folder / "p.csv").write_text("x,y,z\n0,0,0")
-    br.apply(result.folder, tmp_path / "out", draws=asked, **given)
+    br.apply(result.folder, tmp_path / "out", draws=draws, **inputs)
     assert any(line.startswith("labels of") and line.endswith(f"by {used} draws") for line in caplog.messages)

@@ -35,24 +35,24 @@ MESHES = {"ball": lambda: ball_mesh(spacing=13.0), "box": lambda: box_mesh(3), "
 @pytest.mark.parametrize("name", MESHES)
 def test_surroundings_fill_the_sphere_and_no_more(name):
     mesh = MESHES[name]()
-    found = surround(mesh)
-    volumes = signed_volumes(found.points, found.cells)
+    surroundings = surround(mesh)
+    volumes = signed_volumes(surroundings.points, surroundings.cells)
     assert (volumes > 0).all()
-    own = len(mesh.cells)
-    np.testing.assert_array_equal(found.cells[:own], mesh.cells)
-    sphere = found.points[-400:]
-    radius = np.linalg.norm(sphere - found.centre, axis=1)
+    cell_count = len(mesh.cells)
+    np.testing.assert_array_equal(surroundings.cells[:cell_count], mesh.cells)
+    sphere = surroundings.points[-400:]
+    radius = np.linalg.norm(sphere - surroundings.centre, axis=1)
     np.testing.assert_allclose(radius, radius[0])
     hull = 4 / 3 * np.pi * radius[0] ** 3
     assert 0.96 * hull < volumes.sum() < hull
     # Conforming: every face of the mesh's boundary, or what it was cut into, has a tetrahedron on its other side.
-    across = faces_across(found.cells)
+    across = faces_across(surroundings.cells)
     if name != "crease":
         inner = np.concatenate([mesh.points[mesh.boundary_faces].mean(axis=1)])
         both = Deformer(mesh)
-        outwards = both.locate(inner + 1e-3 * (inner - found.centre))
-        assert (outwards.cell >= own).all()
-    assert (across[:own] >= -1).all()
+        outwards = both.locate(inner + 1e-3 * (inner - surroundings.centre))
+        assert (outwards.cell >= cell_count).all()
+    assert (across[:cell_count] >= -1).all()
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -81,9 +81,9 @@ def test_a_rigid_motion_goes_on_as_it_is():
     location = deformer.locate(everywhere)
     assert deformer.is_inside(location).any()
     assert (location.cell < 0).any()
-    found = displaced.displacement(everywhere, location)
-    np.testing.assert_allclose(found, shift + np.cross(turn, everywhere), atol=1e-9)
-    np.testing.assert_allclose(displaced.sources(everywhere + found)[0], everywhere, atol=1e-9)
+    displacement = displaced.displacement(everywhere, location)
+    np.testing.assert_allclose(displacement, shift + np.cross(turn, everywhere), atol=1e-9)
+    np.testing.assert_allclose(displaced.sources(everywhere + displacement)[0], everywhere, atol=1e-9)
 
 
 def test_what_is_not_rigid_dies_away_harmonically():
@@ -94,13 +94,13 @@ def test_what_is_not_rigid_dies_away_harmonically():
     deformer = Deformer(mesh)
     displaced = deformer.displaced(0.1 * (mesh.points - centre))
     for distance in (44.0, 55.0, 65.0):
-        there = centre + distance * direction
-        found = displaced.displacement(there, deformer.locate(there))[0]
+        point = centre + distance * direction
+        displacement = displaced.displacement(point, deformer.locate(point))[0]
         # Zero on the sphere of twice the radius: a r + b / r² in each direction.
         b = 4.0 / (1 / 40**2 - 40 / 80**3)
         expected = b / distance**2 - b / 80**3 * distance
-        np.testing.assert_allclose(found @ direction[0], expected, atol=0.5)  # of 4 mm, by tetrahedra as large
-        assert np.linalg.norm(found - found @ direction[0] * direction[0]) < 0.2
+        np.testing.assert_allclose(displacement @ direction[0], expected, atol=0.5)  # of 4 mm, by tetrahedra as large
+        assert np.linalg.norm(displacement - displacement @ direction[0] * direction[0]) < 0.2
 
 
 def test_an_affine_displacement_and_its_inverse_are_exact_inside():
@@ -125,12 +125,12 @@ def test_places_come_from_where_they_were(name, size):
     inside = deformer.is_inside(location)
     assert 0.005 < inside.mean() < 0.9
     places = points + displaced.displacement(points, location)
-    back, of_back = displaced.sources(places)
-    error = np.linalg.norm(back - points, axis=1)
+    sources, source_location = displaced.sources(places)
+    error = np.linalg.norm(sources - points, axis=1)
     assert error[inside].max() < 1e-6
     assert (error > 1e-6).mean() < 0.01
     # Where tetrahedra around the mesh fold, the source is another one of the same place.
-    again = back + displaced.displacement(back, of_back)
+    again = sources + displaced.displacement(sources, source_location)
     assert (np.linalg.norm(again - places, axis=1) > 1e-6).mean() < 0.002
 
 
@@ -139,13 +139,13 @@ def test_steps_from_near_by_lead_where_a_search_leads():
     places, deformer = _around(mesh, 3000, 10.0), Deformer(mesh)
     mean = _smooth(mesh.points, 2.0)
     _, near = deformer.displaced(mean).sources(places)
-    other = deformer.displaced(mean + 0.3 * rng.standard_normal(mean.shape))
-    searched, at_search = other.sources(places)
-    stepped, at_steps = other.sources(places, near)
+    perturbed = deformer.displaced(mean + 0.3 * rng.standard_normal(mean.shape))
+    searched, at_search = perturbed.sources(places)
+    stepped, at_steps = perturbed.sources(places, near)
     alike = (deformer.is_inside(at_search) == deformer.is_inside(at_steps)).mean()
     assert alike > 0.999
     np.testing.assert_allclose(stepped[deformer.is_inside(at_steps)], searched[deformer.is_inside(at_steps)], atol=1e-6)
-    again = stepped + other.displacement(stepped, at_steps)
+    again = stepped + perturbed.displacement(stepped, at_steps)
     np.testing.assert_allclose(again, places, atol=1e-3)
 
 
@@ -170,7 +170,7 @@ def test_a_fold_is_counted_and_places_in_it_come_from_an_upright_tetrahedron():
 def test_what_lies_across_a_face():
     mesh = box_mesh(2)
     for cell, row in enumerate(faces_across(mesh.cells)):
-        for corner, other in enumerate(row):
+        for corner, neighbour in enumerate(row):
             face = set(mesh.cells[cell]) - {mesh.cells[cell, corner]}
             holders = [k for k in range(len(mesh.cells)) if face <= set(mesh.cells[k]) and k != cell]
-            assert holders == ([] if other < 0 else [other])
+            assert holders == ([] if neighbour < 0 else [neighbour])

@@ -21,8 +21,8 @@ def test_linear_displacements_pass_the_patch_test(mesh):
     rng = np.random.default_rng(0)
     gradient, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     u = mesh.points @ gradient.T + shift
-    found = br.solve_interior(mesh, np.array([10.0]), np.array([1.0]), u[mesh.boundary])
-    np.testing.assert_allclose(found.u, u, atol=1e-7 * abs(u).max())
+    solution = br.solve_interior(mesh, np.array([10.0]), np.array([1.0]), u[mesh.boundary])
+    np.testing.assert_allclose(solution.u, u, atol=1e-7 * abs(u).max())
     strain = (gradient + gradient.T) / 2
     density = 1.0 * (strain**2).sum() + 10.0 / 2 * np.trace(gradient) ** 2
     energy = float(br.strain_energy(mesh, np.array([10.0]), np.array([1.0]), u))
@@ -41,8 +41,8 @@ def test_rigid_motions_cost_nothing(mesh):
 def test_rigid_boundary_motion_moves_the_interior_rigidly(mesh):
     for mode in rigid_modes(mesh.points).T:
         u = mode.reshape(-1, 3) * 10
-        found = br.solve_interior(mesh, LAM, MU, u[mesh.boundary])
-        np.testing.assert_allclose(found.u, u, atol=1e-7 * abs(u).max())
+        solution = br.solve_interior(mesh, LAM, MU, u[mesh.boundary])
+        np.testing.assert_allclose(solution.u, u, atol=1e-7 * abs(u).max())
 
 
 @pytest.mark.parametrize("function", [br.strain_energy, br.solve_interior])

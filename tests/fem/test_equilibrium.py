@@ -37,10 +37,12 @@ def traced(mesh):
 def relative_residual(mesh, K, u, u_boundary):
     """As documented: in the norm of the inverse diagonal."""
     free = (3 * mesh.interior[:, None] + np.arange(3)).ravel()
-    given = np.zeros(mesh.points.shape)
-    given[mesh.boundary] = u_boundary
-    left, load = (np.sqrt(((K @ v.ravel())[free] ** 2 / K.diagonal()[free]).sum()) for v in (np.asarray(u), given))
-    return left / load
+    prescribed = np.zeros(mesh.points.shape)
+    prescribed[mesh.boundary] = u_boundary
+    residual, load = (
+        np.sqrt(((K @ v.ravel())[free] ** 2 / K.diagonal()[free]).sum()) for v in (np.asarray(u), prescribed)
+    )
+    return residual / load
 
 
 @pytest.mark.parametrize(
@@ -50,13 +52,13 @@ def relative_residual(mesh, K, u, u_boundary):
 )
 @pytest.mark.parametrize("inside", ["eager", "compiled"])
 def test_solution_residual_and_iterations(mesh, traced, u_boundary, lam, mu, inside):
-    found = (traced if inside == "compiled" else partial(br.solve_interior, mesh))(lam, mu, u_boundary)
+    solution = (traced if inside == "compiled" else partial(br.solve_interior, mesh))(lam, mu, u_boundary)
     K, expected = lu_solution(mesh, lam, mu, u_boundary)
-    np.testing.assert_allclose(found.u, expected, atol=1e-7 * abs(expected).max())
-    assert bool(found.converged)
-    assert 0 < float(found.residual) <= 1e-8
-    assert 1 <= int(found.iterations) < 400
-    assert relative_residual(mesh, K, found.u, u_boundary) <= 1.5e-8
+    np.testing.assert_allclose(solution.u, expected, atol=1e-7 * abs(expected).max())
+    assert bool(solution.converged)
+    assert 0 < float(solution.residual) <= 1e-8
+    assert 1 <= int(solution.iterations) < 400
+    assert relative_residual(mesh, K, solution.u, u_boundary) <= 1.5e-8
 
 
 def test_a_tighter_tolerance_is_met(traced, u_boundary):
@@ -69,10 +71,10 @@ def test_a_tighter_tolerance_is_met(traced, u_boundary):
 
 def test_too_few_iterations_are_confessed(mesh, u_boundary, monkeypatch):
     monkeypatch.setattr("bayesreg.fem.conjugate_gradients.MAX_ITERATIONS", 3)
-    found = jax.jit(partial(br.solve_interior, mesh))(PAPER_LAM, PAPER_MU, u_boundary)
-    assert not bool(found.converged)
-    assert int(found.iterations) == 3
-    assert float(found.residual) > 1e-8
+    solution = jax.jit(partial(br.solve_interior, mesh))(PAPER_LAM, PAPER_MU, u_boundary)
+    assert not bool(solution.converged)
+    assert int(solution.iterations) == 3
+    assert float(solution.residual) > 1e-8
 
 
 @pytest.mark.parametrize("place", ["lam", "mu", "u_boundary"])
@@ -86,25 +88,25 @@ def test_numbers_never_raise(mesh, u_boundary, place, value):
 @pytest.mark.parametrize("scale", [1e308, 1e-310])
 def test_extreme_parameters_never_raise(mesh, u_boundary, scale):
     """What overflows or underflows may solve or not, but what is called converged solves it."""
-    found = br.solve_interior(mesh, scale * np.ones(3), scale * np.ones(3), u_boundary)
-    if bool(found.converged):
+    solution = br.solve_interior(mesh, scale * np.ones(3), scale * np.ones(3), u_boundary)
+    if bool(solution.converged):
         _, expected = lu_solution(mesh, np.ones(3), np.ones(3), u_boundary)
-        np.testing.assert_allclose(found.u, expected, atol=1e-5)
+        np.testing.assert_allclose(solution.u, expected, atol=1e-5)
 
 
 def test_negative_parameters_are_not_called_converged_wrongly(mesh, u_boundary):
     """An indefinite system may be solved or not, but what is called converged solves it."""
     lam, mu = np.array([2.0, -30.0, 8.0]), MU
-    found = br.solve_interior(mesh, lam, mu, u_boundary)
-    if bool(found.converged):
+    solution = br.solve_interior(mesh, lam, mu, u_boundary)
+    if bool(solution.converged):
         _, expected = lu_solution(mesh, lam, mu, u_boundary)
-        np.testing.assert_allclose(found.u, expected, atol=1e-5 * abs(expected).max())
+        np.testing.assert_allclose(solution.u, expected, atol=1e-5 * abs(expected).max())
 
 
 def test_nothing_moves_if_the_boundary_does_not(mesh):
-    found = br.solve_interior(mesh, LAM, MU, np.zeros((len(mesh.boundary), 3)))
-    assert bool(found.converged)
-    np.testing.assert_array_equal(found.u, 0)
+    solution = br.solve_interior(mesh, LAM, MU, np.zeros((len(mesh.boundary), 3)))
+    assert bool(solution.converged)
+    np.testing.assert_array_equal(solution.u, 0)
 
 
 def test_linear_in_the_boundary_and_scale_free_in_the_parameters(mesh, u_boundary):
@@ -115,11 +117,11 @@ def test_linear_in_the_boundary_and_scale_free_in_the_parameters(mesh, u_boundar
 
 def test_one_bad_chain_leaves_the_others_alone(mesh, u_boundary):
     batch = np.stack([u_boundary, np.full_like(u_boundary, np.nan), 2 * u_boundary])
-    found = jax.vmap(lambda u: br.solve_interior(mesh, LAM, MU, u))(batch)
-    np.testing.assert_array_equal(found.converged, [True, False, True])
+    solution = jax.vmap(lambda u: br.solve_interior(mesh, LAM, MU, u))(batch)
+    np.testing.assert_array_equal(solution.converged, [True, False, True])
     expected = br.solve_interior(mesh, LAM, MU, u_boundary).u
-    np.testing.assert_allclose(found.u[0], expected, atol=1e-7)
-    np.testing.assert_allclose(found.u[2], 2 * expected, atol=2e-7)
+    np.testing.assert_allclose(solution.u[0], expected, atol=1e-7)
+    np.testing.assert_allclose(solution.u[2], 2 * expected, atol=2e-7)
 
 
 def test_gradient_through_the_solve(mesh, u_boundary):
@@ -136,11 +138,11 @@ def test_gradient_through_the_solve(mesh, u_boundary):
         return (weight * br.solve_interior(mesh, lam, mu, u, tolerance=1e-12).u).sum()
 
     gradient = jax.grad(functional, argnums=(0, 1, 2))(PAPER_LAM, PAPER_MU, u_boundary)
-    found = [float((g * d).sum()) for g, d in zip(gradient, direction.values(), strict=True)]
+    slopes = [float((g * d).sum()) for g, d in zip(gradient, direction.values(), strict=True)]
     for i, (name, d) in enumerate(direction.items()):
         values = []
         for sign in (-1, 1):
             state = [PAPER_LAM, PAPER_MU, u_boundary]
             state[i] = state[i] + sign * 1e-4 * d
             values.append((weight * lu_solution(mesh, *state)[1]).sum())
-        assert found[i] == pytest.approx((values[1] - values[0]) / 2e-4, rel=1e-6), name
+        assert slopes[i] == pytest.approx((values[1] - values[0]) / 2e-4, rel=1e-6), name

@@ -26,8 +26,8 @@ def test_cells_equal_brute_force(spacing, count):
     inside = cell >= 0
     assert count == 1 or 0.1 < inside.mean() < 0.9
     assert np.isnan(barycentric[~inside]).all()
-    back = np.einsum("ka,kai->ki", barycentric[inside], mesh.points[mesh.cells[cell[inside]]])
-    np.testing.assert_allclose(back, query[inside], atol=1e-10)
+    interpolated = np.einsum("ka,kai->ki", barycentric[inside], mesh.points[mesh.cells[cell[inside]]])
+    np.testing.assert_allclose(interpolated, query[inside], atol=1e-10)
 
 
 def test_points_on_shared_faces_edges_and_nodes_are_found():
@@ -70,8 +70,8 @@ def test_nearest_points_of_a_cube_are_clipped_coordinates():
     query = np.random.default_rng(2).uniform(-15, 35, (500, 3))
     query = query[((query < 0) | (query > 20)).any(axis=1)]
     face, weight = nearest_on_surface(mesh.points, mesh.boundary_faces, query)
-    found = np.einsum("ka,kai->ki", weight, mesh.points[mesh.boundary_faces[face]])
-    np.testing.assert_allclose(found, query.clip(0, 20), atol=1e-9)
+    nearest = np.einsum("ka,kai->ki", weight, mesh.points[mesh.boundary_faces[face]])
+    np.testing.assert_allclose(nearest, query.clip(0, 20), atol=1e-9)
 
 
 def test_transfer_is_linear_inside_and_constant_beyond_the_surface():

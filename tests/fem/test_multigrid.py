@@ -47,17 +47,17 @@ def test_it_is_linear_symmetric_and_positive_definite():
 
 def test_chains_are_cycled_as_they_are_alone():
     _, matrix, cycle = problem(8.0)
-    many = jnp.asarray(RNG.normal(size=(matrix.shape[0] // 3, 3, 5)))
-    found = jax.jit(lambda cycle, r: cycle(r))(cycle, many)
-    np.testing.assert_allclose(found[..., 3:4], cycle(many[..., 3:4]), atol=1e-6 * float(abs(found).max()))
+    residuals = jnp.asarray(RNG.normal(size=(matrix.shape[0] // 3, 3, 5)))
+    cycled = jax.jit(lambda cycle, r: cycle(r))(cycle, residuals)
+    np.testing.assert_allclose(cycled[..., 3:4], cycle(residuals[..., 3:4]), atol=1e-6 * float(abs(cycled).max()))
 
 
 def two_soft_nodes(mesh):
     """λ = 10, μ = 1, but a hundredth of it in all cells of two neighbours in the middle."""
     middle = mesh.interior[np.argsort(np.linalg.norm(mesh.points[mesh.interior] - mesh.points.mean(axis=0), axis=1))[0]]
     around = mesh.cells[(mesh.cells == middle).any(axis=1)]
-    other = next(node for node in np.unique(around) if node != middle and node in mesh.interior)
-    soft = np.isin(mesh.cells, (middle, other)).any(axis=1)
+    neighbour = next(node for node in np.unique(around) if node != middle and node in mesh.interior)
+    soft = np.isin(mesh.cells, (middle, neighbour)).any(axis=1)
     factor = np.where(soft, 0.01, 1.0)
     return 10 * factor, factor
 
@@ -87,21 +87,21 @@ def test_conjugate_gradients_need_few_iterations(spacing, reference, factor, mos
     assert isinstance(system.preconditioner, Multigrid)
     lam = lam * factor ** (mesh.tissue == 1)
     u_boundary = RNG.normal(size=(len(mesh.boundary), 3))
-    found = equilibrium.equilibrium(system, *map(jnp.asarray, (lam, mu, u_boundary)))
-    assert bool(found.converged)
-    assert int(found.iterations) <= most
+    solution = equilibrium.equilibrium(system, *map(jnp.asarray, (lam, mu, u_boundary)))
+    assert bool(solution.converged)
+    assert int(solution.iterations) <= most
     K = stiffness(mesh, lam, mu).tocsc()
-    free, given = unknowns_of(mesh.interior), unknowns_of(mesh.boundary)
-    expected = scipy.sparse.linalg.spsolve(K[free][:, free], -K[free][:, given] @ u_boundary.ravel())
-    np.testing.assert_allclose(np.ravel(found.u[mesh.interior]), expected, atol=1e-6 * abs(expected).max())
+    free, prescribed = unknowns_of(mesh.interior), unknowns_of(mesh.boundary)
+    expected = scipy.sparse.linalg.spsolve(K[free][:, free], -K[free][:, prescribed] @ u_boundary.ravel())
+    np.testing.assert_allclose(np.ravel(solution.u[mesh.interior]), expected, atol=1e-6 * abs(expected).max())
 
 
 def test_the_same_matrix_has_the_same_hierarchy():
     """Bit by bit: else the same seed would not give the same draws, and nothing compiled would serve again."""
     mesh, matrix, cycle = problem(8.0)
     again = multigrid(matrix, rigid_modes(mesh.points[mesh.interior]))
-    for found, expected in zip(jax.tree.leaves(again), jax.tree.leaves(cycle), strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for array, expected in zip(jax.tree.leaves(again), jax.tree.leaves(cycle), strict=True):
+        np.testing.assert_array_equal(array, expected)
 
 
 @pytest.mark.parametrize("broken", ["nothing held", "empty", "nan"])
@@ -129,8 +129,8 @@ def test_slopes_of_a_large_mesh(monkeypatch):
             return (weight * equilibrium.equilibrium(system, lam[mesh.tissue], mu[mesh.tissue], u).u).sum()
 
         slopes.append(jax.grad(functional, argnums=(0, 1, 2))(*state))
-    for found, expected in zip(*slopes, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9)
+    for slope, expected in zip(*slopes, strict=True):
+        np.testing.assert_allclose(slope, expected, rtol=1e-8, atol=1e-9)
 
 
 def test_a_posterior_of_a_large_mesh_is_compiled_once(monkeypatch):
@@ -140,13 +140,13 @@ def test_a_posterior_of_a_large_mesh_is_compiled_once(monkeypatch):
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
     post = posterior_of(*images, mesh, interpolation="cubic")
     values = post.reference()
-    here = post.target.condition(post.estimands(values))
-    there = post.target.condition(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))
+    reference_data = post.target.condition(post.estimands(values))
+    changed_data = post.target.condition(post.estimands(values | {"mu": values["mu"] * np.array([0.5, 3.0, 1.0])}))
     density = jax.jit(partial(logdensity, post.target))
-    first, second = (float(density(data, post.initial(jax.random.key(0)))) for data in (here, there))
+    first, second = (float(density(data, post.initial(jax.random.key(0)))) for data in (reference_data, changed_data))
     assert density._cache_size() == 1
     assert first == pytest.approx(second, rel=1e-5)
-    slope = jax.grad(lambda x: logdensity(post.target, here, x))(post.initial(jax.random.key(0)))
+    slope = jax.grad(lambda x: logdensity(post.target, reference_data, x))(post.initial(jax.random.key(0)))
     exact = jax.grad(post.logdensity)(post.initial(jax.random.key(0)))
     for name, value in exact.items():
         np.testing.assert_allclose(slope[name], value, atol=0.01 * float(abs(value).max()))

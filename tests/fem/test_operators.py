@@ -29,8 +29,8 @@ def matrix():
     """An empty row, an empty column and entries given in two parts among the others."""
     dense = RNG.normal(size=(13, 9)) * (RNG.random((13, 9)) < 0.4)
     dense[4], dense[:, 2] = 0, 0
-    parts = scipy.sparse.coo_array(dense)
-    data, row, column = np.tile(parts.data / 2, 2), np.tile(parts.row, 2), np.tile(parts.col, 2)
+    entries = scipy.sparse.coo_array(dense)
+    data, row, column = np.tile(entries.data / 2, 2), np.tile(entries.row, 2), np.tile(entries.col, 2)
     return scipy.sparse.coo_array((data, (row, column)), shape=dense.shape)
 
 
@@ -38,15 +38,15 @@ def matrix():
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_the_product_is_scipys(matrix, columns, dtype):
     operator, x = sparse_operator(matrix.astype(dtype)), RNG.normal(size=(9, columns)).astype(dtype)
-    found = jax.jit(lambda operator, x: operator(x))(operator, x)
-    assert found.dtype == dtype
-    np.testing.assert_allclose(found, matrix @ x, atol=50 * np.finfo(dtype).eps)
+    product = jax.jit(lambda operator, x: operator(x))(operator, x)
+    assert product.dtype == dtype
+    np.testing.assert_allclose(product, matrix @ x, atol=50 * np.finfo(dtype).eps)
 
 
 def test_chains_and_candidates_join_the_columns(matrix):
     operator, x = sparse_operator(matrix), RNG.normal(size=(3, 2, 9, 5))
-    found = jax.jit(jax.vmap(jax.vmap(operator)))(x)
-    np.testing.assert_allclose(found, np.einsum("rs,abst->abrt", matrix.toarray(), x), atol=1e-13)
+    products = jax.jit(jax.vmap(jax.vmap(operator)))(x)
+    np.testing.assert_allclose(products, np.einsum("rs,abst->abrt", matrix.toarray(), x), atol=1e-13)
     other_axis = jax.vmap(operator, in_axes=2, out_axes=2)(x[0].swapaxes(0, 1).swapaxes(1, 2))
     np.testing.assert_allclose(other_axis, np.einsum("rs,ast->rta", matrix.toarray(), x[0]), atol=1e-13)
 
@@ -55,7 +55,7 @@ def test_the_derivative_is_the_transposed_product(matrix):
     operator, x, weight = sparse_operator(matrix), RNG.normal(size=(4, 9, 3)), RNG.normal(size=(13, 3))
     dense = matrix.toarray()
     slope = jax.jit(jax.vmap(jax.grad(lambda x: (weight * operator(x) ** 2).sum())))(x)
-    expected = [dense.T @ (2 * weight * (dense @ one)) for one in x]
+    expected = [dense.T @ (2 * weight * (dense @ chain)) for chain in x]
     np.testing.assert_allclose(slope, expected, atol=1e-12)
 
 
@@ -77,8 +77,8 @@ def test_the_hessian_of_the_strain_energy_is_the_stiffness():
     lam, mu, u = jnp.asarray(LAM), jnp.asarray(MU), jnp.asarray(RNG.normal(size=MESH.points.shape))
     exact = stiffness(MESH, LAM, MU).toarray()
     for hessian in (jax.hessian, lambda f: jax.jacrev(jax.grad(f))):
-        found = hessian(lambda u: strain_energy(MESH, lam, mu, u))(u)
-        np.testing.assert_allclose(found.reshape(exact.shape), exact, atol=1e-10)
+        second_derivative = hessian(lambda u: strain_energy(MESH, lam, mu, u))(u)
+        np.testing.assert_allclose(second_derivative.reshape(exact.shape), exact, atol=1e-10)
     mixed = jax.jacfwd(jax.grad(lambda mu, u: strain_energy(MESH, lam, mu, u), argnums=1))(mu, u)
     for tissue, unit in enumerate(np.eye(3)):
         np.testing.assert_allclose(
@@ -89,8 +89,8 @@ def test_the_hessian_of_the_strain_energy_is_the_stiffness():
 def test_a_chain_that_is_not_a_number_leaves_the_others_alone(matrix):
     operator, x = sparse_operator(matrix), RNG.normal(size=(5, 9, 3))
     x[2] = np.nan
-    found = np.asarray(jax.vmap(operator)(x))
-    np.testing.assert_allclose(found[[0, 1, 3, 4]], [matrix @ x[i] for i in (0, 1, 3, 4)], atol=1e-13)
+    products = np.asarray(jax.vmap(operator)(x))
+    np.testing.assert_allclose(products[[0, 1, 3, 4]], [matrix @ x[i] for i in (0, 1, 3, 4)], atol=1e-13)
 
 
 def test_the_matrix_cannot_differ_between_chains(matrix):
@@ -109,19 +109,19 @@ def test_columns_that_are_not_aligned_are_the_same(matrix):
 def test_what_was_given_stays_as_it_was():
     """Rows are sorted for the device, which must not reach the arrays that they came from."""
     data, columns, starts = RNG.normal(size=6), np.array([4, 1, 0, 3, 2, 1]), np.array([0, 3, 6])
-    kept = data.copy(), columns.copy()
-    given = scipy.sparse.csr_array((data, columns, starts), shape=(2, 5))
-    operator = sparse_operator(given)
-    np.testing.assert_array_equal(data, kept[0])
-    np.testing.assert_array_equal(columns, kept[1])
-    np.testing.assert_allclose(operator(jnp.eye(5)), given.toarray())
+    originals = data.copy(), columns.copy()
+    csr_matrix = scipy.sparse.csr_array((data, columns, starts), shape=(2, 5))
+    operator = sparse_operator(csr_matrix)
+    np.testing.assert_array_equal(data, originals[0])
+    np.testing.assert_array_equal(columns, originals[1])
+    np.testing.assert_allclose(operator(jnp.eye(5)), csr_matrix.toarray())
 
 
 def test_displacements_and_gradients_of_a_linear_field():
     slope, shift = RNG.normal(size=(3, 3)), RNG.normal(size=3)
     u = MESH.points @ slope.T + shift
-    found = displacement_gradient(elements_of(MESH).derivative, jnp.asarray(u))
-    np.testing.assert_allclose(found, np.repeat(slope[:, :, None], len(MESH.cells), axis=2), atol=1e-12)
+    gradient = displacement_gradient(elements_of(MESH).derivative, jnp.asarray(u))
+    np.testing.assert_allclose(gradient, np.repeat(slope[:, :, None], len(MESH.cells), axis=2), atol=1e-12)
     quadrature = gauss_quadrature(MESH)
     places = quadrature.positions(MESH)
     np.testing.assert_allclose(quadrature.interpolation(jnp.asarray(u)), places @ slope.T + shift, atol=1e-12)
@@ -132,12 +132,12 @@ def test_forces_of_chains_are_those_of_the_assembled_matrix(batched):
     elements, chains = elements_of(MESH), 3
     full = [RNG.uniform(1, 2, (chains, len(MESH.cells))), RNG.uniform(1, 2, (chains, len(MESH.cells)))]
     full.append(RNG.normal(size=(chains, *MESH.points.shape)))
-    given = [x if axis == 0 else x[0] for x, axis in zip(full, batched, strict=True)]
-    found = jax.vmap(lambda *x: internal_force(elements, *x), in_axes=batched)(*map(jnp.asarray, given))
+    arguments = [x if axis == 0 else x[0] for x, axis in zip(full, batched, strict=True)]
+    forces = jax.vmap(lambda *x: internal_force(elements, *x), in_axes=batched)(*map(jnp.asarray, arguments))
     for chain in range(chains):
         lam, mu, u = (x[chain] if axis == 0 else x[0] for x, axis in zip(full, batched, strict=True))
         expected = stiffness(MESH, lam, mu) @ u.ravel()
-        np.testing.assert_allclose(np.ravel(found[chain]), expected, atol=1e-10)
+        np.testing.assert_allclose(np.ravel(forces[chain]), expected, atol=1e-10)
 
 
 def test_a_block_of_forces_and_its_derivative():
@@ -160,7 +160,7 @@ def test_a_block_of_forces_and_its_derivative():
 def test_the_diagonal_is_that_of_the_assembled_matrix():
     elements, some = elements_of(MESH), MESH.interior
     lam, mu = (RNG.uniform(1, 2, (len(MESH.cells), 3)) for _ in range(2))
-    found = stiffness_diagonal(sparse_operator(derivative_matrix(MESH)[:, some]), elements.volumes, lam, mu)
+    diagonal = stiffness_diagonal(sparse_operator(derivative_matrix(MESH)[:, some]), elements.volumes, lam, mu)
     for chain in range(3):
         expected = stiffness(MESH, lam[:, chain], mu[:, chain]).diagonal()[unknowns_of(some)]
-        np.testing.assert_allclose(np.ravel(found[..., chain]), expected, rtol=1e-12)
+        np.testing.assert_allclose(np.ravel(diagonal[..., chain]), expected, rtol=1e-12)

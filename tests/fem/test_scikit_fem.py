@@ -22,14 +22,14 @@ def skfem_stiffness(mesh, lam, mu):
     """Sum over cells groups of equal parameters; rows 3 · node + axis."""
     grid = skfem.MeshTet(mesh.points.T.copy(), mesh.cells.T.copy())
     element = skfem.ElementVector(skfem.ElementTetP1())
-    parts = [
+    matrices = [
         skfem.asm(
             linear_elasticity(lam[t], mu[t]), skfem.Basis(grid, element, elements=np.flatnonzero(mesh.tissue == t))
         )
         for t in range(len(lam))
     ]
     order = skfem.Basis(grid, element).nodal_dofs.T.ravel()
-    return sum(parts)[order][:, order]
+    return sum(matrices)[order][:, order]
 
 
 @pytest.mark.parametrize(("lam", "mu"), [(LAM, MU), (PAPER_LAM, PAPER_MU)], ids=["gentle", "paper"])
@@ -50,14 +50,14 @@ class TestAgainstScikitFem:
     def test_interior_solution(self, mesh, lam, mu):
         u_boundary = np.random.default_rng(1).normal(size=(len(mesh.boundary), 3))
         K = skfem_stiffness(mesh, lam, mu)
-        given = np.zeros(K.shape[0])
+        prescribed = np.zeros(K.shape[0])
         degrees = (3 * mesh.boundary[:, None] + np.arange(3)).ravel()
-        given[degrees] = u_boundary.ravel()
-        expected = skfem.solve(*skfem.condense(K, x=given, D=degrees)).reshape(-1, 3)
-        found = br.solve_interior(mesh, lam, mu, u_boundary)
-        assert bool(found.converged)
-        np.testing.assert_allclose(found.u, expected, atol=1e-7 * abs(expected).max())
-        np.testing.assert_array_equal(found.u[mesh.boundary], u_boundary)
+        prescribed[degrees] = u_boundary.ravel()
+        expected = skfem.solve(*skfem.condense(K, x=prescribed, D=degrees)).reshape(-1, 3)
+        solution = br.solve_interior(mesh, lam, mu, u_boundary)
+        assert bool(solution.converged)
+        np.testing.assert_allclose(solution.u, expected, atol=1e-7 * abs(expected).max())
+        np.testing.assert_array_equal(solution.u[mesh.boundary], u_boundary)
 
     def test_oracle_too(self, mesh, lam, mu):
         expected = skfem_stiffness(mesh, lam, mu)

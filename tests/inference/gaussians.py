@@ -125,13 +125,13 @@ class GaussianTarget:
 
     def exact_draws(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """(count, nodes, 3), by rejection."""
-        kept = np.zeros((0, NODES, 3))
-        while len(kept) < count:
+        accepted = np.zeros((0, NODES, 3))
+        while len(accepted) < count:
             draws = rng.multivariate_normal(np.zeros(DIMENSION), self.covariance, 2 * count)
             draws = (draws + rng.choice([-1, 1], (len(draws), 1)) * np.asarray(self.data.mean)).reshape(-1, NODES, 3)
             allowed = np.log(rng.uniform(size=len(draws))) < np.asarray(self.log_wall(gap(self.data, draws)))
-            kept = np.concatenate([kept, draws[allowed]])
-        return kept[:count]
+            accepted = np.concatenate([accepted, draws[allowed]])
+        return accepted[:count]
 
 
 def gap(data, u):

@@ -49,11 +49,11 @@ def gaussian_walk(covariance, variances, *, chains, steps, thin=100, entries=10,
     def walk(key, draws):
         key_start, key_walk = jax.random.split(key)
         start = jnp.sqrt(values) * jax.random.normal(key_start, values.shape)
-        (_, accepted), found = jax.lax.scan(kept, (start, 0), jax.random.split(key_walk, draws))
-        return found, accepted
+        (_, accepted), thinned = jax.lax.scan(kept, (start, 0), jax.random.split(key_walk, draws))
+        return thinned, accepted
 
     keys = jax.random.split(jax.random.key(seed), chains)
-    found, accepted = jax.vmap(partial(walk, draws=steps // thin))(keys)
+    coordinates, accepted = jax.vmap(partial(walk, draws=steps // thin))(keys)
     acceptance = float(np.mean(accepted)) / steps
-    measured = np.array([float(az.ess(np.asarray(found[..., i]))) for i in range(entries)]) / (chains * steps)
+    measured = np.array([float(az.ess(np.asarray(coordinates[..., i]))) for i in range(entries)]) / (chains * steps)
     return ess_per_step(covariance, variances, acceptance)[fastest], measured

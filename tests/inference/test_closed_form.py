@@ -55,8 +55,8 @@ def problem() -> Problem:
 @cache
 def walled(wall: float = WALL, width: float = WIDTH) -> br.Posterior:
     """With a skull, whose width is in voxels."""
-    found = problem()
-    images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
+    gaussian_problem = problem()
+    images = (br.Image(*arrays) for arrays in (gaussian_problem.oracle.fixed, gaussian_problem.oracle.moving))
     skull = flat_skull(MESH.points, axis=0, wall=wall, voxel=VOXEL)
     return posterior_of(*images, MESH, skull, **OPTIONS, skull_width=width)
 
@@ -124,8 +124,8 @@ def test_density_is_the_gaussian():
     for step in rng.normal(size=(5, len(exact.mean))):
         expected = -0.5 * step @ exact.precision @ step
         for sign in (-1, 1):
-            found = float(density(exact.mean + sign * step)) - at_mean
-            assert found == pytest.approx(expected, rel=1e-9)
+            difference = float(density(exact.mean + sign * step)) - at_mean
+            assert difference == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.fixture(scope="module", params=["rwmh", "hmc", "nuts", "laplace"])
@@ -178,16 +178,16 @@ def exact_draws(width: float) -> np.ndarray:
     """Brute force: draw from the Gaussian, and keep what the wall of this width, in voxels, lets pass."""
     exact, rng = problem().exact, np.random.default_rng(1)
     height = MESH.points[MESH.boundary, 0]
-    kept = []
-    while sum(map(len, kept)) < 20_000:
+    accepted = []
+    while sum(map(len, accepted)) < 20_000:
         draws = exact.draw(rng, 100_000)
         depth = np.maximum(height + draws[:, ::3] - WALL, 0.0)
         if width:
             passes = np.log(rng.uniform(size=len(draws))) < -0.5 * ((depth / (width * VOXEL)) ** 2).sum(axis=1)
         else:
             passes = (depth == 0).all(axis=1)
-        kept.append(draws[passes])
-    return np.concatenate(kept)
+        accepted.append(draws[passes])
+    return np.concatenate(accepted)
 
 
 @pytest.fixture(scope="module", params=[("rwmh", 0.0, {"sigma_u": 0.22}), ("hmc", WIDTH, {})], ids=["rwmh", "hmc"])

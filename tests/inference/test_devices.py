@@ -36,21 +36,21 @@ def found(sampler):
         state, moments, tally = jax.tree.map(lambda x: x[order], (begun.state, begun.moments, begun.tally))
         block = run_block(chosen, DRAWS, 2, devices, data, 1, order, 0, begun.setup, state, moments, tally)
         jax.block_until_ready(block)
-        kept = block[-1]["u_boundary"]
-        return len(kept.sharding.device_set), np.asarray(kept)[np.argsort(order)]
+        displacements = block[-1]["u_boundary"]
+        return len(displacements.sharding.device_set), np.asarray(displacements)[np.argsort(order)]
 
     two = devices_for(CHAINS)
-    (count, here), (_, there), (_, again), (_, mixed) = (
+    (count, on_two), (_, on_one), (_, again), (_, mixed) = (
         draws(two), draws(None), draws(two), draws(two, (0, 2, 1, 3))
     )  # fmt: skip
     return {
         "devices": count,
         "programs": programs(problem, sampler, settings),
-        "spread": float(here.std()),
-        "moved": float(abs(here[:, 1:] - here[:, :-1]).max()),
-        "one": float(abs(here - there).max()),
-        "again": float(abs(here - again).max()),
-        "mixed": float(abs(here - mixed).max()),
+        "spread": float(on_two.std()),
+        "moved": float(abs(on_two[:, 1:] - on_two[:, :-1]).max()),
+        "one": float(abs(on_two - on_one).max()),
+        "again": float(abs(on_two - again).max()),
+        "mixed": float(abs(on_two - mixed).max()),
     }
 
 
@@ -75,12 +75,12 @@ def test_the_same_draws_on_two_devices(sampler):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["devices"] == 2
-    assert told["programs"] == 1
-    assert told["moved"] > 0
-    assert told["again"] == 0
-    assert max(told["one"], told["mixed"]) < 1e-9 * told["spread"]
+    differences = json.loads(done.stdout)
+    assert differences["devices"] == 2
+    assert differences["programs"] == 1
+    assert differences["moved"] > 0
+    assert differences["again"] == 0
+    assert max(differences["one"], differences["mixed"]) < 1e-9 * differences["spread"]
 
 
 @pytest.mark.parametrize(
@@ -95,12 +95,12 @@ def test_many_chains_run_in_groups_on_a_processor_and_find_the_same(monkeypatch,
         return number, jnp.tanh(matrix @ x)
 
     numbers = jnp.arange(chains)
-    told = jax.make_jaxpr(side_by_side(chain, None))(numbers, x)
-    scans = [each.params["length"] for each in told.eqns if each.primitive.name == "scan"]
+    jaxpr = jax.make_jaxpr(side_by_side(chain, None))(numbers, x)
+    scans = [each.params["length"] for each in jaxpr.eqns if each.primitive.name == "scan"]
     assert scans == ([] if groups == 1 else [groups])
-    same, found = side_by_side(chain, None)(numbers, x)
+    same, outputs = side_by_side(chain, None)(numbers, x)
     np.testing.assert_array_equal(same, numbers)
-    np.testing.assert_allclose(found, jnp.tanh(x @ matrix.T), rtol=1e-12)
+    np.testing.assert_allclose(outputs, jnp.tanh(x @ matrix.T), rtol=1e-12)
 
 
 def test_chains_that_cannot_be_shared_stay_on_one_device(monkeypatch):

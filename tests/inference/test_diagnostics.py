@@ -51,17 +51,17 @@ def found():
     target = posterior(
         normalised=True, priors=priors, t_similarity={"median": 5.0}, t_elastic={"median": 100.0}, fixed={"mu": 1.0}
     ).target
-    given = list(blocks(target))
-    return target, given, to_inference_data(target, given)
+    draw_blocks = list(blocks(target))
+    return target, draw_blocks, to_inference_data(target, draw_blocks)
 
 
 def test_temperatures_are_variables_of_the_posterior(found, tmp_path):
-    target, given, idata = found
-    save_posterior(target, given, tmp_path / "posterior.nc")
+    target, draw_blocks, idata = found
+    save_posterior(target, draw_blocks, tmp_path / "posterior.nc")
     for data in (idata, open_posterior(tmp_path / "posterior.nc")):
         for name in ("t_similarity", "t_elastic"):
             assert data.posterior[name].dims == ("chain", "draw")
-            expected = np.concatenate([block[name] for block in given], axis=1)
+            expected = np.concatenate([block[name] for block in draw_blocks], axis=1)
             np.testing.assert_array_equal(data.posterior[name], expected)
 
 
@@ -94,43 +94,46 @@ def test_what_stands_still_or_is_no_number_has_not_converged(wrong):
 
 
 def test_figures_of_draws_in_parts_are_those_of_all_at_once(found, tmp_path, monkeypatch):
-    target, given, _ = found
-    save_posterior(target, given, tmp_path / "posterior.nc")
+    target, draw_blocks, _ = found
+    save_posterior(target, draw_blocks, tmp_path / "posterior.nc")
     idata = open_posterior(tmp_path / "posterior.nc")
-    whole, extremes = convergence(idata), worst(given)
+    figures_at_once, extremes = convergence(idata), worst(draw_blocks)
     monkeypatch.setattr(diagnostics, "AT_ONCE", 3 * CHAINS * DRAWS)
     monkeypatch.setattr(diagnostics, "READ_AT_ONCE", 7 * CHAINS * DRAWS)
-    assert len(list(diagnostics._columns(given, None))) == -(-diagnostics._flat(given[0]).shape[-1] // 7)
-    assert worst(given) == extremes
-    for expected, parts in zip(whole, convergence(idata), strict=True):
-        assert set(parts.data_vars) == set(expected.data_vars)
+    assert len(list(diagnostics._columns(draw_blocks, None))) == -(-diagnostics._flat(draw_blocks[0]).shape[-1] // 7)
+    assert worst(draw_blocks) == extremes
+    for expected, figures_in_parts in zip(figures_at_once, convergence(idata), strict=True):
+        assert set(figures_in_parts.data_vars) == set(expected.data_vars)
         for name in expected.data_vars:
-            assert parts[name].dims == expected[name].dims
-            np.testing.assert_array_equal(parts[name], expected[name])
+            assert figures_in_parts[name].dims == expected[name].dims
+            np.testing.assert_array_equal(figures_in_parts[name], expected[name])
 
 
 def test_figures_of_blocks_are_those_of_the_file(found, tmp_path):
     """With the known modulus NaN in both; a file has displacements in single precision, which ranks hardly notice."""
-    target, given, idata = found
-    labels = labelled(target, given, figures(given))
-    save_posterior(target, given, tmp_path / "posterior.nc")
+    target, draw_blocks, idata = found
+    labels = labelled(target, draw_blocks, figures(draw_blocks))
+    save_posterior(target, draw_blocks, tmp_path / "posterior.nc")
     for tolerance, data in ((1e-12, idata), (1e-2, open_posterior(tmp_path / "posterior.nc"))):
-        for one, other in zip(labels, convergence(data), strict=True):
-            xr.testing.assert_allclose(one, other, rtol=tolerance)
+        for of_blocks, of_data in zip(labels, convergence(data), strict=True):
+            xr.testing.assert_allclose(of_blocks, of_data, rtol=tolerance)
     assert labels.rhat["mu"].isnull().all()
     assert labels.rhat["lam"].notnull().all()
 
 
 def test_blocks_are_judged_by_name(found):
     """Those of a continued run have their names in another order than those read back of the finished one."""
-    _, given, _ = found
-    assert worst([dict(reversed(given[0].items())), given[1]]) == worst(given)
+    _, draw_blocks, _ = found
+    assert worst([dict(reversed(draw_blocks[0].items())), draw_blocks[1]]) == worst(draw_blocks)
 
 
 def test_blocks_of_unequal_lengths_come_back_from_the_file(found, tmp_path):
-    target, given, idata = found
-    cut = [{name: values[:, part] for name, values in given[0].items()} for part in (slice(0, 12), slice(12, None))]
-    save_posterior(target, [*cut, given[1]], tmp_path / "posterior.nc")
+    target, draw_blocks, idata = found
+    cut = [
+        {name: values[:, draw_range] for name, values in draw_blocks[0].items()}
+        for draw_range in (slice(0, 12), slice(12, None))
+    ]
+    save_posterior(target, [*cut, draw_blocks[1]], tmp_path / "posterior.nc")
     again = open_posterior(tmp_path / "posterior.nc")
     np.testing.assert_array_equal(again.posterior["draw"], idata.posterior["draw"])
     np.testing.assert_allclose(again.posterior["u_boundary"], idata.posterior["u_boundary"], rtol=1e-6)
@@ -139,7 +142,7 @@ def test_blocks_of_unequal_lengths_come_back_from_the_file(found, tmp_path):
     for block, length in zip(to_blocks(target, again, 25), lengths, strict=True):
         assert {len(values[0]) for values in block.values()} == {length}
     np.testing.assert_array_equal(np.concatenate([b["lam"] for b in to_blocks(target, again, 25)], axis=1),
-                                  np.concatenate([block["lam"] for block in given], axis=1))  # fmt: skip
+                                  np.concatenate([block["lam"] for block in draw_blocks], axis=1))  # fmt: skip
 
 
 @pytest.mark.long
@@ -152,20 +155,20 @@ def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
     monkeypatch.setattr(inference_data, "WRITTEN_AT_ONCE", 2**14)
     # What is imported at the first call is no draw.
     _judged_and_written(target, tmp_path / "first", 2)
-    few, many = (_judged_and_written(target, tmp_path / f"{count}", count) for count in (6, 30))
+    peak_of_few, peak_of_many = (_judged_and_written(target, tmp_path / f"{count}", count) for count in (6, 30))
     added = 24 * sum(values.nbytes for values in next(blocks(target)).values())
-    assert many - few < 0.2 * added
+    assert peak_of_many - peak_of_few < 0.2 * added
 
 
 def _judged_and_written(target, folder, count):
     """The greatest number of bytes at once, in the end and on the way."""
     folder.mkdir()
-    kept = StoredBlocks(RunFolder(folder), 0)
+    stored_blocks = StoredBlocks(RunFolder(folder), 0)
     tracemalloc.start()
     for index in range(count):
-        kept.append(next(blocks(target, seed=index)))
-    worst(kept)
-    save_posterior(target, kept, folder / "posterior.nc")
+        stored_blocks.append(next(blocks(target, seed=index)))
+    worst(stored_blocks)
+    save_posterior(target, stored_blocks, folder / "posterior.nc")
     idata = open_posterior(folder / "posterior.nc")
     convergence(idata)
     for _ in to_blocks(target, idata, DRAWS):

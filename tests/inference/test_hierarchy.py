@@ -55,9 +55,9 @@ def given_scale(y, sd):
     """The mode of z, and a covariance of (z, log sd, λ) that is the exact one of z where sd is given."""
     z = sd * y / (sd**2 + NOISE**2)
     slope = np.append(-z, [1.0, 0.3, -0.2])
-    own = np.append(np.full(COUNT, NOISE**2 / (sd**2 + NOISE**2)), [0.0, 0.5, 0.5])
-    covariance = np.diag(own) + np.outer(slope, slope) * 0.01
-    return np.concatenate([z, [np.log(sd)], [1.0, 2.0]]), np.linalg.cholesky(covariance + 1e-12 * np.eye(len(own)))
+    diagonal = np.append(np.full(COUNT, NOISE**2 / (sd**2 + NOISE**2)), [0.0, 0.5, 0.5])
+    covariance = np.diag(diagonal) + np.outer(slope, slope) * 0.01
+    return np.concatenate([z, [np.log(sd)], [1.0, 2.0]]), np.linalg.cholesky(covariance + 1e-12 * np.eye(len(diagonal)))
 
 
 @pytest.mark.parametrize("first", [0.2, 5.0])
@@ -119,8 +119,8 @@ class Displaced:
     def evaluate_estimands(self, data, estimands):
         prior, noise = self.precision / estimands["t_elastic"], estimands["noise"]
         u, logs = estimands["u_boundary"].ravel(), jnp.log(jnp.stack([estimands["t_elastic"], noise]))
-        found = -prior @ u**2 / 2 + jnp.log(prior).sum() / 2 - ((self.y - u) ** 2).sum() / noise**2 / 2
-        return SimpleNamespace(logdensity=found - len(u) * jnp.log(noise) - logs @ logs / 8)
+        log_density = -prior @ u**2 / 2 + jnp.log(prior).sum() / 2 - ((self.y - u) ** 2).sum() / noise**2 / 2
+        return SimpleNamespace(logdensity=log_density - len(u) * jnp.log(noise) - logs @ logs / 8)
 
     def quadratic_part(self, data):
         return data
@@ -142,11 +142,11 @@ def test_scales_come_to_the_maximum_of_their_evidence(temperature, noise, first)
         return stats.norm.logpdf(y, scale=np.sqrt(variance)).sum() + stats.norm.logpdf(logs, scale=2.0).sum()
 
     target = Displaced(precision, y)
-    flat, found = np.append(np.log([first, first]), np.zeros(MOVED)), None
+    flat, maximum = np.append(np.log([first, first]), np.zeros(MOVED)), None
     for _ in range(10):
-        found = maximise_evidence(target, flat, target.quadratic_curvature(None, *[at(target, flat)] * 2))
-        flat = found.flat
-        if found.moved < 1e-3:
+        maximum = maximise_evidence(target, flat, target.quadratic_curvature(None, *[at(target, flat)] * 2))
+        flat = maximum.flat
+        if maximum.moved < 1e-3:
             break
     best = minimize(lambda logs: -log_evidence(logs), np.zeros(2), tol=1e-9).x
     np.testing.assert_allclose(flat[:2], best, atol=1e-2)

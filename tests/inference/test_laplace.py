@@ -33,9 +33,9 @@ def test_a_gaussian_posterior_is_its_own_approximation():
 
 def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
     """Known in closed form at each T_r; the joint mode of T_r and the displacements lies next to T_r = 0."""
-    found = problem()
+    gaussian_problem = problem()
     options = {**OPTIONS, "t_elastic": {"median": 20.0, "log_sd": 1.0}, "normalised": True}
-    arrays = found.oracle.fixed, found.oracle.moving
+    arrays = gaussian_problem.oracle.fixed, gaussian_problem.oracle.moving
     posterior = posterior_of(*(br.Image(*each) for each in arrays), MESH, **options)
 
     def minus_evidence(log_t):
@@ -51,16 +51,16 @@ def test_an_inferred_temperature_lies_where_its_evidence_is_greatest():
     assert abs(best - np.log(20.0)) > 0.1
     assert unravel(posterior.target)(mode)["t_elastic"] == pytest.approx(best, abs=0.01)
     factor, step = np.asarray(laplace(posterior.target, mode).factor), 0.1
-    curvature = sum(way * minus_evidence(best + at * step) for at, way in ((-1, 1), (0, -2), (1, 1))) / step**2
+    curvature = sum(way * minus_evidence(best + offset * step) for offset, way in ((-1, 1), (0, -2), (1, 1))) / step**2
     assert 1 / (factor[0] @ factor[0]) == pytest.approx(curvature, rel=0.03)
     assert curvature > 1.5
 
 
 def test_the_mode_at_a_wall_is_that_of_the_quadratic_program():
     """A wall of a hundredth of a voxel: nodes that the Gaussian presses on it rest there, and others follow."""
-    found, wall = problem(), float(MESH.points[:, 0].max()) + 0.1
-    exact, skull = found.exact, flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
-    images = (br.Image(*arrays) for arrays in (found.oracle.fixed, found.oracle.moving))
+    gaussian_problem, wall = problem(), float(MESH.points[:, 0].max()) + 0.1
+    exact, skull = gaussian_problem.exact, flat_skull(MESH.points, axis=0, wall=wall, voxel=2.0)
+    images = (br.Image(*arrays) for arrays in (gaussian_problem.oracle.fixed, gaussian_problem.oracle.moving))
     posterior = posterior_of(*images, MESH, skull, **OPTIONS, skull_width=1e-2)
     mode = find_mode(posterior.target, np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0]))
     root = np.linalg.cholesky(exact.precision).T
@@ -137,8 +137,8 @@ def test_a_parameter_far_above_its_scale_is_as_wide_as_its_logarithm(above):
     x = stats.expon.ppf((np.arange(4000) + 0.5) / 4000, scale=10.0 * above)
     z = np.asarray(posterior.data.blocks["lam"].unconstrain(jnp.asarray(x)[:, None] * jnp.array([0.0, 1.0, 0.0])))[:, 1]
     position = posterior.unconstrain(posterior.reference())
-    at = {**position, "lam": position["lam"].at[1].set(np.median(z))}
-    least = posterior.target.coordinates.least_curvature(posterior.data, at)["lam"][1]
+    median_position = {**position, "lam": position["lam"].at[1].set(np.median(z))}
+    least = posterior.target.coordinates.least_curvature(posterior.data, median_position)["lam"][1]
     assert 0.5 < z.std() * np.sqrt(least) < 1.5
 
 

@@ -66,7 +66,7 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
     post = posterior()
     flat = np.array(flat_of(post))
     flat[slices(post.target)["lam"]] = -3.0
-    found = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
+    stand_in = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
     entries = np.flatnonzero(mark_normaliser(post.target))
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(20, len(entries)))
@@ -76,7 +76,7 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
     places[20, np.arange(len(flat))[slices(post.target)["lam"]]] = -8.0
     expected = np.array([float(log_normaliser_at(post.target, post.data, place)) for place in places])
     error = expected - [
-        float(found(smooth_coordinates(post.target, post.data, jnp.asarray(place)))) for place in places
+        float(stand_in(smooth_coordinates(post.target, post.data, jnp.asarray(place)))) for place in places
     ]
     error -= error[:20].mean()
     assert expected[:20].std() > 5
@@ -87,9 +87,9 @@ def test_the_stand_in_is_close_to_the_normaliser_over_many_standard_deviations()
 def test_beyond_where_it_was_fitted_the_stand_in_is_linear():
     post = posterior()
     flat = flat_of(post)
-    found = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
-    direction = found.unit / np.sqrt(len(found.unit))
-    near, beyond, far = (float(found(found.centre + scale * found.reach * direction)) for scale in (1, 2, 3))
+    stand_in = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.3 * jnp.eye(len(flat))), flat)
+    direction = stand_in.unit / np.sqrt(len(stand_in.unit))
+    near, beyond, far = (float(stand_in(stand_in.centre + scale * stand_in.reach * direction)) for scale in (1, 2, 3))
     assert beyond - near == pytest.approx(far - beyond, rel=1e-9)
 
 
@@ -99,14 +99,14 @@ def test_many_parameters_have_a_stand_in_of_lower_degree(monkeypatch):
     for degree in (3, 2, 1):
         monkeypatch.setattr("bayesreg.inference.gaussian.normaliser.MOST_TERMS", comb(count + degree, degree))
         assert no_stand_in(post.target).factors.shape == (comb(count + degree, degree), degree)
-    found = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.02 * jnp.eye(len(flat))), flat)
+    stand_in = make_stand_in(post.target, Gaussian(jnp.asarray(flat), 0.02 * jnp.eye(len(flat))), flat)
     step = np.zeros(len(flat))
     step[np.flatnonzero(mark_normaliser(post.target))] = 0.02
     true, approximate = (
         float(of(flat + step) - of(flat - step))
         for of in (
             lambda x: log_normaliser_at(post.target, post.data, x),
-            lambda x: found(smooth_coordinates(post.target, post.data, jnp.asarray(x))),
+            lambda x: stand_in(smooth_coordinates(post.target, post.data, jnp.asarray(x))),
         )
     )
     assert approximate == pytest.approx(true, rel=0.02)
@@ -138,12 +138,12 @@ def test_draws_are_of_the_density_with_the_normaliser(coefficients):
     def chain(key):
         first = kernel.init(jnp.zeros(1))
         state = Delayed(first, log_normaliser(None, jnp.zeros(1)))
-        _, found = jax.lax.scan(
+        _, positions = jax.lax.scan(
             lambda state, key: (lambda new: (new, new.kernel.position[0]))(whole_step(None, None, key, state)[0]),
             state,
             jax.random.split(key, 2100),
         )
-        return found[100:]
+        return positions[100:]
 
     draws = np.asarray(jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(0), 64)))
     x = np.linspace(-7, 7, 4001)
@@ -175,14 +175,14 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
         states, gradients = jax.lax.scan(step, states, jax.random.split(key, (3, 2)))
         return jax.vmap(lambda state: sampler.observe(data, setup, state))(states), gradients
 
-    found, gradients = moved(sampler.data(setup), setup, jax.random.key(0))
+    observed, gradients = moved(sampler.data(setup), setup, jax.random.key(0))
     # Those of trajectories of one step.
     assert (gradients == TOGETHER).all()
     expected = jax.vmap(lambda estimands: post.target.evaluate_estimands(post.data, estimands).logdensity)(
-        found.estimands
+        observed.estimands
     )
-    np.testing.assert_allclose(found.evaluation.logdensity, expected, rtol=1e-9)
-    assert (found.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
+    np.testing.assert_allclose(observed.evaluation.logdensity, expected, rtol=1e-9)
+    assert (observed.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
 
 
 @pytest.mark.long
@@ -193,17 +193,17 @@ def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     setup, _ = hmc(post.target, Hmc(warm_up=2)).prepare(points, jax.random.key(1))
     sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post.target)
     places = np.asarray(setup.middle) + sd * np.random.default_rng(0).normal(size=(10, len(sd)))
-    true, found = (
+    true, approximate = (
         np.array([float(of(post.target, post.data, jnp.asarray(place))) for place in places])
-        for of in (log_normaliser_at, lambda *at: setup.stand_in(smooth_coordinates(*at)))
+        for of in (log_normaliser_at, lambda *arguments: setup.stand_in(smooth_coordinates(*arguments)))
     )
     assert true.std() > 1
-    assert (true - found).std() < 0.05
+    assert (true - approximate).std() < 0.05
 
 
 def test_several_transitions_are_told_of_together():
     flags, counts = jnp.array([False, True]), jnp.array([3, 4])
-    found = together(Info(jnp.array([0.5, 1.0]), flags, ~flags, counts, flags & ~flags, counts, 0 * counts))
-    assert found.acceptance_rate == 0.75
-    assert (bool(found.outside_support), bool(found.solver_failed), bool(found.diverging)) == (True, True, False)
-    assert (int(found.solver_iterations), int(found.gradients), int(found.densities)) == (7, 7, 0)
+    joint = together(Info(jnp.array([0.5, 1.0]), flags, ~flags, counts, flags & ~flags, counts, 0 * counts))
+    assert joint.acceptance_rate == 0.75
+    assert (bool(joint.outside_support), bool(joint.solver_failed), bool(joint.diverging)) == (True, True, False)
+    assert (int(joint.solver_iterations), int(joint.gradients), int(joint.densities)) == (7, 7, 0)

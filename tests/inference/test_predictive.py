@@ -22,27 +22,27 @@ def expected():
 
 @pytest.mark.parametrize("block", [1, 7, 21, 1000])
 def test_every_draw_is_evaluated_once_and_in_order(block):
-    found = list(push_forward(function, DRAWS, block=block))
+    batches = list(push_forward(function, DRAWS, block=block))
     for name, values in expected().items():
-        np.testing.assert_allclose(np.concatenate([part[name] for part in found], axis=1), values, rtol=1e-14)
+        np.testing.assert_allclose(np.concatenate([batch[name] for batch in batches], axis=1), values, rtol=1e-14)
 
 
 def test_mean_sd_and_quantiles_are_those_of_all_draws():
-    found = summarise(push_forward(function, DRAWS, block=21), (0.1, 0.5, 0.9))
+    summary = summarise(push_forward(function, DRAWS, block=21), (0.1, 0.5, 0.9))
     for name, values in expected().items():
-        np.testing.assert_allclose(found.mean[name], values.mean((0, 1)), rtol=1e-12)
-        np.testing.assert_allclose(found.sd[name], values.reshape(150, -1).std(axis=0, ddof=1), rtol=1e-12)
-        np.testing.assert_allclose(found.chain_mean[name], values.mean(1), rtol=1e-12)
-        np.testing.assert_allclose(found.quantiles[name], np.quantile(values, (0.1, 0.5, 0.9), (0, 1)))
+        np.testing.assert_allclose(summary.mean[name], values.mean((0, 1)), rtol=1e-12)
+        np.testing.assert_allclose(summary.sd[name], values.reshape(150, -1).std(axis=0, ddof=1), rtol=1e-12)
+        np.testing.assert_allclose(summary.chain_mean[name], values.mean(1), rtol=1e-12)
+        np.testing.assert_allclose(summary.quantiles[name], np.quantile(values, (0.1, 0.5, 0.9), (0, 1)))
 
 
 def test_memory_is_bounded_and_quantiles_still_come_from_evenly_spaced_draws(monkeypatch):
     monkeypatch.setattr(predictive, "MOST_KEPT", 8)
     ramp = {"x": np.tile(np.arange(50.0), (2, 1))}
-    found = summarise(push_forward(lambda draw, factor: factor * draw["x"], ramp, 1.0, block=6), (0.0, 1.0))
+    summary = summarise(push_forward(lambda draw, factor: factor * draw["x"], ramp, 1.0, block=6), (0.0, 1.0))
     # 8 of 50 are draws 0, 8, …, 48 by way of strides 2 and 4.
-    np.testing.assert_array_equal(found.quantiles, [0, 48])
-    assert found.mean == pytest.approx(24.5)
+    np.testing.assert_array_equal(summary.quantiles, [0, 48])
+    assert summary.mean == pytest.approx(24.5)
 
 
 def test_thinned_draws_are_evenly_spaced_and_at_most_so_many():

@@ -11,12 +11,12 @@ from bayesreg.inference.chains.progress import draws_until, time_left
 
 
 def test_draws_until_convergence_follow_the_excess_of_rhat():
-    seen = [(draws, 1 + 4.0 / draws) for draws in (100, 200, 300)]
-    assert draws_until(seen, 1.01) == pytest.approx(400)
-    assert draws_until(seen, None) is None
+    history = [(draws, 1 + 4.0 / draws) for draws in (100, 200, 300)]
+    assert draws_until(history, 1.01) == pytest.approx(400)
+    assert draws_until(history, None) is None
     assert draws_until([(100, np.inf), (200, np.nan)], 1.01) is None
     # One lucky look does not move it.
-    assert draws_until([*seen, (400, 1.0001)], 1.01) == pytest.approx(400)
+    assert draws_until([*history, (400, 1.0001)], 1.01) == pytest.approx(400)
 
 
 def test_time_left_tells_both():

@@ -22,8 +22,10 @@ def test_the_noise_of_a_sampled_covariance_is_taken_off():
     size, draws = 60, 300
     variances = np.full(size, 0.1)
     exact = ess_per_step(np.eye(size), variances, 0.2)
-    found = np.array([ess_per_step(np.cov(rng.normal(size=(draws, size)).T), variances, 0.2, draws) for _ in range(30)])
-    np.testing.assert_allclose(found.mean(), exact.mean(), rtol=0.03)
+    sampled = np.array(
+        [ess_per_step(np.cov(rng.normal(size=(draws, size)).T), variances, 0.2, draws) for _ in range(30)]
+    )
+    np.testing.assert_allclose(sampled.mean(), exact.mean(), rtol=0.03)
     raw = ess_per_step(np.cov(rng.normal(size=(draws, size)).T), variances, 0.2)
     assert raw.mean() < 0.9 * exact.mean()
 
@@ -33,6 +35,6 @@ def test_entries_whose_spread_is_lost_in_that_noise_have_an_ess_all_the_same():
     size, draws = 60, 80
     widths = np.geomspace(1, 1e-3, size)
     covariance = np.cov((widths * rng.normal(size=(draws, size))).T)
-    found = ess_per_step(covariance, np.full(size, 0.1), 0.2, draws / 2)
-    assert (found > 0).all()
-    assert found.argmin() < 3
+    ess = ess_per_step(covariance, np.full(size, 0.1), 0.2, draws / 2)
+    assert (ess > 0).all()
+    assert ess.argmin() < 3

@@ -36,7 +36,7 @@ def posterior() -> br.Posterior:
 @cache
 def whole():
     blocks = []
-    samples = br.sample(posterior(), draws=12, block=4, on_block=lambda *found: blocks.append(found), **OPTIONS)
+    samples = br.sample(posterior(), draws=12, block=4, on_block=lambda *arguments: blocks.append(arguments), **OPTIONS)
     return samples, blocks
 
 
@@ -45,32 +45,32 @@ def draws(samples):
 
 
 def test_draws_do_not_depend_on_the_blocks():
-    one = br.sample(posterior(), draws=12, block=12, **OPTIONS)
+    single_block = br.sample(posterior(), draws=12, block=12, **OPTIONS)
     for name, values in draws(whole()[0]).items():
-        np.testing.assert_array_equal(values, draws(one)[name])
+        np.testing.assert_array_equal(values, draws(single_block)[name])
 
 
 @pytest.mark.parametrize("target", [GaussianTarget(wall=0.1, width=0.0), None], ids=["gaussian", "registration"])
 def test_steps_passed_over_are_those_that_one_after_the_other_stay_where_they_are(monkeypatch, target):
-    each = SAMPLERS["rwmh"]._replace(make=lambda *given: rwmh(*given)._replace(outside=None))
+    each = SAMPLERS["rwmh"]._replace(make=lambda *arguments: rwmh(*arguments)._replace(outside=None))
     monkeypatch.setitem(SAMPLERS, "each", each)
     # Often outside, and often not.
-    given, sigma_u = (posterior(), 0.05) if target is None else (target, 0.8)
+    sampled_target, sigma_u = (posterior(), 0.05) if target is None else (target, 0.8)
 
     def drawn(sampler):
-        samples = br.sample(given, sampler, 3, 20, 5, thin=4, block=10, progress=False, sigma_u=sigma_u)
-        kept = {name: np.concatenate([block[name] for block in samples.blocks], 1) for name in samples.blocks[0]}
-        return samples.tally, kept | {"mean of u": samples.u_mean, "sd of u": samples.u_sd, **samples.rhat}
+        samples = br.sample(sampled_target, sampler, 3, 20, 5, thin=4, block=10, progress=False, sigma_u=sigma_u)
+        values = {name: np.concatenate([block[name] for block in samples.blocks], 1) for name in samples.blocks[0]}
+        return samples.tally, values | {"mean of u": samples.u_mean, "sd of u": samples.u_sd, **samples.rhat}
 
-    (tally, found), (tally_alone, expected) = drawn("rwmh"), drawn("each")
+    (tally, passed_over), (tally_alone, expected) = drawn("rwmh"), drawn("each")
     for name in expected:
-        np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(passed_over[name], expected[name], rtol=1e-9, atol=1e-12)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9), tally, tally_alone)
     assert (tally.densities == tally.steps - tally.outside_support).all()
     assert (tally.steps == 80).all()
     assert (tally.outside_support > 8).all()
     assert (tally.densities > 8).all()
-    assert (found["outside_support"] == 4).any()
+    assert (passed_over["outside_support"] == 4).any()
 
 
 def test_a_resumed_run_is_the_run_that_was_not_cut_off():
@@ -78,10 +78,10 @@ def test_a_resumed_run_is_the_run_that_was_not_cut_off():
     arrays = {name: value.copy() for name, value in checkpoint_to_arrays(blocks[0][2]).items()}
     checkpoint = checkpoint_from_arrays(arrays, posterior().target, "rwmh", 3)
     assert int(checkpoint.draws) == 4
-    kept = [blocks[0][1]]
-    resumed = br.sample(posterior(), draws=12, block=4, resume=(checkpoint, kept), **OPTIONS)
-    assert resumed.blocks is kept
-    assert [len(block["lp"][0]) for block in kept] == [4, 4, 4]
+    resumed_blocks = [blocks[0][1]]
+    resumed = br.sample(posterior(), draws=12, block=4, resume=(checkpoint, resumed_blocks), **OPTIONS)
+    assert resumed.blocks is resumed_blocks
+    assert [len(block["lp"][0]) for block in resumed_blocks] == [4, 4, 4]
     for name, values in draws(samples).items():
         np.testing.assert_array_equal(values, draws(resumed)[name])
     np.testing.assert_array_equal(resumed.u_sd, samples.u_sd)
@@ -95,29 +95,29 @@ def test_what_is_compiled_serves_another_seed_and_another_pair_on_the_mesh():
     seeded = br.sample(posterior(), draws=12, block=4, **OPTIONS | {"seed": 6})
     paired = br.sample(posterior_of(3), draws=12, block=4, **OPTIONS)
     assert run_block._cache_size() == compiled
-    for found in (seeded, paired):
-        assert (draws(found)["u_boundary"] != draws(again)["u_boundary"]).any()
+    for samples in (seeded, paired):
+        assert (draws(samples)["u_boundary"] != draws(again)["u_boundary"]).any()
     br.sample(posterior(), draws=12, block=4, **OPTIONS | {"sigma_u": 0.06})
     assert run_block._cache_size() == compiled + 1
 
 
 @pytest.mark.parametrize("value", [np.array(0.05), np.float64(0.05)])
 def test_a_setting_may_be_a_number_of_numpys(value):
-    found = br.sample(posterior(), draws=12, block=4, **OPTIONS | {"sigma_u": value})
-    np.testing.assert_array_equal(draws(found)["u_boundary"], draws(whole()[0])["u_boundary"])
+    samples = br.sample(posterior(), draws=12, block=4, **OPTIONS | {"sigma_u": value})
+    np.testing.assert_array_equal(draws(samples)["u_boundary"], draws(whole()[0])["u_boundary"])
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("settings", "message"),
     [
         ({"sigma_u": np.ones(3)}, r"sampler rwmh: sigma_u = array\(\[1., 1., 1.\]\): expected a valid number"),
         ({"sigma_u": -0.1}, "sigma_u = -0.1: expected greater than 0"),
         ({"sigma": 0.1}, "there is no setting sigma; there are sigma_u, sigma_lam, sigma_mu"),
     ],
 )
-def test_a_setting_that_is_none_is_refused(given, message):
+def test_a_setting_that_is_none_is_refused(settings, message):
     with pytest.raises(br.InputError, match=message):
-        br.sample(posterior(), **OPTIONS | given)
+        br.sample(posterior(), **OPTIONS | settings)
 
 
 def test_a_checkpoint_of_another_problem_is_refused():
@@ -159,9 +159,9 @@ def test_statistics_count_what_happened_to_the_proposals():
     assert samples.tally.outside_support.sum() > 50
     for d in range(12):
         values = {name: value[0, d] for name, value in draws(samples).items()}
-        found = posterior().evaluate(values)
-        assert not found.outside_support
-        assert float(found.logdensity) == pytest.approx(float(stats.lp[0, d]), rel=1e-9)
+        evaluation = posterior().evaluate(values)
+        assert not evaluation.outside_support
+        assert float(evaluation.logdensity) == pytest.approx(float(stats.lp[0, d]), rel=1e-9)
 
 
 def test_stop_rules():
@@ -212,25 +212,25 @@ def test_starts_spread_over_the_field_and_stay_out_of_the_skull():
 def test_posterior_file_round_trip(tmp_path):
     samples, _ = whole()
     save_posterior(posterior().target, samples.blocks, tmp_path / "posterior.nc")
-    found = open_posterior(tmp_path / "posterior.nc")
-    assert set(found.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
-    assert found.posterior.u_boundary.dims == ("chain", "draw", "node", "axis")
-    np.testing.assert_array_equal(found.posterior.node, MESH.boundary)
-    np.testing.assert_allclose(found.posterior.u_boundary, samples.idata.posterior.u_boundary, rtol=1e-6, atol=1e-8)
-    np.testing.assert_array_equal(found.posterior.mu.sel(tissue="gm"), 1.0)
-    np.testing.assert_allclose(found.posterior.ratio, found.posterior.lam / found.posterior.mu)
+    idata = open_posterior(tmp_path / "posterior.nc")
+    assert set(idata.posterior.data_vars) == {"u_boundary", "lam", "mu", "ratio"}
+    assert idata.posterior.u_boundary.dims == ("chain", "draw", "node", "axis")
+    np.testing.assert_array_equal(idata.posterior.node, MESH.boundary)
+    np.testing.assert_allclose(idata.posterior.u_boundary, samples.idata.posterior.u_boundary, rtol=1e-6, atol=1e-8)
+    np.testing.assert_array_equal(idata.posterior.mu.sel(tissue="gm"), 1.0)
+    np.testing.assert_allclose(idata.posterior.ratio, idata.posterior.lam / idata.posterior.mu)
     for name in ("lp", "acceptance_rate", "similarity_energy", "strain_energy", "solver_iterations", "diverging"):
-        assert found.sample_stats[name].dims == ("chain", "draw")
-    np.testing.assert_array_equal(found.constant_data.cells, MESH.cells)
+        assert idata.sample_stats[name].dims == ("chain", "draw")
+    np.testing.assert_array_equal(idata.constant_data.cells, MESH.cells)
 
 
 @pytest.mark.long
 def test_solves_of_samplers_about_the_mode_are_those_of_their_draws():
     samples = br.sample(posterior_of(1, 0.5), "hmc", chains=2, draws=3, thin=2, progress=False, warm_up=4)
-    told = samples.idata.sample_stats.solver_iterations.to_numpy()
-    assert (told >= 1).all()
-    assert (told == told.astype(int)).all()
-    assert float(samples.tally.solver_iterations.sum()) == 2 * told.sum()
+    iterations = samples.idata.sample_stats.solver_iterations.to_numpy()
+    assert (iterations >= 1).all()
+    assert (iterations == iterations.astype(int)).all()
+    assert float(samples.tally.solver_iterations.sum()) == 2 * iterations.sum()
 
 
 def test_known_entries_have_no_diagnostics():

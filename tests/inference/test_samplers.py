@@ -133,17 +133,17 @@ def test_from_start_to_end(name):
     Laplace's approximation is exact where the wall is far.
     """
     chains, place = 32, GaussianTarget(wall=50.0) if name == "laplace" else target(name)
-    found = br.sample(
+    samples = br.sample(
         place, name, chains, 220, seed=1, thin=THIN.get(name, 1), block=220, progress=False, **SETTINGS.get(name, {})
     )
-    draws = found.idata.posterior["u_boundary"].values[:, 20:].reshape(chains, 200, -1)
+    draws = samples.idata.posterior["u_boundary"].values[:, 20:].reshape(chains, 200, -1)
     wanted = place.exact_draws(np.random.default_rng(0), 5 * CHAINS).reshape(-1, DIMENSION)
     below = (draws[..., None] < np.quantile(wanted, LEVELS, axis=0).T).mean(axis=1)
     for each, expected in ((draws.mean(axis=1), wanted.mean(axis=0)), (below, LEVELS)):
         error = np.sqrt(each.var(axis=0, ddof=1) / chains + 0.25 / len(wanted))
         assert error.max() < 0.05
         assert abs((each.mean(axis=0) - expected) / error).max() < 4.5
-    assert found.exact == (name != "laplace")
+    assert samples.exact == (name != "laplace")
 
 
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "rwmh"])
@@ -159,17 +159,17 @@ def test_a_resumed_run_is_the_run_that_was_not_cut_off(name):
     blocks = []
     settings = SETTINGS.get(name, {})
     options = {"chains": 3, "draws": 6, "seed": 5, "block": 3, "progress": False} | settings
-    whole = br.sample(target(), name, on_block=lambda *found: blocks.append(found), **options)
+    uninterrupted = br.sample(target(), name, on_block=lambda *arguments: blocks.append(arguments), **options)
     checkpoint = checkpoint_from_arrays(checkpoint_to_arrays(blocks[0][2]), target(), name, 3, **settings)
     resumed = br.sample(target(), name, resume=(checkpoint, [blocks[0][1]]), **options)
-    np.testing.assert_array_equal(whole.idata.posterior["u_boundary"], resumed.idata.posterior["u_boundary"])
+    np.testing.assert_array_equal(uninterrupted.idata.posterior["u_boundary"], resumed.idata.posterior["u_boundary"])
 
 
 def test_chains_that_do_not_stand_where_their_draws_end_are_told():
     """As those of a version with other coordinates."""
     blocks = []
     options = {"chains": 3, "draws": 6, "block": 3, "sigma_u": 0.5, "progress": False}
-    br.sample(target(), "rwmh", on_block=lambda *found: blocks.append(found), **options)
+    br.sample(target(), "rwmh", on_block=lambda *arguments: blocks.append(arguments), **options)
     _, draws, checkpoint = blocks[0]
     elsewhere = draws | {"u_boundary": draws["u_boundary"] + 0.01}
     with pytest.raises(br.InputError, match="another version of bayesreg began this run"):
@@ -188,20 +188,20 @@ def starts_at(*y: float) -> dict[str, np.ndarray]:
 
 def test_every_chain_finds_its_own_mode(caplog):
     caplog.set_level(logging.INFO)
-    found = search_modes(two_modes(), starts_at(-3.0, 4.0, 2.0, -4.0), True)
-    assert len(found.gaussians) == 2
-    assert found.chains[0] == found.chains[3] != found.chains[1] == found.chains[2]
-    centres = np.array([np.asarray(gaussian.centre)[1] for gaussian in found.gaussians])
+    modes = search_modes(two_modes(), starts_at(-3.0, 4.0, 2.0, -4.0), True)
+    assert len(modes.gaussians) == 2
+    assert modes.chains[0] == modes.chains[3] != modes.chains[1] == modes.chains[2]
+    centres = np.array([np.asarray(gaussian.centre)[1] for gaussian in modes.gaussians])
     assert sorted(centres) == pytest.approx([-4.5, 4.5], abs=0.1)
     sd = np.sqrt(two_modes().covariance[1, 1])
-    assert distance(found.gaussians[0], np.asarray(found.gaussians[1].centre)) == pytest.approx(9 / sd, rel=0.02)
+    assert distance(modes.gaussians[0], np.asarray(modes.gaussians[1].centre)) == pytest.approx(9 / sd, rel=0.02)
     assert any("2, about which" in text for text in caplog.messages)
     assert any("chains 0, 3" in text for text in caplog.messages)
 
 
 def test_searches_that_end_in_one_place_are_one_mode():
-    found = search_modes(two_modes(), starts_at(3.0, 4.0), True)
-    assert (len(found.gaussians), found.chains) == (1, [0, 0])
+    modes = search_modes(two_modes(), starts_at(3.0, 4.0), True)
+    assert (len(modes.gaussians), modes.chains) == (1, [0, 0])
 
 
 @pytest.mark.slow
@@ -210,8 +210,8 @@ def test_chains_start_about_their_own_modes():
     start = br.Start(field=np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), fraction=(-0.7, 1.0))
     means = {}
     for search in ("once", "per_chain"):
-        found = br.sample(two_modes(), "hmc", 4, 40, seed=3, start=start, progress=False, mode_search=search)
-        means[search] = found.idata.posterior["u_boundary"].values[:, :, 0, 1].mean(axis=1)
+        samples = br.sample(two_modes(), "hmc", 4, 40, seed=3, start=start, progress=False, mode_search=search)
+        means[search] = samples.idata.posterior["u_boundary"].values[:, :, 0, 1].mean(axis=1)
     assert np.ptp(np.sign(means["once"])) == 0
     assert (np.sign(means["per_chain"]) == [-1, -1, 1, 1]).all()
 
@@ -220,8 +220,8 @@ def test_chains_start_about_their_own_modes():
 def test_tempered_particles_find_both_modes():
     """In proportion to their mass, from a search for the mode that knows only one."""
     start = br.Start(field=np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0]]), fraction=(1.0, 1.0))
-    found = br.sample(two_modes(), "smc", 64, 2, seed=4, start=start, progress=False, particles=512, spread=6.0)
-    share = (found.idata.posterior["u_boundary"].values[:, -1, 0, 1] > 0).mean()
+    samples = br.sample(two_modes(), "smc", 64, 2, seed=4, start=start, progress=False, particles=512, spread=6.0)
+    share = (samples.idata.posterior["u_boundary"].values[:, -1, 0, 1] > 0).mean()
     # Over eight seeds the share was 0.54 with standard deviation 0.05.
     assert 0.3 < share < 0.7
 

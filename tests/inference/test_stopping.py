@@ -24,7 +24,7 @@ def drawn(shift=0.0, node=17):
     mean = {name: x.mean(axis=1) for name, x in draws.items()}
     squares = {name: ((x - x.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) for name, x in draws.items()}
     moments = Moments(np.full(4, DRAWS), {"estimands": mean}, {"estimands": squares})
-    blocks = [{name: x[:, part] for name, x in draws.items()} for part in (slice(0, 200), slice(200, None))]
+    blocks = [{name: x[:, draw_range] for name, x in draws.items()} for draw_range in (slice(0, 200), slice(200, None))]
     return Checkpoint(np.array(DRAWS), None, None, moments, no_steps((4,)), np.array(0.0)), blocks
 
 
@@ -99,8 +99,11 @@ def test_long_runs_are_judged_when_they_have_grown(asked):
     assert all(after / before < 1.11 for before, after in pairwise(due[20:]))
     assert sum(due) < 25 * due[-1]
     late = next(count for count in range(100, 200) if not stopping._is_due(count))
-    parts = np.array_split(np.arange(DRAWS), late)
-    many = [{name: np.concatenate([b[name] for b in blocks], axis=1)[:, part] for name in blocks[0]} for part in parts]
-    assert judge(RULE, checkpoint, many) == (False, None)
+    index_groups = np.array_split(np.arange(DRAWS), late)
+    many_blocks = [
+        {name: np.concatenate([b[name] for b in blocks], axis=1)[:, indices] for name in blocks[0]}
+        for indices in index_groups
+    ]
+    assert judge(RULE, checkpoint, many_blocks) == (False, None)
     assert asked == []
-    assert judge_all(RULE, checkpoint, many).holds
+    assert judge_all(RULE, checkpoint, many_blocks).holds

@@ -41,14 +41,14 @@ class Walk:
 def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_its_own():
     starts = {"u_boundary": jnp.zeros((4, 3)).at[3, 0].set(9.0)}
     tuning = Tuning(60, 0.75, quarter_turns=True)
-    found = {}
+    outcomes = {}
     for apart in (True, False):
         setup, points = tune(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
-        found[apart] = float(setup.step_size), float(points["u_boundary"][3, 0])
-    assert found[True][1] < 3
+        outcomes[apart] = float(setup.step_size), float(points["u_boundary"][3, 0])
+    assert outcomes[True][1] < 3
     # With one step for all it stands where it began, and the others pay for it.
-    assert found[False][1] == 9.0
-    assert found[False][0] < found[True][0]
+    assert outcomes[False][1] == 9.0
+    assert outcomes[False][0] < outcomes[True][0]
 
 
 @pytest.mark.parametrize("size", [0.011, 0.3, 0.46, 0.53, 0.79, 1.2, 1.5, 1.6, 4.0])
@@ -69,11 +69,11 @@ def test_a_place_without_a_slope_has_no_part_in_the_reference():
     target, mode = Broken(), np.zeros(DIMENSION)
     sound = jnp.asarray(target.exact_draws(np.random.default_rng(0), 3))
     lost = sound.at[1].set(jnp.array([-1.0, 60.0, 0.0]))
-    found = about_gaussian._setup_on_average(target, mode, {"u_boundary": lost})
+    setup = about_gaussian._setup_on_average(target, mode, {"u_boundary": lost})
     expected = about_gaussian._setup_on_average(target, mode, {"u_boundary": sound[jnp.array([0, 2])]})
-    np.testing.assert_array_equal(found.gaussian.centre, expected.gaussian.centre)
-    np.testing.assert_array_equal(found.middle, expected.middle)
-    assert np.isfinite(found.middle).all()
+    np.testing.assert_array_equal(setup.gaussian.centre, expected.gaussian.centre)
+    np.testing.assert_array_equal(setup.middle, expected.middle)
+    assert np.isfinite(setup.middle).all()
 
 
 class Ledge(GaussianTarget):

@@ -32,7 +32,7 @@ def test_a_mesh_of_the_labels_agrees(given):
 
 
 @pytest.mark.parametrize(
-    ("points", "order", "said"),
+    ("points", "order", "message"),
     [
         (lambda x: x / 1000, [0, 1, 2], r"in m \(write it in mm\)$"),
         (lambda x: x / 10, [0, 1, 2], r"in cm \(write it in mm\)$"),
@@ -47,24 +47,24 @@ def test_a_mesh_of_the_labels_agrees(given):
         ),
     ],
 )  # fmt: skip
-def test_a_mesh_that_lies_elsewhere_is_told(given, points, order, said):
+def test_a_mesh_that_lies_elsewhere_is_told(given, points, order, message):
     mesh, labels = given
     moved = TetMesh(points(mesh.points), mesh.cells, np.array(order)[mesh.tissue], mesh.names)
     if (moved.volumes < 0).all():
         moved = TetMesh(moved.points, mesh.cells[:, [1, 0, 2, 3]], moved.tissue, mesh.names)
-    with pytest.raises(br.InputError, match=said):
+    with pytest.raises(br.InputError, match=message):
         require_agreement(moved, labels, "mesh.vtu")
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda x: x / 1000, r"% in m \(write it in mm\)$"),
         (lambda x: x * (-1, -1, 1), r"% with x and y reversed \(it may be in LPS: write it in RAS\)$"),
         (lambda x: x + 25, "in no more than .*% of its volume; give a mesh of these labels"),
     ],
 )
-def test_of_readings_that_agree_about_as_well_the_most_usual_is_told(change, said):
+def test_of_readings_that_agree_about_as_well_the_most_usual_is_told(change, message):
     """Shells are much the same reversed."""
     centre = np.array([5.0, -3.0, 8.0])
     affine = np.diag([2.0, 2.0, 2.0, 1.0])
@@ -78,7 +78,7 @@ def test_of_readings_that_agree_about_as_well_the_most_usual_is_told(change, sai
     tissue = label(ball.points[ball.cells].mean(axis=1)) - 1
     labels = grid.with_voxels(label(grid.grid_points()))
     require_agreement(TetMesh(ball.points, ball.cells, tissue, ball.names), labels, "mesh.vtu")
-    with pytest.raises(br.InputError, match=said):
+    with pytest.raises(br.InputError, match=message):
         require_agreement(TetMesh(change(ball.points), ball.cells, tissue, ball.names), labels, "mesh.vtu")
 
 
@@ -90,7 +90,7 @@ def test_a_tetrahedron_that_is_there_twice_is_told(tmp_path):
     with pytest.raises(br.InputError, match="twice"):
         br.load_mesh(tmp_path / "twice.vtu")
     # A node more, far beyond an inner face: three tetrahedra share it.
-    faces = [cell[[k for k in range(4) if k != left]] for cell in mesh.cells for left in range(4)]
+    faces = [cell[[k for k in range(4) if k != opposite]] for cell in mesh.cells for opposite in range(4)]
     inner = next(face for face in faces if sum(set(face) <= set(cell) for cell in mesh.cells.tolist()) == 2)
     points, corners = np.vstack([mesh.points, [200.0, 0.0, 0.0]]), [*inner, len(mesh.points)]
     cells[-1] = (

@@ -44,29 +44,29 @@ def moved(pose, values=lambda v: v):
     return pose.inverse.aligned(FIXED.with_voxels(values(np.asarray(FIXED.voxels)) + noise))
 
 
-def off(found, pose):
-    at = MASK.voxel_to_world(np.argwhere(np.asarray(MASK.voxels)))
-    return np.linalg.norm(found.place(at) - pose.place(at), axis=1).mean()
+def off(estimate, pose):
+    points = MASK.voxel_to_world(np.argwhere(np.asarray(MASK.voxels)))
+    return np.linalg.norm(estimate.place(points) - pose.place(points), axis=1).mean()
 
 
 @pytest.mark.parametrize(("millimetres", "degrees"), [(8.0, 8.0), (20.0, 15.0), (300.0, 20.0)])
 def test_a_rigid_motion_is_found(millimetres, degrees):
     pose = motion(millimetres, degrees)
-    found = find_pose(FIXED, moved(pose), MASK)
-    assert off(found.pose, pose) < 0.3
-    assert found.information > 1.5 * found.as_given
+    alignment = find_pose(FIXED, moved(pose), MASK)
+    assert off(alignment.pose, pose) < 0.3
+    assert alignment.information > 1.5 * alignment.as_given
 
 
 def test_it_is_found_where_bright_and_dark_change_places():
     pose = motion(8.0, 8.0, seed=2)
-    found = find_pose(FIXED, moved(pose, lambda v: np.where(v > 0, 2 - v, 0.0)), MASK)
-    assert off(found.pose, pose) < 0.3
+    alignment = find_pose(FIXED, moved(pose, lambda v: np.where(v > 0, 2 - v, 0.0)), MASK)
+    assert off(alignment.pose, pose) < 0.3
 
 
 def test_images_that_lie_on_one_another_stay():
-    found = find_pose(FIXED, moved(Pose.identity()), MASK)
-    assert off(found.pose, Pose.identity()) < 0.1
-    assert found.information < 1.05 * found.as_given
+    alignment = find_pose(FIXED, moved(Pose.identity()), MASK)
+    assert off(alignment.pose, Pose.identity()) < 0.1
+    assert alignment.information < 1.05 * alignment.as_given
 
 
 def test_what_is_ignored_does_not_mislead():
@@ -77,17 +77,17 @@ def test_what_is_ignored_does_not_mislead():
     voxels[10:25, 10:40, 8:40] = 3 * ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(15, 30, 32)), 1)
     ignored = np.zeros(moving.shape, np.uint8)
     ignored[10:25, 10:40, 8:40] = 1
-    found = find_pose(FIXED, moving.with_voxels(voxels), MASK, moving_ignore=moving.with_voxels(ignored))
-    assert off(found.pose, pose) < 0.3
+    alignment = find_pose(FIXED, moving.with_voxels(voxels), MASK, moving_ignore=moving.with_voxels(ignored))
+    assert off(alignment.pose, pose) < 0.3
 
 
 def test_a_mask_of_a_small_grid_ignores_what_it_holds_alone():
     """In both images, and what is bright there, such as metal, has no say."""
     pose = motion(8.0, 8.0, seed=3)
     moving = moved(pose)
-    part = np.s_[20:28, 20:28, 18:26]
+    block = np.s_[20:28, 20:28, 18:26]
     inside = np.zeros(moving.shape, bool)
-    inside[part] = True
+    inside[block] = True
     cropped = moving.with_voxels(inside.astype(np.uint8)).affine.copy()
     cropped[:3, 3] = moving.voxel_to_world(np.array([20.0, 20.0, 18.0]))
     mask = Image(np.ones((8, 8, 8), np.uint8), cropped)
@@ -100,8 +100,8 @@ def test_a_mask_of_a_small_grid_ignores_what_it_holds_alone():
 
 def test_the_same_images_give_the_same_pose():
     moving = moved(motion(8.0, 8.0))
-    one, other = (find_pose(FIXED, moving, MASK).pose.matrix for _ in range(2))
-    np.testing.assert_array_equal(one, other)
+    first_matrix, second_matrix = (find_pose(FIXED, moving, MASK).pose.matrix for _ in range(2))
+    np.testing.assert_array_equal(first_matrix, second_matrix)
 
 
 def test_images_without_anything_in_common_are_refused():
@@ -124,10 +124,10 @@ def test_demons_find_a_smooth_displacement_in_world_axes():
         x = points - displacement(x)
     moving = fixed.with_voxels(np.asarray(fixed.interpolate(x, "cubic")))
     inside = points[np.asarray(MASK.voxels) != 0]
-    found = np.stack([np.asarray(u.interpolate(inside)) for u in find_demons(fixed, moving)], axis=-1)
+    estimate = np.stack([np.asarray(u.interpolate(inside)) for u in find_demons(fixed, moving)], axis=-1)
     true = displacement(inside)
     moved = np.linalg.norm(true, axis=-1) > 2
-    left = np.linalg.norm(found - true, axis=-1)[moved].mean()
-    assert left < np.linalg.norm(true[moved], axis=-1).mean() / 2
+    residual = np.linalg.norm(estimate - true, axis=-1)[moved].mean()
+    assert residual < np.linalg.norm(true[moved], axis=-1).mean() / 2
     for axis in range(3):
-        assert np.polyfit(true[moved][:, axis], found[moved][:, axis], 1)[0] > 0.5
+        assert np.polyfit(true[moved][:, axis], estimate[moved][:, axis], 1)[0] > 0.5

@@ -74,8 +74,8 @@ def test_damaged_files_are_named(tmp_path):
 def test_arrays_come_back_bit_for_bit(tmp_path):
     arrays = {"x": np.random.default_rng(0).normal(size=(3, 4)), "key": np.array([1, 2], np.uint32), "n": np.array(5)}
     save_arrays(tmp_path / "a.npz", arrays)
-    back = load_arrays(tmp_path / "a.npz", "")
-    assert set(back) == set(arrays)
+    loaded = load_arrays(tmp_path / "a.npz", "")
+    assert set(loaded) == set(arrays)
     for name, value in arrays.items():
-        assert back[name].dtype == value.dtype
-        np.testing.assert_array_equal(back[name], value)
+        assert loaded[name].dtype == value.dtype
+        np.testing.assert_array_equal(loaded[name], value)

@@ -42,7 +42,7 @@ def test_a_field_of_itk_is_read_in_ras(tmp_path):
     field.SetSpacing((2.0, 3.0, 4.0))
     SimpleITK.WriteImage(field, str(tmp_path / "itk.nii.gz"))
     components = load_displacement(tmp_path / "itk.nii.gz")
-    assert [np.unique(one.voxels).tolist() for one in components] == [[-1.0], [-2.0], [3.0]]
+    assert [np.unique(component.voxels).tolist() for component in components] == [[-1.0], [-2.0], [3.0]]
     np.testing.assert_allclose(components[0].voxel_sizes, (2, 3, 4))
 
 
@@ -61,12 +61,12 @@ def test_a_field_may_be_where_chains_start(tmp_path):
     np.testing.assert_allclose(
         read_start(tmp_path / "u.nii.gz", MESH, Pose.identity()), affine_field(MESH.points), atol=1e-4
     )
-    there = MESH.points + affine_field(MESH.points)
-    for found, nodes in (
+    displaced = MESH.points + affine_field(MESH.points)
+    for displacement, nodes in (
         (read_start(tmp_path / "u.nii.gz", MESH, pose), slice(None)),
         (read_boundary(tmp_path / "u.nii.gz", MESH, pose), MESH.boundary),
     ):
-        np.testing.assert_allclose(pose.place(MESH.points[nodes] + found), there[nodes], atol=1e-4)
+        np.testing.assert_allclose(pose.place(MESH.points[nodes] + displacement), displaced[nodes], atol=1e-4)
 
 
 def test_a_field_that_ends_at_the_boundary_is_refused(tmp_path):

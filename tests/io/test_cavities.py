@@ -24,7 +24,7 @@ def deep_cells(mesh):
 
 def neighbour(mesh, cell):
     """The deep cell with which a cell shares a face."""
-    shared = [len(set(mesh.cells[cell]) & set(mesh.cells[other])) for other in deep_cells(mesh)]
+    shared = [len(set(mesh.cells[cell]) & set(mesh.cells[candidate])) for candidate in deep_cells(mesh)]
     return deep_cells(mesh)[shared.index(3)]
 
 

@@ -133,9 +133,9 @@ class TestFromFiles:
         assert tissue[1, 1, 1] == 1
         assert tissue[0, 0, 0] == 0
         nib.save(nib.Nifti1Image(np.full((2, 2, 3), 5, np.int16), affine), tmp_path / "full.nii")
-        whole = from_files(files["t1"], tmp_path / "full.nii", {"brain": 0, "tumour": 5}, files["inside"])
-        assert whole.names == ("brain", "tumour")
-        assert whole.tissue.voxels[1, 1, 1] == 1
+        dataset = from_files(files["t1"], tmp_path / "full.nii", {"brain": 0, "tumour": 5}, files["inside"])
+        assert dataset.names == ("brain", "tumour")
+        assert dataset.tissue.voxels[1, 1, 1] == 1
 
     def test_zero_is_the_rest_of_the_mask(self, files, tmp_path):
         """A mask on a finer grid: what has no label is the organ within it and nothing beyond."""
@@ -189,19 +189,19 @@ def head(affine):
 
 class TestWithoutLabels:
     def test_a_mask_is_the_organ_and_bounds_it(self, files):
-        found = without_labels(files["t1"], files["inside"])
-        assert found.names == ("organ",)
-        np.testing.assert_array_equal(found.tissue.voxels, found.intracranial.voxels)
-        assert found.tissue.voxels.sum() == 64
+        dataset = without_labels(files["t1"], files["inside"])
+        assert dataset.names == ("organ",)
+        np.testing.assert_array_equal(dataset.tissue.voxels, dataset.intracranial.voxels)
+        assert dataset.tissue.voxels.sum() == 64
 
     def test_without_one_the_organ_is_what_stands_out_filled(self, tmp_path, caplog):
         image, ball = head(np.diag([2.0, 2.0, 2.0, 1.0]))
         nib.save(image, tmp_path / "head.nii")
-        found = without_labels(tmp_path / "head.nii")
-        assert found.intracranial is None
-        assert (np.asarray(found.tissue.voxels) != ball).sum() < 0.03 * ball.sum()
+        dataset = without_labels(tmp_path / "head.nii")
+        assert dataset.intracranial is None
+        assert (np.asarray(dataset.tissue.voxels) != ball).sum() < 0.03 * ball.sum()
         assert "Otsu" in caplog.text
-        assert f"{np.count_nonzero(found.tissue.voxels) * 8 / 1000:.4g} ml" in caplog.text
+        assert f"{np.count_nonzero(dataset.tissue.voxels) * 8 / 1000:.4g} ml" in caplog.text
 
 
 def test_a_sheared_image_is_laid_on_axes_at_right_angles(tmp_path, caplog):
@@ -211,17 +211,17 @@ def test_a_sheared_image_is_laid_on_axes_at_right_angles(tmp_path, caplog):
     image = nib.Nifti1Image(ndimage.gaussian_filter(np.asarray(image.dataobj), 1.5), sheared)
     nib.save(image, tmp_path / "head.nii")
     nib.save(nib.Nifti1Image(ball.astype(np.uint8), sheared), tmp_path / "ball.nii")
-    found = from_files(tmp_path / "head.nii", tmp_path / "ball.nii", {"organ": 1})
-    assert found.image.is_orthogonal
+    dataset = from_files(tmp_path / "head.nii", tmp_path / "ball.nii", {"organ": 1})
+    assert dataset.image.is_orthogonal
     assert "not at right angles" in caplog.text
     centre = nib.affines.apply_affine(sheared, np.argwhere(ball).mean(axis=0))
-    there = found.tissue.voxel_to_world(np.argwhere(np.asarray(found.tissue.voxels)).mean(axis=0))
-    np.testing.assert_allclose(there, centre, atol=0.1)
-    at = nib.affines.apply_affine(sheared, np.argwhere(ball)[::50])
-    given = np.asarray(image.dataobj)[tuple(np.argwhere(ball)[::50].T)]
-    assert np.corrcoef(given, np.asarray(found.image.interpolate(at, "cubic")))[0, 1] > 0.98
+    label_centre = dataset.tissue.voxel_to_world(np.argwhere(np.asarray(dataset.tissue.voxels)).mean(axis=0))
+    np.testing.assert_allclose(label_centre, centre, atol=0.1)
+    points = nib.affines.apply_affine(sheared, np.argwhere(ball)[::50])
+    intensities = np.asarray(image.dataobj)[tuple(np.argwhere(ball)[::50].T)]
+    assert np.corrcoef(intensities, np.asarray(dataset.image.interpolate(points, "cubic")))[0, 1] > 0.98
 
 
 def test_a_straight_image_stays_as_it_is(files):
-    found = from_files(files["t1"], files["labels"], OWN_TABLE)
-    np.testing.assert_array_equal(found.image.voxels, np.asarray(nib.load(files["t1"]).dataobj))
+    dataset = from_files(files["t1"], files["labels"], OWN_TABLE)
+    np.testing.assert_array_equal(dataset.image.voxels, np.asarray(nib.load(files["t1"]).dataobj))

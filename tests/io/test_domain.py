@@ -88,10 +88,10 @@ class TestWithoutRidges:
         rough = smooth.voxels.copy()
         rough[middle[0], :, top + 1] = 1
         rough[middle[0] + 5, middle[1], top - 4 : top + 1] = 0
-        found = without_ridges(smooth.with_voxels(rough)).voxels
-        assert found[middle[0], 1, top + 1] == 0
-        assert found[middle[0] + 5, middle[1], top - 1] == 1
-        assert (found != smooth.voxels).mean() < 1e-3
+        cleaned = without_ridges(smooth.with_voxels(rough)).voxels
+        assert cleaned[middle[0], 1, top + 1] == 0
+        assert cleaned[middle[0] + 5, middle[1], top - 1] == 1
+        assert (cleaned != smooth.voxels).mean() < 1e-3
 
     def test_moves_a_flat_wall_nowhere(self, phantom):
         _, inside = phantom

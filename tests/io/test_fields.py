@@ -70,7 +70,7 @@ PLACES = FIELD + GRID.grid_points()
 def test_every_convention_gives_the_same_displacement(tmp_path, make):
     components = load_displacement(make(tmp_path))
     np.testing.assert_allclose(components[0].affine, AFFINE, atol=1e-4)
-    np.testing.assert_allclose(np.stack([one.voxels for one in components], axis=-1), FIELD, atol=1e-4)
+    np.testing.assert_allclose(np.stack([component.voxels for component in components], axis=-1), FIELD, atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -97,13 +97,13 @@ def test_an_affine_transform_is_no_field(tmp_path):
 def test_a_composite_of_a_rigid_motion_and_a_field_is_one_field(tmp_path):
     """As ANTs writes it: points go through the last that was added first."""
     rigid = SimpleITK.Euler3DTransform((0.0, 0.0, 0.0), 0.1, -0.05, 0.2, (3.0, -2.0, 1.0))
-    whole = SimpleITK.CompositeTransform([rigid, SimpleITK.DisplacementFieldTransform(itk_field())])
-    SimpleITK.WriteTransform(whole, str(tmp_path / "both.h5"))
-    found = load_displacement(tmp_path / "both.h5")
+    composite = SimpleITK.CompositeTransform([rigid, SimpleITK.DisplacementFieldTransform(itk_field())])
+    SimpleITK.WriteTransform(composite, str(tmp_path / "both.h5"))
+    components = load_displacement(tmp_path / "both.h5")
     voxel = np.array([2, 2, 1])
-    point = found[0].voxel_to_world(voxel.astype(float))
-    expected = np.array(whole.TransformPoint((point * LPS).tolist())) * LPS - point
-    np.testing.assert_allclose([float(one.voxels[tuple(voxel)]) for one in found], expected, atol=1e-6)
+    point = components[0].voxel_to_world(voxel.astype(float))
+    expected = np.array(composite.TransformPoint((point * LPS).tolist())) * LPS - point
+    np.testing.assert_allclose([float(component.voxels[tuple(voxel)]) for component in components], expected, atol=1e-6)
 
 
 def test_file_holds_lps_vectors(tmp_path):

@@ -30,5 +30,5 @@ def test_a_scale_is_undone_in_the_file(tmp_path):
     for greatest in (1.1, 20.0):
         image = _image(greatest)
         save_in_levels(image, tmp_path / "image.nii.gz", scale)
-        found = np.asarray(nib.load(tmp_path / "image.nii.gz").dataobj)
-        np.testing.assert_allclose(found, scale.undo(image).voxels, atol=400 * LEVEL)
+        stored = np.asarray(nib.load(tmp_path / "image.nii.gz").dataobj)
+        np.testing.assert_allclose(stored, scale.undo(image).voxels, atol=400 * LEVEL)

@@ -45,8 +45,8 @@ def oriented(points, cells):
 
 
 def mesh_of(points, cells):
-    used, kept = np.unique(cells, return_inverse=True)
-    return TetMesh.from_arrays(points[used], kept.reshape(-1, 4), np.zeros(len(cells), int), ("all",))
+    used, renumbered = np.unique(cells, return_inverse=True)
+    return TetMesh.from_arrays(points[used], renumbered.reshape(-1, 4), np.zeros(len(cells), int), ("all",))
 
 
 def held_by(mesh):
@@ -88,24 +88,26 @@ def test_no_edge_may_be_contracted_that_changes_the_topology():
     edges = np.unique(np.sort(mesh.cells[:, EDGES].reshape(-1, 2)), axis=0)
     # Some go through the inside from boundary to boundary: contracted, they would pinch the mesh.
     edges = edges[np.isin(edges, mesh.boundary).all(axis=1)]
-    found = np.array([(may_be_contracted(mesh.cells, a, b), stays_a_ball(mesh.cells, a, b)) for a, b in edges.tolist()])
-    by_links, whole = found.T
-    assert not (by_links & ~whole).any()
-    assert (~whole).sum() > 10
-    assert (by_links & whole).sum() > 0.95 * whole.sum()
+    contractible = np.array(
+        [(may_be_contracted(mesh.cells, a, b), stays_a_ball(mesh.cells, a, b)) for a, b in edges.tolist()]
+    )
+    by_links, by_topology = contractible.T
+    assert not (by_links & ~by_topology).any()
+    assert (~by_topology).sum() > 10
+    assert (by_links & by_topology).sum() > 0.95 * by_topology.sum()
 
 
 def stays_a_ball(cells, a, b):
     """Whether contracting ab leaves one ball, wherever its nodes may lie."""
-    left = np.where(cells == a, b, cells)[~((cells == a).any(axis=1) & (cells == b).any(axis=1))]
-    used, left = np.unique(left, return_inverse=True)
-    left = left.reshape(-1, 4)
-    faces, count = np.unique(np.sort(left[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
-    edges = np.unique(np.sort(left[:, EDGES].reshape(-1, 2), axis=1), axis=0)
-    distinct = len(rows(np.sort(left))) == len(left)
-    if not distinct or count.max() > 2 or len(used) - len(edges) + len(faces) - len(left) != 1:
+    remaining = np.where(cells == a, b, cells)[~((cells == a).any(axis=1) & (cells == b).any(axis=1))]
+    used, remaining = np.unique(remaining, return_inverse=True)
+    remaining = remaining.reshape(-1, 4)
+    faces, count = np.unique(np.sort(remaining[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
+    edges = np.unique(np.sort(remaining[:, EDGES].reshape(-1, 2), axis=1), axis=0)
+    distinct = len(rows(np.sort(remaining))) == len(remaining)
+    if not distinct or count.max() > 2 or len(used) - len(edges) + len(faces) - len(remaining) != 1:
         return False
-    mesh = TetMesh(np.zeros((len(used), 3)), left, np.zeros(len(left), int), ("all",))
+    mesh = TetMesh(np.zeros((len(used), 3)), remaining, np.zeros(len(remaining), int), ("all",))
     try:
         return check_topology(mesh) == 0
     except MeshError:

@@ -58,36 +58,36 @@ LPS = PLACES * [-1, -1, 1]
     ],
 )
 def test_points_are_read_in_ras(tmp_path, name, text):
-    found = read_points(written(tmp_path, name, text))
-    np.testing.assert_allclose(found.points, PLACES)
-    assert found.names == ("a", "b")
-    assert found.sd is None
+    point_set = read_points(written(tmp_path, name, text))
+    np.testing.assert_allclose(point_set.points, PLACES)
+    assert point_set.names == ("a", "b")
+    assert point_set.sd is None
 
 
 def test_a_label_may_hold_what_ends_a_tag_file(tmp_path):
     text = 'MNI Tag Point File\nVolumes = 1;\nPoints =\n 1 -2 3 "a;b % c"\n 4.5 5 -6 % last\n;\n'
-    found = read_points(written(tmp_path, "p.tag", text))
-    np.testing.assert_allclose(found.points, PLACES)
-    assert found.names == ("a;b % c", "")
+    point_set = read_points(written(tmp_path, "p.tag", text))
+    np.testing.assert_allclose(point_set.points, PLACES)
+    assert point_set.names == ("a;b % c", "")
 
 
 def test_pairs_of_a_csv_may_be_lps(tmp_path):
     header = "# CoordinateSystem = LPS\nfixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z\n"
-    found = read_point_pairs(written(tmp_path, "p.csv", header + "1,2,3,4,5,6\n"))
-    np.testing.assert_allclose(found.fixed, [[-1, -2, 3]])
-    np.testing.assert_allclose(found.moving, [[-4, -5, 6]])
+    pairs = read_point_pairs(written(tmp_path, "p.csv", header + "1,2,3,4,5,6\n"))
+    np.testing.assert_allclose(pairs.fixed, [[-1, -2, 3]])
+    np.testing.assert_allclose(pairs.moving, [[-4, -5, 6]])
 
 
 def test_pairs_from_one_file(tmp_path):
     rows = "".join(",".join(map(str, [*p, *q, 0.5])) + "\n" for p, q in zip(PLACES, MOVED, strict=True))
     path = written(tmp_path, "p.csv", "fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z,sd\n" + rows)
-    found = read_point_pairs(path)
-    np.testing.assert_allclose(found.fixed, PLACES)
-    np.testing.assert_allclose(found.moving, MOVED)
-    np.testing.assert_allclose(found.sd, 0.5)
+    pairs = read_point_pairs(path)
+    np.testing.assert_allclose(pairs.fixed, PLACES)
+    np.testing.assert_allclose(pairs.moving, MOVED)
+    np.testing.assert_allclose(pairs.sd, 0.5)
     rows = "".join(" " + " ".join(map(str, [*p, *q])) + ' ""\n' for p, q in zip(PLACES, MOVED, strict=True))
-    found = read_point_pairs(written(tmp_path, "p.tag", f"MNI Tag Point File\nVolumes = 2;\nPoints =\n{rows};\n"))
-    np.testing.assert_allclose(found.moving, MOVED)
+    pairs = read_point_pairs(written(tmp_path, "p.tag", f"MNI Tag Point File\nVolumes = 2;\nPoints =\n{rows};\n"))
+    np.testing.assert_allclose(pairs.moving, MOVED)
     with pytest.raises(br.InputError, match="expected points of one space"):
         read_points(path)
 
@@ -100,17 +100,17 @@ def test_pairs_from_two_files_go_by_name_or_by_order(tmp_path):
     np.testing.assert_allclose(read_point_pairs(first, unnamed).moving, MOVED)
     with pytest.raises(br.InputError, match="give the points of the moving image"):
         read_point_pairs(first)
-    other = written(tmp_path, "o.fcsv", fcsv("RAS", MOVED, labels=("b", "c")))
+    moving_file = written(tmp_path, "o.fcsv", fcsv("RAS", MOVED, labels=("b", "c")))
     with pytest.raises(br.InputError, match="share some names only; 'a' stands in one of them"):
-        read_point_pairs(first, other)
-    other = written(tmp_path, "o.fcsv", fcsv("RAS", MOVED, labels=("m1", "m2")))
-    np.testing.assert_allclose(read_point_pairs(first, other).moving, MOVED)
-    own = written(tmp_path, "sd.csv", "x,y,z,sd\n1,2,3,1\n1,2,4,1\n")
+        read_point_pairs(first, moving_file)
+    moving_file = written(tmp_path, "o.fcsv", fcsv("RAS", MOVED, labels=("m1", "m2")))
+    np.testing.assert_allclose(read_point_pairs(first, moving_file).moving, MOVED)
+    file_with_sd = written(tmp_path, "sd.csv", "x,y,z,sd\n1,2,3,1\n1,2,4,1\n")
     with pytest.raises(br.InputError, match=r"sd\.csv gives an sd; expected it in the file of the fixed points"):
-        read_point_pairs(first, own)
-    one = written(tmp_path, "one.csv", "x,y,z\n1,2,3\n")
+        read_point_pairs(first, file_with_sd)
+    file_of_one = written(tmp_path, "one.csv", "x,y,z\n1,2,3\n")
     with pytest.raises(br.InputError, match=r"holds 2 points and .*one\.csv 1"):
-        read_point_pairs(first, one)
+        read_point_pairs(first, file_of_one)
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def dicom(folder, places=(0.0, 3.0, 6.0, 9.0), series="1.2.3.4", tilt=0.0):
     writer = SimpleITK.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     for number, height in enumerate(places):
-        one = image[:, :, number % SHAPE[2]]
+        slice_image = image[:, :, number % SHAPE[2]]
         tags = {
             "0008|0060": "MR",
             "0020|000e": series,
@@ -83,9 +83,9 @@ def dicom(folder, places=(0.0, 3.0, 6.0, 9.0), series="1.2.3.4", tilt=0.0):
             "0018|0050": "3",
         }
         for tag, value in tags.items():
-            one.SetMetaData(tag, value)
+            slice_image.SetMetaData(tag, value)
         writer.SetFileName(str(folder / f"{(3 * number) % 7}_{number}.dcm"))
-        writer.Execute(one)
+        writer.Execute(slice_image)
     locale.setlocale(locale.LC_ALL, before)
     return folder
 
@@ -142,8 +142,8 @@ def test_a_folder_without_one_series_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds 0 DICOM series; expected one"):
         read_volume(tmp_path)
     dicom(tmp_path / "series")
-    (other,) = dicom(tmp_path / "other", (0.0,), "1.2.3.5").iterdir()
-    other.rename(tmp_path / "series" / "other.dcm")
+    (second_file,) = dicom(tmp_path / "other", (0.0,), "1.2.3.5").iterdir()
+    second_file.rename(tmp_path / "series" / "other.dcm")
     with pytest.raises(ValueError, match=r"holds 2 DICOM series: 1\.2\.3"):
         read_volume(tmp_path / "series")
 
@@ -225,22 +225,22 @@ def trailing_zero(header):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (unit_quaternion, ""),
         (zero_sform, "its q-form is taken"),
         (trailing_zero, ""),
     ],
 )
-def test_headers_that_simpleitk_reads_are_read_as_it_does(tmp_path, caplog, change, told):
+def test_headers_that_simpleitk_reads_are_read_as_it_does(tmp_path, caplog, change, message):
     path = nifti(tmp_path / "a.nii", change)
-    other = SimpleITK.ReadImage(str(path))
+    reference = SimpleITK.ReadImage(str(path))
     volume = load_image(path)
     np.testing.assert_array_equal(volume.voxels, VOXELS)
     for index in ((0, 0, 0), (4, 0, 1), (2, 5, 3)):
-        ras = np.array(other.TransformIndexToPhysicalPoint(index)) * (-1, -1, 1)
+        ras = np.array(reference.TransformIndexToPhysicalPoint(index)) * (-1, -1, 1)
         np.testing.assert_allclose(volume.voxel_to_world(np.array(index, float)), ras, atol=1e-3)
-    assert told in caplog.text
+    assert message in caplog.text
 
 
 @pytest.mark.parametrize("offset", [16, 100, 348, -5])

@@ -58,8 +58,8 @@ def test_killed_between_two_replacements_each_file_is_whole(tmp_path, monkeypatc
             with pytest.raises(KeyboardInterrupt):
                 write(tmp_path, "finished", one=f"1{attempt}", two=f"2{attempt}", three=f"3{attempt}")
         monkeypatch.undo()
-        found = [read(tmp_path, name) for name in ("one", "two", "three")]
-        assert found == [f"{k}{attempt if k <= replaced else ''}" for k in (1, 2, 3)]
+        contents = [read(tmp_path, name) for name in ("one", "two", "three")]
+        assert contents == [f"{k}{attempt if k <= replaced else ''}" for k in (1, 2, 3)]
         assert RunFolder(tmp_path).stage == ("finished" if replaced == 3 else "prepared")
 
 

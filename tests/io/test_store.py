@@ -53,33 +53,33 @@ def assert_same(a: Run, b: Run) -> None:
     np.testing.assert_array_equal(a.u_mean, b.u_mean)
     np.testing.assert_array_equal(a.u_sd, b.u_sd)
     for name in (field.name for field in fields(Run)):
-        one, other = getattr(a, name), getattr(b, name)
-        if isinstance(one, Image):
-            np.testing.assert_array_equal(one.voxels, other.voxels, err_msg=name)
-            np.testing.assert_allclose(one.affine, other.affine, atol=1e-4, err_msg=name)
+        first_value, second_value = getattr(a, name), getattr(b, name)
+        if isinstance(first_value, Image):
+            np.testing.assert_array_equal(first_value.voxels, second_value.voxels, err_msg=name)
+            np.testing.assert_allclose(first_value.affine, second_value.affine, atol=1e-4, err_msg=name)
 
 
 def test_a_run_comes_back_as_it_was_written(run, tmp_path):
     folder = tmp_path / "new" / "run"
     write(folder, run)
-    back = store.read_run(RunFolder(folder))
-    assert_same(run, back)
-    for one, other in zip(run.truth, back.truth, strict=True):
-        np.testing.assert_array_equal(one, other)
+    read_run = store.read_run(RunFolder(folder))
+    assert_same(run, read_run)
+    for written_array, read_array in zip(run.truth, read_run.truth, strict=True):
+        np.testing.assert_array_equal(written_array, read_array)
 
 
 def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
     arrays = {name: np.arange(k + 2.0) for k, name in enumerate(Predicted._fields) if name != "observations"}
     by_cell = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
     arrays |= {name: np.linspace(0, k + 1.0, len(run.mesh.cells)) for k, name in enumerate(by_cell)}
-    left = {"images/residual": np.arange(3.0), "points/names": np.array(["a", "b"])}
-    names = {"place_names": np.array(["third ventricle", "λ"]), "observations": left}
+    observations = {"images/residual": np.arange(3.0), "points/names": np.array(["a", "b"])}
+    names = {"place_names": np.array(["third ventricle", "λ"]), "observations": observations}
     write(tmp_path, replace(run, predicted=Predicted(**arrays | names)))
-    back = store.read_run(RunFolder(tmp_path)).predicted
-    assert list(back.place_names) == ["third ventricle", "λ"]
-    np.testing.assert_array_equal(back.reach, arrays["reach"])
-    np.testing.assert_array_equal(back.of_observation("images")["residual"], np.arange(3.0))
-    assert back.of_observation("points")["names"].tolist() == ["a", "b"]
+    predicted = store.read_run(RunFolder(tmp_path)).predicted
+    assert list(predicted.place_names) == ["third ventricle", "λ"]
+    np.testing.assert_array_equal(predicted.reach, arrays["reach"])
+    np.testing.assert_array_equal(predicted.of_observation("images")["residual"], np.arange(3.0))
+    assert predicted.of_observation("points")["names"].tolist() == ["a", "b"]
     stored = pyvista.read(tmp_path / "mesh.vtu").cell_data
     for name in by_cell:
         np.testing.assert_array_equal(stored[name], arrays[name])
@@ -88,12 +88,12 @@ def test_predictions_come_back_with_names_and_shapes(run, tmp_path):
 def test_truth_skull_and_metrics_may_be_missing(run, tmp_path):
     run = replace(run, truth=None, skull=None, metrics=None)
     write(tmp_path, run)
-    back = store.read_run(RunFolder(tmp_path))
-    assert_same(run, back)
-    assert back.truth is None
-    assert back.skull is None
-    assert back.metrics is None
-    assert back.predicted is None
+    read_run = store.read_run(RunFolder(tmp_path))
+    assert_same(run, read_run)
+    assert read_run.truth is None
+    assert read_run.skull is None
+    assert read_run.metrics is None
+    assert read_run.predicted is None
 
 
 def test_a_truth_without_a_start_comes_back_without(run, tmp_path):

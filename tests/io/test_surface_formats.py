@@ -51,25 +51,25 @@ def _cells(dataset):
 @pytest.mark.parametrize("binary", [False, True])
 def test_the_legacy_format_is_read_as_vtk_reads_it(make, version, binary, tmp_path):
     _write(make(), tmp_path / "a.vtk", version, binary)
-    ours, theirs = read_dataset(tmp_path / "a.vtk"), pyvista.read(tmp_path / "a.vtk")
-    assert type(ours) is type(theirs)
-    np.testing.assert_array_equal(ours.points, theirs.points)
-    for one, other in zip(_cells(ours), _cells(theirs), strict=True):
-        np.testing.assert_array_equal(one, other)
+    dataset, vtk_dataset = read_dataset(tmp_path / "a.vtk"), pyvista.read(tmp_path / "a.vtk")
+    assert type(dataset) is type(vtk_dataset)
+    np.testing.assert_array_equal(dataset.points, vtk_dataset.points)
+    for cells, vtk_cells in zip(_cells(dataset), _cells(vtk_dataset), strict=True):
+        np.testing.assert_array_equal(cells, vtk_cells)
     for name in ("point_data", "cell_data", "field_data"):
-        one, other = getattr(ours, name), getattr(theirs, name)
-        assert set(one.keys()) == set(other.keys())
-        for key in other:
-            np.testing.assert_array_equal(one[key], other[key])
+        arrays, vtk_arrays = getattr(dataset, name), getattr(vtk_dataset, name)
+        assert set(arrays.keys()) == set(vtk_arrays.keys())
+        for key in vtk_arrays:
+            np.testing.assert_array_equal(arrays[key], vtk_arrays[key])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 @pytest.mark.parametrize("binary", [False, True])
 def test_points_and_faces_are_those_that_vtk_reads(suffix, binary, tmp_path):
     _surface().save(tmp_path / f"a{suffix}", **({"binary": binary} if suffix == ".ply" else {}))
-    ours, theirs = read_dataset(tmp_path / f"a{suffix}"), pyvista.read(tmp_path / f"a{suffix}")
-    np.testing.assert_array_equal(ours.points, theirs.points)
-    np.testing.assert_array_equal(ours.faces, theirs.faces)
+    dataset, vtk_dataset = read_dataset(tmp_path / f"a{suffix}"), pyvista.read(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(dataset.points, vtk_dataset.points)
+    np.testing.assert_array_equal(dataset.faces, vtk_dataset.faces)
 
 
 @pytest.mark.parametrize(
@@ -102,6 +102,6 @@ def test_cells_of_points_that_are_not_there_are_refused_in_xml_too(tmp_path):
 
 def test_an_obj_counts_from_one_and_from_the_end(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1/1 2/1 3/1\nf -1 -2 -3\nl 1 4\n")
-    found = read_dataset(tmp_path / "a.obj")
-    np.testing.assert_array_equal(found.faces, [3, 0, 1, 2, 3, 3, 2, 1])
-    np.testing.assert_array_equal(found.lines, [2, 0, 3])
+    dataset = read_dataset(tmp_path / "a.obj")
+    np.testing.assert_array_equal(dataset.faces, [3, 0, 1, 2, 3, 3, 2, 1])
+    np.testing.assert_array_equal(dataset.lines, [2, 0, 3])

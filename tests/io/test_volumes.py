@@ -40,11 +40,11 @@ class TestRoundTrip:
         np.testing.assert_allclose(loaded.affine, affine, rtol=1e-6, atol=1e-5)
 
     @pytest.mark.parametrize(
-        ("given", "stored"),
+        ("dtype", "stored"),
         [("f8", "f4"), ("f4", "f4"), ("i2", "i2"), ("u1", "u1"), ("i8", "i4"), ("?", "u1")],
     )
-    def test_number_types(self, tmp_path, given, stored):
-        image = some_image(dtype=given)
+    def test_number_types(self, tmp_path, dtype, stored):
+        image = some_image(dtype=dtype)
         save_image(image, tmp_path / "image.nii.gz")
         loaded = load_image(tmp_path / "image.nii.gz").voxels
         assert loaded.dtype == np.dtype(stored)
@@ -81,11 +81,11 @@ class TestRoundTrip:
 def test_simpleitk_sees_the_voxels_at_the_same_places(tmp_path, affine):
     image = some_image(affine)
     save_image(image, tmp_path / "image.nii.gz")
-    other = SimpleITK.ReadImage(str(tmp_path / "image.nii.gz"))
+    itk_image = SimpleITK.ReadImage(str(tmp_path / "image.nii.gz"))
     index = (3, 1, 2)
-    ras = np.array(other.TransformIndexToPhysicalPoint(index)) * (-1, -1, 1)
+    ras = np.array(itk_image.TransformIndexToPhysicalPoint(index)) * (-1, -1, 1)
     np.testing.assert_allclose(ras, image.voxel_to_world(np.array(index, float)), atol=1e-4)
-    assert other[index] == image.voxels[index]
+    assert itk_image[index] == image.voxels[index]
 
 
 class TestLoadImage:
@@ -236,17 +236,17 @@ class TestLoadMask:
 
     @pytest.mark.parametrize("values", [(0, 1), (0, 255), (1, 2), (-3.5, 1.5)])
     def test_of_two_values_the_greater_is_inside(self, tmp_path, values):
-        found = load_mask(write(tmp_path / "a.nii", np.where(self.ball, values[1], values[0]).astype(np.float32)))
-        np.testing.assert_array_equal(found.voxels, self.ball)
-        assert found.voxels.dtype == np.uint8
+        mask = load_mask(write(tmp_path / "a.nii", np.where(self.ball, values[1], values[0]).astype(np.float32)))
+        np.testing.assert_array_equal(mask.voxels, self.ball)
+        assert mask.voxels.dtype == np.uint8
 
     @pytest.mark.parametrize("order", [1, 3])
     def test_probabilities_are_cut_at_a_half(self, tmp_path, caplog, order):
         """Smoothed, or resampled by a spline, which overshoots."""
         soft = ndimage.shift(self.ball.astype(float), 0.3, order=order)
         soft = ndimage.gaussian_filter(soft, 0.7) if order == 1 else soft
-        found = load_mask(write(tmp_path / "a.nii", soft.astype(np.float32)))
-        assert found.voxels.sum() == pytest.approx(self.ball.sum(), rel=0.05)
+        mask = load_mask(write(tmp_path / "a.nii", soft.astype(np.float32)))
+        assert mask.voxels.sum() == pytest.approx(self.ball.sum(), rel=0.05)
         assert "at least 0.5 is inside" in caplog.text
 
     def test_255_that_was_stored_as_signed_is_not_the_outside(self, tmp_path):
@@ -296,8 +296,8 @@ class TestOnGridOf:
 
     def test_says_what_falls_off_a_grid_of_whole_voxels(self, caplog):
         image = Image(np.ones((10, 10, 10), np.uint8), np.diag([10.0, 10, 10, 1]))
-        found = on_grid_of(Image(np.zeros((10, 10, 4)), image.affine), image)
-        assert found.voxels.all()
+        resampled = on_grid_of(Image(np.zeros((10, 10, 4)), image.affine), image)
+        assert resampled.voxels.all()
         assert "of 1000 ml that are not zero 400 remain" in caplog.text
 
     def test_half_a_voxel_at_the_border_is_on_the_grid(self):
@@ -322,8 +322,8 @@ class TestProbabilities:
         shares[0, ..., 0], shares[1, ..., 1], shares[2, ..., 2] = 0.9, 0.6, 0.55
         shares[1, ..., 2] = 0.4
         path = write(tmp_path / "tissues.nii.gz", shares)
-        found = load_whole_numbers(path)
-        np.testing.assert_array_equal(found.voxels[:, 0, 0], [1, 2, 3, 0])
+        labels = load_whole_numbers(path)
+        np.testing.assert_array_equal(labels.voxels[:, 0, 0], [1, 2, 3, 0])
         assert "probabilities of 3 tissues" in caplog.text
         tissue = load_labels(path, {"gm": 1, "wm": 2, "csf": 3})
         np.testing.assert_array_equal(tissue.voxels[:, 0, 0], [1, 2, 3, 0])

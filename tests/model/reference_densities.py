@@ -69,12 +69,12 @@ def densities(posterior: br.Posterior, case: str) -> dict[str, np.ndarray]:
     heights, slopes = zip(*map(slope, places), strict=True)
     values = [posterior.constrain(unravel(place)) for place in places]
     terms = [posterior.energies(value) for value in values]
-    found = {
+    arrays = {
         "logdensity": np.array(heights),
         "gradient": np.array(slopes),
         "constrained": np.array([posterior.logdensity_constrained(value) for value in values]),
     }
-    return found | {name: np.array([term[name] for term in terms]) for name in terms[0]}
+    return arrays | {name: np.array([term[name] for term in terms]) for name in terms[0]}
 
 
 def main() -> None:

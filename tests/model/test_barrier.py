@@ -36,10 +36,10 @@ def build(mesh, fixed, moving, least_volume):
 def test_shares_are_those_of_the_volumes():
     mesh = box_mesh()
     u = np.random.default_rng(0).normal(scale=5.0, size=mesh.points.shape)
-    found = volume_shares(elements_of(mesh), jnp.asarray(u))
+    shares = volume_shares(elements_of(mesh), jnp.asarray(u))
     moved = signed_volumes(mesh.points + u, mesh.cells)
     assert (moved < 0).any()
-    np.testing.assert_allclose(found, moved / mesh.volumes, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(shares, moved / mesh.volumes, rtol=1e-9, atol=1e-12)
 
 
 def test_it_is_silent_above_the_least_volume_and_steep_below():
@@ -62,13 +62,13 @@ def test_its_curvature_is_that_of_the_linearised_volumes(shift):
     mesh = box_mesh()
     barrier = build(mesh, mesh.points, mesh.points, 0.1).data.terms["barrier"]
     u = np.random.default_rng(1).normal(scale=0.1, size=mesh.points.shape)
-    one, *others = mesh.cells[len(mesh.cells) // 2]
-    u[one] += shift * (mesh.points[others].mean(axis=0) - mesh.points[one])
+    apex, *others = mesh.cells[len(mesh.cells) // 2]
+    u[apex] += shift * (mesh.points[others].mean(axis=0) - mesh.points[apex])
     shares, push = jax.linearize(lambda u: volume_shares(barrier.elements, u), jnp.asarray(u))
     assert (np.asarray(shares) < 0.1).any() == bool(shift)
     curved = jax.hessian(lambda step: cost((shares + push(step)) / 0.1).sum())(jnp.zeros_like(u))
-    found = _assemble(len(u), barrier.gauss_newton(jnp.asarray(u), {})).toarray()
-    np.testing.assert_allclose(found, curved.reshape(found.shape), rtol=1e-8, atol=1e-8)
+    curvature = _assemble(len(u), barrier.gauss_newton(jnp.asarray(u), {})).toarray()
+    np.testing.assert_allclose(curvature, curved.reshape(curvature.shape), rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("least", [0.0, 0.1])
@@ -108,11 +108,11 @@ def test_displacements_that_the_evidence_takes_too_far_rest(wild, monkeypatch):
     expected, searches = find_mode(posterior.target, start), []
 
     def go_too_far(target, flat, *rest):
-        found = maximise_evidence(target, flat, *rest)
-        searches.append(found)
+        maximum = maximise_evidence(target, flat, *rest)
+        searches.append(maximum)
         away = wild * np.random.default_rng(1).normal(size=flat.shape)
-        far = np.where(mark_hyperparameters(target), found.flat, found.flat + away)
-        return found._replace(flat=far) if len(searches) == 1 else found
+        far = np.where(mark_hyperparameters(target), maximum.flat, maximum.flat + away)
+        return maximum._replace(flat=far) if len(searches) == 1 else maximum
 
     monkeypatch.setattr(mode_search, "maximise_evidence", go_too_far)
     np.testing.assert_allclose(find_mode(posterior.target, start), expected, atol=0.02)

@@ -72,20 +72,20 @@ def with_tolerances(data, solve, slope):
 @pytest.mark.long
 def test_solves_a_hundred_times_as_exact_give_the_same_draws():
     conditioned, draws = chains()
-    found, rate = draws(conditioned)
+    sampled, rate = draws(conditioned)
     expected, _ = draws(with_tolerances(conditioned, 100, 1))
     assert 0.5 < rate.mean() < 0.999
     # In standard deviations of the reference.
-    assert 0 < abs(found - expected).max() < 0.01
+    assert 0 < abs(sampled - expected).max() < 0.01
 
 
 @pytest.mark.long
 def test_slopes_a_million_times_as_exact_are_accepted_no_more_often():
     """A slope only proposes: what it is off by may cost acceptance, and does not."""
     conditioned, draws = chains()
-    (found, rate), (exact, best) = draws(conditioned), draws(with_tolerances(conditioned, 1, 1e6))
+    (sampled, rate), (exact, best) = draws(conditioned), draws(with_tolerances(conditioned, 1, 1e6))
     # After one transition, before what is rounding to a trajectory grows.
-    assert 0 < abs(found[0] - exact[0]).max() < 0.01
+    assert 0 < abs(sampled[0] - exact[0]).max() < 0.01
     assert abs(rate.mean() - best.mean()) < 0.01
 
 
@@ -98,10 +98,10 @@ def test_steps_of_the_papers_kernel_are_as_probable_as_exact_ones():
     exact = with_tolerances(near, 1e4, 1)
 
     def step(state, key):
-        found, expected = (kernel.step(data, start, key, state) for data in (near, exact))
-        return found[0], (found[1].acceptance_rate, expected[1].acceptance_rate)
+        transition, expected = (kernel.step(data, start, key, state) for data in (near, exact))
+        return transition[0], (transition[1].acceptance_rate, expected[1].acceptance_rate)
 
     keys = jax.random.split(jax.random.key(0), count)
-    found, expected = jax.jit(lambda state: jax.lax.scan(step, state, keys))(kernel.init(near, start, start))[1]
+    acceptance, expected = jax.jit(lambda state: jax.lax.scan(step, state, keys))(kernel.init(near, start, start))[1]
     assert 0.1 < expected.mean() < 0.9
-    assert 0 < abs(found - expected).max() < 0.01
+    assert 0 < abs(acceptance - expected).max() < 0.01

@@ -25,14 +25,14 @@ def pairs(temperature, of_flair):
 
 @pytest.mark.parametrize("temperature", [KNOWN, INFERRED])
 def test_the_logs_of_both_add_up(temperature):
-    given = pairs(temperature, temperature)
-    both, *alone = (br.build_posterior(MESH, some) for some in (given, given[:1], given[1:]))
+    both_pairs = pairs(temperature, temperature)
+    both, *alone = (br.build_posterior(MESH, some) for some in (both_pairs, both_pairs[:1], both_pairs[1:]))
     u = np.random.default_rng(0).normal(size=(len(MESH.boundary), 3))
     values = {**both.reference(), "u_boundary": u}
-    found = both.energies(values)
-    for name, one in zip(("images", "flair"), alone, strict=True):
-        its_own = {key: values[key] for key in one.reference()}
-        assert float(found[name]) == pytest.approx(float(one.energies(its_own)[name]), rel=1e-12)
+    energies = both.energies(values)
+    for name, single in zip(("images", "flair"), alone, strict=True):
+        its_own = {key: values[key] for key in single.reference()}
+        assert float(energies[name]) == pytest.approx(float(single.energies(its_own)[name]), rel=1e-12)
 
 
 def test_each_has_its_own_temperature_where_it_is_inferred():
@@ -48,17 +48,17 @@ def test_each_has_its_own_temperature_where_it_is_inferred():
 
 
 def test_known_ones_may_differ():
-    same, other = (br.build_posterior(MESH, pairs(KNOWN, of_flair)) for of_flair in (KNOWN, 3.0))
-    assert [float(other.reference()[name]) for name in ("t_similarity", "flair_t_similarity")] == [2.0, 3.0]
-    before, after = (post.energies(post.reference()) for post in (same, other))
+    same, different = (br.build_posterior(MESH, pairs(KNOWN, of_flair)) for of_flair in (KNOWN, 3.0))
+    assert [float(different.reference()[name]) for name in ("t_similarity", "flair_t_similarity")] == [2.0, 3.0]
+    before, after = (post.energies(post.reference()) for post in (same, different))
     assert float(before["images"]) == float(after["images"])
     assert float(after["flair"]) == pytest.approx(2 / 3 * float(before["flair"]), rel=1e-12)
 
 
 def test_both_are_checked_for_fit():
     """Each as it is alone."""
-    given, chains, draws = pairs(KNOWN, KNOWN), 2, 3
-    both, *alone = (br.build_posterior(MESH, some) for some in (given, given[:1], given[1:]))
+    both_pairs, chains, draws = pairs(KNOWN, KNOWN), 2, 3
+    both, *alone = (br.build_posterior(MESH, some) for some in (both_pairs, both_pairs[:1], both_pairs[1:]))
     u = np.random.default_rng(0).normal(size=(chains, draws, len(MESH.boundary), 3))
     lame = {name: np.broadcast_to(both.reference()[name], (chains, draws, 3)) for name in ("lam", "mu")}
     dims = {"u_boundary": ("node", "axis"), "lam": ("tissue",), "mu": ("tissue",)}
@@ -69,14 +69,14 @@ def test_both_are_checked_for_fit():
         mean = mean_values(post, posterior, still)
         return predict(post, posterior, mean, still, still, places, 0, Pose.identity()).observations
 
-    found = predicted(both)
+    predictions = predicted(both)
     for name, post in zip(("images", "flair"), alone, strict=True):
         expected = predicted(post)
         assert {f"{name}/observed", f"{name}/replicated", f"{name}/residual"} <= set(expected)
-        assert found[f"{name}/observed"].shape[:2] == (chains, draws)
+        assert predictions[f"{name}/observed"].shape[:2] == (chains, draws)
         for key, value in expected.items():
-            np.testing.assert_allclose(found[key], value, rtol=1e-6, atol=1e-6)
-    assert abs(found["images/observed"] - found["flair/observed"]).max() > 0.01
+            np.testing.assert_allclose(predictions[key], value, rtol=1e-6, atol=1e-6)
+    assert abs(predictions["images/observed"] - predictions["flair/observed"]).max() > 0.01
 
 
 def test_a_name_that_another_pair_has_is_refused():

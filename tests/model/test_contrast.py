@@ -44,18 +44,18 @@ def test_the_map_at_rest_is_the_contrast_of_the_other_image():
     moving = FIXED.with_voxels(other_contrast(np.asarray(FIXED.voxels)))
     inside = FIXED.voxel_to_world(np.argwhere(np.ones(FIXED.shape)))
     inside = inside[np.linalg.norm(inside - MESH.points.mean(0), axis=1) < 40]
-    found = map_contrast(FIXED, moving, inside)
-    one, other = (np.asarray(image.interpolate(inside)) for image in (found, moving))
-    assert np.corrcoef(one, other)[0, 1] > 0.95
-    assert np.corrcoef(np.asarray(FIXED.interpolate(inside)), other)[0, 1] < 0.2
+    mapped = map_contrast(FIXED, moving, inside)
+    mapped_values, moving_values = (np.asarray(image.interpolate(inside)) for image in (mapped, moving))
+    assert np.corrcoef(mapped_values, moving_values)[0, 1] > 0.95
+    assert np.corrcoef(np.asarray(FIXED.interpolate(inside)), moving_values)[0, 1] < 0.2
 
 
 @pytest.mark.long
 def test_the_mode_of_a_pair_of_unlike_contrast_is_as_near_as_that_of_one_contrast():
-    one, other = error_of(moved(), one_contrast=True), error_of(moved(other_contrast), one_contrast=False)
+    like_error, unlike_error = error_of(moved(), one_contrast=True), error_of(moved(other_contrast), one_contrast=False)
     # The mesh itself is as coarse as that: it moves by 1.8 mm in the mean.
-    assert one < 0.3
-    assert other < 1.3 * one
+    assert like_error < 0.3
+    assert unlike_error < 1.3 * like_error
 
 
 def displacement(x):
@@ -80,8 +80,8 @@ def error_of(moving, one_contrast, **options):
     posterior = br.build_posterior(MESH, [pair], model)
     start = flat_position(posterior.target, posterior.data, posterior.estimands(posterior.reference()))
     mode = unravel(posterior.target)(find_mode(posterior.target, np.asarray(start)))
-    found = posterior.constrain(mode)["u_boundary"]
-    return np.linalg.norm(np.asarray(found) - displacement(MESH.points), axis=1).mean()
+    displacements = posterior.constrain(mode)["u_boundary"]
+    return np.linalg.norm(np.asarray(displacements) - displacement(MESH.points), axis=1).mean()
 
 
 def test_the_functions_of_the_map_are_among_the_unknowns():
@@ -90,8 +90,8 @@ def test_the_functions_of_the_map_are_among_the_unknowns():
     posterior = br.build_posterior(MESH, [pair])
     basis = np.asarray(posterior.images.shading)
     functions = contrast_functions(FIXED, np.asarray(posterior.images.positions))
-    left = functions - basis @ np.linalg.lstsq(basis, functions, rcond=None)[0]
-    assert np.linalg.norm(left) < 0.01 * np.linalg.norm(functions)
+    residual = functions - basis @ np.linalg.lstsq(basis, functions, rcond=None)[0]
+    assert np.linalg.norm(residual) < 0.01 * np.linalg.norm(functions)
     assert posterior.reference()["images_shading"].shape == (basis.shape[1],)
 
 
@@ -108,7 +108,7 @@ def test_tissues_of_one_brightness_may_differ_in_the_other_image():
     moving = FIXED.with_voxels(np.where(labels == 1, 0.5 * np.asarray(FIXED.voxels), 1 - np.asarray(FIXED.voxels)))
     inside = FIXED.voxel_to_world(np.argwhere(np.ones(FIXED.shape))[::3])
     tissue = FIXED.with_voxels(labels)
-    with_labels, without = (map_contrast(FIXED, moving, inside, given) for given in (tissue, None))
+    with_labels, without = (map_contrast(FIXED, moving, inside, label_image) for label_image in (tissue, None))
     values = np.asarray(moving.voxels).ravel()
     assert np.corrcoef(values, np.asarray(with_labels.voxels).ravel())[0, 1] > 0.98
     assert np.corrcoef(values, np.asarray(without.voxels).ravel())[0, 1] < 0.8
@@ -121,11 +121,11 @@ def test_labels_on_another_grid_are_refused():
 
 def test_a_line_and_a_map_explain_what_they_can():
     rng = np.random.default_rng(0)
-    one = rng.uniform(size=20_000)
-    noise = 0.1 * rng.normal(size=one.shape)
-    line, any_map = explained_shares(one, 3 - 2 * one + noise)
+    intensities = rng.uniform(size=20_000)
+    noise = 0.1 * rng.normal(size=intensities.shape)
+    line, any_map = explained_shares(intensities, 3 - 2 * intensities + noise)
     assert line == pytest.approx(-(4 / 12) / (4 / 12 + 0.01), abs=0.01)
     assert any_map == pytest.approx(-line, abs=0.01)
-    line, any_map = explained_shares(one, (one - 0.5) ** 2)
+    line, any_map = explained_shares(intensities, (intensities - 0.5) ** 2)
     assert abs(line) < 0.01
     assert any_map > 0.99

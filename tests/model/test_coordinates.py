@@ -91,18 +91,18 @@ def test_a_prior_is_the_same_after_a_round_trip_as_a_pytree():
     prior = ScaledBeta(*map(jnp.asarray, (2.0, 3.0, 0.0, 5.0)))
     expected = stats.beta.logpdf(1.0, 2, 3, 0, 5)
     assert float(jax.jit(lambda prior: prior.log_prob(jnp.ones(())))(prior)) == pytest.approx(expected, rel=1e-12)
-    given = ScaledBeta(*map(jnp.asarray, (2.0, 3.0, 0.0, 5.0)), jnp.asarray(betaln(2.0, 3.0)))
-    assert float(jax.tree.map(lambda x: x, given).log_prob(jnp.ones(()))) == pytest.approx(expected, rel=1e-12)
+    with_constant = ScaledBeta(*map(jnp.asarray, (2.0, 3.0, 0.0, 5.0)), jnp.asarray(betaln(2.0, 3.0)))
+    assert float(jax.tree.map(lambda x: x, with_constant).log_prob(jnp.ones(()))) == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_scale_is_the_reference():
     mesh = box_mesh(2)
     images = (smooth_image(mesh.points, seed=seed) for seed in (1, 2))
     priors = {"lam": {"low": 1.0}, "mu": {"high": 8.0}}
-    given = {"lam": np.array([3.0, 0.5, 30.0]), "mu": np.ones(3)}
-    posterior = posterior_of(*images, mesh, reference=given, priors=priors)
+    reference = {"lam": np.array([3.0, 0.5, 30.0]), "mu": np.ones(3)}
+    posterior = posterior_of(*images, mesh, reference=reference, priors=priors)
     median = {**posterior.unconstrain(posterior.reference()), "lam": jnp.zeros(3), "mu": jnp.zeros(2)}
-    found = posterior.constrain(median)
-    np.testing.assert_allclose(found["lam"], 1 + np.log(2) * given["lam"])
+    values = posterior.constrain(median)
+    np.testing.assert_allclose(values["lam"], 1 + np.log(2) * reference["lam"])
     # μ of GM is known.
-    np.testing.assert_allclose(found["mu"], [4.0, 1.0, 4.0])
+    np.testing.assert_allclose(values["mu"], [4.0, 1.0, 4.0])

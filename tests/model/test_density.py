@@ -56,18 +56,18 @@ def posterior(skull=None, **options):
     return posterior_of(FIXED, MOVING, MESH, skull, **(defaults | options))
 
 
-def assert_same_density(found, expected, tolerance=1e-9):
+def assert_same_density(log_densities, expected, tolerance=1e-9):
     """Equal up to one constant for all states, relative to the spread of the values."""
-    found, expected = np.asarray(found), np.asarray(expected)
+    log_densities, expected = np.asarray(log_densities), np.asarray(expected)
     assert np.isfinite(expected).all()
     spread = np.ptp(expected)
     assert spread > 20
-    assert np.ptp(found - expected) < tolerance * spread
+    assert np.ptp(log_densities - expected) < tolerance * spread
 
 
 def assert_densities_agree(post, paper, trial, tolerance=1e-9):
-    found = [float(post.logdensity_constrained(s.values)) for s in trial]
-    assert_same_density(found, [paper.logdensity(*s) for s in trial], tolerance)
+    log_densities = [float(post.logdensity_constrained(s.values)) for s in trial]
+    assert_same_density(log_densities, [paper.logdensity(*s) for s in trial], tolerance)
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -113,9 +113,9 @@ def test_chains_side_by_side_do_not_disturb_one_another():
     trial[2].u[4, 1] = np.nan
     post = posterior()
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *(s.values for s in trial))
-    found = jax.vmap(post.logdensity_constrained)(batch)
+    log_densities = jax.vmap(post.logdensity_constrained)(batch)
     alone = np.array([float(post.logdensity_constrained(s.values)) for s in trial])
-    np.testing.assert_allclose(found, alone, rtol=1e-10)
+    np.testing.assert_allclose(log_densities, alone, rtol=1e-10)
     np.testing.assert_array_equal(np.isfinite(alone), [True, False, False, True])
 
 
@@ -156,7 +156,7 @@ def test_rigid_prior_is_on_the_root_mean_square_displacement():
 @pytest.mark.parametrize("elasticity", ["tissue", "uniform", "element"])
 def test_density_with_beta_priors_and_a_fixed_parameter(elasticity):
     """Scaled Beta priors on all that is free; μ of grey matter (uniform: μ) is known and has none."""
-    known = {"tissue": [1], "uniform": [0], "element": np.flatnonzero(MESH.tissue == 1)}[elasticity]
+    known_entries = {"tissue": [1], "uniform": [0], "element": np.flatnonzero(MESH.tissue == 1)}[elasticity]
     fixed = {"mu": 0.8} if elasticity == "uniform" else {"mu": {"gm": 0.8}}
     priors = {
         "lam": {"alpha": 2.0, "beta": 3.5, "low": 0.1, "high": 40.0},
@@ -166,11 +166,11 @@ def test_density_with_beta_priors_and_a_fixed_parameter(elasticity):
         MESH.boundary,
         prior_lam=Prior(2.0, 3.5, 0.1, 40.0),
         prior_mu=Prior(1.5, 0.8, 0.05, 9.0),
-        free_mu=[i for i in range(ENTRIES[elasticity]) if i not in set(known)],
+        free_mu=[i for i in range(ENTRIES[elasticity]) if i not in set(known_entries)],
     )
     trial = states(len(MESH.boundary), elasticity)
     for state in trial:
-        state.mu[known] = 0.8
+        state.mu[known_entries] = 0.8
     assert_densities_agree(posterior(elasticity=elasticity, fixed=fixed, priors=priors), paper, trial)
 
 
@@ -197,8 +197,10 @@ def test_held_nodes_matter():
     nodes = np.setdiff1d(MESH.boundary, list(HELD))
     elsewhere = dict.fromkeys(HELD, (-2.0, 2.0, 0.0))
     state = states(len(nodes), "tissue")[0]
-    here, there = (posterior(held=held).logdensity_constrained(state.values) for held in (HELD, elsewhere))
-    assert abs(float(here) - float(there)) > 1
+    log_density, shifted_log_density = (
+        posterior(held=held).logdensity_constrained(state.values) for held in (HELD, elsewhere)
+    )
+    assert abs(float(log_density) - float(shifted_log_density)) > 1
 
 
 def test_outside_the_support_the_density_is_zero():
@@ -233,18 +235,18 @@ def test_skull_forbids_what_the_oracle_forbids():
     skull = flat_skull(MESH.points, axis=1, wall=wall, voxel=2.0)
     post, free = posterior(skull=skull, skull_width=0.0), posterior()
     paper = oracle(MESH.boundary, skull=(skull.voxels, skull.affine))
-    seen = {True: 0, False: 0}
+    counts = {True: 0, False: 0}
     for state in states(len(MESH.boundary), "tissue", count=12, seed=3):
         state.u[:] *= 0.95
         if abs(MESH.points[MESH.boundary, 1] + state.u[:, 1] - wall).min() < 0.01:
             continue
         expected = paper.logdensity(*state)
-        seen[bool(np.isfinite(expected))] += 1
-        found = float(post.logdensity_constrained(state.values))
-        assert np.isfinite(found) == np.isfinite(expected)
-        if np.isfinite(found):
-            assert found == pytest.approx(float(free.logdensity_constrained(state.values)), rel=1e-12)
-    assert min(seen.values()) >= 2
+        counts[bool(np.isfinite(expected))] += 1
+        log_density = float(post.logdensity_constrained(state.values))
+        assert np.isfinite(log_density) == np.isfinite(expected)
+        if np.isfinite(log_density):
+            assert log_density == pytest.approx(float(free.logdensity_constrained(state.values)), rel=1e-12)
+    assert min(counts.values()) >= 2
 
 
 def test_off_the_skulls_grid_is_forbidden():

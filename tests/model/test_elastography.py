@@ -34,7 +34,7 @@ def phantom():
 def posterior(free=("lam gm", "mu wm"), **options):
     """Two parameters are free, the others known."""
     fixed, moving, t_similarity, u = phantom()
-    known = {
+    known_parameters = {
         name: {t: float(v) for t, v in zip(NAMES, values, strict=True) if f"{name} {t}" not in free}
         for name, values in (("lam", LAM), ("mu", MU))
     }
@@ -42,7 +42,7 @@ def posterior(free=("lam gm", "mu wm"), **options):
         fixed,
         moving,
         MESH,
-        fixed=known,
+        fixed=known_parameters,
         sampled=[],
         held={int(node): tuple(u[node].tolist()) for node in MESH.boundary},
         t_similarity=t_similarity,
@@ -66,11 +66,11 @@ def oracle():
         MESH.points, MESH.cells, MESH.tissue, *images, MESH.boundary, quadrature="voxels", interpolation="cubic"
     )
     unit, none = np.eye(3), np.zeros(3)
-    parts = [plain.stiffness(one, none) for one in unit], [plain.stiffness(none, one) for one in unit]
+    stiffnesses = [plain.stiffness(tissue, none) for tissue in unit], [plain.stiffness(none, tissue) for tissue in unit]
 
     def energy(lam_gm, mu_wm):
         lam, mu = np.array([LAM[0], lam_gm, LAM[2]]), np.array([MU[0], MU[1], mu_wm])
-        K = sum(c * part for c, part in zip((*lam, *mu), (*parts[0], *parts[1]), strict=True))
+        K = sum(c * matrix for c, matrix in zip((*lam, *mu), (*stiffnesses[0], *stiffnesses[1]), strict=True))
         return plain.similarity(paper.solve_unknown(K, MESH.boundary, u[MESH.boundary])) / t_similarity
 
     return energy
@@ -103,9 +103,9 @@ def grid_posterior():
 @pytest.mark.long
 def test_draws_follow_the_posterior_on_a_grid():
     draws = br.sample(posterior(), "hmc", chains=4, draws=300, seed=0, warm_up=40, block=300, progress=False)
-    found = convergence(draws.idata)
+    diagnostics = convergence(draws.idata)
     sampled = draws.idata.posterior["lam"].values[..., 1], draws.idata.posterior["mu"].values[..., 2]
-    ess = float(found.ess_bulk["lam"][1]), float(found.ess_bulk["mu"][2])
+    ess = float(diagnostics.ess_bulk["lam"][1]), float(diagnostics.ess_bulk["mu"][2])
     for chain_draws, count, (axis, mass) in zip(sampled, ess, grid_posterior(), strict=True):
         mean = mass @ axis
         sd = np.sqrt(mass @ (axis - mean) ** 2)

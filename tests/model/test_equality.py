@@ -32,15 +32,15 @@ def test_what_was_compiled_for_one_finds_the_mode_of_the_other():
     assert first.target == second.target
     assert hash(first.target) == hash(second.target)
     compiled = _height_and_slope._cache_size
-    found = [mode(first)]
+    modes = [mode(first)]
     before = compiled()
-    found.append(mode(second))
+    modes.append(mode(second))
     assert compiled() == before
-    assert abs(found[0] - found[1]).max() > 0.1
+    assert abs(modes[0] - modes[1]).max() > 0.1
     # Downhill to the other's mode.
-    towards = found[1] + 0.05 * (found[0] - found[1])
-    here, there = (second.logdensity(unravel(second.target)(flat)) for flat in (found[1], towards))
-    assert here > there
+    towards = modes[1] + 0.05 * (modes[0] - modes[1])
+    at_mode, beside_mode = (second.logdensity(unravel(second.target)(flat)) for flat in (modes[1], towards))
+    assert at_mode > beside_mode
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,9 @@ def by_tissue(values):
 
 def posterior(elasticity="field", **options):
     fixed, moving = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
-    given = {"field": FieldConfig(modes=MODES, correlation=30.0)} if elasticity == "field" else {}
+    field_options = {"field": FieldConfig(modes=MODES, correlation=30.0)} if elasticity == "field" else {}
     settings = {"t_similarity": 5.0, "t_elastic": 100.0, "interpolation": "cubic", "fixed": {"mu": by_tissue(MU)}}
-    return posterior_of(fixed, moving, MESH, elasticity=elasticity, **(given | settings | options))
+    return posterior_of(fixed, moving, MESH, elasticity=elasticity, **(field_options | settings | options))
 
 
 @cache
@@ -51,9 +51,9 @@ def test_laplacian_is_the_sum_over_common_faces():
     """Every pair of elements, face by face."""
     s = np.random.default_rng(0).normal(size=len(MESH.cells))
     centres, expected = MESH.points[MESH.cells].mean(axis=1), 0.0
-    for e, one in enumerate(MESH.cells):
+    for e, cell in enumerate(MESH.cells):
         for f in range(e):
-            common = sorted(set(one) & set(MESH.cells[f]))
+            common = sorted(set(cell) & set(MESH.cells[f]))
             if len(common) == 3:
                 a, b, c = MESH.points[common]
                 area = np.linalg.norm(np.cross(b - a, c - a)) / 2
@@ -75,8 +75,8 @@ def test_prior_is_a_dense_multivariate_normal():
     dense = stats.multivariate_normal(cov=linalg.inv(N.T @ Q @ N))
     log_volume = np.linalg.slogdet(N.T @ basis)[1]
     for z in np.random.default_rng(1).normal(size=(5, size - tissues)):
-        ours = stats.norm.logpdf(z).sum() - log_volume
-        assert ours == pytest.approx(dense.logpdf(N.T @ basis @ z), abs=1e-6)
+        log_density = stats.norm.logpdf(z).sum() - log_volume
+        assert log_density == pytest.approx(dense.logpdf(N.T @ basis @ z), abs=1e-6)
 
 
 def test_components_are_those_of_the_greatest_variance():
@@ -110,27 +110,27 @@ def test_covariance_is_materns():
 def test_density_is_that_of_parameters_by_element():
     """E_s, E_r and the normaliser, with λ_e = λ_t exp(s_e) and μ_e alike; besides them only the priors."""
     options = {"normalised": True, "priors": {"lam": br.PriorConfig(high=100.0), "mu": br.PriorConfig(high=100.0)}}
-    ours, known = posterior(**options), values()
-    factor = np.exp(0.6 * np.asarray(ours.data.body.field.basis) @ np.asarray(known["field"]))
-    np.testing.assert_allclose(ours.data.body.stiffness_factor(known), factor, rtol=1e-12)
+    field_posterior, state = posterior(**options), values()
+    factor = np.exp(0.6 * np.asarray(field_posterior.data.body.field.basis) @ np.asarray(state["field"]))
+    np.testing.assert_allclose(field_posterior.data.body.stiffness_factor(state), factor, rtol=1e-12)
     lam, mu = (jnp.asarray(entries[MESH.tissue] * factor) for entries in (LAM, MU))
     element = posterior("element", **options | {"fixed": {"mu": by_tissue(MU)}})
-    element = element.energies({"u_boundary": known["u_boundary"], "lam": lam, "mu": mu})
-    found = ours.energies(known)
+    element = element.energies({"u_boundary": state["u_boundary"], "lam": lam, "mu": mu})
+    energies = field_posterior.energies(state)
     for name in ("similarity_energy", "strain_energy", "images", "elastic"):
-        assert float(found[name]) == pytest.approx(float(element[name]), rel=1e-8), name
-    assert float(found["prior_field"]) == pytest.approx(stats.norm.logpdf(known["field"]).sum())
-    assert float(found["prior_field_sd"]) == pytest.approx(stats.halfnorm(scale=0.5).logpdf(0.6))
-    total = sum(float(value) for name, value in found.items() if not name.endswith("_energy"))
-    assert float(ours.logdensity_constrained(known)) == pytest.approx(total, rel=1e-10)
+        assert float(energies[name]) == pytest.approx(float(element[name]), rel=1e-8), name
+    assert float(energies["prior_field"]) == pytest.approx(stats.norm.logpdf(state["field"]).sum())
+    assert float(energies["prior_field_sd"]) == pytest.approx(stats.halfnorm(scale=0.5).logpdf(0.6))
+    total = sum(float(value) for name, value in energies.items() if not name.endswith("_energy"))
+    assert float(field_posterior.logdensity_constrained(state)) == pytest.approx(total, rel=1e-10)
 
 
 def test_positions_and_values_are_two_names_of_one_state():
     position = example().unconstrain(values())
     assert float(position["field_sd"]) == pytest.approx(np.log(0.6))
-    back = example().constrain(position)
+    constrained = example().constrain(position)
     for name, value in values().items():
-        np.testing.assert_allclose(back[name], value, rtol=1e-12)
+        np.testing.assert_allclose(constrained[name], value, rtol=1e-12)
     # The Jacobian of λ (three entries) and log sd.
     slopes = jax.jacobian(lambda z: example().constrain({**position, "lam": z})["lam"])(position["lam"])
     jacobian = np.linalg.slogdet(slopes)[1] + np.log(0.6)
@@ -186,9 +186,9 @@ KEYS = ("field", "u_boundary")
 
 def test_a_stiffness_that_is_not_finite_has_no_density():
     for name, value in (("field_sd", 1e6), ("field_sd", -0.1)):
-        found = example().evaluate(values() | {name: jnp.asarray(value)})
-        assert float(found.logdensity) == -np.inf
-        assert bool(found.outside_support)
+        evaluation = example().evaluate(values() | {name: jnp.asarray(value)})
+        assert float(evaluation.logdensity) == -np.inf
+        assert bool(evaluation.outside_support)
 
 
 def test_the_random_walk_of_the_paper_has_no_step_for_a_field():

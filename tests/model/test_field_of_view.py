@@ -22,16 +22,16 @@ END = 12.5 * 1.5
 @pytest.mark.parametrize("quadrature", ["gauss4", "gauss32", "voxels"])
 def test_no_point_beyond_the_grid_is_compared(quadrature):
     term = build(SLAB, quadrature).data.terms["images"]
-    whole = build(WHOLE, quadrature).data.terms["images"]
-    expected = np.asarray(whole.positions)[np.asarray(whole.positions)[:, 2] <= END]
+    whole_term = build(WHOLE, quadrature).data.terms["images"]
+    expected = np.asarray(whole_term.positions)[np.asarray(whole_term.positions)[:, 2] <= END]
     np.testing.assert_allclose(term.positions, expected)
-    assert float(term.quadrature.weights.sum()) < float(whole.quadrature.weights.sum())
+    assert float(term.quadrature.weights.sum()) < float(whole_term.quadrature.weights.sum())
 
 
 def test_images_do_not_pull_where_nothing_is_seen():
     posterior = build(SLAB, "gauss32")
-    at = posterior.reference()
-    position = posterior.unconstrain(at)
+    reference = posterior.reference()
+    position = posterior.unconstrain(reference)
     pull = jax.grad(lambda x: posterior.logdensity(x))(position)["u_boundary"]
     without = build(None, None)
     prior = jax.grad(lambda x: without.logdensity(x))(without.unconstrain(without.reference()))
@@ -54,5 +54,5 @@ def build(moving, quadrature):
 
 def test_the_state_of_a_slab_is_finite():
     posterior = build(SLAB, "voxels")
-    found = posterior.logdensity(posterior.unconstrain(posterior.reference()))
-    assert jnp.isfinite(found)
+    log_density = posterior.logdensity(posterior.unconstrain(posterior.reference()))
+    assert jnp.isfinite(log_density)

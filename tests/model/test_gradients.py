@@ -52,8 +52,8 @@ def central_difference(function, position, direction, step=1e-4):
 def assert_gradient(function, position):
     gradient = jax.grad(function)(position)
     for group, direction in directions(position):
-        found = sum(float((gradient[name] * direction[name]).sum()) for name in position)
-        assert found == pytest.approx(central_difference(function, position, direction), rel=1e-6), group
+        slope = sum(float((gradient[name] * direction[name]).sum()) for name in position)
+        assert slope == pytest.approx(central_difference(function, position, direction), rel=1e-6), group
 
 
 @pytest.mark.parametrize(("lam", "mu"), [(LAM, MU), (PAPER_LAM, PAPER_MU)], ids=["gentle", "paper"])
@@ -108,9 +108,9 @@ def test_jacobian_of_the_unconstrained_density():
     post = posterior(priors={"lam": {"alpha": 2.0, "beta": 3.0, "low": 0.5, "high": 40.0}})
     values = {**state(LAM, MU), "lam": LAM, "mu": MU}
     position = post.unconstrain(values)
-    back = post.constrain(position)
+    constrained = post.constrain(position)
     for name, value in values.items():
-        np.testing.assert_allclose(back[name], value, rtol=1e-12)
+        np.testing.assert_allclose(constrained[name], value, rtol=1e-12)
     log_determinant = 0.0
     for name in ("lam", "mu"):
         jacobian = jax.jacobian(lambda z, name=name: post.constrain({**position, name: z})[name])(position[name])
@@ -124,11 +124,11 @@ def test_curvature_in_the_displacements_is_the_hessian(similarity):
     """With its remainder, against differences of the gradient; the images differ, so that it is more than rounding."""
     post = posterior(similarity=similarity, rigid_sd=0.5, fixed={"lam": by_tissue(LAM), "mu": by_tissue(MU)})
     u = state(LAM, MU)["u_boundary"]
-    found = post.target.mode_search.curvature(post.data, {"u_boundary": u})
+    curvature = post.target.mode_search.curvature(post.data, {"u_boundary": u})
     slope = jax.jit(jax.grad(lambda u: -post.logdensity({"u_boundary": u})))
     for direction in np.random.default_rng(1).normal(size=(3, *u.shape)):
         expected = (slope(u + 1e-4 * direction) - slope(u - 1e-4 * direction)) / 2e-4
-        product, rest = (matrix @ direction.ravel() for matrix in (found.gauss_newton, found.remainder))
+        product, rest = (matrix @ direction.ravel() for matrix in (curvature.gauss_newton, curvature.remainder))
         np.testing.assert_allclose(product + rest, np.ravel(expected), atol=1e-4 * float(abs(expected).max()))
         assert abs(rest).max() > 0.01 * abs(product).max()
 

@@ -35,11 +35,11 @@ def build(similarity="ssd", t_similarity=4.0, interpolation="linear", **ignored)
 
 
 def test_no_point_is_compared_where_the_fixed_image_is_ignored():
-    term, whole = (build(**given).data.terms["images"] for given in ({"fixed_ignore": IGNORE}, {}))
-    x = np.asarray(whole.positions)[:, 0]
+    term, whole_term = (build(**options).data.terms["images"] for options in ({"fixed_ignore": IGNORE}, {}))
+    x = np.asarray(whole_term.positions)[:, 0]
     # The image's voxels lie at multiples of 1.5 mm. The one at the end is ignored as the neighbour of an ignored one,
     # and so is half the way to the next.
-    np.testing.assert_allclose(term.positions, np.asarray(whole.positions)[x > END + 0.75])
+    np.testing.assert_allclose(term.positions, np.asarray(whole_term.positions)[x > END + 0.75])
     assert (x <= END + 0.75).any()
 
 
@@ -72,10 +72,10 @@ def test_replicates_are_drawn_from_the_density(similarity):
     f, m, w = (np.asarray(x) for x in (term.fixed_values, term.moving(places), term.quadrature.weights))
     noise, variance = stats.norm() if similarity == "ssd" else stats.t(4.0), 4.0 / (2 * w)
     x = np.asarray(places)[:, 0]
-    hidden, seen = x < END, x > END + 1.5
-    assert min(hidden.sum(), seen.sum()) > 50
+    hidden, visible = x < END, x > END + 1.5
+    assert min(hidden.sum(), visible.sum()) > 50
     for points, mean, scale in (
-        (seen, m, np.sqrt(variance)),
+        (visible, m, np.sqrt(variance)),
         (hidden, np.full_like(f, f.mean()), np.sqrt(variance + f.var())),
     ):
         z = ((replicates - mean) / scale)[:, points]
@@ -103,26 +103,28 @@ def test_intensities_that_are_ignored_change_nothing(similarity, smoothing):
     voxels, fixed = np.array(MOVING.voxels), np.array(FIXED.voxels)
     voxels[:8], fixed[:8] = 1000.0, -500.0
     pairs = (FIXED, MOVING), (FIXED.with_voxels(fixed), MOVING.with_voxels(voxels))
-    one, other = (
+    original, altered = (
         br.build_posterior(MESH, [br.ImagePair(*pair, fixed_ignore=IGNORE, moving_ignore=IGNORE, **options)], MODEL)
         for pair in pairs
     )
-    values = {**one.reference(), "u_boundary": RNG.normal(scale=0.1, size=MESH.points.shape)}
+    values = {**original.reference(), "u_boundary": RNG.normal(scale=0.1, size=MESH.points.shape)}
     for name in ("images", "elastic"):
-        assert float(other.energies(values)[name]) == pytest.approx(float(one.energies(values)[name]), rel=1e-12)
+        assert float(altered.energies(values)[name]) == pytest.approx(float(original.energies(values)[name]), rel=1e-12)
 
 
 def test_beyond_its_own_grid_a_mask_ignores_nothing():
     """A mask that was cropped to what it holds is worth as much as on the whole grid."""
-    whole = np.zeros((60, 60, 60))
-    whole[20:30, 22:34, 18:28] = 1
-    cropped = Image(whole[20:30, 22:34, 18:28], IGNORE.affine.copy())
+    mask_voxels = np.zeros((60, 60, 60))
+    mask_voxels[20:30, 22:34, 18:28] = 1
+    cropped = Image(mask_voxels[20:30, 22:34, 18:28], IGNORE.affine.copy())
     cropped.affine[:3, 3] = IGNORE.affine[:3, :3] @ (20, 22, 18)
     for which in ("fixed_ignore", "moving_ignore"):
-        one, other = (build(**{which: mask}).data.terms["images"] for mask in (IGNORE.with_voxels(whole), cropped))
-        np.testing.assert_array_equal(one.positions, other.positions)
+        whole_term, cropped_term = (
+            build(**{which: mask}).data.terms["images"] for mask in (IGNORE.with_voxels(mask_voxels), cropped)
+        )
+        np.testing.assert_array_equal(whole_term.positions, cropped_term.positions)
         if which == "moving_ignore":
-            shares = [np.asarray(term.visible(term.positions)) for term in (one, other)]
+            shares = [np.asarray(term.visible(term.positions)) for term in (whole_term, cropped_term)]
             np.testing.assert_array_equal(*shares)
             assert 0.5 < shares[0].mean() < 1
 
@@ -133,10 +135,10 @@ def test_no_warmth_of_the_similarity_draws_points_into_the_mask():
         post = build("student_t", t_similarity, moving_ignore=IGNORE)
         term = post.data.terms["images"]
         same = term._replace(fixed_values=term.moving(term.positions))
-        seen = same._replace(visible=lambda places: jnp.ones(len(places)))
+        visible = same._replace(visible=lambda places: jnp.ones(len(places)))
         hidden = same._replace(visible=lambda places: jnp.zeros(len(places)))
         values = post.reference()
-        logs = [float(_log(one, values)) for one in (seen, hidden)]
+        logs = [float(_log(variant, values)) for variant in (visible, hidden)]
         assert logs[0] > logs[1]
 
 

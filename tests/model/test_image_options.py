@@ -13,9 +13,9 @@ FIXED, MOVING = (smooth_image(MESH.points, seed=seed) for seed in (1, 2))
 WIDE = br.ScalePrior(median=0.05, log_sd=3.0)
 
 
-def options_of(preset, **given):
+def options_of(preset, **options):
     """The options of the pair in a posterior of a model with this preset."""
-    post = br.build_posterior(MESH, [br.ImagePair(FIXED, MOVING, **given)], br.ModelConfig(preset=preset))
+    post = br.build_posterior(MESH, [br.ImagePair(FIXED, MOVING, **options)], br.ModelConfig(preset=preset))
     return post.observations["images"].options
 
 
@@ -62,7 +62,7 @@ def test_what_is_given_replaces_the_preset_and_the_rest_stays():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         ({"similarity": "lncc", "intensity_map": 1}, "images: intensity_map: .*maps of its own"),
         ({"similarity": "ncc"}, "images: similarity: .*'ncc'"),
@@ -71,6 +71,6 @@ def test_what_is_given_replaces_the_preset_and_the_rest_stays():
         ({"blur": 1.0}, "images: blur"),
     ],
 )
-def test_what_is_wrong_is_told(given, message):
+def test_what_is_wrong_is_told(options, message):
     with pytest.raises(br.InputError, match=message):
-        br.ImagePair(FIXED, MOVING, **given)
+        br.ImagePair(FIXED, MOVING, **options)

@@ -32,9 +32,9 @@ def ball():
 def affine():
     corners = np.array([[0.0, 0.0, 0.0], (np.array(SHAPE) - 1) * SIZES])
     rotation = rotated_affine(corners, SHAPE)[:3, :3]
-    found = np.eye(4)
-    found[:3, :3] = rotation / np.linalg.norm(rotation, axis=0) * SIZES
-    return found
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation / np.linalg.norm(rotation, axis=0) * SIZES
+    return matrix
 
 
 def field(width, seed=0):
@@ -50,18 +50,18 @@ def test_smooth_noise_has_the_volume_of_its_correlation(width):
     volume = mask.sum() * SIZES.prod()
     expected = volume / (4 * np.pi * width**2) ** 1.5
     grid = affine()
-    found = [
+    counts = [
         independent_points(Image(field(width, seed), grid), Image(mask.astype(np.uint8), grid)) for seed in range(6)
     ]
-    assert np.mean(found) == pytest.approx(expected, rel=0.1)
-    assert 0.6 * expected < min(found) < max(found) < 1.5 * expected
+    assert np.mean(counts) == pytest.approx(expected, rel=0.1)
+    assert 0.6 * expected < min(counts) < max(counts) < 1.5 * expected
 
 
 def test_white_noise_is_worth_all_its_points():
     grid, mask = affine(), ball()
     noise = np.random.default_rng(1).normal(size=SHAPE)
-    found = independent_points(Image(noise, grid), Image(mask.astype(np.uint8), grid))
-    assert 0.9 * mask.sum() < found <= mask.sum()
+    count = independent_points(Image(noise, grid), Image(mask.astype(np.uint8), grid))
+    assert 0.9 * mask.sum() < count <= mask.sum()
 
 
 def test_outside_the_mask_nothing_matters():
@@ -92,16 +92,16 @@ def test_scores_of_some_voxels_count_by_the_variance_of_their_sum(density):
     """n independent ones of the same variance would have a sum as variable as this one, over many realisations."""
     rng = np.random.default_rng(0)
     chosen = np.argwhere(ball() & (rng.uniform(size=SHAPE) < density))
-    at, found, sums, variance = tuple(chosen.T), [], [], []
+    indices, counts, sums, variance = tuple(chosen.T), [], [], []
     for seed in range(60):
-        values = field(2.0, seed)[at] - 0.3
+        values = field(2.0, seed)[indices] - 0.3
         sums.append(values.sum())
         variance.append((values**2).mean())
         if seed < 6:
-            found.append(independent_scores(values[:, None], chosen, Image(np.zeros(SHAPE), affine())))
+            counts.append(independent_scores(values[:, None], chosen, Image(np.zeros(SHAPE), affine())))
     expected = len(chosen) ** 2 * np.mean(variance) / np.mean(np.square(sums))
-    assert np.mean(found) == pytest.approx(expected, rel=0.4)
-    assert np.mean(found) < 0.5 * len(chosen)
+    assert np.mean(counts) == pytest.approx(expected, rel=0.4)
+    assert np.mean(counts) < 0.5 * len(chosen)
 
 
 def test_a_residual_of_nothing_is_told():
@@ -142,26 +142,26 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted(caplog):
     caplog.set_level(logging.INFO)
     post = posterior(independent_points="residual")
     assert not post.tempered
-    found = temper_target(post.target, 2, 0).posterior
-    count = found.independent_points["images"]
-    assert found.tempered
+    tempered = temper_target(post.target, 2, 0).posterior
+    count = tempered.independent_points["images"]
+    assert tempered.tempered
     assert caplog.messages
     # The images are smooth, and no displacement makes them equal: far fewer than all are independent.
     assert 1 < count < 0.2 * len(post.images.positions)
-    values = complete(post.data.blocks, found.search_start)
+    values = complete(post.data.blocks, tempered.search_start)
     assert post.count_independent_points(values)["images"] == pytest.approx(count, rel=1e-9)
     same = posterior(independent_points=count)
-    assert float(found.logdensity_constrained(values)) == pytest.approx(float(same.logdensity_constrained(values)))
-    assert temper_target(found.target, 2, 0) is found.target
+    assert float(tempered.logdensity_constrained(values)) == pytest.approx(float(same.logdensity_constrained(values)))
+    assert temper_target(tempered.target, 2, 0) is tempered.target
 
 
 def test_a_search_goes_on_where_the_tempering_has_led_to():
-    found = temper_target(posterior(independent_points="residual").target, 2, 0)
-    start, there = (
-        np.asarray(flat_position(found, found.data, at))
-        for at in (found.coordinates.reference(), found.mode_search.search_start)
+    tempered = temper_target(posterior(independent_points="residual").target, 2, 0)
+    start, search_start = (
+        np.asarray(flat_position(tempered, tempered.data, values))
+        for values in (tempered.coordinates.reference(), tempered.mode_search.search_start)
     )
-    np.testing.assert_array_equal(approach(found, start), there)
+    np.testing.assert_array_equal(approach(tempered, start), search_start)
 
 
 def test_residuals_tell_of_voxels_alone():

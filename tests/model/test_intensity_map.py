@@ -34,8 +34,8 @@ def test_a_shading_is_all_that_tells_images_at_rest_apart():
     difference = -np.asarray(images.residuals(zero, post.reference()))
     coefficients = np.linalg.lstsq(basis, difference, rcond=None)[0]
     assert np.abs(difference).max() > 0.1
-    found = post.images.residuals(zero, {"images_shading": coefficients})
-    np.testing.assert_allclose(found, 0.0, atol=1e-9)
+    residuals = post.images.residuals(zero, {"images_shading": coefficients})
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-9)
 
 
 def test_functions_are_orthogonal_and_as_great_as_the_image():
@@ -71,9 +71,9 @@ def test_fewer_points_weigh_as_much_as_all():
 def test_both_images_are_smoothed():
     moving = smooth_image(MESH.points, seed=2)
     sd = 0.8 * FIXED.voxel_volume ** (1 / 3)
-    found = posterior(moving, smoothing=0.8)
+    smoothed = posterior(moving, smoothing=0.8)
     by_hand = posterior_of(FIXED.smoothed(sd), moving.smoothed(sd), MESH, quadrature="voxels")
     state = {"u_boundary": np.ones((len(MESH.boundary), 3)), "lam": np.ones(3), "mu": np.ones(3)}
-    assert float(found.evaluate(state).similarity_energy) == pytest.approx(
+    assert float(smoothed.evaluate(state).similarity_energy) == pytest.approx(
         float(by_hand.evaluate(state).similarity_energy)
     )

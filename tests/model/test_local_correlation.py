@@ -34,8 +34,8 @@ def images():
 
 
 def posterior(moving=None, **options):
-    fixed, other = images()
-    return posterior_of(fixed, moving or other, MESH, **(OPTIONS | options))
+    fixed, default_moving = images()
+    return posterior_of(fixed, moving or default_moving, MESH, **(OPTIONS | options))
 
 
 def values(seed=0, **temperatures):
@@ -59,9 +59,9 @@ def fitted(post, state):
         root = np.sqrt(w[inside])
         rows = np.column_stack([root * m[inside], root])
         rows = np.vstack([rows, [np.sqrt(w[inside].sum() * ridge), 0.0]])
-        found, squares, rank, _ = np.linalg.lstsq(rows, np.append(root * f[inside], 0.0), rcond=None)
+        coefficients, squares, rank, _ = np.linalg.lstsq(rows, np.append(root * f[inside], 0.0), rcond=None)
         assert rank == 2
-        gain[inside], offset[inside], energy = found[0], found[1], energy + squares[0]
+        gain[inside], offset[inside], energy = coefficients[0], coefficients[1], energy + squares[0]
     return gain, offset, energy
 
 
@@ -118,9 +118,9 @@ def test_affine_maps_of_the_moving_image_change_nothing(gain, offset):
     def slope(post):
         return jax.value_and_grad(lambda u: post.logdensity_constrained({**values(), "u_boundary": u}))
 
-    (height, gradient), (other, its) = (slope(p)(values()["u_boundary"]) for p in (post, changed))
-    assert float(other) == pytest.approx(float(height), rel=1e-8)
-    np.testing.assert_allclose(its, gradient, atol=1e-7 * float(abs(gradient).max()))
+    (height, gradient), (changed_height, changed_gradient) = (slope(p)(values()["u_boundary"]) for p in (post, changed))
+    assert float(changed_height) == pytest.approx(float(height), rel=1e-8)
+    np.testing.assert_allclose(changed_gradient, gradient, atol=1e-7 * float(abs(gradient).max()))
 
 
 def test_a_smooth_bias_field_changes_little():
@@ -131,8 +131,8 @@ def test_a_smooth_bias_field_changes_little():
     changes = {}
     for options in (SQUARES, OPTIONS | {"window_mm": 8.0}):
         # Where the images agree and nothing is left to explain.
-        found = posterior_of(moving, biased, MESH, **(options | {"quadrature": "gauss32"}))
-        changes[options["similarity"]] = float(found.energies(found.reference())["similarity_energy"])
+        post = posterior_of(moving, biased, MESH, **(options | {"quadrature": "gauss32"}))
+        changes[options["similarity"]] = float(post.energies(post.reference())["similarity_energy"])
     assert 0 < changes["lncc"] < 0.01 * changes["ssd"]
 
 
@@ -146,19 +146,19 @@ def test_derivatives_of_the_energy_are_those_of_the_loop():
     """In f, m and the weights, and the second one in m, in which the maps follow m."""
     post = posterior()
     rng = np.random.default_rng(0)
-    parts = [jnp.asarray(x) for x in compared(post, values())]
+    arrays = [jnp.asarray(x) for x in compared(post, values())]
 
-    def energy(*parts):
-        return post.images.similarity.energy(Intensities(*parts), jnp.asarray(5.0))
+    def energy(*intensities):
+        return post.images.similarity.energy(Intensities(*intensities), jnp.asarray(5.0))
 
     slopes = jax.grad(energy, argnums=(0, 1, 2))
     for k, step in ((0, 1e-5), (1, 1e-5), (2, 1e-2)):
-        d = jnp.asarray(rng.normal(size=len(parts[0])))
-        ahead, behind = ([p + sign * step * d * (j == k) for j, p in enumerate(parts)] for sign in (1, -1))
+        d = jnp.asarray(rng.normal(size=len(arrays[0])))
+        ahead, behind = ([p + sign * step * d * (j == k) for j, p in enumerate(arrays)] for sign in (1, -1))
         expected = float(energy(*ahead) - energy(*behind)) / (2 * step)
-        assert float(slopes(*parts)[k] @ d) == pytest.approx(expected, rel=1e-5)
+        assert float(slopes(*arrays)[k] @ d) == pytest.approx(expected, rel=1e-5)
         if k == 1:
-            along = jax.jvp(lambda m: slopes(parts[0], m, parts[2])[1], (parts[1],), (d,))[1]
+            along = jax.jvp(lambda m: slopes(arrays[0], m, arrays[2])[1], (arrays[1],), (d,))[1]
             bend = (slopes(*ahead)[1] - slopes(*behind)[1]) / (2 * step)
             np.testing.assert_allclose(along, bend, atol=1e-4 * float(abs(bend).max()))
 
@@ -166,15 +166,15 @@ def test_derivatives_of_the_energy_are_those_of_the_loop():
 def test_curvature_in_the_displacements_is_the_hessian():
     """With its remainder, against differences of the gradient; Gauss and Newton's part is positive semidefinite."""
     post, state = posterior(fixed=KNOWN, quadrature="gauss32", rigid_sd=0.5), values()
-    found = post.target.mode_search.curvature(post.data, {"u_boundary": state["u_boundary"]})
+    curvature = post.target.mode_search.curvature(post.data, {"u_boundary": state["u_boundary"]})
     slope = jax.jit(jax.grad(lambda u: -post.logdensity_constrained({**state, "u_boundary": u})))
     for direction in np.random.default_rng(1).normal(size=(3, *state["u_boundary"].shape)):
         ahead, behind = (slope(state["u_boundary"] + sign * 1e-4 * direction) for sign in (1, -1))
         expected = np.ravel(ahead - behind) / 2e-4
-        product, rest = (matrix @ direction.ravel() for matrix in (found.gauss_newton, found.remainder))
+        product, rest = (matrix @ direction.ravel() for matrix in (curvature.gauss_newton, curvature.remainder))
         np.testing.assert_allclose(product + rest, expected, atol=1e-4 * abs(expected).max())
         assert abs(rest).max() > 0.01 * abs(product).max()
-    assert np.linalg.eigvalsh(found.gauss_newton).min() > 0
+    assert np.linalg.eigvalsh(curvature.gauss_newton).min() > 0
 
 
 def test_gauss_and_newtons_curvature_is_that_of_the_projected_residuals():
@@ -182,9 +182,9 @@ def test_gauss_and_newtons_curvature_is_that_of_the_projected_residuals():
     post, state = posterior(), values()
     f, m, w = compared(post, state)
     gain, _, _ = fitted(post, state)
-    found = post.images.similarity.convexity(Intensities(*map(jnp.asarray, (f, m, w))), jnp.asarray(1.0))
-    label, dense = np.asarray(post.images.similarity.windows.label), np.diag(np.asarray(found.diagonal))
-    for vector, sign in zip(np.asarray(found.shared.vectors), np.asarray(found.shared.signs), strict=True):
+    convexity = post.images.similarity.convexity(Intensities(*map(jnp.asarray, (f, m, w))), jnp.asarray(1.0))
+    label, dense = np.asarray(post.images.similarity.windows.label), np.diag(np.asarray(convexity.diagonal))
+    for vector, sign in zip(np.asarray(convexity.shared.vectors), np.asarray(convexity.shared.signs), strict=True):
         dense += sign * np.outer(vector, vector) * (label[:, None] == label)
     for window in np.unique(label):
         inside = label == window
@@ -205,14 +205,14 @@ def test_the_normaliser_counts_two_degrees_of_freedom_of_each_window():
     contrasts = np.linalg.svd(maps)[0][:, maps.shape[1] :]
     assert contrasts.shape[1] == len(f) - 2 * post.images.similarity.windows.number > 0
     z = contrasts.T @ (np.sqrt(w) * f)
-    found, expected = (
+    difference, expected = (
         np.diff([function(t) for t in (0.5, 6.0)])[0]
         for function in (
             lambda t: float(post.energies(values(t_similarity=t))["images"]),
             lambda t: stats.norm.logpdf(z, scale=np.sqrt(t / 2)).sum(),
         )
     )
-    assert found == pytest.approx(expected, rel=20 * RIDGE)
+    assert difference == pytest.approx(expected, rel=20 * RIDGE)
 
 
 def test_replicates_have_the_maps_of_the_data_and_the_noise_of_the_model():
@@ -259,8 +259,8 @@ def test_predictive_checks_hold_where_the_model_does():
         {n: (["chain", "draw", *dims[n]], np.broadcast_to(x, (2, 150, *x.shape))) for n, x in at_rest.items()}
     )
     places = {"here": tuple(MESH.points.mean(axis=0))}
-    found = predict(post, draws, mean_values(post, draws, zero), zero, zero, places, 0, Pose.identity())
-    observed, replicated = (found.observations[f"images/{which}"] for which in ("observed", "replicated"))
+    predicted = predict(post, draws, mean_values(post, draws, zero), zero, zero, places, 0, Pose.identity())
+    observed, replicated = (predicted.observations[f"images/{which}"] for which in ("observed", "replicated"))
     for k, name in enumerate(("sd", "greatest", "neighbours")):
         assert 0.01 < (observed[..., k] <= replicated[..., k]).mean() < 0.99, name
 
@@ -269,8 +269,8 @@ def test_the_same_windows_serve_smoothed_images():
     post = posterior(quadrature="voxels", fixed=KNOWN)
     estimands = {"u_boundary": values()["u_boundary"]}
     for stage in post.target.mode_search.continuation():
-        found = post.target.evaluate_estimands(stage, estimands)
-        assert 0 < float(found.similarity_energy) < np.inf
+        evaluation = post.target.evaluate_estimands(stage, estimands)
+        assert 0 < float(evaluation.similarity_energy) < np.inf
 
 
 def test_a_constant_moving_image_is_told():

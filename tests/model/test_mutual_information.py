@@ -37,16 +37,16 @@ def test_the_energy_is_the_information_of_the_joint_histogram():
     inside = joint > 0
     product = joint.sum(1)[:, None] * joint.sum(0)
     information = (joint[inside] * np.log(joint[inside] / product[inside])).sum()
-    found = float(SIMILARITY.energy(PAIR, jnp.asarray(7.0)))
-    assert found == pytest.approx(-0.05 * 400 * information, rel=1e-4)
+    energy = float(SIMILARITY.energy(PAIR, jnp.asarray(7.0)))
+    assert energy == pytest.approx(-0.05 * 400 * information, rel=1e-4)
 
 
 @pytest.mark.parametrize("change", [lambda m: 3 * m + 2, lambda m: -m])
 def test_an_affine_map_of_the_moving_image_changes_nothing(change):
     ends = np.sort(change(np.array([-1.2, 1.2])))
-    other = SIMILARITY._replace(moving_range=jnp.asarray(ends))
-    found = float(other.energy(PAIR._replace(moving=change(PAIR.moving)), jnp.asarray(1.0)))
-    assert found == pytest.approx(float(SIMILARITY.energy(PAIR, jnp.asarray(1.0))), rel=1e-9)
+    rescaled = SIMILARITY._replace(moving_range=jnp.asarray(ends))
+    energy = float(rescaled.energy(PAIR._replace(moving=change(PAIR.moving)), jnp.asarray(1.0)))
+    assert energy == pytest.approx(float(SIMILARITY.energy(PAIR, jnp.asarray(1.0))), rel=1e-9)
 
 
 def test_the_curvature_is_the_square_of_the_slope_of_each_point():
@@ -59,16 +59,16 @@ def test_the_curvature_is_the_square_of_the_slope_of_each_point():
 def test_the_likelihood_is_a_density_of_f():
     """Replicates of f, given m, have the mean and the spread of p(f | m) that the histogram tells, point by point."""
     joint = np.asarray(SIMILARITY.histogram(PAIR).joint)
-    given = shares_of(M, -1.2, 1.2) @ joint.T
-    given /= given.sum(1, keepdims=True)
+    conditional = shares_of(M, -1.2, 1.2) @ joint.T
+    conditional /= conditional.sum(1, keepdims=True)
     centres = (np.arange(BINS) - 1) / (BINS - 3)
     keys = jax.random.split(jax.random.key(0), 2000)
     scale = np.sqrt(0.05 / (2 * WEIGHTS))
     draws = np.asarray(jax.vmap(lambda key: SIMILARITY.draw(key, PAIR))(keys)) * scale
-    variance = given @ centres**2 - (given @ centres) ** 2 + (1 / (BINS - 3)) ** 2 / 12
+    variance = conditional @ centres**2 - (conditional @ centres) ** 2 + (1 / (BINS - 3)) ** 2 / 12
     assert np.abs(draws.mean(0)).max() < 5 * np.sqrt(variance.max() / 2000)
     np.testing.assert_allclose(draws.var(0), variance, rtol=0.25)
-    np.testing.assert_allclose(SIMILARITY.residuals(PAIR), F - given @ centres, atol=1e-9)
+    np.testing.assert_allclose(SIMILARITY.residuals(PAIR), F - conditional @ centres, atol=1e-9)
 
 
 def test_the_gradient_is_that_of_differences():

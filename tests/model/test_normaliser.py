@@ -56,8 +56,8 @@ def test_elastic_prior_is_scipys_gaussian(held):
         u = covariance @ np.linalg.pinv(covariance, 1e-10, hermitian=True) @ state["u_boundary"].ravel()
         gaussian = stats.multivariate_normal(np.zeros(len(u)), covariance, allow_singular=True)
         terms = post.energies(state | {"u_boundary": u.reshape(-1, 3)})
-        found = float(terms["elastic"])
-        assert found == pytest.approx(gaussian.logpdf(u), rel=1e-9)
+        log_prior = float(terms["elastic"])
+        assert log_prior == pytest.approx(gaussian.logpdf(u), rel=1e-9)
 
 
 @pytest.mark.parametrize("elasticity", ["tissue", "uniform", "element"])

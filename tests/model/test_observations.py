@@ -54,12 +54,12 @@ class Distance:
 
     name = "distance"
 
-    def __init__(self, one, other, measured, sd):
-        self.points, self.measured, self.sd = np.stack([one, other]), measured, sd
+    def __init__(self, first, second, measured, sd):
+        self.points, self.measured, self.sd = np.stack([first, second]), measured, sd
 
     def log(self, state):
-        one, other = self.points + state.at(self.points)
-        return -0.5 * ((jnp.linalg.norm(one - other) - self.measured) / self.sd) ** 2
+        first, second = self.points + state.at(self.points)
+        return -0.5 * ((jnp.linalg.norm(first - second) - self.measured) / self.sd) ** 2
 
 
 def places(count=9):
@@ -100,27 +100,27 @@ def prior():
     K = np.asarray(paper.stiffness(MESH.points, MESH.cells, LAM[MESH.tissue], MU[MESH.tissue]).todense())
     boundary = (3 * MESH.boundary[:, None] + np.arange(3)).ravel()
     interior = np.setdiff1d(np.arange(len(K)), boundary)
-    whole = np.zeros((len(K), len(boundary)))
-    whole[boundary] = np.eye(len(boundary))
-    whole[interior] = -np.linalg.solve(K[np.ix_(interior, interior)], K[np.ix_(interior, boundary)])
+    extension = np.zeros((len(K), len(boundary)))
+    extension[boundary] = np.eye(len(boundary))
+    extension[interior] = -np.linalg.solve(K[np.ix_(interior, interior)], K[np.ix_(interior, boundary)])
     modes = np.linalg.qr(rigid(MESH.points[MESH.boundary]))[0]
-    return whole.T @ K @ whole / T_ELASTIC + modes @ modes.T / (len(MESH.boundary) * RIGID_SD**2), whole
+    return extension.T @ K @ extension / T_ELASTIC + modes @ modes.T / (len(MESH.boundary) * RIGID_SD**2), extension
 
 
 @cache
 def exact(with_region=False, without=None):
     """Mean and covariance of the flat u_B, by dense matrices of its own; without one landmark."""
-    precision, whole = prior()
+    precision, extension = prior()
     force = np.zeros(len(precision))
-    kept = np.delete(np.arange(9), [] if without is None else without)
-    points, moved, sd = (part[kept] for part in places())
+    remaining = np.delete(np.arange(9), [] if without is None else without)
+    points, moved, sd = (array[remaining] for array in places())
     observed = [(np.kron(barycentric(points), np.eye(3)), (moved - points).ravel(), np.repeat(sd, 3))]
     if with_region:
         region, measured, error = REGION
         mean = barycentric(region).mean(axis=0, keepdims=True)
         observed.append((np.kron(mean, np.eye(3)), measured, np.full(3, error)))
     for rows, value, error in observed:
-        J = rows @ whole / error[:, None]
+        J = rows @ extension / error[:, None]
         precision, force = precision + J.T @ J, force + J.T @ (value / error)
     return np.linalg.solve(precision, force), np.linalg.inv(precision)
 
@@ -149,16 +149,16 @@ def test_density_is_the_gaussian(with_region):
 @pytest.mark.parametrize("with_region", [False, True])
 def test_curvature_is_the_gaussians(with_region):
     post = posterior(with_region)
-    found = post.target.mode_search.curvature(post.data, post.estimands(post.reference()))
-    np.testing.assert_allclose(found.gauss_newton, np.linalg.inv(exact(with_region)[1]), rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(found.remainder, 0, atol=1e-12)
+    curvature = post.target.mode_search.curvature(post.data, post.estimands(post.reference()))
+    np.testing.assert_allclose(curvature.gauss_newton, np.linalg.inv(exact(with_region)[1]), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(curvature.remainder, 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("with_region", [False, True])
 @pytest.mark.parametrize("sampler", ["hmc", "laplace"])
 def test_samplers_meet_mean_and_covariance(sampler, with_region):
-    found = br.sample(posterior(with_region), sampler, chains=CHAINS, draws=160, seed=1, block=160, progress=False)
-    draws = found.idata.posterior["u_boundary"].values.reshape(CHAINS, 160, -1)[:, 40:]
+    samples = br.sample(posterior(with_region), sampler, chains=CHAINS, draws=160, seed=1, block=160, progress=False)
+    draws = samples.idata.posterior["u_boundary"].values.reshape(CHAINS, 160, -1)[:, 40:]
     mean, covariance = exact(with_region)
     whitened = (draws - mean) @ np.linalg.cholesky(np.linalg.inv(covariance))
     for moment, expected in ((whitened, 0.0), (whitened**2, 1.0)):
@@ -171,25 +171,25 @@ def test_samplers_meet_mean_and_covariance(sampler, with_region):
 def test_left_out_landmarks_are_predicted_as_by_a_posterior_without_them():
     post = posterior(True)
     mean = jnp.asarray(exact(True)[0].reshape(-1, 3))
-    found = leave_out(post, post.data.terms["landmarks"], {"u_boundary": mean})
+    left_out = leave_out(post, post.data.terms["landmarks"], {"u_boundary": mean})
     points, moved, sd = places()
     for k in range(len(points)):
-        at = np.kron(barycentric(points[k : k + 1]), np.eye(3)) @ prior()[1]
+        rows = np.kron(barycentric(points[k : k + 1]), np.eye(3)) @ prior()[1]
         without, covariance = exact(True, k)
-        np.testing.assert_allclose(found.residual[k], moved[k] - points[k] - at @ without, rtol=1e-5, atol=1e-7)
-        expected = at @ covariance @ at.T + sd[k] ** 2 * np.eye(3)
-        np.testing.assert_allclose(found.covariance[k], expected, rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(left_out.residual[k], moved[k] - points[k] - rows @ without, rtol=1e-5, atol=1e-7)
+        expected = rows @ covariance @ rows.T + sd[k] ** 2 * np.eye(3)
+        np.testing.assert_allclose(left_out.covariance[k], expected, rtol=1e-5, atol=1e-8)
 
 
 def test_a_landmark_that_nothing_else_determines_is_told():
     """Without a rigid prior three landmarks say where the body is; any two of them leave a turn about their line."""
     model = MODEL.model_copy(update={"rigid_sd": None})
     rest = {"u_boundary": jnp.zeros((len(MESH.boundary), 3))}
-    points, moved, sd = (part[:3] for part in places())
+    points, moved, sd = (array[:3] for array in places())
     post = br.build_posterior(MESH, [br.Landmarks(points, moved, sd)], model)
-    found = leave_out(post, post.data.terms["landmarks"], rest)
-    assert np.isnan(found.residual).all()
-    assert np.isinf(found.covariance).all()
+    left_out = leave_out(post, post.data.terms["landmarks"], rest)
+    assert np.isnan(left_out.residual).all()
+    assert np.isinf(left_out.covariance).all()
 
 
 # The wider prior allows the sd of the joint mode, next to zero, where the nodes follow every landmark.
@@ -199,8 +199,8 @@ def test_an_inferred_sd_has_the_posterior_of_its_evidence(median, log_sd):
     points, moved, _ = places()
     observed = [br.Landmarks(points, moved, br.ScalePrior(median=median, log_sd=log_sd))]
     post = br.build_posterior(MESH, observed, MODEL)
-    precision, whole = prior()
-    A = np.kron(barycentric(points), np.eye(3)) @ whole
+    precision, extension = prior()
+    A = np.kron(barycentric(points), np.eye(3)) @ extension
     spread, shift = A @ np.linalg.solve(precision, A.T), (moved - points).ravel()
     grid = np.linspace(np.log(0.3) - 4, np.log(0.3) + 4, 400)
     height = [
@@ -213,8 +213,8 @@ def test_an_inferred_sd_has_the_posterior_of_its_evidence(median, log_sd):
     expected = weight @ grid
     deviation = np.sqrt(weight @ (grid - expected) ** 2)
 
-    found = br.sample(post, "hmc", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
-    draws = np.log(found.idata.posterior["landmarks_sd"].values)[:, 20:]
+    samples = br.sample(post, "hmc", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
+    draws = np.log(samples.idata.posterior["landmarks_sd"].values)[:, 20:]
     error = draws.mean(axis=1).std(ddof=1) / np.sqrt(CHAINS)
     assert abs(draws.mean() - expected) < 4 * error + 0.02 * deviation
     assert draws.std() == pytest.approx(deviation, rel=0.12)
@@ -222,15 +222,15 @@ def test_an_inferred_sd_has_the_posterior_of_its_evidence(median, log_sd):
     # Laplace's approximation is at the evidence's greatest value, and as wide as its curvature there.
     best = np.argmax(height)
     second = (height[best + 1] - 2 * height[best] + height[best - 1]) / (grid[1] - grid[0]) ** 2
-    found = br.sample(post, "laplace", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
-    draws = np.log(found.idata.posterior["landmarks_sd"].values)
+    samples = br.sample(post, "laplace", chains=CHAINS, draws=120, seed=2, block=120, progress=False)
+    draws = np.log(samples.idata.posterior["landmarks_sd"].values)
     assert draws.mean() == pytest.approx(grid[best], abs=0.1 * deviation + grid[1] - grid[0])
     assert draws.std() == pytest.approx((-second) ** -0.5, rel=0.05)
 
 
 def test_the_papers_kernel_runs_with_them():
-    found = br.sample(posterior(True), "rwmh", chains=2, draws=40, thin=2, seed=1, progress=False, sigma_u=0.05)
-    assert 0.05 < float(found.idata.sample_stats["acceptance_rate"].mean()) < 0.99
+    samples = br.sample(posterior(True), "rwmh", chains=2, draws=40, thin=2, seed=1, progress=False, sigma_u=0.05)
+    assert 0.05 < float(samples.idata.sample_stats["acceptance_rate"].mean()) < 0.99
 
 
 def test_terms_have_their_names_and_add_up():
@@ -249,8 +249,8 @@ def test_images_and_landmarks_are_one_density():
     both = br.build_posterior(MESH, [br.ImagePair(fixed, moving), landmarks()], MODEL)
     short = br.build_posterior(MESH, [br.ImagePair(fixed, moving)], MODEL)
     values = {"u_boundary": 0.3 * np.sin(MESH.points[MESH.boundary]), "lam": LAM, "mu": MU}
-    parts = both.energies(values)
-    expected = float(short.logdensity_constrained(values)) + float(parts["landmarks"])
+    energies = both.energies(values)
+    expected = float(short.logdensity_constrained(values)) + float(energies["landmarks"])
     assert float(both.logdensity_constrained(values)) == pytest.approx(expected, rel=1e-12)
     curvature = both.target.mode_search.curvature(both.data, both.estimands(values))
     alone = short.target.mode_search.curvature(short.data, short.estimands(values))
@@ -272,9 +272,9 @@ def test_curvature_of_a_term_from_outside_is_the_dense_hessian():
     eigenvalues, vectors = np.linalg.eigh(dense)
     assert eigenvalues.min() < -0.1 < 0.1 < eigenvalues.max()
     convex = (vectors * np.maximum(eigenvalues, 0)) @ vectors.T
-    seen = FixedState(post.data, {}, jnp.zeros(len(mesh.cells)), jnp.zeros(len(mesh.cells)))
-    found = _curvature_of_term(ExternalTerm(term), seen, jnp.asarray(u)).toarray()
-    np.testing.assert_allclose(found, convex, atol=1e-10 * eigenvalues.max())
+    fixed_state = FixedState(post.data, {}, jnp.zeros(len(mesh.cells)), jnp.zeros(len(mesh.cells)))
+    curvature = _curvature_of_term(ExternalTerm(term), fixed_state, jnp.asarray(u)).toarray()
+    np.testing.assert_allclose(curvature, convex, atol=1e-10 * eigenvalues.max())
 
 
 @pytest.mark.parametrize("count", [0, 1, 10])
@@ -287,22 +287,22 @@ def test_a_term_from_outside_costs_the_directions_it_looks_at(count, monkeypatch
         def log(self, state):
             return -0.5 * (state.u[self.nodes] ** 2).sum() + 0.0 * state.u.sum()
 
-    mesh, asked = box_mesh(4), []
+    mesh, requested = box_mesh(4), []
     post = br.build_posterior(mesh, [OfNodes()], model_of(sampled="all"))
     products = external_curvature._products
 
-    def counted(term, seen, flat, directions):
-        asked.append(np.asarray(directions))
-        return products(term, seen, flat, directions)
+    def counted(term, fixed_state, flat, directions):
+        requested.append(np.asarray(directions))
+        return products(term, fixed_state, flat, directions)
 
     monkeypatch.setattr(external_curvature, "_products", counted)
     without = post.data.without_term("nodes")
     at_rest, u = post.data.blocks, jnp.zeros(mesh.points.shape)
     values = {name: block.reference() for name, block in at_rest.items()}
-    whole, rest = (displacement_curvature(data, values, u).gauss_newton for data in (post.data, without))
+    full, rest = (displacement_curvature(data, values, u).gauss_newton for data in (post.data, without))
     expected = (3 * OfNodes.nodes[:, None] + np.arange(3)).ravel()
-    np.testing.assert_array_equal(np.concatenate([[], *asked]), expected)
-    np.testing.assert_allclose(np.diag(whole - rest), np.isin(np.arange(u.size), expected), atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate([[], *requested]), expected)
+    np.testing.assert_allclose(np.diag(full - rest), np.isin(np.arange(u.size), expected), atol=1e-9)
     assert len(expected) == 3 * count < u.size
 
 
@@ -311,23 +311,23 @@ def test_curvature_that_points_share_is_the_sum_of_products():
     groups, vectors, matrices = rng.integers(0, 3, len(points)), rng.normal(size=(2, 9, 3)), rng.normal(size=(9, 3, 3))
     nodes, weights = interpolation_at(MESH, points)
     shared = SharedCurvature(jnp.asarray(groups), jnp.asarray(vectors), jnp.array([-1.0, 1.0]))
-    found = _assemble(len(MESH.points), PointCurvature(*map(jnp.asarray, (nodes, weights, matrices)), shared))
+    curvature = _assemble(len(MESH.points), PointCurvature(*map(jnp.asarray, (nodes, weights, matrices)), shared))
     of_points = np.zeros((9, 3, 9, 3))
-    for one in range(9):
-        of_points[one, :, one] += matrices[one]
-        for other in np.flatnonzero(groups == groups[one]):
-            of_points[one, :, other] += np.outer(vectors[1, one], vectors[1, other])
-            of_points[one, :, other] -= np.outer(vectors[0, one], vectors[0, other])
+    for first in range(9):
+        of_points[first, :, first] += matrices[first]
+        for second in np.flatnonzero(groups == groups[first]):
+            of_points[first, :, second] += np.outer(vectors[1, first], vectors[1, second])
+            of_points[first, :, second] -= np.outer(vectors[0, first], vectors[0, second])
     rows = np.kron(barycentric(points), np.eye(3))
-    np.testing.assert_allclose(found.toarray(), rows.T @ of_points.reshape(27, 27) @ rows, atol=1e-12)
+    np.testing.assert_allclose(curvature.toarray(), rows.T @ of_points.reshape(27, 27) @ rows, atol=1e-12)
 
 
 class Own:
     name = "own"
 
-    def __init__(self, log, **other):
+    def __init__(self, log, **attributes):
         self.log = log
-        vars(self).update(other)
+        vars(self).update(attributes)
 
 
 TWO = br.Landmarks([[1.0, 1, 1], [2.0, 1, 1]], [[1.0, 1, 1], [2.0, 1, 1]], 1.0)
@@ -410,19 +410,19 @@ OF_YOUR_OWN = {"kind": "own", "title": "an observation of your own"}
 def test_observations_say_how_they_fit():
     """By the root of the mean square of their residuals over the sd, if they know these."""
     points, moved, sd = places()
-    own = Own(lambda state: -0.5 * (state.u[3] ** 2).sum(), standardised_residual=lambda state: state.u[3])
-    post = br.build_posterior(MESH, [landmarks(), own, Own(lambda state: state.u[0, 0], name="shift")], MODEL)
-    told = describe_observations(post, post.reference())
+    observation = Own(lambda state: -0.5 * (state.u[3] ** 2).sum(), standardised_residual=lambda state: state.u[3])
+    post = br.build_posterior(MESH, [landmarks(), observation, Own(lambda state: state.u[0, 0], name="shift")], MODEL)
+    descriptions = describe_observations(post, post.reference())
     z = (moved - points) / sd[:, None]
-    assert told["landmarks"] == {
+    assert descriptions["landmarks"] == {
         "kind": "landmarks",
         "title": "pairs of points",
         "log": pytest.approx(-0.5 * (z**2).sum()),
         "values": z.size,
         "residual_rms": pytest.approx(np.sqrt((z**2).mean())),
     }
-    assert told["own"] == {**OF_YOUR_OWN, "log": 0.0, "values": 3, "residual_rms": 0.0}
-    assert told["shift"] == {**OF_YOUR_OWN, "log": 0.0}
+    assert descriptions["own"] == {**OF_YOUR_OWN, "log": 0.0, "values": 3, "residual_rms": 0.0}
+    assert descriptions["shift"] == {**OF_YOUR_OWN, "log": 0.0}
 
 
 def test_a_posterior_without_a_mesh_is_told():

@@ -57,9 +57,9 @@ def test_the_prior_is_scipys_gaussian():
     state = values()
     C, rigid = covariance(MESH, LAM, MU, **LOADS)
     u = state["u_boundary"].ravel() - rigid @ (rigid.T @ state["u_boundary"].ravel())
-    found = float(posterior().energies(state)["elastic"])
+    log_prior = float(posterior().energies(state)["elastic"])
     gaussian = stats.multivariate_normal(np.zeros(len(u)), C, allow_singular=True)
-    assert found == pytest.approx(gaussian.logpdf(u), rel=1e-8)
+    assert log_prior == pytest.approx(gaussian.logpdf(u), rel=1e-8)
 
 
 def test_rigid_motions_cost_nothing():
@@ -84,7 +84,7 @@ def test_areas_are_those_of_the_surface():
 @pytest.mark.parametrize(("prior", "growth"), [("loads", (0.8, 1.3)), ("boltzmann", (1.5, 2.5))])
 def test_the_variance_of_a_point_keeps_its_size_where_the_mesh_is_refined(prior, growth):
     """That of exp(−E_r / T_r) grows as one over the length of an edge."""
-    found = []
+    variances = []
     for mesh in (box_mesh(3), refined(box_mesh(3))):
         lam, mu = np.full(3, 5.0), np.ones(3)
         if prior == "loads":
@@ -93,8 +93,8 @@ def test_the_variance_of_a_point_keeps_its_size_where_the_mesh_is_refined(prior,
             K = paper.stiffness(mesh.points, mesh.cells, lam[mesh.tissue], mu[mesh.tissue]).toarray()
             C = np.linalg.pinv(K, 1e-10, hermitian=True)
         inside = np.repeat((abs(mesh.points - 10.0) < 5.5).all(axis=1), 3)
-        found.append(np.diag(C)[inside].mean())
-    assert growth[0] < found[1] / found[0] < growth[1]
+        variances.append(np.diag(C)[inside].mean())
+    assert growth[0] < variances[1] / variances[0] < growth[1]
 
 
 def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
@@ -120,10 +120,10 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
         return -stats.multivariate_normal.logpdf(apart.T @ moved.ravel(), cov=marginal) - logs
 
     start = np.asarray(flat_position(post.target, post.data, post.target.coordinates.reference()))
-    found = unravel(post.target)(find_mode(post.target, start))
-    found = np.r_[found["body_load"], found["surface_load"], found["mu"]]
-    best = minimize(minus_evidence, found + 0.2, method="Nelder-Mead", options={"xatol": 1e-4}).x
-    np.testing.assert_allclose(found, best, atol=0.02)
+    mode = unravel(post.target)(find_mode(post.target, start))
+    mode = np.r_[mode["body_load"], mode["surface_load"], mode["mu"]]
+    best = minimize(minus_evidence, mode + 0.2, method="Nelder-Mead", options={"xatol": 1e-4}).x
+    np.testing.assert_allclose(mode, best, atol=0.02)
     np.testing.assert_allclose(np.exp(best[0]), 0.5, rtol=0.5)
 
 
@@ -157,7 +157,7 @@ def test_the_preset_is_a_model_that_what_is_given_replaces():
     assert br.ModelConfig(**preset.model_dump()) == preset
     assert br.ModelConfig(preset="registration", elastic_prior={"body": 0.2}).elastic_prior == br.RandomLoads(body=0.2)
     boltzmann = br.Boltzmann(temperature=5.0)
-    for given in (boltzmann, {"kind": "boltzmann", "temperature": 5.0}):
-        assert br.ModelConfig(preset="registration", elastic_prior=given).elastic_prior == boltzmann
+    for prior in (boltzmann, {"kind": "boltzmann", "temperature": 5.0}):
+        assert br.ModelConfig(preset="registration", elastic_prior=prior).elastic_prior == boltzmann
     assert br.ModelConfig() == br.ModelConfig(preset="paper")
     assert br.ModelConfig(elastic_prior={"temperature": 5.0}).elastic_prior == boltzmann

@@ -28,11 +28,11 @@ def former(name):
 def test_densities_gradients_and_energies_are_those_of_the_former_code(case):
     with np.load(FILE) as file:
         expected = {name.removeprefix(f"{case}/"): file[name] for name in file.files if name.startswith(f"{case}/")}
-    found = densities(posterior_of_case(case), case)
-    difference = np.linalg.norm(found["gradient"] - expected["gradient"], axis=1)
+    arrays = densities(posterior_of_case(case), case)
+    difference = np.linalg.norm(arrays["gradient"] - expected["gradient"], axis=1)
     assert (difference < 1e-6 * np.linalg.norm(expected["gradient"], axis=1)).all()
-    for name in set(found) - {"gradient"}:
-        sum_of_former = sum(expected[part] for part in former(name) if part in expected)
-        np.testing.assert_allclose(found[name], sum_of_former, rtol=1e-9, atol=1e-12, err_msg=name)
-    left_out = set(expected) - {part for name in found for part in former(name)}
+    for name in set(arrays) - {"gradient"}:
+        sum_of_former = sum(expected[term] for term in former(name) if term in expected)
+        np.testing.assert_allclose(arrays[name], sum_of_former, rtol=1e-9, atol=1e-12, err_msg=name)
+    left_out = set(expected) - {term for name in arrays for term in former(name)}
     assert all((expected[name] == 0).all() for name in left_out), left_out

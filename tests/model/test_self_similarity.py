@@ -24,7 +24,7 @@ def small_image():
 
 def test_descriptors_are_those_of_loops():
     """Patches, distances and descriptors by their definition, at one voxel that is far from the borders."""
-    image, at = small_image(), np.array([7, 7, 6])
+    image, voxel = small_image(), np.array([7, 7, 6])
     voxels = np.asarray(image.voxels)
     # As far as SciPy's kernel goes.
     reach = range(-2, 3)
@@ -34,19 +34,23 @@ def test_descriptors_are_those_of_loops():
     steps = [np.array(step) for step in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))]
     distances = []
     for step in steps:
-        here, there = (tuple((at + offsets + shift).T) for shift in (0, step))
-        distances.append(weights @ (voxels[here] - voxels[there]) ** 2)
+        patch, shifted_patch = (tuple((voxel + offsets + shift).T) for shift in (0, step))
+        distances.append(weights @ (voxels[patch] - voxels[shifted_patch]) ** 2)
     expected = np.exp(-(np.array(distances) - min(distances)) / np.mean(distances))
-    found = describe_self_similarity(image, np.eye(3), DISTANCE)
-    np.testing.assert_allclose([float(one.voxels[tuple(at)]) for one in found], expected, rtol=1e-6)
+    descriptors = describe_self_similarity(image, np.eye(3), DISTANCE)
+    np.testing.assert_allclose(
+        [float(descriptor.voxels[tuple(voxel)]) for descriptor in descriptors], expected, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(300.0, 20.0), (-2.0, 1.0)])
 def test_gain_offset_and_an_inverted_contrast_change_nothing(gain, offset):
     image = small_image()
-    other = image.with_voxels(gain * np.asarray(image.voxels) + offset)
-    for one, two in zip(*(describe_self_similarity(x, np.eye(3), DISTANCE) for x in (image, other)), strict=True):
-        np.testing.assert_allclose(one.voxels, two.voxels, rtol=1e-6)
+    changed = image.with_voxels(gain * np.asarray(image.voxels) + offset)
+    for descriptor, changed_descriptor in zip(
+        *(describe_self_similarity(x, np.eye(3), DISTANCE) for x in (image, changed)), strict=True
+    ):
+        np.testing.assert_allclose(descriptor.voxels, changed_descriptor.voxels, rtol=1e-6)
 
 
 def test_neighbours_lie_in_the_world_and_not_on_a_grid():
@@ -60,15 +64,17 @@ def test_neighbours_lie_in_the_world_and_not_on_a_grid():
     affine[:3, 3] = image.affine[:3, 3] + (len(voxels) - 1) * image.affine[:3, 0]
     affine[:3, 1] *= -1
     affine[3, 3] = 1
-    found = describe_self_similarity(image, np.eye(3), DISTANCE)
+    descriptors = describe_self_similarity(image, np.eye(3), DISTANCE)
     again = describe_self_similarity(Image(turned, affine), np.eye(3), DISTANCE)
-    for one, two in zip(found, again, strict=True):
-        np.testing.assert_allclose(np.transpose(np.asarray(one.voxels), (2, 0, 1))[:, ::-1], two.voxels, rtol=1e-6)
+    for descriptor, turned_descriptor in zip(descriptors, again, strict=True):
+        np.testing.assert_allclose(
+            np.transpose(np.asarray(descriptor.voxels), (2, 0, 1))[:, ::-1], turned_descriptor.voxels, rtol=1e-6
+        )
 
 
 def test_a_constant_image_is_like_itself_everywhere():
-    for one in describe_self_similarity(small_image().with_voxels(np.ones((15, 14, 13))), np.eye(3), DISTANCE):
-        assert (np.asarray(one.voxels) == 1).all()
+    for descriptor in describe_self_similarity(small_image().with_voxels(np.ones((15, 14, 13))), np.eye(3), DISTANCE):
+        assert (np.asarray(descriptor.voxels) == 1).all()
 
 
 @pytest.mark.parametrize("count", [17, 18, 1])
@@ -111,16 +117,16 @@ def test_the_curvature_is_the_hessian():
     """Against differences of the gradient."""
     post = posterior(quadrature="gauss32", fixed={"lam": 10.0, "mu": 1.0}, rigid_sd=0.5)
     u = post.constrain(post.initial(jax.random.key(1)))["u_boundary"]
-    found = post.target.mode_search.curvature(post.data, {"u_boundary": u})
+    hessian = post.target.mode_search.curvature(post.data, {"u_boundary": u})
     values = post.reference()
     slope = jax.jit(jax.grad(lambda u: -post.logdensity_constrained({**values, "u_boundary": u})))
     for direction in RNG.normal(size=(3, *u.shape)):
         ahead, behind = (slope(u + sign * 1e-4 * direction) for sign in (1, -1))
         expected = np.ravel(ahead - behind) / 2e-4
         np.testing.assert_allclose(
-            (found.gauss_newton + found.remainder) @ direction.ravel(), expected, atol=1e-3 * abs(expected).max()
+            (hessian.gauss_newton + hessian.remainder) @ direction.ravel(), expected, atol=1e-3 * abs(expected).max()
         )
-    assert np.linalg.eigvalsh(found.gauss_newton).min() > 0
+    assert np.linalg.eigvalsh(hessian.gauss_newton).min() > 0
 
 
 def test_the_mode_of_a_pair_of_unlike_contrast_is_near():
@@ -129,11 +135,11 @@ def test_the_mode_of_a_pair_of_unlike_contrast_is_near():
 
 def test_what_is_ignored_stays_so():
     bright = FIXED.with_voxels(np.asarray(FIXED.voxels) > 0.9)
-    seen, all_of_it = (
+    masked, all_of_it = (
         br.ImagePair(FIXED, FIXED, fixed_ignore=mask, similarity="mind", quadrature="voxels").on(MESH).term
         for mask in (bright, None)
     )
-    assert len(seen.positions) < len(all_of_it.positions)
+    assert len(masked.positions) < len(all_of_it.positions)
 
 
 def test_a_map_of_intensities_is_refused_beside_it():

@@ -41,18 +41,18 @@ def test_sign_is_that_of_the_nearest_voxel_away_from_the_interface(left_handed):
     distance = signed_distance(skull)
     away = abs(np.asarray(distance.interpolate(points))) > voxel
     expected = ~in_skull(skull.voxels, skull.affine, points)
-    found = np.asarray(is_allowed(distance.interpolator("linear"), points))
-    np.testing.assert_array_equal(found[away], expected[away])
+    allowed = np.asarray(is_allowed(distance.interpolator("linear"), points))
+    np.testing.assert_array_equal(allowed[away], expected[away])
     assert 100 < expected[away].sum() < away.sum() - 100
     # Near the interface the two may differ, by a fraction of a voxel: so many more, the more it is curved.
-    assert (found == expected).mean() > 0.95
+    assert (allowed == expected).mean() > 0.95
 
 
 def test_every_voxel_centre_has_its_own_sign():
     skull = blobs()
     points = skull.grid_points().reshape(-1, 3)
-    found = np.asarray(is_allowed(signed_distance(skull).interpolator("linear"), points))
-    np.testing.assert_array_equal(found, skull.voxels.ravel() == 0)
+    allowed = np.asarray(is_allowed(signed_distance(skull).interpolator("linear"), points))
+    np.testing.assert_array_equal(allowed, skull.voxels.ravel() == 0)
 
 
 def test_distance_to_a_flat_wall_is_exact_around_it():
@@ -65,10 +65,10 @@ def test_distance_to_a_sphere():
     skull = sphere(30.0)
     x = np.random.default_rng(3).normal(size=(500, 3))
     x *= np.random.default_rng(4).uniform(24, 36, (500, 1)) / np.linalg.norm(x, axis=1, keepdims=True)
-    found = np.asarray(signed_distance(skull).interpolate(x))
+    distance = np.asarray(signed_distance(skull).interpolate(x))
     expected = 30.0 - np.linalg.norm(x, axis=1)
-    assert abs(found - expected).max() < skull.voxel_sizes.max()
-    assert abs((found - expected).mean()) < 0.25 * skull.voxel_sizes.max()
+    assert abs(distance - expected).max() < skull.voxel_sizes.max()
+    assert abs((distance - expected).mean()) < 0.25 * skull.voxel_sizes.max()
 
 
 def test_nothing_is_allowed_off_the_grid():
@@ -150,7 +150,7 @@ def test_a_soft_skull_lets_nodes_in_at_a_price():
 def test_the_curvature_of_a_soft_skull_is_that_of_its_log():
     posterior, values, _ = soft()
     term, filled = posterior.data.terms["skull"], posterior.fill(values)
-    found = np.asarray(term.gauss_newton(posterior.evaluate(values).u, filled).matrices)
+    curvature = np.asarray(term.gauss_newton(posterior.evaluate(values).u, filled).matrices)
 
     def log(u):
         state = state_of(posterior.data.body, posterior.data.blocks, {**filled, "u_boundary": u})
@@ -158,7 +158,7 @@ def test_the_curvature_of_a_soft_skull_is_that_of_its_log():
 
     u = jnp.asarray(values["u_boundary"])
     slope = jax.jit(jax.grad(log))
-    for row, axis in ((int(found[:, 2, 2].argmax()), 2), (0, 0), (0, 1)):
+    for row, axis in ((int(curvature[:, 2, 2].argmax()), 2), (0, 0), (0, 1)):
         step = jnp.zeros_like(u).at[row, axis].set(1e-3)
         expected = (slope(u + step) - slope(u - step)) / 2e-3
-        np.testing.assert_allclose(found[row, axis], expected[row], atol=1e-6)
+        np.testing.assert_allclose(curvature[row, axis], expected[row], atol=1e-6)

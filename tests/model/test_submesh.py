@@ -23,7 +23,7 @@ def squared_error(mesh):
     x = quadrature.positions(mesh)
     error = (smooth(x) - np.asarray(quadrature.interpolation(smooth(mesh.points)))) ** 2
     counts = np.bincount(quadrature.cells)
-    return np.stack([np.bincount(quadrature.cells, one) for one in error.T], axis=1) / counts[:, None]
+    return np.stack([np.bincount(quadrature.cells, component) for component in error.T], axis=1) / counts[:, None]
 
 
 def test_a_linear_field_is_followed():
@@ -33,6 +33,6 @@ def test_a_linear_field_is_followed():
 
 def test_it_is_the_error_of_interpolation_inside():
     inside = ~np.isin(MESH.cells, MESH.boundary).any(axis=1)
-    found = submesh_variance(MESH, smooth(MESH.points))[inside].mean(axis=0)
+    variance = submesh_variance(MESH, smooth(MESH.points))[inside].mean(axis=0)
     expected = squared_error(MESH)[inside].mean(axis=0)
-    np.testing.assert_allclose(found, expected, rtol=0.25)
+    np.testing.assert_allclose(variance, expected, rtol=0.25)

@@ -61,8 +61,8 @@ def test_students_t_is_scipys(t_similarity):
     expected = stats.t.logpdf(residuals, NU, scale=scales).sum()
     assert log_likelihood(post, state) == pytest.approx(expected, rel=1e-10)
     # Of a known temperature the same but for a constant, and its energy alone.
-    known = posterior(t_similarity=t_similarity, similarity="student_t", degrees_of_freedom=NU)
-    difference = log_likelihood(post, state) - float(known.energies(values())["images"])
+    known_posterior = posterior(t_similarity=t_similarity, similarity="student_t", degrees_of_freedom=NU)
+    difference = log_likelihood(post, state) - float(known_posterior.energies(values())["images"])
     at_zero = stats.t.logpdf(0 * residuals, NU, scale=scales).sum()
     assert difference == pytest.approx(at_zero, rel=1e-10)
 
@@ -82,13 +82,13 @@ def test_an_outlier_counts_little_under_students_t():
     fixed, moving = images()
     wrong = np.array(fixed.voxels)
     wrong[7, 5, 8] += 30
-    found = {}
+    energies = {}
     for name in ("ssd", "student_t"):
         options = {"similarity": name, "t_similarity": 5.0}
         clean, spoilt = (posterior_of(f, moving, MESH, **options) for f in (fixed, fixed.with_voxels(wrong)))
-        found[name] = [float(post.energies(values())["similarity_energy"]) for post in (clean, spoilt)]
-    assert found["ssd"][1] > 5 * found["ssd"][0]
-    assert found["student_t"][1] < 1.5 * found["student_t"][0]
+        energies[name] = [float(post.energies(values())["similarity_energy"]) for post in (clean, spoilt)]
+    assert energies["ssd"][1] > 5 * energies["ssd"][0]
+    assert energies["student_t"][1] < 1.5 * energies["student_t"][0]
 
 
 @pytest.mark.parametrize("name", ["t_similarity", "t_elastic"])
@@ -129,9 +129,9 @@ def test_coordinates():
     position = post.unconstrain(state)
     assert set(position) == {"u_boundary", "lam", "mu", "t_similarity", "t_elastic"}
     assert position["t_elastic"] == pytest.approx(np.log(60.0))
-    back = post.constrain(position)
+    constrained = post.constrain(position)
     for name, value in state.items():
-        np.testing.assert_allclose(back[name], value, rtol=1e-12)
+        np.testing.assert_allclose(constrained[name], value, rtol=1e-12)
     assert {name: np.shape(value) for name, value in post.estimands(state).items()}["t_similarity"] == ()
     assert post.reference()["t_similarity"] == 5.0
     assert {name: value.shape for name, value in post.initial(jax.random.key(0)).items()} == {
@@ -145,8 +145,8 @@ def test_coordinates():
     only_lame = posterior(**PROPER, t_similarity=3.0, t_elastic=60.0)
     of_lame = only_lame.logdensity({n: position[n] for n in ("u_boundary", "lam", "mu")})
     of_lame -= only_lame.logdensity_constrained(state)
-    found = post.logdensity(position) - post.logdensity_constrained(state)
-    assert float(found) == pytest.approx(float(of_lame) + sum(jacobian), rel=1e-9)
+    log_jacobian = post.logdensity(position) - post.logdensity_constrained(state)
+    assert float(log_jacobian) == pytest.approx(float(of_lame) + sum(jacobian), rel=1e-9)
 
 
 def test_known_temperatures_are_no_estimands():

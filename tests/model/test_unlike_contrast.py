@@ -47,10 +47,10 @@ def registered(similarity, which, sampler, t_similarity=None, **settings):
         t_elastic=300.0,
         t_similarity=t_similarity or {"median": 2 * pair[4]},
     )
-    found = br.sample(post, sampler, seed=0, progress=False, **settings)
-    draws = found.idata.posterior["u_boundary"].values
+    samples = br.sample(post, sampler, seed=0, progress=False, **settings)
+    draws = samples.idata.posterior["u_boundary"].values
     error = draws.mean(axis=(0, 1)) - pair[3]
-    return np.median(np.linalg.norm(error, axis=1)), np.sqrt(np.mean((error / draws.std(axis=(0, 1))) ** 2)), found
+    return np.median(np.linalg.norm(error, axis=1)), np.sqrt(np.mean((error / draws.std(axis=(0, 1))) ** 2)), samples
 
 
 ALIKE, INVERTED = 1, 2
@@ -61,8 +61,8 @@ def test_an_inverted_contrast_is_registered_where_squared_differences_fail():
     start = np.median(np.linalg.norm(phantom()[3], axis=1))
     alike, *_ = registered("ssd", ALIKE, "laplace", **QUICK)
     failed, *_ = registered("ssd", INVERTED, "laplace", **QUICK)
-    error, away, found = registered("lncc", INVERTED, "laplace", **QUICK)
-    warmth = float(found.idata.posterior["t_similarity"].mean()) / phantom()[4]
+    error, away, samples = registered("lncc", INVERTED, "laplace", **QUICK)
+    warmth = float(samples.idata.posterior["t_similarity"].mean()) / phantom()[4]
     print(f"median error of u_B, mm: at rest {start:.2f}, ssd {alike:.3f} of one contrast and {failed:.1f} of inverted")
     print(f"contrast, lncc {error:.3f} of inverted contrast, {away:.2f} of its sd; T_s {warmth:.3f} of the true one")
     assert failed > start > 2
@@ -74,9 +74,9 @@ def test_an_inverted_contrast_is_registered_where_squared_differences_fail():
 @pytest.mark.long
 @pytest.mark.slow
 def test_trajectories_agree_with_the_approximation():
-    error, away, found = registered("lncc", INVERTED, "hmc", chains=2, draws=60, warm_up=30, block=60)
+    error, away, samples = registered("lncc", INVERTED, "hmc", chains=2, draws=60, warm_up=30, block=60)
     quick_error, _, quick = registered("lncc", INVERTED, "laplace", **QUICK)
-    sd, quick_sd = (r.idata.posterior["u_boundary"].std(("chain", "draw")).values for r in (found, quick))
+    sd, quick_sd = (r.idata.posterior["u_boundary"].std(("chain", "draw")).values for r in (samples, quick))
     print(f"error {error:.3f} mm, {quick_error:.3f} of laplace; {away:.2f} sd; sd {np.median(sd / quick_sd):.3f}")
     assert error < 1.3 * quick_error + 0.05
     assert 0.6 < away < 1.6
@@ -84,5 +84,5 @@ def test_trajectories_agree_with_the_approximation():
 
 
 def test_the_papers_kernel_runs():
-    *_, found = registered("lncc", INVERTED, "rwmh", chains=2, draws=50, thin=2, sigma_u=0.003, t_similarity=0.01)
-    assert 0.02 < float(found.idata.sample_stats["acceptance_rate"].mean()) < 0.99
+    *_, samples = registered("lncc", INVERTED, "rwmh", chains=2, draws=50, thin=2, sigma_u=0.003, t_similarity=0.01)
+    assert 0.02 < float(samples.idata.sample_stats["acceptance_rate"].mean()) < 0.99

@@ -39,9 +39,9 @@ def test_interior_solution_has_the_least_energy(mesh, oracle):
     u = oracle.displacement(rng.normal(size=(len(mesh.boundary), 3)), LAM, MU)
     least = oracle.strain(u, LAM, MU)
     for _ in range(5):
-        other = u.copy()
-        other[mesh.interior] += 1e-2 * rng.normal(size=(len(mesh.interior), 3))
-        assert oracle.strain(other, LAM, MU) > least
+        perturbed = u.copy()
+        perturbed[mesh.interior] += 1e-2 * rng.normal(size=(len(mesh.interior), 3))
+        assert oracle.strain(perturbed, LAM, MU) > least
 
 
 @pytest.mark.parametrize("rule", ["gauss4", "gauss32"])

@@ -208,7 +208,7 @@ def sample_stats(rng: np.random.Generator, chains: int, draws: int, memory: floa
 def diagnose(rng: np.random.Generator, posterior: xr.Dataset, memory: float, total: int) -> list[xr.Dataset]:
     """Figures of the size that such chains would have; NaN where μ is fixed."""
     slow = memory > 0.95
-    found = []
+    diagnostics = []
     for kind in ("rhat", "bulk", "tail"):
         variables = {}
         for name, draws in posterior.data_vars.items():
@@ -217,8 +217,8 @@ def diagnose(rng: np.random.Generator, posterior: xr.Dataset, memory: float, tot
             values = 1 + excess if kind == "rhat" else total * rng.uniform(0.1, 0.4, shape) / (1 + 20 * excess)
             varies = draws.to_numpy().std(axis=(0, 1)) > 0
             variables[name] = (draws.dims[2:], np.where(varies, values, np.nan))
-        found.append(xr.Dataset(variables, coords=posterior.coords))
-    return found
+        diagnostics.append(xr.Dataset(variables, coords=posterior.coords))
+    return diagnostics
 
 
 def manifest(uniform: bool, converged: bool) -> dict:

@@ -30,33 +30,33 @@ def compare(path, studies) -> Page:
 
 
 def test_two_runs_beside_one_another_and_beside_the_paper(tmp_path, study, other):
-    found = compare(tmp_path, [study, other])
-    assert set(found.figures) == {"maps", "ratios", "distributions"}
-    assert "By tissue against Uniform" in found.text
+    page = compare(tmp_path, [study, other])
+    assert set(page.figures) == {"maps", "ratios", "distributions"}
+    assert "By tissue against Uniform" in page.text
     run = study.run
     distance = np.linalg.norm((run.u_mean - run.truth.u)[run.mesh.boundary], axis=1)
-    assert found.named("By tissue")[0][1] == f"{np.median(distance):.2f}"
-    assert found.named("Uniform")[0][1] == f"{2 * np.median(distance):.2f}"
-    assert found.named("By tissue")[1][1:] == ["0.16", "0.72", "2.43"]
-    assert len(found.named("No motion")) == 2
-    assert "Converged" in found.text
-    assert "Not converged" in found.text
-    assert "Beware" not in found.text
-    assert all(link.startswith(("#", "data:")) for link in found.links)
+    assert page.named("By tissue")[0][1] == f"{np.median(distance):.2f}"
+    assert page.named("Uniform")[0][1] == f"{2 * np.median(distance):.2f}"
+    assert page.named("By tissue")[1][1:] == ["0.16", "0.72", "2.43"]
+    assert len(page.named("No motion")) == 2
+    assert "Converged" in page.text
+    assert "Not converged" in page.text
+    assert "Beware" not in page.text
+    assert all(link.startswith(("#", "data:")) for link in page.links)
 
 
 def test_runs_without_truth_and_of_one_name(tmp_path, clinical_study):
     run = replace(clinical_study.run, manifest={"name": "<Anna>"})
-    found = compare(tmp_path, [clinical_study._replace(run=run)] * 3)
-    assert "<Anna> (1), <Anna> (2), <Anna> (3)" in found.text
-    assert "Table 1" not in found.text
+    page = compare(tmp_path, [clinical_study._replace(run=run)] * 3)
+    assert "<Anna> (1), <Anna> (2), <Anna> (3)" in page.text
+    assert "Table 1" not in page.text
 
 
 def test_unequal_pairs_and_meshes_are_told(tmp_path, study):
     foreign = make_study(seed=7, spacing=16.0, draws=30, shape=(30, 36, 24))
-    found = compare(tmp_path, [study, foreign])
-    assert "not of one pair" in found.text
-    assert "different meshes" in found.text
+    page = compare(tmp_path, [study, foreign])
+    assert "not of one pair" in page.text
+    assert "different meshes" in page.text
 
 
 def test_one_run_is_no_comparison(tmp_path, study):
@@ -66,6 +66,6 @@ def test_one_run_is_no_comparison(tmp_path, study):
 
 def test_an_approximate_run_is_told_by_name(tmp_path, study, other):
     run = replace(other.run, manifest=other.run.manifest | {"exact": False, "sampler": {"name": "laplace"}})
-    found = compare(tmp_path, [study, other._replace(run=run)])
-    assert "Uniform is approximate. The draws come from laplace" in found.text
-    assert "By tissue is approximate" not in found.text
+    page = compare(tmp_path, [study, other._replace(run=run)])
+    assert "Uniform is approximate. The draws come from laplace" in page.text
+    assert "By tissue is approximate" not in page.text

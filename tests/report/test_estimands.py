@@ -29,14 +29,14 @@ def make(lam_shape: int = 3) -> tuple[xr.Dataset, Diagnosed]:
 
 def test_every_sampled_entry_has_its_name_place_and_figures():
     posterior, diagnosed = make()
-    found = estimands(MESH, diagnosed, posterior)
-    assert len(found) == 9 + 3 + 1
-    names = {entry.name: entry for entry in found}
-    one = names["u_z of node 2"]
-    assert one.place == pytest.approx(tuple(MESH.points[2]))
-    assert one.rhat == pytest.approx(float(diagnosed.rhat["u_boundary"].sel(node=2, axis="z")))
-    assert one.ess_tail == pytest.approx(float(diagnosed.ess_tail["u_boundary"].sel(node=2, axis="z")))
-    np.testing.assert_array_equal(draws_of(posterior, one, 100), posterior["u_boundary"].sel(node=2, axis="z"))
+    entries = estimands(MESH, diagnosed, posterior)
+    assert len(entries) == 9 + 3 + 1
+    names = {entry.name: entry for entry in entries}
+    displacement = names["u_z of node 2"]
+    assert displacement.place == pytest.approx(tuple(MESH.points[2]))
+    assert displacement.rhat == pytest.approx(float(diagnosed.rhat["u_boundary"].sel(node=2, axis="z")))
+    assert displacement.ess_tail == pytest.approx(float(diagnosed.ess_tail["u_boundary"].sel(node=2, axis="z")))
+    np.testing.assert_array_equal(draws_of(posterior, displacement, 100), posterior["u_boundary"].sel(node=2, axis="z"))
     assert draws_of(posterior, names["λ wm"], 10).shape == (2, 10)
     assert names["λ wm"].place is None
     assert "T_s" in names
@@ -45,20 +45,20 @@ def test_every_sampled_entry_has_its_name_place_and_figures():
 def test_a_fixed_entry_is_none_but_one_stuck_at_different_places_is_the_worst():
     posterior, diagnosed = make()
     posterior["mu"][1, :, 2] = 2.0
-    found = estimands(MESH, diagnosed, posterior)
-    assert [entry.name for entry in found if entry.variable == "mu"] == ["μ wm"]
-    assert worst(found, 1)[0].name == "μ wm"
-    assert above(found, 1e9) == 1
+    entries = estimands(MESH, diagnosed, posterior)
+    assert [entry.name for entry in entries if entry.variable == "mu"] == ["μ wm"]
+    assert worst(entries, 1)[0].name == "μ wm"
+    assert above(entries, 1e9) == 1
 
 
 def test_a_displacement_that_never_moved_is_the_worst():
     posterior, diagnosed = make()
     posterior["u_boundary"][:, :, 1, 2] = 0.3
-    for part in diagnosed:
-        part["u_boundary"][1, 2] = np.nan
-    found = estimands(MESH, diagnosed, posterior)
-    assert len(found) == 9 + 3 + 1
-    assert worst(found, 1)[0].name == "u_z of node 2"
+    for dataset in diagnosed:
+        dataset["u_boundary"][1, 2] = np.nan
+    entries = estimands(MESH, diagnosed, posterior)
+    assert len(entries) == 9 + 3 + 1
+    assert worst(entries, 1)[0].name == "u_z of node 2"
 
 
 def test_elements_are_named_with_their_centre():

@@ -34,9 +34,9 @@ def by_element():
     return Study(study.run, study.idata._replace(posterior=posterior), nothing, nothing, nothing)
 
 
-def changed(seen: Study, **changes) -> Study:
+def changed(study: Study, **changes) -> Study:
     """The study of another run."""
-    return Study(replace(seen.run, **changes), seen.idata, seen.rhat, seen.ess_bulk, seen.ess_tail)
+    return Study(replace(study.run, **changes), study.idata, study.rhat, study.ess_bulk, study.ess_tail)
 
 
 @pytest.fixture(autouse=True)
@@ -102,9 +102,9 @@ def test_one_colour_range_holds_all_pictures_and_signs_balance():
 
 
 def test_pictures_differ_where_the_runs_do(seen):
-    other = changed(seen, u_mean=seen.run.u_mean * (-1.0))
-    one, two = (pixels(anatomy.displacement(study)) for study in (seen, other))
-    assert np.abs(one - two).max() > 0.2
+    mirrored = changed(seen, u_mean=seen.run.u_mean * (-1.0))
+    first_pixels, second_pixels = (pixels(anatomy.displacement(study)) for study in (seen, mirrored))
+    assert np.abs(first_pixels - second_pixels).max() > 0.2
 
 
 def test_stiffness_by_element_is_mapped_by_its_median(by_element):

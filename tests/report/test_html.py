@@ -34,18 +34,18 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        found = dict(attrs)
+        attributes = dict(attrs)
         self.tags.add(tag)
         self._script = tag == "script"
-        self._key = found.get("id", "").removeprefix("figure-") if tag == "figure" else self._key
+        self._key = attributes.get("id", "").removeprefix("figure-") if tag == "figure" else self._key
         if tag == "img":
-            self.figures[self._key] = found["src"]
-            assert found["alt"]
+            self.figures[self._key] = attributes["src"]
+            assert attributes["alt"]
         if tag == "tr":
             self.rows.append([])
         if tag in ("td", "th") and self.rows:
             self.rows[-1].append("")
-        self.links += [value for key, value in found.items() if key in ("href", "src") and value]
+        self.links += [value for key, value in attributes.items() if key in ("href", "src") and value]
 
     def handle_endtag(self, tag):
         self._script = False
@@ -161,10 +161,10 @@ def test_table_2_holds_the_integrated_errors(full, study):
     # Monte Carlo over every cell: uniform points in a simplex.
     inside = np.array([((shares @ error[cell]) ** 2).sum(axis=1).mean() for cell in run.mesh.cells])
     weights = run.mesh.volumes
-    found = [float(text) for text in full.named("Posterior mean")[1][1:]]
+    written = [float(text) for text in full.named("Posterior mean")[1][1:]]
     expected = [np.average(inside, weights=weights)]
     expected += [np.average(inside[run.mesh.tissue == k], weights=weights[run.mesh.tissue == k]) for k in range(3)]
-    np.testing.assert_allclose(found, expected, rtol=0.02)
+    np.testing.assert_allclose(written, expected, rtol=0.02)
 
 
 def test_the_papers_numbers_stand_beside(full):
@@ -257,12 +257,12 @@ def test_separate_chains_and_an_approximate_sampler_are_told_first(tmp_path, stu
     predicted = study.run.predicted._replace(chain_mean=study.run.u_mean + shifted)
     manifest = study.run.manifest | {"exact": False, "sampler": {"name": "laplace"}}
     run = replace(study.run, predicted=predicted, manifest=manifest)
-    found = page(tmp_path, study._replace(run=run, idata=study.idata._replace(posterior=posterior)))
-    assert "group 1: chains 1, 2; group 2: chain 3" in found.text
-    assert "several modes" in found.text
-    assert "The chains lie in 2 groups, each shown" in found.text
-    assert set(found.figures) == FIGURES | PAPER | {"modes"}
-    assert found.text.index("Approximate: a quick look") < found.text.index("Converged")
+    report_page = page(tmp_path, study._replace(run=run, idata=study.idata._replace(posterior=posterior)))
+    assert "group 1: chains 1, 2; group 2: chain 3" in report_page.text
+    assert "several modes" in report_page.text
+    assert "The chains lie in 2 groups, each shown" in report_page.text
+    assert set(report_page.figures) == FIGURES | PAPER | {"modes"}
+    assert report_page.text.index("Approximate: a quick look") < report_page.text.index("Converged")
 
 
 def test_names_from_anywhere_are_shown_as_they_are(study, tmp_path):
@@ -285,7 +285,7 @@ def test_names_from_anywhere_are_shown_as_they_are(study, tmp_path):
         "observations": study.run.manifest["observations"] | described,
     }
     run = replace(study.run, mesh=mesh, predicted=predicted, manifest=manifest, metrics=None)
-    figures = [one.assign_coords(tissue=list(tissues)) for one in (study.rhat, study.ess_bulk, study.ess_tail)]
+    figures = [dataset.assign_coords(tissue=list(tissues)) for dataset in (study.rhat, study.ess_bulk, study.ess_tail)]
     write_report(run, study.idata._replace(posterior=posterior), *figures, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<script>alert" not in text

@@ -13,13 +13,13 @@ MESH = box_mesh(2)
 
 def summary(residual, covariance):
     """What three landmarks leave, left out with these results, or not left out."""
-    known = {
+    arrays = {
         "names": np.array(["a", "b", "c"]),
         "points": MESH.points[:3],
         "sd": np.full(3, 0.5),
         "residual": np.full((3, 3), 0.1),
     }
-    return known if residual is None else {**known, "left_out_residual": residual, "left_out_covariance": covariance}
+    return arrays if residual is None else {**arrays, "left_out_residual": residual, "left_out_covariance": covariance}
 
 
 def test_surprise_is_uniform_where_the_covariance_is_right():
@@ -40,15 +40,15 @@ def test_what_was_left_out_is_counted():
 
 
 @pytest.mark.parametrize(
-    ("residual", "covariance", "said"),
+    ("residual", "covariance", "sentence"),
     [
         (np.full((3, 3), np.nan), np.full((3, 3, 3), np.inf), "no landmark is determined by the other observations"),
         (None, None, "They were not left out in turn"),
     ],
 )
-def test_where_nothing_is_left_out_that_is_said(residual, covariance, said):
-    left = summary(residual, covariance)
-    table = landmark_table("landmarks", left)
-    assert said in table.caption
+def test_where_nothing_is_left_out_that_is_said(residual, covariance, sentence):
+    arrays = summary(residual, covariance)
+    table = landmark_table("landmarks", arrays)
+    assert sentence in table.caption
     assert "nan" not in str(table)
-    assert _drawing(distance_figure("landmarks", left)).uri.startswith("data:image/svg")
+    assert _drawing(distance_figure("landmarks", arrays)).uri.startswith("data:image/svg")

@@ -29,20 +29,20 @@ def test_mean_squared_error_by_tissue():
     mesh = ball_mesh(40.0, 18.0)
     rng = np.random.default_rng(1)
     u, truth = rng.normal(size=(2, *mesh.points.shape))
-    found = metrics.mean_squared_error(mesh, u, truth)
+    errors = metrics.mean_squared_error(mesh, u, truth)
     integral = by_quadrature(mesh, u - truth)
-    assert found["domain"] == pytest.approx(integral.sum() / mesh.volumes.sum(), rel=1e-12)
+    assert errors["domain"] == pytest.approx(integral.sum() / mesh.volumes.sum(), rel=1e-12)
     for k, name in enumerate(mesh.names):
         inside = mesh.tissue == k
-        assert found[name] == pytest.approx(integral[inside].sum() / mesh.volumes[inside].sum(), rel=1e-12)
+        assert errors[name] == pytest.approx(integral[inside].sum() / mesh.volumes[inside].sum(), rel=1e-12)
 
 
 def test_mean_squared_error_of_a_constant_shift_and_of_an_absent_tissue():
     mesh = box_mesh()
     mesh = TetMesh.from_arrays(mesh.points, mesh.cells, np.zeros(len(mesh.cells), int), ("csf", "gm"))
     truth = np.zeros_like(mesh.points)
-    found = metrics.mean_squared_error(mesh, truth + np.array([1.0, 2.0, -2.0]), truth)
-    assert found == pytest.approx({"domain": 9.0, "csf": 9.0})
+    errors = metrics.mean_squared_error(mesh, truth + np.array([1.0, 2.0, -2.0]), truth)
+    assert errors == pytest.approx({"domain": 9.0, "csf": 9.0})
 
 
 def test_boundary_error_looks_at_the_given_nodes_only():
@@ -50,8 +50,8 @@ def test_boundary_error_looks_at_the_given_nodes_only():
     u = np.zeros((101, 3))
     u[:100, 1] = np.arange(100)
     u[100] = 1e6
-    found = metrics.boundary_error(u, truth, np.arange(100))
-    assert found == pytest.approx({"median": 49.5, "q95": 94.05, "max": 99.0})
+    errors = metrics.boundary_error(u, truth, np.arange(100))
+    assert errors == pytest.approx({"median": 49.5, "q95": 94.05, "max": 99.0})
 
 
 def test_divergence_of_a_linear_field_is_the_trace():
@@ -85,10 +85,10 @@ def test_metrics_of_a_run_pair_nodes_with_their_truth():
     draws = u[nodes] + rng.normal(size=(2, 300, len(nodes), 3))
     posterior = xr.Dataset({"u_boundary": (("chain", "draw", "node", "axis"), draws)}, coords={"node": nodes})
     truth = Truth(u, np.ones(3), np.ones(3), 0.5 * u)
-    found = metrics.compute_metrics(mesh, u + np.array([0.0, 0.6, 0.8]), truth, posterior, max_draws=200)
-    assert found["coverage"]["0.5"] > 0.95
-    assert found["boundary_error"]["posterior_mean"]["max"] == pytest.approx(1.0)
-    assert found["mean_squared_error"]["posterior_mean"]["gm"] == pytest.approx(1.0)
+    run_metrics = metrics.compute_metrics(mesh, u + np.array([0.0, 0.6, 0.8]), truth, posterior, max_draws=200)
+    assert run_metrics["coverage"]["0.5"] > 0.95
+    assert run_metrics["boundary_error"]["posterior_mean"]["max"] == pytest.approx(1.0)
+    assert run_metrics["mean_squared_error"]["posterior_mean"]["gm"] == pytest.approx(1.0)
     distance = np.linalg.norm(u[mesh.boundary], axis=1)
-    assert found["boundary_error"]["unregistered"]["median"] == pytest.approx(np.median(distance))
-    assert found["boundary_error"]["initial"]["max"] == pytest.approx(distance.max() / 2)
+    assert run_metrics["boundary_error"]["unregistered"]["median"] == pytest.approx(np.median(distance))
+    assert run_metrics["boundary_error"]["initial"]["max"] == pytest.approx(distance.max() / 2)

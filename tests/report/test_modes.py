@@ -22,18 +22,18 @@ def posterior_of(offsets: list[float], drift: float = 0.0, seed: int = 0) -> xr.
 
 
 def test_chains_about_one_place_are_one_group():
-    found = grouping(posterior_of([0.0, 0.1, -0.1, 0.0]))
-    assert found.groups == 1
-    assert not found.drifting.any()
+    chain_groups = grouping(posterior_of([0.0, 0.1, -0.1, 0.0]))
+    assert chain_groups.groups == 1
+    assert not chain_groups.drifting.any()
 
 
 def test_chains_apart_are_groups_in_the_order_of_their_first():
-    found = grouping(posterior_of([2.0, 0.0, 2.1, 0.0]))
-    np.testing.assert_array_equal(found.label, [0, 1, 0, 1])
-    text = " ".join(explanation(found))
+    chain_groups = grouping(posterior_of([2.0, 0.0, 2.1, 0.0]))
+    np.testing.assert_array_equal(chain_groups.label, [0, 1, 0, 1])
+    text = " ".join(explanation(chain_groups))
     assert "group 1: chains 1, 3; group 2: chains 2, 4" in text
     assert "several modes" in text
-    np.testing.assert_array_equal(group_means(np.array([1.0, 2.0, 3.0, 4.0]), found), [2, 3])
+    np.testing.assert_array_equal(group_means(np.array([1.0, 2.0, 3.0, 4.0]), chain_groups), [2, 3])
 
 
 def test_one_estimand_alone_does_not_part_chains():
@@ -43,10 +43,10 @@ def test_one_estimand_alone_does_not_part_chains():
 
 
 def test_chains_on_their_way_are_not_called_modes():
-    found = grouping(posterior_of([0.0, 9.0], drift=4.0))
-    assert found.drifting.all()
-    assert "have not arrived yet" in " ".join(explanation(found))
-    assert "several modes" not in " ".join(explanation(found))
+    chain_groups = grouping(posterior_of([0.0, 9.0], drift=4.0))
+    assert chain_groups.drifting.all()
+    assert "have not arrived yet" in " ".join(explanation(chain_groups))
+    assert "several modes" not in " ".join(explanation(chain_groups))
 
 
 def test_chains_that_stand_still_are_apart_only_where_they_differ():

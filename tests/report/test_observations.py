@@ -36,9 +36,9 @@ def test_every_term_is_named():
     scales = {"t_similarity": {"median": 1.0, "log_sd": 1.0}, "points_sd": {"median": 1.0, "log_sd": 1.0}}
     model = {"elastic_prior": {"kind": "boltzmann", "normalised": True}, "rigid_sd": 3.0}
     observed = {"images": IMAGES, "t2": IMAGES, "points": POINTS, "<own>": OWN}
-    found = formula({"observations": observed, "model": model, "scales": scales}, elastography=False)
-    assert "&lt;own&gt;" in found
-    assert plain(found) == (
+    density = formula({"observations": observed, "model": model, "scales": scales}, elastography=False)
+    assert "&lt;own&gt;" in density
+    assert plain(density) == (
         "−Es / Ts − Es(t2) / Ts(t2) + log p(points | u) + log p(&lt;own&gt; | u) − Er / Tr − log Z(λ, μ, Tr) "
         "+ log p(rigid motion of u) + log p(λ) + log p(μ) + log p(Ts) + log p(points sd)"
     )
@@ -51,16 +51,16 @@ def test_random_loads_take_the_place_of_the_elastic_energy():
         "model": {"elastic_prior": {"kind": "loads", "body": load, "surface": load}},
         "scales": {"body_load": load, "surface_load": load},
     }
-    found = plain(formula(manifest, elastography=False))
+    density = plain(formula(manifest, elastography=False))
     sizes = "log p(sd of the random loads inside) + log p(sd of the random loads at the surface)"
-    assert found == f"−Es / Ts + log p(u | λ, μ, random loads) + log p(λ) + log p(μ) + {sizes}"
+    assert density == f"−Es / Ts + log p(u | λ, μ, random loads) + log p(λ) + log p(μ) + {sizes}"
 
 
 def test_the_default_model_has_the_papers_density():
     """As a run writes its options down, those that it does not use among them."""
     model = br.ModelConfig().model_dump(mode="json")
-    found = plain(formula({"observations": {"images": IMAGES}, "model": model}, elastography=False))
-    assert found == "−Es / Ts − Er / Tr + log p(λ) + log p(μ)"
+    density = plain(formula({"observations": {"images": IMAGES}, "model": model}, elastography=False))
+    assert density == "−Es / Ts − Er / Tr + log p(λ) + log p(μ)"
 
 
 def test_landmarks_alone_have_no_similarity():
@@ -70,9 +70,9 @@ def test_landmarks_alone_have_no_similarity():
 
 
 def test_each_pair_of_images_says_what_it_compares():
-    found = [plain(text) for text in explanations({"observations": {"images": IMAGES, "t2": IMAGES, "points": POINTS}})]
-    assert [text.split(" = ")[0] for text in found] == ["Es", "Es(t2)"]
-    assert all("affine map" in text for text in found)
+    texts = [plain(text) for text in explanations({"observations": {"images": IMAGES, "t2": IMAGES, "points": POINTS}})]
+    assert [text.split(" = ")[0] for text in texts] == ["Es", "Es(t2)"]
+    assert all("affine map" in text for text in texts)
 
 
 def test_observations_without_residuals_leave_their_cells_empty():

@@ -50,7 +50,7 @@ def posterior():
 
 
 @pytest.mark.parametrize(
-    ("law", "said"),
+    ("law", "reading"),
     [
         (stats.norm(10, 0.5), "identified"),
         (stats.uniform(0, 3), "only an upper bound"),
@@ -61,11 +61,11 @@ def posterior():
         (stats.lognorm(3.0), "not identified"),
     ],
 )
-def test_readings_of_known_laws(law, said):
+def test_readings_of_known_laws(law, reading):
     draws = law.ppf((np.arange(DRAWS) + 0.5) / DRAWS)
-    assert describe_bounds(draws) == said
+    assert describe_bounds(draws) == reading
     mirror = {"only an upper bound": "only a lower bound", "only a lower bound": "only an upper bound"}
-    assert describe_bounds(1 / draws) == mirror.get(said, said)
+    assert describe_bounds(1 / draws) == mirror.get(reading, reading)
 
 
 def test_a_posterior_like_its_prior_is_not_identified():
@@ -93,15 +93,15 @@ def test_a_row_for_all_that_is_known(posterior):
         "priors": {"lam": {"gm": {"alpha": 1.0, "beta": 1.0, "low": 0.0, "high": 20.0}}},
     }
     table = parameter_table(studied(posterior, model, [1.0] * 3, [1.0, np.nan, 1.5], t_similarity=1.0))
-    found = {(group, row[0]): row[1:] for group, rows in table.groups for row in rows}
+    cells = {(group, row[0]): row[1:] for group, rows in table.groups for row in rows}
     elastic = [(tissue, symbol) for tissue in ("CSF", "GM", "WM") for symbol in ("λ/μ", "λ", "μ")]
-    assert list(found) == [*elastic, ("Scales", "T_s")]
-    assert float(found["WM", "λ/μ"][0]) == pytest.approx(24, rel=0.02)
-    low, high = (float(edge) for edge in found["WM", "λ/μ"][1].split(" to "))
+    assert list(cells) == [*elastic, ("Scales", "T_s")]
+    assert float(cells["WM", "λ/μ"][0]) == pytest.approx(24, rel=0.02)
+    low, high = (float(edge) for edge in cells["WM", "λ/μ"][1].split(" to "))
     assert (low, high) == pytest.approx((24 * np.exp(-0.196), 24 * np.exp(0.196)), rel=0.03)
-    assert found["GM", "λ"][2:4] == ["0.500 to 19.5", "identified"]
-    assert found["GM", "μ"] == ["1.00", "fixed", "–", "–", "–", "–"]
-    assert found["CSF", "λ"][2:4] == ["improper", "only an upper bound"]
-    assert found["CSF", "λ/μ"][3] == "not identified"
-    assert found["WM", "μ"][3:] == ["the chains disagree", "1.500", "150"]
-    assert found["Scales", "T_s"][3] == "identified"
+    assert cells["GM", "λ"][2:4] == ["0.500 to 19.5", "identified"]
+    assert cells["GM", "μ"] == ["1.00", "fixed", "–", "–", "–", "–"]
+    assert cells["CSF", "λ"][2:4] == ["improper", "only an upper bound"]
+    assert cells["CSF", "λ/μ"][3] == "not identified"
+    assert cells["WM", "μ"][3:] == ["the chains disagree", "1.500", "150"]
+    assert cells["Scales", "T_s"][3] == "identified"

@@ -54,8 +54,8 @@ def test_sampling_is_linear_inside_and_says_what_lies_outside():
 
 def test_labels_are_sampled_without_mixing():
     image = Image(np.array([0, 5, 0]).reshape(3, 1, 1), np.eye(4))
-    found = sample(image, np.array([[0.4, 0, 0], [0.6, 0, 0], [1.4, 0, 0], [1.6, 0, 0]]), order=0)
-    np.testing.assert_array_equal(found, [0, 5, 5, 0])
+    labels = sample(image, np.array([[0.4, 0, 0], [0.6, 0, 0], [1.4, 0, 0], [1.6, 0, 0]]), order=0)
+    np.testing.assert_array_equal(labels, [0, 5, 5, 0])
 
 
 def test_planes_pass_through_an_inner_point_and_leave_one_that_would_only_graze():

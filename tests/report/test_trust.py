@@ -47,11 +47,13 @@ def test_nothing_is_told_of_what_a_run_does_not_have():
 
 
 @pytest.mark.parametrize(
-    ("sampled", "pair", "told"),
+    ("sampled", "pair", "warned"),
     [("boundary", None, True), ("boundary", {"kind": "paper"}, False), ("all", None, False)],
 )
-def test_a_strict_equilibrium_of_real_images_is_warned_of(sampled, pair, told):
+def test_a_strict_equilibrium_of_real_images_is_warned_of(sampled, pair, warned):
     manifest = MANIFEST | {"model": {"elastic_prior": {"nodes": sampled}}, "pair": pair}
     warnings = warnings_of(manifest, box_mesh(), elastic([1.0] * 3, [1.0] * 3))
-    assert any("preset: registration" in text for text in warnings) == told
-    assert (doubt_of_equilibrium({"elastic_prior": {"nodes": sampled}}, simulated=pair is not None) is not None) == told
+    assert any("preset: registration" in text for text in warnings) == warned
+    assert (
+        doubt_of_equilibrium({"elastic_prior": {"nodes": sampled}}, simulated=pair is not None) is not None
+    ) == warned

@@ -28,26 +28,26 @@ def elastic(lam: list[float], mu: list[float]) -> xr.Dataset:
 
 
 def test_converged_only_if_every_estimand_is_below_the_threshold():
-    found = verdict(stopped("R̂ is below 1.2", converged=True), [entry(1.01), entry(1.19, name="λ gm")])
-    assert found.converged
-    assert found.headline.startswith("Converged: R̂ is below 1.2 for all 2 estimands; the greatest is 1.190 (λ gm")
-    assert found.detail == "It stopped because R̂ is below 1.2."
+    judgement = verdict(stopped("R̂ is below 1.2", converged=True), [entry(1.01), entry(1.19, name="λ gm")])
+    assert judgement.converged
+    assert judgement.headline.startswith("Converged: R̂ is below 1.2 for all 2 estimands; the greatest is 1.190 (λ gm")
+    assert judgement.detail == "It stopped because R̂ is below 1.2."
 
 
 def test_one_estimand_above_is_not_converged_whatever_the_manifest_says():
-    found = verdict(stopped(converged=True), [entry(1.01)] * 9 + [entry(1.2)])
-    assert not found.converged
-    assert "Not converged: R̂ is 1.2 or more for 1 of 10 estimands" in found.headline
-    assert "u_x of node 7 at (1, −20, 3) mm" in found.headline
-    assert "the budget of 60 s was spent" in found.detail
-    assert "not the posterior" in found.detail
+    judgement = verdict(stopped(converged=True), [entry(1.01)] * 9 + [entry(1.2)])
+    assert not judgement.converged
+    assert "Not converged: R̂ is 1.2 or more for 1 of 10 estimands" in judgement.headline
+    assert "u_x of node 7 at (1, −20, 3) mm" in judgement.headline
+    assert "the budget of 60 s was spent" in judgement.detail
+    assert "not the posterior" in judgement.detail
 
 
 @pytest.mark.parametrize("rhat", [math.nan, math.inf])
 def test_undefined_figures_are_not_converged(rhat):
-    found = verdict(stopped(), [entry(1.0), entry(rhat)])
-    assert not found.converged
-    assert ("undefined" if math.isnan(rhat) else "infinite") in found.headline
+    judgement = verdict(stopped(), [entry(1.0), entry(rhat)])
+    assert not judgement.converged
+    assert ("undefined" if math.isnan(rhat) else "infinite") in judgement.headline
 
 
 def test_nothing_sampled_is_not_converged():
@@ -62,10 +62,10 @@ def test_few_effective_draws_are_admitted_even_when_converged():
 
 def test_a_run_whose_own_rule_says_no_has_not_converged():
     manifest = stopped() | {"convergence": {"rhat_paper_max": 1.4321}}
-    found = verdict(manifest, [entry(1.01)])
-    assert not found.converged
-    assert "unsplit, as in the paper) is 1.432, asked for 1.2" in found.headline
-    assert "not the posterior" in found.detail
+    judgement = verdict(manifest, [entry(1.01)])
+    assert not judgement.converged
+    assert "unsplit, as in the paper) is 1.432, asked for 1.2" in judgement.headline
+    assert "not the posterior" in judgement.detail
 
 
 def test_without_a_stop_rule_the_estimands_decide():
@@ -170,8 +170,8 @@ def test_only_an_approximate_sampler_is_called_so():
 
 
 def test_the_worst_estimand_is_named_with_its_region():
-    found = verdict(stopped(), [entry(1.3)._replace(region="left posterior, GM")])
-    assert "u_x of node 7 at (1, −20, 3) mm, left posterior, GM" in found.headline
+    judgement = verdict(stopped(), [entry(1.3)._replace(region="left posterior, GM")])
+    assert "u_x of node 7 at (1, −20, 3) mm, left posterior, GM" in judgement.headline
 
 
 @pytest.mark.parametrize(
@@ -210,6 +210,6 @@ def test_too_few_effective_draws_are_named():
         "stopped": {"converged": False, "rhat_threshold": 1.01, "ess_threshold": 400.0},
         "convergence": {"ess_bulk_min": 512.3, "ess_tail_min": 380.2},
     }
-    found = verdict(manifest, [entry(1.004)])
-    assert not found.converged
-    assert "the least ESS is 512 (bulk) and 380 (tail), asked for more than 400" in found.headline
+    judgement = verdict(manifest, [entry(1.004)])
+    assert not judgement.converged
+    assert "the least ESS is 512 (bulk) and 380 (tail), asked for more than 400" in judgement.headline

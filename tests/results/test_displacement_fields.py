@@ -57,12 +57,12 @@ def _smooth_image(grid: Image) -> Image:
 
 
 def _to_itk(image: Image) -> SimpleITK.Image:
-    found = SimpleITK.GetImageFromArray(np.asarray(image.voxels, np.float64).transpose(2, 1, 0))
+    itk_image = SimpleITK.GetImageFromArray(np.asarray(image.voxels, np.float64).transpose(2, 1, 0))
     sizes = image.voxel_sizes
-    found.SetSpacing(sizes.tolist())
-    found.SetOrigin((image.affine[:3, 3] * LPS).tolist())
-    found.SetDirection((LPS[:, None] * image.affine[:3, :3] / sizes).ravel().tolist())
-    return found
+    itk_image.SetSpacing(sizes.tolist())
+    itk_image.SetOrigin((image.affine[:3, 3] * LPS).tolist())
+    itk_image.SetDirection((LPS[:, None] * image.affine[:3, :3] / sizes).ravel().tolist())
+    return itk_image
 
 
 def _of_itk(transform, points):
@@ -84,20 +84,20 @@ def _lies_between_voxels(image, points):
 def test_simpleitk_resamples_and_moves_points_as_we_do(name, tmp_path):
     transform, grid = _transform(), _grid(GRIDS[name])
     write_transforms(_place(tmp_path), transform, grid)
-    there, back = (SimpleITK.ReadTransform(str(tmp_path / f"transform_mean{end}.h5")) for end in ("", "_inverse"))
+    forward, inverse = (SimpleITK.ReadTransform(str(tmp_path / f"transform_mean{end}.h5")) for end in ("", "_inverse"))
     # On voxel centres the field is exact; the moving image has a grid of its own.
     moving = _smooth_image(Image(np.zeros((45, 60, 50)), POSE.matrix @ _grid(TURN @ np.diag([3.0, 2.0, -2.5])).affine))
-    ours = np.asarray(moving.interpolate(transform.place(grid.grid_points().reshape(-1, 3))[0])).reshape(grid.shape)
-    theirs = SimpleITK.Resample(_to_itk(moving), _to_itk(grid), there, SimpleITK.sitkLinear, np.nan)
-    theirs = SimpleITK.GetArrayFromImage(theirs).transpose(2, 1, 0)
-    known = np.isfinite(theirs)
-    assert known.mean() > 0.3
-    np.testing.assert_allclose(theirs[known], ours[known], atol=2e-4)
+    expected = np.asarray(moving.interpolate(transform.place(grid.grid_points().reshape(-1, 3))[0])).reshape(grid.shape)
+    by_itk = SimpleITK.Resample(_to_itk(moving), _to_itk(grid), forward, SimpleITK.sitkLinear, np.nan)
+    by_itk = SimpleITK.GetArrayFromImage(by_itk).transpose(2, 1, 0)
+    finite = np.isfinite(by_itk)
+    assert finite.mean() > 0.3
+    np.testing.assert_allclose(by_itk[finite], expected[finite], atol=2e-4)
     points = CENTRE + np.random.default_rng(0).uniform(-20, 20, (200, 3))
     placed, _ = transform.place(points)
     coarse = 0.12 if grid.voxel_sizes.max() > 2.5 else 0.06
-    assert np.linalg.norm(_of_itk(there, points) - placed, axis=1).max() < coarse
-    assert np.linalg.norm(_of_itk(back, placed) - points, axis=1).max() < coarse
+    assert np.linalg.norm(_of_itk(forward, points) - placed, axis=1).max() < coarse
+    assert np.linalg.norm(_of_itk(inverse, placed) - points, axis=1).max() < coarse
 
 
 @pytest.mark.parametrize("name", ["upright", "oblique, anisotropic and left-handed"])
@@ -109,13 +109,13 @@ def test_each_draw_has_its_own(name, tmp_path):
     ]
     points = CENTRE + np.random.default_rng(1).uniform(-20, 20, (100, 3))
     for number, u in enumerate(transform.draws, start=1):
-        one = Transform(transform.deformer, POSE, u, transform.draws[:0])
-        placed, _ = one.place(points)
+        draw_transform = Transform(transform.deformer, POSE, u, transform.draws[:0])
+        placed, _ = draw_transform.place(points)
         base = tmp_path / "transforms" / f"draw-{number}"
-        there = SimpleITK.ReadTransform(f"{base}.h5")
-        assert np.linalg.norm(_of_itk(there, points) - placed, axis=1).mean() < 0.1
-        back = SimpleITK.ReadTransform(f"{base}_inverse.h5")
-        assert np.linalg.norm(_of_itk(back, placed) - points, axis=1).mean() < 0.1
+        forward = SimpleITK.ReadTransform(f"{base}.h5")
+        assert np.linalg.norm(_of_itk(forward, points) - placed, axis=1).mean() < 0.1
+        inverse = SimpleITK.ReadTransform(f"{base}_inverse.h5")
+        assert np.linalg.norm(_of_itk(inverse, placed) - points, axis=1).mean() < 0.1
         header = nib.load(f"{base}.nii.gz").header
         assert int(header["intent_code"]) == 1007
         assert header.get_data_shape()[3:] == (1, 3)
@@ -139,18 +139,18 @@ def test_ants_nitransforms_and_nibabel_resample_and_move_points_as_we_do(name, t
         assert np.linalg.norm(by_nitransforms - end, axis=1).max() < 0.12
 
     moving = _smooth_image(Image(np.zeros((45, 60, 50)), POSE.matrix @ _grid(TURN @ np.diag([3.0, 2.0, -2.5])).affine))
-    there = transform.place(grid.grid_points().reshape(-1, 3))[0].reshape(*grid.shape, 3)
-    ours, known = np.asarray(moving.interpolate(there)), _lies_between_voxels(moving, there)
-    assert known.mean() > 0.3
+    moving_points = transform.place(grid.grid_points().reshape(-1, 3))[0].reshape(*grid.shape, 3)
+    expected, interior = np.asarray(moving.interpolate(moving_points)), _lies_between_voxels(moving, moving_points)
+    assert interior.mean() > 0.3
     for image, stem in ((grid, "fixed"), (moving, "moving")):
         nib.save(nib.Nifti1Image(np.asarray(image.voxels, np.float64), image.affine), tmp_path / f"{stem}.nii.gz")
     fixed_file, moving_file = tmp_path / "fixed.nii.gz", tmp_path / "moving.nii.gz"
 
     by_ants = ants.apply_transforms(ants.image_read(str(fixed_file)), ants.image_read(str(moving_file)), [composite])
-    np.testing.assert_allclose(by_ants.numpy()[known], ours[known], atol=5e-4)
+    np.testing.assert_allclose(by_ants.numpy()[interior], expected[interior], atol=5e-4)
     read = nitransforms.manip.load(composite, fmt="itk")
     by_nitransforms = nitransforms.resampling.apply(read, moving_file, reference=fixed_file, order=1, prefilter=False)
-    np.testing.assert_allclose(np.asarray(by_nitransforms.dataobj)[known], ours[known], atol=5e-4)
+    np.testing.assert_allclose(np.asarray(by_nitransforms.dataobj)[interior], expected[interior], atol=5e-4)
 
 
 def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
@@ -164,9 +164,11 @@ def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
         index = nib.affines.apply_affine(np.linalg.inv(moving.affine), places)
         theirs = ndimage.map_coordinates(np.asarray(moving.voxels), np.moveaxis(index, -1, 0), order=1)
         centres = nib.affines.apply_affine(field.affine, voxels).reshape(-1, 3)
-        there, _ = Transform(transform.deformer, POSE, u, transform.draws[:0]).place(centres)
-        known = _lies_between_voxels(moving, there)
-        np.testing.assert_allclose(theirs.ravel()[known], np.asarray(moving.interpolate(there))[known], atol=5e-4)
+        moving_points, _ = Transform(transform.deformer, POSE, u, transform.draws[:0]).place(centres)
+        interior = _lies_between_voxels(moving, moving_points)
+        np.testing.assert_allclose(
+            theirs.ravel()[interior], np.asarray(moving.interpolate(moving_points))[interior], atol=5e-4
+        )
 
 
 def test_without_a_pose_and_without_draws(tmp_path):
@@ -176,8 +178,8 @@ def test_without_a_pose_and_without_draws(tmp_path):
     x, y, z = load_displacement(tmp_path / "transform_mean.h5")
     expected = transform.mean.displacement(*[grid.grid_points().reshape(-1, 3)] * 1, transform.deformer.locate(
         grid.grid_points().reshape(-1, 3)))  # fmt: skip
-    found = np.stack([one.voxels for one in (x, y, z)], axis=-1).reshape(-1, 3)
-    np.testing.assert_allclose(found, expected, atol=2.0**-12)
+    displacements = np.stack([component.voxels for component in (x, y, z)], axis=-1).reshape(-1, 3)
+    np.testing.assert_allclose(displacements, expected, atol=2.0**-12)
 
 
 def test_small_voxels_are_passed_over(tmp_path):
@@ -187,9 +189,9 @@ def test_small_voxels_are_passed_over(tmp_path):
     x, _, _ = load_displacement(tmp_path / "transform_mean.h5")
     np.testing.assert_allclose(x.voxel_sizes, [2.25, 2.0, 2.0])
     assert x.contains(grid.voxel_to_world(np.array([[0.0, 0.0, 0.0], np.array(grid.shape) - 1.0]))).all()
-    there = SimpleITK.ReadTransform(str(tmp_path / "transform_mean.h5"))
+    forward = SimpleITK.ReadTransform(str(tmp_path / "transform_mean.h5"))
     points = CENTRE + np.random.default_rng(2).uniform(-20, 20, (200, 3))
-    away = np.linalg.norm(_of_itk(there, points) - transform.place(points)[0], axis=1)
+    away = np.linalg.norm(_of_itk(forward, points) - transform.place(points)[0], axis=1)
     assert np.median(away) < 0.01
     assert away.max() < 0.06
 
@@ -201,27 +203,29 @@ def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow(linea
     """On small voxels, too, where what lies around the mesh is interpolated."""
     transform, grid = _transform(), _grid(linear)
     sd = np.full(transform.mesh.points.shape, 0.2)
-    mean, found, parts = moments = moments_on(transform, sd, grid)
+    mean, total_sd, sd_by_cause = moments = moments_on(transform, sd, grid)
     points = grid.grid_points().reshape(-1, 3)
     covered = covered_voxels(grid, transform.mesh)
-    at = tuple(covered.voxel.T)
+    index = tuple(covered.voxel.T)
     away = np.abs(points + mean.reshape(-1, 3) - transform.place(points)[0]).reshape(mean.shape)
-    assert away[at].max() < 1e-5
+    assert away[index].max() < 1e-5
     assert np.percentile(away, 99) < around
     assert away.max() < 5 * around
     total = transform.pose.displacement(transform.mesh.points, transform.u_mean)
     expected = np.sqrt(0.04 + submesh_variance(transform.mesh, total)[covered.cell])
-    np.testing.assert_allclose(found[at], expected, rtol=1e-5)
-    assert parts["nodes"] == pytest.approx(0.2)
-    assert parts["nodes"] ** 2 + parts["mesh"] ** 2 == pytest.approx((found[at].astype(float) ** 2).mean())
+    np.testing.assert_allclose(total_sd[index], expected, rtol=1e-5)
+    assert sd_by_cause["nodes"] == pytest.approx(0.2)
+    assert sd_by_cause["nodes"] ** 2 + sd_by_cause["mesh"] ** 2 == pytest.approx(
+        (total_sd[index].astype(float) ** 2).mean()
+    )
     outside = np.ones(grid.shape, bool)
-    outside[at] = False
+    outside[index] = False
     assert outside.any()
-    assert (found[outside] == 0).all()
+    assert (total_sd[outside] == 0).all()
     written_mean, written_sd = moments.rounded
-    assert np.abs(written_mean - mean)[at].max() <= MEAN_STEP / 2 + 1e-6
+    assert np.abs(written_mean - mean)[index].max() <= MEAN_STEP / 2 + 1e-6
     assert np.abs(written_mean - mean).max() <= STEP_AROUND / 2 + 1e-5
-    assert np.abs(written_sd - found).max() <= SD_STEP / 2 + 1e-6
+    assert np.abs(written_sd - total_sd).max() <= SD_STEP / 2 + 1e-6
     assert ((written_sd > 0).any(axis=-1) == ~outside).all()
 
 
@@ -229,6 +233,6 @@ def test_a_sheared_grid_gets_one_at_right_angles(tmp_path):
     linear = np.array([[2.0, 0.6, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.5]])
     transform = _transform(draws=0)
     write_transforms(_place(tmp_path), transform, _grid(linear))
-    there = SimpleITK.ReadTransform(str(tmp_path / "transform_mean.h5"))
+    forward = SimpleITK.ReadTransform(str(tmp_path / "transform_mean.h5"))
     points = CENTRE + np.random.default_rng(2).uniform(-20, 20, (50, 3))
-    assert np.linalg.norm(_of_itk(there, points) - transform.place(points)[0], axis=1).max() < 0.12
+    assert np.linalg.norm(_of_itk(forward, points) - transform.place(points)[0], axis=1).max() < 0.12

@@ -33,13 +33,13 @@ def _points(transform: Transform, count: int, radius: float, seed: int = 1) -> n
 def test_there_and_back():
     transform = _transform()
     points = _points(transform, 2000, 60.0)
-    there, location = transform.place(points)
+    placed, location = transform.place(points)
     assert 0.2 < transform.deformer.is_inside(location).mean() < 0.4
-    back, _ = transform.inverse.place(there)
-    np.testing.assert_allclose(back, points, atol=1e-9)
+    restored, _ = transform.inverse.place(placed)
+    np.testing.assert_allclose(restored, points, atol=1e-9)
     inside = transform.deformer.is_inside(location)
     u = transform.mean.displacement(points[inside], transform.deformer.locate(points[inside]))
-    np.testing.assert_allclose(there[inside], transform.pose.place(points[inside] + u), atol=1e-12)
+    np.testing.assert_allclose(placed[inside], transform.pose.place(points[inside] + u), atol=1e-12)
 
 
 def test_the_covariance_is_that_of_the_nodes_interpolated_and_turned_with_the_pose():
@@ -49,34 +49,38 @@ def test_the_covariance_is_that_of_the_nodes_interpolated_and_turned_with_the_po
     sd = np.array([0.1, 0.2, 0.4])
     draws = u + sd * np.random.default_rng(0).standard_normal((2000, *u.shape))
     transform = Transform(Deformer(mesh), POSE, u, draws)
-    found = spread(transform, _points(transform, 200, 25.0), far=(0.5, 1.0))
-    assert found.inside.all()
+    uncertainty = spread(transform, _points(transform, 200, 25.0), far=(0.5, 1.0))
+    assert uncertainty.inside.all()
     expected = POSE.rotation @ np.diag(sd**2) @ POSE.rotation.T
-    np.testing.assert_allclose(found.covariance.mean(axis=0), expected, atol=0.004)
-    np.testing.assert_allclose(found.covariance, np.broadcast_to(expected, found.covariance.shape), atol=0.03)
-    lengths, axes = found.ellipsoids(0.95)
+    np.testing.assert_allclose(uncertainty.covariance.mean(axis=0), expected, atol=0.004)
+    np.testing.assert_allclose(
+        uncertainty.covariance, np.broadcast_to(expected, uncertainty.covariance.shape), atol=0.03
+    )
+    lengths, axes = uncertainty.ellipsoids(0.95)
     np.testing.assert_allclose(lengths.mean(axis=0), np.sqrt(chi2.ppf(0.95, 3)) * sd[::-1], rtol=0.05)
     np.testing.assert_allclose(np.abs(axes[:, 0] @ POSE.rotation[:, 2]), 1, atol=0.02)
     drawn = np.linalg.norm(sd * np.random.default_rng(1).standard_normal((100_000, 3)), axis=1)
-    for share, distance in zip(found.far, (0.5, 1.0), strict=True):
+    for share, distance in zip(uncertainty.far, (0.5, 1.0), strict=True):
         assert share.mean() == pytest.approx((drawn > distance).mean(), abs=0.01)
 
 
 def test_the_inverse_spreads_as_far():
     transform = _transform(draws=300)
     points = _points(transform, 300, 25.0)
-    there = spread(transform, points)
-    back = spread(transform.inverse, there.places)
-    np.testing.assert_allclose(back.places, points, atol=1e-9)
-    sd, other = (np.sqrt(np.trace(one.covariance, axis1=1, axis2=2)) for one in (there, back))
-    assert np.median(other / sd) == pytest.approx(1, abs=0.1)
+    forward = spread(transform, points)
+    inverse = spread(transform.inverse, forward.places)
+    np.testing.assert_allclose(inverse.places, points, atol=1e-9)
+    forward_sd, inverse_sd = (
+        np.sqrt(np.trace(uncertainty.covariance, axis1=1, axis2=2)) for uncertainty in (forward, inverse)
+    )
+    assert np.median(inverse_sd / forward_sd) == pytest.approx(1, abs=0.1)
 
 
 def test_around_the_mesh_is_told():
     transform = _transform(draws=5)
-    found = spread(transform, CENTRE + np.array([[0.0, 0, 0], [60, 0, 0], [300, 0, 0]]))
-    assert found.inside.tolist() == [True, False, False]
-    assert np.isfinite(found.places).all()
+    uncertainty = spread(transform, CENTRE + np.array([[0.0, 0, 0], [60, 0, 0], [300, 0, 0]]))
+    assert uncertainty.inside.tolist() == [True, False, False]
+    assert np.isfinite(uncertainty.places).all()
 
 
 def test_folded_draws_are_counted():
@@ -106,43 +110,45 @@ def test_label_probabilities_are_those_of_brute_force(turned):
     if turned:
         grid = Image(grid.voxels, labels.affine @ np.diag([1.7, 1.6, 1.5, 1.0]))
         labels = Image(labels.voxels, transform.pose.matrix @ labels.affine)
-    found = carry_labels(transform, labels, grid)
-    assert 0.02 < len(found.open) / len(found.certain) < 0.9
-    back, places = transform.inverse, grid.grid_points().reshape(-1, 3)
-    _, near = back.place(places)
+    carried = carry_labels(transform, labels, grid)
+    assert 0.02 < len(carried.open) / len(carried.certain) < 0.9
+    inverse, places = transform.inverse, grid.grid_points().reshape(-1, 3)
+    _, near = inverse.place(places)
     # Every voxel by every draw; the Normal numbers are those of the open voxels.
-    open_near = type(near)(near.cell[found.open], near.barycentric[found.open])
-    sd = back.unresolved_sd(open_near)
+    open_near = type(near)(near.cell[carried.open], near.barycentric[carried.open])
+    sd = inverse.unresolved_sd(open_near)
     brute = {value: np.zeros(len(places)) for value in (2, 5, 70)}
-    for draw, u in enumerate(back.draws):
-        if back.turned:
-            source = back.deformer.displaced(u).sources(back.pose.inverse.place(places))[0]
+    for draw, u in enumerate(inverse.draws):
+        if inverse.turned:
+            source = inverse.deformer.displaced(u).sources(inverse.pose.inverse.place(places))[0]
         else:
-            source = back.pose.place(places + back.deformer.displaced(u).displacement(places, near))
-        source[found.open] = back.place_by(draw, places[found.open], open_near, sd.astype(np.float32))
+            source = inverse.pose.place(places + inverse.deformer.displaced(u).displacement(places, near))
+        source[carried.open] = inverse.place_by(draw, places[carried.open], open_near, sd.astype(np.float32))
         for value, count in brute.items():
             count += labels.nearest(source) == value
-    for value, probability in found.probabilities():
+    for value, probability in carried.probabilities():
         # Float32 of the spread between nodes decides where a source lies on the border of two voxels.
         away = np.abs(probability.ravel() - brute[value] / 12)
         assert (away > 1e-6).mean() < 1e-3
-    assert set(np.unique(found.most_probable.voxels)) <= {0, 2, 5, 70}
-    total = sum(probability for _, probability in found.probabilities())
+    assert set(np.unique(carried.most_probable.voxels)) <= {0, 2, 5, 70}
+    total = sum(probability for _, probability in carried.probabilities())
     assert total.max() <= 1 + 1e-6
 
 
 def test_labels_around_the_mesh_can_be_left_out():
     transform, labels = _transform(draws=6), _labels()
     grid = Image(np.zeros((20, 20, 20)), transform.pose.matrix @ labels.affine @ np.diag([1.65, 1.65, 1.65, 1.0]))
-    whole, alone = (carry_labels(transform, labels, grid, keep_around=keep) for keep in (True, False))
+    with_surroundings, alone = (carry_labels(transform, labels, grid, keep_around=keep) for keep in (True, False))
     inside = transform.inverse.place(grid.grid_points().reshape(-1, 3))[1]
-    known = transform.deformer.is_inside(inside).reshape(grid.shape)
-    for (_, one), (_, other) in zip(whole.probabilities(), alone.probabilities(), strict=True):
-        np.testing.assert_array_equal(np.isnan(other), ~known)
+    in_mesh = transform.deformer.is_inside(inside).reshape(grid.shape)
+    for (_, probability), (_, probability_alone) in zip(
+        with_surroundings.probabilities(), alone.probabilities(), strict=True
+    ):
+        np.testing.assert_array_equal(np.isnan(probability_alone), ~in_mesh)
         # Other Normal numbers, of six draws.
-        assert abs((one - other)[known].mean()) < 0.01
-    assert (np.asarray(alone.most_probable.voxels)[~known] == 0).all()
-    assert (np.asarray(whole.most_probable.voxels)[~known] != 0).any()
+        assert abs((probability - probability_alone)[in_mesh].mean()) < 0.01
+    assert (np.asarray(alone.most_probable.voxels)[~in_mesh] == 0).all()
+    assert (np.asarray(with_surroundings.most_probable.voxels)[~in_mesh] != 0).any()
 
 
 CASES, LEVELS = 150, (0.5, 0.9, 0.95)
@@ -168,9 +174,9 @@ def test_ellipsoids_and_labels_hold_the_truth_as_often_as_they_say():
         start = CENTRE + rng.uniform(-12, 12, (1, 3))
         for row, way in enumerate((transform, transform.inverse)):
             points = start if row == 0 else POSE.place(start)
-            found = spread(way, points)
-            away = _true_place(way, points, u, rng)[0] - found.places[0]
-            square = away @ np.linalg.solve(found.covariance[0], away)
+            uncertainty = spread(way, points)
+            away = _true_place(way, points, u, rng)[0] - uncertainty.places[0]
+            square = away @ np.linalg.solve(uncertainty.covariance[0], away)
             hits[row] += [square <= chi2.ppf(level, 3) for level in LEVELS]
         grid = Image(np.zeros((1, 1, 1)), _at(POSE.place(CENTRE + rng.uniform(-15, 15, 3))))
         carried = carry_labels(transform, labels, grid)
@@ -180,13 +186,16 @@ def test_ellipsoids_and_labels_hold_the_truth_as_often_as_they_say():
     for level, share in zip(LEVELS, hits.T / CASES, strict=True):
         assert np.abs(share - level).max() < 3 * np.sqrt(level * (1 - level) / CASES), hits / CASES
     # Sum of Bernoulli variables of the probabilities told.
-    told, happened = np.array(calibrated).T
-    spread_of_sum = np.sqrt((told * (1 - told)).sum())
+    probabilities, happened = np.array(calibrated).T
+    spread_of_sum = np.sqrt((probabilities * (1 - probabilities)).sum())
     assert spread_of_sum > 2
-    assert abs((happened - told).sum()) < 3 * spread_of_sum
-    middle = (told > 0.1) & (told < 0.9)
+    assert abs((happened - probabilities).sum()) < 3 * spread_of_sum
+    middle = (probabilities > 0.1) & (probabilities < 0.9)
     assert middle.sum() > 20
-    assert abs((happened - told)[middle].mean()) < 3 * np.sqrt((told * (1 - told))[middle].sum()) / middle.sum()
+    assert (
+        abs((happened - probabilities)[middle].mean())
+        < 3 * np.sqrt((probabilities * (1 - probabilities))[middle].sum()) / middle.sum()
+    )
 
 
 def _true_place(way, points, u, rng):
@@ -221,19 +230,19 @@ def test_distances_of_normal_vectors_are_those_of_drawn_ones(sd):
     covariance = (turn @ np.diag(np.square(sd)) @ turn.T)[None]
     drawn = np.linalg.norm(np.random.default_rng(0).standard_normal((200_000, 3)) * sd, axis=1)
     distances = (0.3, 0.5, 1.0, 2.0, 4.0)
-    found = distances_of(np.concatenate([covariance, covariance * np.nan]), distances)
-    for share, distance in zip(found.far, distances, strict=True):
+    uncertainty = distances_of(np.concatenate([covariance, covariance * np.nan]), distances)
+    for share, distance in zip(uncertainty.far, distances, strict=True):
         assert share[0] == pytest.approx((drawn > distance).mean(), abs=0.01)
-    assert found.radius[0] == pytest.approx(np.quantile(drawn, 0.95), rel=0.02)
-    assert np.isnan([found.radius[1], *found.far[:, 1]]).all()
+    assert uncertainty.radius[0] == pytest.approx(np.quantile(drawn, 0.95), rel=0.02)
+    assert np.isnan([uncertainty.radius[1], *uncertainty.far[:, 1]]).all()
 
 
 def test_the_covariance_in_closed_form_is_that_of_the_draws():
     transform = _transform(draws=400)
     points = _points(transform, 200, 28.0)
-    found = spread(transform, points)
+    uncertainty = spread(transform, points)
     _, near = transform.place(points)
     closed = POSE.rotation @ transform.covariance(near) @ POSE.rotation.T
-    sd, drawn = (np.sqrt(np.einsum("kii->ki", one)) for one in (closed, found.covariance))
+    sd, drawn = (np.sqrt(np.einsum("kii->ki", covariance)) for covariance in (closed, uncertainty.covariance))
     np.testing.assert_allclose(drawn, sd, rtol=0.15)
     assert np.mean(drawn / sd) == pytest.approx(1, abs=0.01)

@@ -38,8 +38,8 @@ INFERRED = "{kind: ssd, temperature: {median: 0.05, log_sd: 0.5}}"
 
 def test_a_sampler_that_does_not_fit_is_a_note(folder, tmp_path):  # noqa: F811
     config = br.load_config(folder / "run.yaml", [f"observations=[{{kind: images, similarity: {INFERRED}}}]"])
-    (found,) = compare_samplers(config, tmp_path / "out", ["rwmh"], 0.1, progress=False)
-    assert "no step for t_similarity" in found.note
+    (efficiency,) = compare_samplers(config, tmp_path / "out", ["rwmh"], 0.1, progress=False)
+    assert "no step for t_similarity" in efficiency.note
     assert "no step for t_similarity" in (tmp_path / "out" / "samplers.json").read_text()
 
 

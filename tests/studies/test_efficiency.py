@@ -18,25 +18,25 @@ def target():
 
 
 def test_figures_are_those_of_the_draws(target, monkeypatch):
-    kept = {}
+    recorded = {}
 
     def sample(*args, **options):
-        kept["samples"] = br.sample(*args, **options)
-        return kept["samples"]
+        recorded["samples"] = br.sample(*args, **options)
+        return recorded["samples"]
 
     monkeypatch.setattr(module, "sample", sample)
-    found = measure_efficiency(target, "rwmh", BUDGET, thin=4, block=20, sigma_u=0.4)
-    draws = kept["samples"].idata.posterior["u_boundary"]
+    efficiency = measure_efficiency(target, "rwmh", BUDGET, thin=4, block=20, sigma_u=0.4)
+    draws = recorded["samples"].idata.posterior["u_boundary"]
     bulk, tail = (float(az.ess(draws, method=method).min()["u_boundary"]) for method in ("bulk", "tail"))
-    assert (found.ess_bulk, found.ess_tail) == (pytest.approx(bulk), pytest.approx(tail))
-    inside = 3 * 60 * 4 - int(kept["samples"].tally.outside_support.sum())
-    assert (found.draws, found.gradients, found.densities) == (180, 0, inside)
-    assert found.ess_per_evaluation == pytest.approx(min(bulk, tail) / inside)
-    assert found.ess_per_second_in_all == pytest.approx(min(bulk, tail) / found.seconds)
-    assert 0 < found.sampling_seconds < found.seconds
-    assert 0 < found.preparing_seconds < found.seconds
-    assert found.exact
-    assert found.seconds_to_rule is None
+    assert (efficiency.ess_bulk, efficiency.ess_tail) == (pytest.approx(bulk), pytest.approx(tail))
+    inside = 3 * 60 * 4 - int(recorded["samples"].tally.outside_support.sum())
+    assert (efficiency.draws, efficiency.gradients, efficiency.densities) == (180, 0, inside)
+    assert efficiency.ess_per_evaluation == pytest.approx(min(bulk, tail) / inside)
+    assert efficiency.ess_per_second_in_all == pytest.approx(min(bulk, tail) / efficiency.seconds)
+    assert 0 < efficiency.sampling_seconds < efficiency.seconds
+    assert 0 < efficiency.preparing_seconds < efficiency.seconds
+    assert efficiency.exact
+    assert efficiency.seconds_to_rule is None
 
 
 def test_time_to_the_rule_is_told_where_it_was_met(target):
@@ -51,17 +51,17 @@ def test_time_to_the_rule_is_told_where_it_was_met(target):
 @pytest.mark.slow
 def test_gradients_are_counted(target):
     """As many a draw as the trajectory of hmc has steps."""
-    found = measure_efficiency(target, "hmc", BUDGET._replace(draws=4), block=2, warm_up=5)
-    assert found.densities == 0
-    assert found.gradients % 12 == 0
-    assert found.gradients >= 12
+    efficiency = measure_efficiency(target, "hmc", BUDGET._replace(draws=4), block=2, warm_up=5)
+    assert efficiency.densities == 0
+    assert efficiency.gradients % 12 == 0
+    assert efficiency.gradients >= 12
     assert not measure_efficiency(target, "laplace", BUDGET._replace(draws=4), block=2).exact
 
 
 def test_a_sampler_that_cannot_run_says_why(target):
-    found = measure_efficiency(target, "smc", BUDGET, particles=2)
-    assert "particles must be at least as many" in found.note
-    assert found.ess_per_second is None
+    efficiency = measure_efficiency(target, "smc", BUDGET, particles=2)
+    assert "particles must be at least as many" in efficiency.note
+    assert efficiency.ess_per_second is None
 
 
 def test_compilation_is_not_sampling():
@@ -70,7 +70,7 @@ def test_compilation_is_not_sampling():
 
 
 def test_an_ess_that_is_not_known_has_no_rate():
-    found = measure_efficiency(GaussianTarget(), "rwmh", BUDGET._replace(draws=2), block=2, sigma_u=0.4)
-    assert found.ess_bulk is None
-    assert found.ess_per_second is None
-    assert np.isfinite(found.acceptance)
+    efficiency = measure_efficiency(GaussianTarget(), "rwmh", BUDGET._replace(draws=2), block=2, sigma_u=0.4)
+    assert efficiency.ess_bulk is None
+    assert efficiency.ess_per_second is None
+    assert np.isfinite(efficiency.acceptance)

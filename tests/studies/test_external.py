@@ -14,12 +14,12 @@ def pair(share, ratio=(1.2, 1.9)):
 
 
 def test_the_mean_over_pairs_is_judged_and_its_error_told():
-    found = summarise({"sag-21-0": pair(0.95), "gravity-21-0": pair(0.85), "gravity-22-0": pair(0.9, (1.2, 1.5))})
-    assert found["as_it_should"]
-    assert found["coverage"]["after"]["90%"] == pytest.approx([0.9, 0.05 / np.sqrt(3)])
-    assert found["coverage"]["before"]["50%"][0] == pytest.approx(0.4)
-    assert found["ratio of white over grey held"] == "1 of 2"
-    assert found["converged"] == 3
+    summary = summarise({"sag-21-0": pair(0.95), "gravity-21-0": pair(0.85), "gravity-22-0": pair(0.9, (1.2, 1.5))})
+    assert summary["as_it_should"]
+    assert summary["coverage"]["after"]["90%"] == pytest.approx([0.9, 0.05 / np.sqrt(3)])
+    assert summary["coverage"]["before"]["50%"][0] == pytest.approx(0.4)
+    assert summary["ratio of white over grey held"] == "1 of 2"
+    assert summary["converged"] == 3
     assert not summarise({"a": pair(0.7), "b": pair(0.75)})["as_it_should"]
 
 

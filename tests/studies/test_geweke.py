@@ -20,16 +20,16 @@ def simulator():
 
 @pytest.mark.slow
 def test_the_papers_kernel_leaves_the_joint_distribution_alone():
-    found = geweke.compare(simulator(), "rwmh", **SIZE)
-    assert found.passes
-    assert 0.6 < np.mean(found.z**2) < 1.6
-    assert 0.1 < found.acceptance < 0.9
-    assert found.moved > 0.5
+    comparison = geweke.compare(simulator(), "rwmh", **SIZE)
+    assert comparison.passes
+    assert 0.6 < np.mean(comparison.z**2) < 1.6
+    assert 0.1 < comparison.acceptance < 0.9
+    assert comparison.moved > 0.5
 
 
 @pytest.mark.slow
 def test_a_density_without_its_normaliser_is_found_out():
     """The paper's: λ and μ drift towards zero."""
     wrong = calibrated(VARIANTS["no skull"], normalised=False)
-    found = geweke.compare(simulator(), "rwmh", wrong, **SIZE)
-    assert not found.passes
+    comparison = geweke.compare(simulator(), "rwmh", wrong, **SIZE)
+    assert not comparison.passes

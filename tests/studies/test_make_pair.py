@@ -49,11 +49,11 @@ def test_the_truth_takes_the_moving_image_to_the_fixed_one(kind, data, tmp_path)
     assert after < 0.3 * before
 
     save_displacement(tmp_path / "truth.nii.gz", truth.u, AFFINE)
-    found = score(tmp_path, tmp_path / "truth.nii.gz")
-    assert found["error"] == [0, 0, 0]
-    assert found["tre"] == pytest.approx([0, 0], abs=0.1)
-    assert found["unregistered_mean"] == pytest.approx(facts["mean"], abs=1e-3)
-    assert (found["cavity_walls"] == [0, 0, 0]) == (kind == "resect")
+    scores = score(tmp_path, tmp_path / "truth.nii.gz")
+    assert scores["error"] == [0, 0, 0]
+    assert scores["tre"] == pytest.approx([0, 0], abs=0.1)
+    assert scores["unregistered_mean"] == pytest.approx(facts["mean"], abs=1e-3)
+    assert (scores["cavity_walls"] == [0, 0, 0]) == (kind == "resect")
 
 
 def test_a_misaligned_shaded_image_of_another_contrast(data, tmp_path):
@@ -63,9 +63,9 @@ def test_a_misaligned_shaded_image_of_another_contrast(data, tmp_path):
     fixed, moving = (nib.load(tmp_path / f"{name}.nii.gz") for name in ("fixed", "moving"))
     truth = read_truth(tmp_path)
     index = np.argwhere(truth.valid)
-    there = nib.affines.apply_affine(fixed.affine, index) + truth.u[truth.valid]
+    displaced = nib.affines.apply_affine(fixed.affine, index) + truth.u[truth.valid]
     # The header alone is misaligned.
-    assert nib.affines.apply_affine(moving.affine, index) == pytest.approx(there, abs=1e-4)
+    assert nib.affines.apply_affine(moving.affine, index) == pytest.approx(displaced, abs=1e-4)
     gm, wm = (np.asarray(moving.dataobj)[truth.valid & (truth.labels == tissue)].mean() for tissue in (GM, WM))
     assert gm > 1.2 * wm
 

@@ -27,16 +27,16 @@ def fake(_subject: Subject, seed: int) -> Body:
     """A mesh that halves the λ/μ it finds; the search for one body fails."""
     rng = np.random.default_rng(seed)
     true, error = np.exp(rng.uniform(0.7, 4.6, 2)), np.exp(0.1 * rng.normal(size=2))
-    true, found = (dict(zip(NAMES[1:], values.tolist(), strict=True)) for values in (true, true * error / 2))
-    return Body(seed, true, {}, "it folds") if seed == 3 else Body(seed, true, found)
+    true, estimated = (dict(zip(NAMES[1:], values.tolist(), strict=True)) for values in (true, true * error / 2))
+    return Body(seed, true, {}, "it folds") if seed == 3 else Body(seed, true, estimated)
 
 
 @pytest.fixture(scope="module")
 def study():
-    found = make_study(draws=100, spacing=18.0)
+    phantom_study = make_study(draws=100, spacing=18.0)
     images = {"kind": "images", "noise_sd": 0.0146, "options": OPTIONS.model_dump(mode="json")}
-    manifest = {**found.run.manifest, "observations": {"images": images}}
-    return found._replace(run=replace(found.run, manifest=manifest))
+    manifest = {**phantom_study.run.manifest, "observations": {"images": images}}
+    return phantom_study._replace(run=replace(phantom_study.run, manifest=manifest))
 
 
 def result_of(folder, run, study):
@@ -56,11 +56,13 @@ def folder(study, tmp_path, monkeypatch):
 
 
 def subject_of(**options) -> Subject:
-    given = head(2.5)
-    values = (dict(zip(NAMES, known.tolist(), strict=True)) for known in (PAPER_LAM, PAPER_MU))
+    phantom = head(2.5)
+    values = (dict(zip(NAMES, parameters.tolist(), strict=True)) for parameters in (PAPER_LAM, PAPER_MU))
     images = {"similarity": br.SquaredDifferences(temperature=1e-3), "interpolation": "cubic"}
     model = br.ModelConfig(**options)
-    return Subject(given.fixed, given.tissue, given.skull, given.mesh, given.mesh, model, images, *values, 7.0, 1e-4)
+    return Subject(
+        phantom.fixed, phantom.tissue, phantom.skull, phantom.mesh, phantom.mesh, model, images, *values, 7.0, 1e-4
+    )
 
 
 def test_on_the_mesh_that_made_a_body_its_registration_finds_its_ratio():
@@ -72,16 +74,16 @@ def test_on_the_mesh_that_made_a_body_its_registration_finds_its_ratio():
 
 @pytest.mark.parametrize("known", [{"mu": {"gm": 1.0}}, {"lam": {"gm": 5.0}}, {"mu": {"gm": 1.0}, "lam": {"gm": 5.0}}])
 def test_bodies_have_the_parameters_that_the_registration_knows(known, monkeypatch):
-    made = []
+    attempts = []
 
     def refuse(*_images, lam, mu, **_push):
-        made.append((lam, mu))
+        attempts.append((lam, mu))
         raise br.InputError("it folds")
 
     monkeypatch.setattr(bodies_module, "make_pair", refuse)
     body = register_body(subject_of(fixed=known), seed=1)
     assert body.failed == "no patch can be pushed by 7.0 mm; the last attempt: it folds"
-    lam, mu = (dict(zip(NAMES, values.tolist(), strict=True)) for values in made[0])
+    lam, mu = (dict(zip(NAMES, values.tolist(), strict=True)) for values in attempts[0])
     for parameter, values in (("lam", lam), ("mu", mu)):
         for name, value in known.get(parameter, {}).items():
             assert values[name] == pytest.approx(value)
@@ -101,17 +103,17 @@ def test_the_table_and_the_figure_allow_for_the_mesh(folder, monkeypatch, capsys
 
 
 def test_bodies_are_kept_and_more_are_added(folder, monkeypatch):
-    asked = []
+    seeds = []
 
     def asking(subject: Subject, seed: int) -> Body:
-        asked.append(seed)
+        seeds.append(seed)
         assert ImageOptions(**subject.image_options) == OPTIONS
         return fake(subject, seed)
 
     monkeypatch.setattr(module, "register_body", asking)
     mesh_error("run", folder, 13, progress=False)
     table = mesh_error("run", folder, 24, progress=False)
-    assert asked == list(range(24))
+    assert seeds == list(range(24))
     ((_, rows),) = table.groups
     on_it, allowing = ({row[0][:2]: float(row[3]) for row in rows[first::2]} for first in (0, 1))
     for tissue in ("GM", "WM"):

@@ -18,19 +18,19 @@ def bodies(count: int, seed: int, mesh: Response = MESH) -> tuple[np.ndarray, np
 
 
 def test_the_curve_that_made_the_bodies_is_found():
-    found = response(*bodies(2000, seed=1))
-    np.testing.assert_allclose(found.offset, MESH.offset, rtol=0.1)
-    np.testing.assert_allclose(found.slope, MESH.slope, rtol=0.1, atol=0.03)
-    np.testing.assert_allclose(found.scatter, MESH.scatter, rtol=0.1, atol=0.005)
-    assert found.degrees_of_freedom == 1997
+    curve = response(*bodies(2000, seed=1))
+    np.testing.assert_allclose(curve.offset, MESH.offset, rtol=0.1)
+    np.testing.assert_allclose(curve.slope, MESH.slope, rtol=0.1, atol=0.03)
+    np.testing.assert_allclose(curve.scatter, MESH.scatter, rtol=0.1, atol=0.005)
+    assert curve.degrees_of_freedom == 1997
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():
     inside, count = np.zeros(2, int), 300
     for seed in range(count):
-        true, found = bodies(25, seed=1000 + seed)
-        known = response(true[1:], found[1:])
-        low, high = np.quantile(recalibrate(known, found[:1], seed), (0.05, 0.95), axis=0)
+        true, estimated = bodies(25, seed=1000 + seed)
+        curve = response(true[1:], estimated[1:])
+        low, high = np.quantile(recalibrate(curve, estimated[:1], seed), (0.05, 0.95), axis=0)
         inside += (low <= true[0]) & (true[0] <= high)
     for covered in inside:
         assert stats.binomtest(int(covered), count, 0.9).pvalue > 0.01, inside
@@ -60,8 +60,8 @@ def test_a_mesh_without_error_leaves_the_posterior_as_it_is():
 
 def test_what_a_mesh_hides_is_left_to_the_prior():
     stiff = MESH._replace(offset=np.array([0.02, 0.5]))
-    own = recalibrate(stiff, np.tile([20.0, 2.0], (100, 1)))
-    low, high = np.quantile(own[:, 1], (0.05, 0.95))
+    recalibrated = recalibrate(stiff, np.tile([20.0, 2.0], (100, 1)))
+    low, high = np.quantile(recalibrated[:, 1], (0.05, 0.95))
     assert low > RANGE[0]
     assert high > 0.4 * RANGE[1]
 
@@ -73,13 +73,13 @@ def test_the_same_seed_gives_the_same_draws():
 
 
 def test_too_few_bodies_and_broken_ones_are_refused():
-    true, found = bodies(24, seed=6)
+    true, estimated = bodies(24, seed=6)
     few = least_bodies(2) - 1
     with pytest.raises(InputError, match=f"12 simulated bodies or more, got {few}"):
-        response(true[:few], found[:few])
-    found[3, 1] = np.inf
+        response(true[:few], estimated[:few])
+    estimated[3, 1] = np.inf
     with pytest.raises(InputError, match="positive and finite"):
-        response(true, found)
+        response(true, estimated)
     with pytest.raises(InputError, match="no draw"):
         recalibrate(MESH, np.zeros((0, 2)))
 
@@ -87,7 +87,7 @@ def test_too_few_bodies_and_broken_ones_are_refused():
 def test_bodies_that_are_all_found_alike_tell_nothing():
     """The scatter that they lack is not taken for certainty of what is true."""
     true, _ = bodies(24, seed=7)
-    own = recalibrate(response(true, np.full_like(true, 10.0)), np.full((5, 2), 10.0))
-    low, high = np.quantile(own, (0.05, 0.95), axis=0)
+    recalibrated = recalibrate(response(true, np.full_like(true, 10.0)), np.full((5, 2), 10.0))
+    low, high = np.quantile(recalibrated, (0.05, 0.95), axis=0)
     assert (low < 2).all()
     assert (high > 100).all()

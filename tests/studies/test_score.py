@@ -27,28 +27,28 @@ def truth():
 
 
 def test_the_truth_has_no_error(truth):
-    found = compare(truth, truth.u)
+    scores = compare(truth, truth.u)
     nothing = pytest.approx([0, 0, 0], abs=1e-3)
-    assert found["error"] == found["csf"] == found["gm"] == found["wm"] == nothing
-    assert found["tre"] == pytest.approx([0, 0], abs=1e-3)
-    assert found["given_share"] == 1
-    assert found["folded_share"] == 0
-    assert found["cavity_walls"] is None
-    assert found["unregistered_mean"] == pytest.approx(np.linalg.norm(truth.u, axis=-1).mean(), abs=1e-3)
-    assert "coverage_50_90_95" not in found
+    assert scores["error"] == scores["csf"] == scores["gm"] == scores["wm"] == nothing
+    assert scores["tre"] == pytest.approx([0, 0], abs=1e-3)
+    assert scores["given_share"] == 1
+    assert scores["folded_share"] == 0
+    assert scores["cavity_walls"] is None
+    assert scores["unregistered_mean"] == pytest.approx(np.linalg.norm(truth.u, axis=-1).mean(), abs=1e-3)
+    assert "coverage_50_90_95" not in scores
 
 
 def test_error_by_tissue_where_the_field_is_given(truth):
     off = np.zeros((*SHAPE, 3))
     off[truth.labels == 2] = [3.0, 0.0, 4.0]
     off[0] = 100.0
-    given = np.ones(SHAPE, bool)
-    given[0] = False
-    found = compare(truth, truth.u + off, defined=given)
-    assert found["gm"] == [5, 5, 5]
-    assert found["csf"] == found["wm"] == [0, 0, 0]
-    assert found["error"] == [1.25, 5, 5]
-    assert found["given_share"] == pytest.approx(11 / 12, abs=1e-4)
+    defined = np.ones(SHAPE, bool)
+    defined[0] = False
+    scores = compare(truth, truth.u + off, defined=defined)
+    assert scores["gm"] == [5, 5, 5]
+    assert scores["csf"] == scores["wm"] == [0, 0, 0]
+    assert scores["error"] == [1.25, 5, 5]
+    assert scores["given_share"] == pytest.approx(11 / 12, abs=1e-4)
 
 
 def test_coverage_and_sharpness(truth):

@@ -36,8 +36,8 @@ def simulator(name="no skull"):
 def require_covariance(draws, expected):
     """Every entry of the covariance of Gaussian draws lies within its error of the expected one."""
     white = np.linalg.solve(np.linalg.cholesky(expected), draws.T)
-    count, one = len(draws), np.eye(len(white))
-    z = (white @ white.T / count - one) * np.sqrt(count) / np.sqrt(1 + one)
+    count, identity = len(draws), np.eye(len(white))
+    z = (white @ white.T / count - identity) * np.sqrt(count) / np.sqrt(1 + identity)
     assert abs(z).max() < 4.9
     assert (z**2).mean() == pytest.approx(1, abs=0.1)
 
@@ -120,11 +120,11 @@ def test_the_skull_lets_as_many_pass_as_its_density_says():
     depth = np.maximum(MESH.points[MESH.boundary, 0] + draws["u_boundary"][..., 0] - WALL, 0.0)
     expected = -0.5 * ((depth / WIDTH) ** 2).sum(axis=1)
     rows = jnp.asarray(draws["u_boundary"])
-    found = -0.5 * (jax.vmap(walled.data.terms["skull"].depth)(rows) ** 2).sum(axis=1) / WIDTH**2
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    log_factor = -0.5 * (jax.vmap(walled.data.terms["skull"].depth)(rows) ** 2).sum(axis=1) / WIDTH**2
+    np.testing.assert_allclose(log_factor, expected, atol=1e-6)
     weights = np.exp(expected)
-    kept = simulator("skull").draw_prior(np.random.default_rng(5), 300)
+    accepted = simulator("skull").draw_prior(np.random.default_rng(5), 300)
     mean = (weights @ depth.max(axis=1)) / weights.sum()
-    deepest = np.maximum(MESH.points[MESH.boundary, 0] + kept["u_boundary"][..., 0] - WALL, 0.0).max(axis=1)
+    deepest = np.maximum(MESH.points[MESH.boundary, 0] + accepted["u_boundary"][..., 0] - WALL, 0.0).max(axis=1)
     assert 0.1 < weights.mean() < 0.8
     assert abs(deepest.mean() - mean) < 5 * deepest.std() / np.sqrt(len(deepest) / 2)

@@ -25,7 +25,7 @@ PAIR = table.Asked("sag", 11, 0.15)
 def test_pairs_are_named():
     assert table.Asked.read("sag:11:0.15") == PAIR
     assert PAIR.name == "sag-11-0.15"
-    assert [asked.name for asked in table.DEFAULT] == [
+    assert [pair.name for pair in table.DEFAULT] == [
         "sag-11-0", "sag-12-0.15", "sag-13-0.25", "gravity-11-0", "gravity-12-0.15", "gravity-13-0.25",
     ]  # fmt: skip
     with pytest.raises(argparse.ArgumentTypeError, match="none of sag, gravity, resect"):
@@ -54,7 +54,7 @@ def test_scores_are_kept_until_the_field_is_newer(tmp_path, monkeypatch):
     field.touch()
     facts.touch()
     calls = []
-    monkeypatch.setattr(table, "score", lambda *given: calls.append(given) or {"times": len(calls)})
+    monkeypatch.setattr(table, "score", lambda *arguments: calls.append(arguments) or {"times": len(calls)})
     assert [table.scored(record, tmp_path, field)["times"] for _ in range(2)] == [1, 1]
     later = record.stat().st_mtime + 10
     os.utime(field, (later, later))

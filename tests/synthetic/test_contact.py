@@ -55,7 +55,7 @@ def test_optimality_conditions(lam, mu):
 
 def test_the_energy_is_that_of_another_solver():
     mesh, held, held_u, problem = _pushed_box(LAM, MU)
-    ours = problem.solve(np.full(len(mesh.points), 0.2))
+    solution = problem.solve(np.full(len(mesh.points), 0.2))
     stiff = stiffness(mesh, LAM, MU).toarray()
     free = np.setdiff1d(np.arange(len(mesh.points)), held)
     bounded = np.setdiff1d(mesh.boundary, held)
@@ -75,7 +75,7 @@ def test_the_energy_is_that_of_another_solver():
         jacobian[np.arange(len(bounded)), np.searchsorted(free, bounded)] = normal
         return jacobian.reshape(len(bounded), -1)
 
-    theirs = minimize(
+    minimum = minimize(
         lambda x: 0.5 * whole(x).ravel() @ stiff @ whole(x).ravel(),
         np.zeros(3 * len(free)),
         jac=gradient,
@@ -87,10 +87,10 @@ def test_the_energy_is_that_of_another_solver():
         },
         options={"ftol": 1e-10, "maxiter": 500},
     )
-    assert theirs.success
-    energy = 0.5 * ours.u.ravel() @ stiff @ ours.u.ravel()
-    assert energy == pytest.approx(theirs.fun, rel=1e-8)
-    np.testing.assert_allclose(ours.u, whole(theirs.x), atol=1e-4)
+    assert minimum.success
+    energy = 0.5 * solution.u.ravel() @ stiff @ solution.u.ravel()
+    assert energy == pytest.approx(minimum.fun, rel=1e-8)
+    np.testing.assert_allclose(solution.u, whole(minimum.x), atol=1e-4)
 
 
 def test_without_an_obstacle_the_body_just_translates():

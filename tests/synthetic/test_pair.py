@@ -52,9 +52,9 @@ def head(voxel: float, spacing: float = 18.0) -> Head:
     )
 
 
-def pair_of(given: Head, **changed):
+def pair_of(phantom: Head, **changed):
     options = {"lam": PAPER_LAM, "mu": PAPER_MU, **PATCH, "smoothing_mm": 0.0, "noise_sd": 0.0, **changed}
-    return make_pair(*given, **options)
+    return make_pair(*phantom, **options)
 
 
 @pytest.fixture(scope="module")
@@ -145,8 +145,8 @@ def test_moving_at_displaced_points_is_fixed_at_rest(clean, inside):
 def test_the_error_falls_with_the_voxel_size(clean, inside):
     error = []
     for voxel in (5.0, 2.5, 1.25):
-        given = head(voxel)
-        moving = deformed_image(given.fixed, given.tissue, given.skull, given.mesh, clean.u, 0.0)
+        phantom = head(voxel)
+        moving = deformed_image(phantom.fixed, phantom.tissue, phantom.skull, phantom.mesh, clean.u, 0.0)
         error.append(np.abs(mismatch(clean._replace(moving=moving), inside, "linear")).mean())
     assert error[1] < error[0] / 3
     assert error[2] < error[1] / 3
@@ -161,9 +161,9 @@ def test_outside_the_mesh_csf_fills_what_the_brain_leaves_and_the_skull_stays(sm
     csf = np.median(small.fixed.voxels[small.tissue.voxels == 1])
     moving, points = np.asarray(clean.moving.voxels), small.fixed.grid_points()
     patch = clean.deformation.patch[0]
-    left = np.linalg.norm(points - (small.mesh.points + 0.2 * clean.u)[patch], axis=-1) < 1.8
-    assert left.any()
-    np.testing.assert_allclose(moving[left], csf)
+    vacated = np.linalg.norm(points - (small.mesh.points + 0.2 * clean.u)[patch], axis=-1) < 1.8
+    assert vacated.any()
+    np.testing.assert_allclose(moving[vacated], csf)
     skull = np.linalg.norm(points - CENTRE, axis=-1) > SKULL_RADIUS + 5
     np.testing.assert_array_equal(moving[skull], small.fixed.voxels[skull])
 
@@ -177,10 +177,10 @@ def test_tissue_beyond_the_mesh_rides_on_its_surface(small, clean):
 
 
 def test_noise_is_independent_and_repeats_with_its_seed(small, clean):
-    first, again, other = (pair_of(small, noise_sd=0.01, seed=seed) for seed in (3, 3, 4))
+    first, again, reseeded = (pair_of(small, noise_sd=0.01, seed=seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.u, clean.u)
     for name in ("fixed", "moving"):
-        noise, more = (np.ravel(getattr(p, name).voxels - getattr(clean, name).voxels) for p in (first, other))
+        noise, more = (np.ravel(getattr(p, name).voxels - getattr(clean, name).voxels) for p in (first, reseeded))
         np.testing.assert_array_equal(getattr(first, name).voxels, getattr(again, name).voxels)
         assert noise.std() == pytest.approx(0.01, rel=0.02)
         assert abs(np.corrcoef(noise, more)[0, 1]) < 0.02
@@ -193,8 +193,8 @@ def test_noise_is_independent_and_repeats_with_its_seed(small, clean):
 
 def test_smoothing_lowers_what_interpolation_leaves(small, clean):
     rough = small.fixed.voxels + 0.2 * np.random.default_rng(0).normal(size=small.fixed.shape)
-    given = small._replace(fixed=small.fixed.with_voxels(rough))
-    none, some = (pair_of(given, smoothing_mm=sd).interpolation_sd for sd in (0.0, 2.5))
+    rough_phantom = small._replace(fixed=small.fixed.with_voxels(rough))
+    none, some = (pair_of(rough_phantom, smoothing_mm=sd).interpolation_sd for sd in (0.0, 2.5))
     assert some < none / 3
 
 
@@ -235,8 +235,8 @@ def test_another_direction_is_tried_where_none_is_asked_for(small, monkeypatch):
     with pytest.raises(InputError, match="inverts"):
         push_patch(small.mesh, small.skull, direction=bad, **options)
     monkeypatch.setattr("bayesreg.synthetic.deformation.DIRECTIONS", (bad, good))
-    found = push_patch(small.mesh, small.skull, **options)
-    np.testing.assert_array_equal(found.patch, surface_patch(small.mesh, 8, np.array(good)))
+    deformation = push_patch(small.mesh, small.skull, **options)
+    np.testing.assert_array_equal(deformation.patch, surface_patch(small.mesh, 8, np.array(good)))
 
 
 def test_bad_images(small):
