@@ -71,8 +71,8 @@ class _Commands(TyperGroup):
             if error.errno not in STORAGE_FAILURES:
                 raise
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-            kept = "; what was stored before is kept, and a run goes on with --resume" if full else ""
-            typer.echo(f"bayesreg: {error}{kept}", err=True)
+            advice = "; what was stored before is kept, and a run goes on with --resume" if full else ""
+            typer.echo(f"bayesreg: {error}{advice}", err=True)
             raise typer.Exit(1) from None
 
 

@@ -24,7 +24,7 @@ def with_chains_as_columns(function: Callable[..., Any]) -> Callable[..., Any]:
     def _(size: int, batched: Sequence[Any], shared: Any, *arrays: AnyArray) -> tuple[Any, Any]:
         if any(jax.tree.leaves(batched[0])):
             raise NotImplementedError(f"what {function.__name__} shares among chains cannot differ from chain to chain")
-        shapes = [(size, *array.shape[own:]) for array, own in zip(arrays, batched[1:], strict=True)]
+        shapes = [(size, *array.shape[is_batched:]) for array, is_batched in zip(arrays, batched[1:], strict=True)]
         longer = [_join(jnp.broadcast_to(x, shape)) for x, shape in zip(arrays, shapes, strict=True)]
         results, chains = decorated(shared, *longer), shapes[0][-1]
         parted = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], chains, size), -1, 0), results)

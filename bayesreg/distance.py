@@ -55,17 +55,17 @@ def signed_distance(skull: Image, margin: float = MARGIN) -> Image:
     if not allowed.any():
         raise InputError("the skull image forbids every voxel: nonzero means forbidden, zero allowed")
     box, border = ndimage.find_objects(allowed.astype(np.uint8))[0], np.ceil(margin / skull.voxel_sizes).astype(int)
-    before = np.maximum(border - [part.start for part in box], 1)
-    after = np.maximum(border - np.subtract(allowed.shape, [part.stop for part in box]), 1)
+    before = np.maximum(border - [extent.start for extent in box], 1)
+    after = np.maximum(border - np.subtract(allowed.shape, [extent.stop for extent in box]), 1)
     width = [(low + _END, high + _END) for low, high in zip(before, after, strict=True)]
     allowed = np.pad(allowed, width, constant_values=False)
     half = skull.voxel_sizes.min() / 2
     distance = edt.sdf(allowed, anisotropy=tuple(skull.voxel_sizes))
     distance -= np.copysign(half, distance, dtype=distance.dtype)
     distance = ndimage.gaussian_filter(distance, _SMOOTHING, output=float, mode="nearest", truncate=_END)
-    kept = _KEPT * skull.voxel_sizes.min()
-    np.maximum(distance, kept, out=distance, where=allowed)
-    np.minimum(distance, -kept, out=distance, where=~allowed)
+    least_distance = _KEPT * skull.voxel_sizes.min()
+    np.maximum(distance, least_distance, out=distance, where=allowed)
+    np.minimum(distance, -least_distance, out=distance, where=~allowed)
     affine = skull.affine.copy()
     affine[:3, 3] = skull.voxel_to_world(-before.astype(float))
     distance = distance[(slice(_END, -_END),) * 3]

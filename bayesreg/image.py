@@ -126,7 +126,7 @@ class Image:
             raise InputError(f"expected voxels of shape {self.shape}, got {np.shape(voxels)}")
         return Image(voxels, self.affine)
 
-    def part(self, box: Sequence[slice]) -> Image:
+    def cropped(self, box: Sequence[slice]) -> Image:
         """Crop the image to a box of voxels; they keep their coordinates in the world."""
         affine = np.array(self.affine, float)
         affine[:3, 3] = self.voxel_to_world(np.array([float(along.start) for along in box]))

@@ -95,7 +95,7 @@ def _together() -> int:
     return 2**13 if jax.default_backend() == "cpu" else 2**20
 
 
-def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
+def _in_batches(at_one_point: Callable[..., Any]) -> Callable[..., Any]:
     """Turn a function of single points into one of indices (points, chains) by axis."""
 
     def interpolation(coefficients: AnyArray, *indices: AnyArray) -> Any:
@@ -105,7 +105,7 @@ def _in_batches(at: Callable[..., Any]) -> Callable[..., Any]:
         batches = max(-(-count * chains // _together()), 1)
         size = -(-count // batches)
         filled = [jnp.pad(i, ((0, batches * size - count), (0, 0))).reshape(batches, size * chains) for i in indices]
-        results = jax.lax.map(lambda batch: jax.vmap(partial(at, coefficients))(*batch), filled)
+        results = jax.lax.map(lambda batch: jax.vmap(partial(at_one_point, coefficients))(*batch), filled)
         return jax.tree.map(lambda x: x.reshape(-1, chains)[:count], jax.lax.optimization_barrier(results))
 
     return interpolation

@@ -110,7 +110,7 @@ def read_label_names(path: str | Path) -> dict[str, int]:
     return labels
 
 
-def name_values(entry: object, known: Mapping[str, int]) -> object:
+def name_values(entry: object, values_by_name: Mapping[str, int]) -> object:
     """Replace the names of labels in an entry of a table by their values."""
     several = entry if isinstance(entry, list | tuple) else [entry]
-    return [known.get(label, label) if isinstance(label, str) else label for label in several]
+    return [values_by_name.get(label, label) if isinstance(label, str) else label for label in several]

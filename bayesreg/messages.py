@@ -12,12 +12,12 @@ _log = logging.getLogger("bayesreg")
 
 
 class TerminalHandler(logging.Handler):
-    """Handler that prints messages without markup, above any progress bar; a warning begins with "beware"."""
+    """Handler that prints messages without markup, above any progress bar; a warning begins with "warning:"."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one message on the terminal."""
-        beware = "beware: " if record.levelno >= logging.WARNING else ""
-        rich.get_console().print(beware + self.format(record), markup=False, highlight=False, soft_wrap=True)
+        prefix = "warning: " if record.levelno >= logging.WARNING else ""
+        rich.get_console().print(prefix + self.format(record), markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager

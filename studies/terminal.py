@@ -1,4 +1,4 @@
-"""Tables of studies on the terminal."""
+"""The tables of studies, shown on a terminal."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from bayesreg.report.tables import Table
 
 def in_terminal(table: Table) -> TerminalTable:
     """Format a table for a terminal, without its caption."""
-    shown = TerminalTable(title=table.title)
+    terminal_table = TerminalTable(title=table.title)
     for index, name in enumerate(table.header):
-        shown.add_column(name, justify="right" if index else "left")
+        terminal_table.add_column(name, justify="right" if index else "left")
     for _, rows in table.groups:
         for row in rows:
-            shown.add_row(*row)
-    return shown
+            terminal_table.add_row(*row)
+    return terminal_table

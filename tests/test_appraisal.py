@@ -23,7 +23,7 @@ def moved_by(millimetres):
 
 
 def told(moving, **options):
-    return " ".join(appraise(TISSUE, DOMAIN, ("gm", "wm"), compare_images(FIXED, moving, DOMAIN), **options).beware)
+    return " ".join(appraise(TISSUE, DOMAIN, ("gm", "wm"), compare_images(FIXED, moving, DOMAIN), **options).warnings)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +74,6 @@ def test_tissue_outside_the_region_is_told_in_millilitres():
     inside, outside = appraisal.millilitres["gm"]
     assert inside + outside == pytest.approx((TISSUE.voxels == 1).sum() * 8 / 1000)
     assert appraisal.millilitres["wm"][1] == 0
-    assert appraisal.beware == (
+    assert appraisal.warnings == (
         f"{outside:.3g} of {inside + outside:.3g} ml of GM lie outside the region to mesh, which leaves them out.",
     )

@@ -43,7 +43,7 @@ def test_metal_that_is_ignored_changes_neither_contrast_nor_scale(which):
         np.testing.assert_allclose(masked_voxels[away], plain_voxels[away], atol=0.1)
     assert masked.likeness.correlation > 0.99
     assert any(f"2.74 ml of the organ in the {which} image" in note for note in masked.notes)
-    assert not masked.beware
+    assert not masked.warnings
 
 
 def test_metal_that_is_not_ignored_would():
@@ -67,7 +67,7 @@ def test_a_channel_is_scaled_by_what_is_seen():
     ],
 )
 def test_a_mask_elsewhere_or_of_nearly_all_is_told(mask, sentence):
-    assert sentence in " ".join(match(fixed_ignore=mask).beware)
+    assert sentence in " ".join(match(fixed_ignore=mask).warnings)
 
 
 def test_a_mask_of_all_the_organ_is_refused():

@@ -28,7 +28,7 @@ def test_messages_are_shown_as_they_are_and_warnings_stand_out(terminal):
         LOG.warning("%d draws are few", 3)
         LOG.debug("details")
     LOG.info("nobody hears this")
-    assert terminal.getvalue().splitlines() == [text, "beware: 3 draws are few"]
+    assert terminal.getvalue().splitlines() == [text, "warning: 3 draws are few"]
 
 
 def test_a_level_holds_within_its_block(terminal):

@@ -240,7 +240,7 @@ def test_a_run_is_reproduced_bit_for_bit_and_another_is_told(finished, folder):
         manifest["versions"]["jax"] = "0.0.1"
         store.write_json(place("run.json"), manifest)
     reproduction = reproduce(folder / "doubtful", folder / "once_more", progress=False)
-    assert list(reproduction.apart) == ["u_boundary"]
+    assert list(reproduction.greatest_differences) == ["u_boundary"]
     assert reproduction.lines[0] == "the draws are not the same"
     assert "versions was" in reproduction.lines[-1]
     assert "0.0.1" in reproduction.lines[-1]

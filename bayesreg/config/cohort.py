@@ -188,23 +188,23 @@ def _of_patterns(patterns: Mapping[str, str], folder: Path) -> dict[str, dict[st
 
 
 def _matches(pattern: str, folder: Path) -> Iterator[tuple[str, Path]]:
-    whole = folder / Path(pattern).expanduser()
-    root, pattern = Path(whole.anchor), whole.relative_to(whole.anchor).as_posix()
+    full_pattern = folder / Path(pattern).expanduser()
+    root, pattern = Path(full_pattern.anchor), full_pattern.relative_to(full_pattern.anchor).as_posix()
     # The glob finds the paths; the regular expression extracts the subject from each path.
-    own = re.escape(pattern).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
-    own = own.replace(re.escape("{subject}"), "(?P<subject>[A-Za-z0-9]+)", 1)
-    expression = re.compile(own.replace(re.escape("{subject}"), "(?P=subject)"))
+    regex = re.escape(pattern).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
+    regex = regex.replace(re.escape("{subject}"), "(?P<subject>[A-Za-z0-9]+)", 1)
+    expression = re.compile(regex.replace(re.escape("{subject}"), "(?P=subject)"))
     for path in sorted(root.glob(pattern.replace("{subject}", "*"))):
         match = expression.fullmatch(path.relative_to(root).as_posix())
         if match:
             yield match["subject"], path
 
 
-def _tasks(subject: str, given: Mapping[str, str], sweep: Mapping[str, list[Any]]) -> Iterator[Task]:
+def _tasks(subject: str, cells: Mapping[str, str], sweep: Mapping[str, list[Any]]) -> Iterator[Task]:
     for values in product(*sweep.values()):
         settings = dict(zip(sweep, values, strict=True))
         # JSON is valid YAML, so that a value of the sweep keeps its type. A cell of a table is read as YAML.
-        values_of = {**{key: _quoted(cell) for key, cell in given.items()},
+        values_of = {**{key: _quoted(cell) for key, cell in cells.items()},
                      **{key: json.dumps(value, default=str) for key, value in settings.items()}}  # fmt: skip
         overrides = tuple(f"{key}={value}" for key, value in values_of.items())
         name = f"{subject}/{_folder_of(settings)}" if settings else subject

@@ -21,13 +21,13 @@ from bayesreg.settings import wrong as _wrong
 from bayesreg.tissues import BRAIN_EDGE
 
 
-def _require_tissues(key: str, given: object, names: Sequence[str] | None, whole: bool = False) -> None:
-    """Raise an error for unknown names of tissues and, if the mapping must be `whole`, for missing tissues."""
-    if not isinstance(given, Mapping) or names is None:
+def _require_tissues(key: str, option: object, names: Sequence[str] | None, require_all: bool = False) -> None:
+    """Raise an error for unknown names of tissues and, with `require_all`, for missing tissues."""
+    if not isinstance(option, Mapping) or names is None:
         return
-    for tissue in sorted(set(given) - set(names)):
+    for tissue in sorted(set(option) - set(names)):
         raise _wrong(f"{key}.{tissue}", f"unknown tissue; expected {', '.join(names)}")
-    if whole and (missing := [name for name in names if name not in given]):
+    if require_all and (missing := [name for name in names if name not in option]):
         raise _wrong(key, f"lacks {', '.join(missing)}; expected a value for every tissue")
 
 
@@ -48,36 +48,36 @@ def _require_nothing_else(model: ModelConfig) -> None:
         )
 
 
-def complete(given: Mapping[str, Any]) -> dict[str, Any]:
+def complete(configuration: Mapping[str, Any]) -> dict[str, Any]:
     """Add the default preset of the model and the default observations to an unchecked configuration.
 
     The default preset is `registration` for data from files, and `paper` for a synthetic pair or a known boundary. The
     default observation is the pair of images, if there is one.
     """
-    data, completed = given.get("data"), dict(given)
+    data, completed = configuration.get("data"), dict(configuration)
     if not isinstance(data, Mapping):
         return completed
     from_files = data.get("source") == "files"
-    if given.get("observations") is None:
+    if configuration.get("observations") is None:
         completed["observations"] = [] if from_files and data.get("fixed") is None else [{"kind": "images"}]
-    model = given.get("model") or {}
+    model = configuration.get("model") or {}
     if isinstance(model, Mapping) and "preset" not in model:
-        registers = from_files and given.get("known_boundary") is None
+        registers = from_files and configuration.get("known_boundary") is None
         completed["model"] = {"preset": "registration" if registers else "paper", **model}
     return completed
 
 
-def _with_image_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the preset's options to every pair of images in a completed configuration; given options stay."""
-    model, observations = given.get("model"), given.get("observations")
+def _with_image_options(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """Add the preset's options to every pair of images in a completed configuration; options that it holds stay."""
+    model, observations = configuration.get("model"), configuration.get("observations")
     preset = model.get("preset") if isinstance(model, Mapping) else getattr(model, "preset", None)
     if preset not in ("paper", "registration") or not isinstance(observations, list):
-        return dict(given)
+        return dict(configuration)
     are_images = [
         isinstance(observation, Mapping) and observation.get("kind") == "images" for observation in observations
     ]
     return {
-        **given,
+        **configuration,
         "observations": [
             with_preset(preset, observation) if is_images else observation
             for observation, is_images in zip(observations, are_images, strict=True)
@@ -118,8 +118,8 @@ class Config(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete(cls, given: Any) -> Any:
-        return _with_image_options(complete(given)) if isinstance(given, Mapping) else given
+    def _complete(cls, configuration: Any) -> Any:
+        return _with_image_options(complete(configuration)) if isinstance(configuration, Mapping) else configuration
 
     # Checks between sections are validators of fields: pydantic skips validators of the model if a field is wrong.
 
@@ -143,8 +143,8 @@ class Config(Section):
         ):
             raise _wrong("making_edge_length", f"expected less than mesh.edge_length, {edge:g} mm")
         if simulate is not None:
-            _require_tissues("lam", simulate.lam, data and data.tissues, whole=True)
-            _require_tissues("mu", simulate.mu, data and data.tissues, whole=True)
+            _require_tissues("lam", simulate.lam, data and data.tissues, require_all=True)
+            _require_tissues("mu", simulate.mu, data and data.tissues, require_all=True)
         return simulate
 
     @field_validator("mesh")

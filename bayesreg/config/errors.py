@@ -59,23 +59,23 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
     entries = [(_path(details, data, model), details) for details in errors[:MOST_ERRORS]]
     messages: dict[Keys, list[str]] = {}
     for path, details in entries:
-        if not any(_explains(*other, path, details["type"]) for other in entries):
+        if not any(_explains(*entry, path, details["type"]) for entry in entries):
             messages.setdefault(path, []).append(_message(details, model))
     lines = [f"  {_head(path, data, origins)}: {_join(texts)}" for path, texts in messages.items()]
     more = len({details["loc"] for details in errors}) - MOST_ERRORS
     return "\n".join([*lines, *([f"  and {more:,} more"] if more > 0 else [])])
 
 
-def _explains(other: Keys, by: ErrorDetails, path: Keys, kind: str) -> bool:
-    """Decide whether the error `by` at the path `other` makes an error of type `kind` at `path` superfluous.
+def _explains(other_path: Keys, by: ErrorDetails, path: Keys, kind: str) -> bool:
+    """Decide whether the error `by` at the path `other_path` makes an error of type `kind` at `path` superfluous.
 
     Every member of a union reports its own errors. If a value is wrong as a whole, its parts are right, and errors of
     its parts are dropped. If a part of a value is wrong, the value was meant to have parts, and errors of the whole are
     dropped.
     """
-    if len(other) < len(path):
-        return path[: len(other)] == other and by["type"] in ("value_error", "wrong")
-    return len(other) > len(path) > 0 and other[: len(path)] == path and kind in (*_EXPECTED, "literal_error")
+    if len(other_path) < len(path):
+        return path[: len(other_path)] == other_path and by["type"] in ("value_error", "wrong")
+    return len(other_path) > len(path) > 0 and other_path[: len(path)] == path and kind in (*_EXPECTED, "literal_error")
 
 
 def _join(messages: list[str]) -> str:

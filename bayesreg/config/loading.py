@@ -131,12 +131,14 @@ _Representer.add_representer(
 )
 
 
-def _read(path: Path, seen: tuple[Path, ...]) -> _Document:
+def _read(path: Path, extending_files: tuple[Path, ...]) -> _Document:
     path = path.absolute()
-    if path in seen:
-        raise ConfigError(f"{path} extends itself, by way of {seen[-1]}")
-    if len(seen) > DEEPEST:
-        raise ConfigError(f"{seen[0]} extends a file that extends another, and so on, over more than {DEEPEST} files")
+    if path in extending_files:
+        raise ConfigError(f"{path} extends itself, by way of {extending_files[-1]}")
+    if len(extending_files) > DEEPEST:
+        raise ConfigError(
+            f"{extending_files[0]} extends a file that extends another, and so on, over more than {DEEPEST} files"
+        )
     data, node = parse(_text(path), str(path))
     data = {} if data is None else data
     if not isinstance(data, dict):
@@ -148,7 +150,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> _Document:
         return document
     if not isinstance(base, str):
         raise ConfigError(f"{origins['extends',]}: extends = {base!r}: expected the path of a file")
-    return _merge(_read(path.parent / base, (*seen, path)), document)
+    return _merge(_read(path.parent / base, (*extending_files, path)), document)
 
 
 def _text(path: Path) -> str:

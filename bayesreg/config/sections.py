@@ -122,7 +122,7 @@ class ReportConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _landmarks_are_data(cls, given: Any) -> Any:
-        if isinstance(given, dict) and "landmarks" in given:
+    def _landmarks_are_data(cls, section: Any) -> Any:
+        if isinstance(section, dict) and "landmarks" in section:
             raise _wrong("landmarks", "this key is called report.places now; landmarks are data, see observations")
-        return given
+        return section

@@ -95,10 +95,10 @@ def _named_table(value: object, info: ValidationInfo) -> object:
 
     The values of label names come from the lookup table `label_names`, if it is given.
     """
-    known = info.data.get("label_names")
+    label_names = info.data.get("label_names")
     # The table of a stored configuration holds only numbers, so that the lookup table is not needed.
-    if isinstance(value, dict) and known is not None and not is_stored(info):
-        names = read_label_names(known)
+    if isinstance(value, dict) and label_names is not None and not is_stored(info):
+        names = read_label_names(label_names)
         return {tissue: name_values(entry, names) for tissue, entry in value.items()}
     if not isinstance(value, str):
         return value

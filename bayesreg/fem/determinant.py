@@ -119,15 +119,15 @@ def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLay
     rank[_narrow_order(mesh, unknowns)] = np.arange(len(unknowns))
     degrees = rank[unknowns_of(mesh.cells).reshape(-1, 12)].T
     row, column = np.repeat(degrees, 12, axis=0), np.tile(degrees, (12, 1))
-    kept = (row >= 0) & (column >= 0)
-    width = -(-int(np.abs(row - column)[kept].max()) // BLOCKS_BELOW)
+    is_stored = (row >= 0) & (column >= 0)
+    width = -(-int(np.abs(row - column)[is_stored].max()) // BLOCKS_BELOW)
     columns, block, below = -(-len(unknowns) // width), column // width, row // width - column // width
-    # Blocks above the diagonal are transposes of those below, so they are not kept.
-    kept &= below >= 0
+    # Blocks above the diagonal are transposes of those below, so they are not stored.
+    is_stored &= below >= 0
     places = ((block * (1 + BLOCKS_BELOW) + below) * width + row % width) * width + column % width
     padding = np.arange(columns * width).reshape(columns, width) >= len(unknowns)
     past_the_end = columns * (1 + BLOCKS_BELOW) * width**2
-    return BandLayout(jnp.asarray(np.where(kept, places, past_the_end)), jnp.asarray(padding, float))
+    return BandLayout(jnp.asarray(np.where(is_stored, places, past_the_end)), jnp.asarray(padding, float))
 
 
 def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[np.ndarray, "unknowns"]:
@@ -231,15 +231,15 @@ def _factorise(
     """
     columns, _, width, _ = band.shape
 
-    def eliminate(k: AnyArray, found: AnyArray) -> AnyArray:
+    def eliminate(k: AnyArray, factored: AnyArray) -> AnyArray:
         column = band[k]
-        for back in range(1, 1 + BLOCKS_BELOW):
-            before = found[k + BLOCKS_BELOW - back, back:]
+        for offset in range(1, 1 + BLOCKS_BELOW):
+            before = factored[k + BLOCKS_BELOW - offset, offset:]
             product = before.reshape(-1, width) @ before[0].T
-            column = column.at[: 1 + BLOCKS_BELOW - back].add(-product.reshape(before.shape))
+            column = column.at[: 1 + BLOCKS_BELOW - offset].add(-product.reshape(before.shape))
         factor = jax.lax.linalg.cholesky(column[0], symmetrize_input=False)
         panel = solve_triangular(factor, column[1:].reshape(-1, width).T, lower=True).T
-        return found.at[k + BLOCKS_BELOW].set(jnp.concatenate([factor, panel]).reshape(column.shape))
+        return factored.at[k + BLOCKS_BELOW].set(jnp.concatenate([factor, panel]).reshape(column.shape))
 
     nothing = jnp.zeros((BLOCKS_BELOW + columns, *band.shape[1:]), band.dtype)
     cholesky_factor = jax.lax.fori_loop(0, columns, eliminate, nothing)[BLOCKS_BELOW:]
@@ -261,8 +261,8 @@ def _inverse_in_band(
         gain = solve_triangular(factor, panel.T, lower=True, trans=1)
         below = -window @ gain.T
         diagonal = cho_solve((factor, True), jnp.eye(width)) - gain @ below
-        kept = below[:-width]
-        window = jnp.block([[diagonal, kept.T], [kept, window[:-width, :-width]]])
+        remaining = below[:-width]
+        window = jnp.block([[diagonal, remaining.T], [remaining, window[:-width, :-width]]])
         return window, jnp.concatenate([diagonal, below])
 
     return jax.lax.scan(ascend, jnp.zeros((height, height)), (factors, panels), reverse=True)[1]

@@ -127,8 +127,8 @@ def _force_between_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> t
     # Functions with chains as columns have no derivative, so the same formula without this wrapper is differentiated.
     *shared, lam, mu, u = primals
 
-    def force(*given: AnyArray) -> AnyArray:
-        return forces(*shared, *(x[..., None] for x in given))[..., 0]
+    def force(*arguments: AnyArray) -> AnyArray:
+        return forces(*shared, *(x[..., None] for x in arguments))[..., 0]
 
     return jax.jvp(force, (lam, mu, u), tangents[3:])
 
@@ -172,9 +172,9 @@ def stiffness_diagonal(
     derivative : SparseOperator
         `Elements.derivative`, or its columns that belong to the nodes of the result.
     """
-    squares = SparseOperator(*(part._replace(entries=part.entries**2) for part in derivative))
-    own = (lam + mu)[:, None] * jnp.eye(3)[:, None, :, None]
-    entries = volumes[:, None, None] * (mu[:, None] + own)
+    squares = SparseOperator(*(matrix._replace(entries=matrix.entries**2) for matrix in derivative))
+    same_axis = (lam + mu)[:, None] * jnp.eye(3)[:, None, :, None]
+    entries = volumes[:, None, None] * (mu[:, None] + same_axis)
     return squares.transpose(entries.reshape(3 * len(volumes), -1)).reshape(-1, 3, lam.shape[1])
 
 

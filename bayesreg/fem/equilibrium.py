@@ -23,7 +23,7 @@ from bayesreg.fem.elasticity import (
     unknowns_of,
 )
 from bayesreg.fem.elements import derivative_matrix, displacement_gradient, elements_of
-from bayesreg.fem.multigrid import Multigrid, multigrid
+from bayesreg.fem.multigrid import Multigrid, build_multigrid
 from bayesreg.fem.operators import SparseOperator, sparse_operator
 from bayesreg.fem.preconditioners import ReferenceInverse
 from bayesreg.mesh import TetMesh
@@ -75,7 +75,7 @@ def _preconditioner(
 ) -> ReferenceInverse | Multigrid:
     if matrix.shape[0] <= preconditioners.DENSE_LIMIT:
         return preconditioners.reference_inverse(matrix)
-    return multigrid(matrix, rigid_modes(points))
+    return build_multigrid(matrix, rigid_modes(points))
 
 
 def equilibrium(
@@ -149,14 +149,14 @@ def _forward(
 
 
 def _backward(
-    kept: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
+    saved: tuple[ElasticSystem, AnyArray, AnyArray, AnyArray], cotangent: Equilibrium
 ) -> tuple[None, AnyArray, AnyArray, AnyArray]:
     """Solve the adjoint K_II w = ū_I, w_B = 0; then ∂/∂u_B = ū_B − (K w)_B and ∂/∂θ = −wᵀ (∂K/∂θ) u.
 
     One solve serves all functions of u. The strain energy needs none: it is minimal in u_I, so that its ū_I is the
     residual.
     """
-    system, lam, mu, u = kept
+    system, lam, mu, u = saved
     bar = cotangent.u
     if len(system.free) == 0:
         return None, jnp.zeros_like(lam), jnp.zeros_like(mu), bar[system.prescribed]
@@ -223,7 +223,7 @@ def _reference(
 
     They are λ and μ themselves if these are known and K has a factor, else ones.
     """
-    known = not any(isinstance(values, jax.core.Tracer) for values in (lam, mu))
-    if known and all(np.all((np.asarray(v) > 1e-12) & (np.asarray(v) < 1e12)) for v in (lam, mu)):
+    are_concrete = not any(isinstance(values, jax.core.Tracer) for values in (lam, mu))
+    if are_concrete and all(np.all((np.asarray(v) > 1e-12) & (np.asarray(v) < 1e12)) for v in (lam, mu)):
         return np.asarray(lam, float), np.asarray(mu, float)
     return np.ones(np.shape(lam)), np.ones(np.shape(mu))

@@ -84,7 +84,7 @@ class CellSearch:
     def __call__(self, query: Float[np.ndarray, "queries 3"], tolerance: float = 1e-9) -> Location:
         """Find the tetrahedron that holds each point; see `locate`."""
         return _in_threads(
-            lambda part: _search(part, self._bins, self._origin, self._to_barycentric, tolerance), query, 4
+            lambda points: _search(points, self._bins, self._origin, self._to_barycentric, tolerance), query, 4
         )
 
 
@@ -240,10 +240,10 @@ def _in_threads(
 ) -> Location:
     """Search at groups of points in threads, because NumPy and SciPy release Python's lock."""
     cell, barycentric = np.empty(len(query), int), np.empty((len(query), corners))
-    parts = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
+    blocks = [slice(start, start + _CHUNK) for start in range(0, len(query), _CHUNK)]
     with ThreadPoolExecutor(max_workers=_THREADS) as pool:
-        for part, location in zip(parts, pool.map(search, (query[part] for part in parts)), strict=True):
-            cell[part], barycentric[part] = location
+        for block, location in zip(blocks, pool.map(search, (query[block] for block in blocks)), strict=True):
+            cell[block], barycentric[block] = location
     return Location(cell, barycentric)
 
 

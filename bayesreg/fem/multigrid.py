@@ -20,7 +20,7 @@ from bayesreg.fem.preconditioners import SINGULAR
 from bayesreg.types import AnyArray, InputError, Scalar
 
 # Coarsening ends at about this number of unknowns; the coarsest matrix is inverted as a dense matrix.
-COARSEST = 600
+COARSEST_UNKNOWNS = 600
 # The smoother is Chebyshev's polynomial of this degree. It damps the eigenvalues above this share of the greatest
 # eigenvalue.
 LEAST_SHARE = 0.1
@@ -78,7 +78,7 @@ class Multigrid(NamedTuple):
         return scale * _cycle(self.levels, self.coarsest, scaled).reshape(residual.shape)
 
 
-def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "unknowns modes"]) -> Multigrid:
+def build_multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "unknowns modes"]) -> Multigrid:
     """Make the hierarchy of a symmetric positive definite matrix; the same matrix always gives the same hierarchy.
 
     Parameters
@@ -108,21 +108,23 @@ def multigrid(matrix: scipy.sparse.csr_matrix, near_kernel: Float[np.ndarray, "u
         smooth=("jacobi", {"omega": 4 / 3, "weighting": "local"}),
         improve_candidates=None,
         # This limit counts blocks of unknowns. On coarse levels a block has the six motions of an aggregate.
-        max_coarse=COARSEST // 6,
+        max_coarse=COARSEST_UNKNOWNS // 6,
         max_levels=20,
     ).levels
     # An aggregate of one or two nodes has fewer than six independent motions. The rows and columns of its other motions
     # are zero, and are removed.
-    kept = [np.flatnonzero(level.A.diagonal() > 1e-12) for level in hierarchy]
-    inner = [scipy.sparse.csr_array(level.A)[own][:, own] for level, own in zip(hierarchy, kept, strict=True)]
+    nonzero_rows = [np.flatnonzero(level.A.diagonal() > 1e-12) for level in hierarchy]
+    inner = [
+        scipy.sparse.csr_array(level.A)[rows][:, rows] for level, rows in zip(hierarchy, nonzero_rows, strict=True)
+    ]
     scales = [1 / np.sqrt(each.diagonal()) for each in inner]
-    matrices = [_scale(each, own, own) for each, own in zip(inner, scales, strict=True)]
+    matrices = [_scale(each, level_scale, level_scale) for each, level_scale in zip(inner, scales, strict=True)]
     values, vectors = np.linalg.eigh(matrices[-1].toarray())
     if not (np.isfinite(values).all() and values[0] > SINGULAR_BELOW):
         raise InputError(SINGULAR)
     levels = []
     for depth, fine in enumerate(matrices[:-1]):
-        prolongation = scipy.sparse.csr_array(hierarchy[depth].P)[kept[depth]][:, kept[depth + 1]]
+        prolongation = scipy.sparse.csr_array(hierarchy[depth].P)[nonzero_rows[depth]][:, nonzero_rows[depth + 1]]
         prolongation = _scale(prolongation, 1 / scales[depth], scales[depth + 1])
         greatest = jnp.float32(_above_the_eigenvalues(fine))
         levels.append(

@@ -101,13 +101,13 @@ def surround(mesh: TetMesh) -> Surroundings:
     count = len(surface.points)
     harmonic = _harmonic(points, cells, surface.weights, count, len(points) - ON_SPHERE)
     # The nodes of the mesh's boundary come first; they are nodes of the mesh, too.
-    own = len(mesh.boundary)
-    number = np.concatenate([mesh.boundary, len(mesh.points) + np.arange(len(points) - own)])
+    boundary_count = len(mesh.boundary)
+    number = np.concatenate([mesh.boundary, len(mesh.points) + np.arange(len(points) - boundary_count)])
     return Surroundings(
         mesh=mesh,
-        points=np.concatenate([mesh.points, points[own:]]),
+        points=np.concatenate([mesh.points, points[boundary_count:]]),
         cells=np.concatenate([mesh.cells, number[cells]]),
-        harmonic=harmonic[own:],
+        harmonic=harmonic[boundary_count:],
         centre=centre,
         projection=projection,
     )

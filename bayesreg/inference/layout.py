@@ -55,7 +55,7 @@ def slices(target: Placed) -> dict[str, slice]:
 
 def dimension(target: Placed) -> int:
     """Count the coordinates of a position."""
-    return sum(part.stop - part.start for part in slices(target).values())
+    return sum(block.stop - block.start for block in slices(target).values())
 
 
 def marked(target: Placed, *names: str) -> Bool[np.ndarray, "dimension"]:

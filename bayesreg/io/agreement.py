@@ -70,30 +70,30 @@ def require_agreement(mesh: TetMesh, tissue: Image, path: str | Path) -> None:
         The path of the file of the mesh, for the message.
     """
     as_is = tuple(range(len(mesh.names)))
-    own = float(np.trace(_volumes(mesh, tissue, 1.0, (1, 1, 1))))
+    share_as_is = float(np.trace(_volumes(mesh, tissue, 1.0, (1, 1, 1))))
     readings = [_best_order(mesh, tissue, unit, signs) for unit in UNITS for signs in product((1, -1), repeat=3)]
     highest = max(reading.share for reading in readings)
     best = min(
         (reading for reading in readings if reading.share >= highest - BETTER),
         key=lambda reading: (_cost(reading), -reading.share),
     )
-    if best.share > own + BETTER and 1 - best.share < LESS * (1 - own):
-        parts = []
+    if best.share > share_as_is + BETTER and 1 - best.share < LESS * (1 - share_as_is):
+        differences = []
         if best.unit != 1:
-            parts.append(f"in {UNITS[best.unit]} (write it in mm)")
+            differences.append(f"in {UNITS[best.unit]} (write it in mm)")
         if turned := [axis for axis, sign in zip("xyz", best.signs, strict=True) if sign < 0]:
             lps = " (it may be in LPS: write it in RAS)" if turned == ["x", "y"] else ""
-            parts.append(f"with {' and '.join(turned)} reversed{lps}")
+            differences.append(f"with {' and '.join(turned)} reversed{lps}")
         if best.order != as_is:
             names = ", ".join(mesh.names[k] for k in best.order)
-            parts.append(f"with its tissues numbered as {names} and not as {', '.join(mesh.names)}")
+            differences.append(f"with its tissues numbered as {names} and not as {', '.join(mesh.names)}")
         raise InputError(
-            f"mesh {path} agrees with the labels in {own:.0%} of its volume; the share would be "
-            f"{best.share:.0%} {' and '.join(parts)}"
+            f"mesh {path} agrees with the labels in {share_as_is:.0%} of its volume; the share would be "
+            f"{best.share:.0%} {' and '.join(differences)}"
         )
-    if own < LEAST:
+    if share_as_is < LEAST:
         raise InputError(
-            f"mesh {path} agrees with the labels in no more than {own:.0%} of its volume; give a mesh of these "
+            f"mesh {path} agrees with the labels in no more than {share_as_is:.0%} of its volume; give a mesh of these "
             "labels in the world of the fixed image (RAS, mm), or leave mesh.file out"
         )
 

@@ -81,7 +81,7 @@ def find_pose(
     """
     size = relative_size(np.asarray(organ.voxels) != 0, organ.voxel_volume)
     region = _around(organ, size * SURROUNDINGS)
-    kept = None if moving_ignore is None else moving.with_voxels(~ignored_voxels(moving, moving_ignore))
+    moving_mask = None if moving_ignore is None else moving.with_voxels(~ignored_voxels(moving, moving_ignore))
     if fixed_ignore is not None:
         region = region.with_voxels(np.asarray(region.voxels) * ~ignored_voxels(region, fixed_ignore))
     # Smoothing and the centre of mass must not use ignored voxels, either.
@@ -89,7 +89,7 @@ def find_pose(
     headers = _euler(Pose.identity(), _centre_of(organ))
     starts, near_headers, best = list(_starts(fixed, moving, organ)), headers, headers
     for edge, share, most in LEVELS:
-        level = _Level.of(fixed, moving, region, kept, size * edge, share)
+        level = _Level.of(fixed, moving, region, moving_mask, size * edge, share)
         # The start from the headers stays at every level: if the headers are right, no other start is nearer.
         near_headers, *others = (level.improve(start) for start in (near_headers, *starts[:most]))
         # A step of the optimiser can also make a pose worse, so that the headers stay among the candidates.
@@ -159,12 +159,16 @@ class _Level(NamedTuple):
     moving: SimpleITK.Image
     edge: float
     share: float
-    around: SimpleITK.Image
-    kept: SimpleITK.Image | None
+    fixed_mask: SimpleITK.Image
+    moving_mask: SimpleITK.Image | None
 
     @classmethod
-    def of(cls, fixed: Image, moving: Image, around: Image, kept: Image | None, edge: float, share: float) -> _Level:
-        masks = [None if mask is None else to_itk(_coarser(mask, edge, 0), "uint8") for mask in (around, kept)]
+    def of(
+        cls, fixed: Image, moving: Image, fixed_mask: Image, moving_mask: Image | None, edge: float, share: float
+    ) -> _Level:
+        masks = [
+            None if mask is None else to_itk(_coarser(mask, edge, 0), "uint8") for mask in (fixed_mask, moving_mask)
+        ]
         fixed_image, moving_image = (to_itk(_coarser(image, edge, 1), "float32") for image in (fixed, moving))
         assert masks[0] is not None
         return cls(fixed_image, moving_image, edge, share, masks[0], masks[1])
@@ -172,9 +176,9 @@ class _Level(NamedTuple):
     def method(self) -> SimpleITK.ImageRegistrationMethod:
         method = SimpleITK.ImageRegistrationMethod()
         method.SetMetricAsMattesMutualInformation(BINS)
-        method.SetMetricFixedMask(self.around)
-        if self.kept is not None:
-            method.SetMetricMovingMask(self.kept)
+        method.SetMetricFixedMask(self.fixed_mask)
+        if self.moving_mask is not None:
+            method.SetMetricMovingMask(self.moving_mask)
         if self.share < 1:
             method.SetMetricSamplingStrategy(method.RANDOM)
             method.SetMetricSamplingPercentage(self.share, 1)

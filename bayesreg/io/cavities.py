@@ -31,11 +31,11 @@ def without_cavities(
         The given points and cells first, then the new ones.
     """
     faces = boundary_faces_of(cells)
-    part = _surface_parts(faces)
+    surface = _surface_parts(faces)
     a, b, c = np.moveaxis(points[faces], 1, 0)
-    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
+    volume = np.bincount(surface, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
     for cavity in np.flatnonzero(volume < 0):
-        points, cells = _fill(points, cells, faces[part == cavity])
+        points, cells = _fill(points, cells, faces[surface == cavity])
     return points, cells
 
 

@@ -89,7 +89,7 @@ def reopen(folder: RunFolder, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
     If the process is killed between two steps, the folder holds either the finished run or the interrupted one.
     """
     state = load_arrays(folder.file(STATE), ANEW)
-    kept = StoredBlocks(folder, 0)
+    stored = StoredBlocks(folder, 0)
     for block in blocks:
-        kept.append(block)
-    save_state(folder, state | {"blocks": np.array(len(kept))}, "prepared")
+        stored.append(block)
+    save_state(folder, state | {"blocks": np.array(len(stored))}, "prepared")

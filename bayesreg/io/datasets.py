@@ -77,9 +77,9 @@ def mni152() -> Anatomy:
     # Beyond the margin the image is zero.
     box = _box_about(inside, MNI152_MARGIN)
     return Anatomy(
-        t1.part(box),
-        t1.with_voxels(tissue.astype(np.int8)).part(box),
-        t1.with_voxels(inside.astype(np.uint8)).part(box),
+        t1.cropped(box),
+        t1.with_voxels(tissue.astype(np.int8)).cropped(box),
+        t1.with_voxels(inside.astype(np.uint8)).cropped(box),
     )
 
 
@@ -87,8 +87,8 @@ def _box_about(mask: np.ndarray, margin: int) -> list[slice]:
     """Compute the box of voxels that holds a mask and a margin around it, as slices."""
     box = []
     for axis in range(3):
-        known = np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis})))
-        box.append(slice(max(known[0] - margin, 0), min(known[-1] + margin + 1, mask.shape[axis])))
+        filled = np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis})))
+        box.append(slice(max(filled[0] - margin, 0), min(filled[-1] + margin + 1, mask.shape[axis])))
     return box
 
 
@@ -192,16 +192,16 @@ def _tissues_there(tissue: Image, table: LabelTable, path: str | Path) -> tuple[
     The tissue that stands for the rest of the mask stays, since it may lie beyond cropped labels.
     """
     names, present = tissue_names(table), set(np.unique(tissue.voxels).tolist())
-    kept = [k for k, name in enumerate(names, start=1) if k in present or REST in np.atleast_1d(table[name])]
-    if len(kept) == len(names):
+    remaining = [k for k, name in enumerate(names, start=1) if k in present or REST in np.atleast_1d(table[name])]
+    if len(remaining) == len(names):
         return tissue, names
-    absent = [name for index, name in enumerate(names, start=1) if index not in kept]
-    if all(is_fluid(names[index - 1]) for index in kept):
+    absent = [name for index, name in enumerate(names, start=1) if index not in remaining]
+    if all(is_fluid(names[index - 1]) for index in remaining):
         raise InputError(f"label file {path} holds no label of {' and '.join(absent)}, and so nothing solid")
     _log.warning("label file %s holds no label of %s, and the organ goes without", path, " and ".join(absent))
     number = np.zeros(len(names) + 1, np.int8)
-    number[kept] = np.arange(1, len(kept) + 1)
-    return tissue.with_voxels(number[np.asarray(tissue.voxels)]), tuple(names[index - 1] for index in kept)
+    number[remaining] = np.arange(1, len(remaining) + 1)
+    return tissue.with_voxels(number[np.asarray(tissue.voxels)]), tuple(names[index - 1] for index in remaining)
 
 
 def without_labels(image_path: str | Path, mask_path: str | Path | None = None) -> Anatomy:
@@ -246,8 +246,8 @@ def _outstanding(image: Image) -> np.ndarray:
     voxels = SimpleITK.GetImageFromArray(np.asarray(image.voxels, np.float32).transpose(2, 1, 0))
     radius = [max(round(CLOSING / size), 1) for size in image.voxel_sizes]
     bright = SimpleITK.OtsuThreshold(SimpleITK.Median(voxels, [1] * 3), 0, 1)
-    parts = SimpleITK.RelabelComponent(SimpleITK.ConnectedComponent(bright))
-    closed = SimpleITK.BinaryMorphologicalClosing(parts == 1, radius, SimpleITK.sitkBall, 1.0, True)
+    components = SimpleITK.RelabelComponent(SimpleITK.ConnectedComponent(bright))
+    closed = SimpleITK.BinaryMorphologicalClosing(components == 1, radius, SimpleITK.sitkBall, 1.0, True)
     mask = SimpleITK.GetArrayFromImage(SimpleITK.BinaryFillhole(closed)).transpose(2, 1, 0) != 0
     if not mask.any():
         raise InputError("nothing stands out in the fixed image; give labels of it, or a mask of the organ as labels")
@@ -267,8 +267,8 @@ def require_forms_taken(
 ) -> None:
     """Raise InputError if two images share a grid only by the form of a header (q-form) that is not used."""
     for candidate, source, taken in ((grid, grid_path, image), (image, path, grid)):
-        other = read_grid(source).other
-        if other is not None and is_same_grid(Image(candidate.voxels, other), taken):
+        qform = read_grid(source).qform
+        if qform is not None and is_same_grid(Image(candidate.voxels, qform), taken):
             raise InputError(
                 f"the {names[0]} and the {names[1]} image share one grid by the q-form of {source}, but not by its "
                 "s-form, which is taken; write the right one of the two forms into both"

@@ -121,19 +121,19 @@ def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X
 
     Raise MeshError if the mask is empty or has several large parts.
     """
-    parts, count = ndimage.label(mask)
+    components, count = ndimage.label(mask)
     if count == 0:
         raise MeshError(f"the {name} is empty")
     if count == 1:
         return mask
-    sizes = np.bincount(parts.ravel())[1:]
+    sizes = np.bincount(components.ravel())[1:]
     large = np.flatnonzero(sizes >= SPECK * sizes.sum())
     if len(large) > 1:
         shares = ", ".join(f"{sizes[i] / sizes.sum():.0%}" for i in large[np.argsort(-sizes[large])])
         raise MeshError(f"the {name} has {len(large)} separate parts ({shares} of its volume); expected one")
     dropped = int(sizes.sum() - sizes.max())
     _log.warning("%d specks of the %s left out, %d voxels together", count - 1, name, dropped)
-    return parts == sizes.argmax() + 1
+    return components == sizes.argmax() + 1
 
 
 def without_ridges(intracranial: Image) -> Image:
@@ -165,5 +165,5 @@ def _close(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: flo
 
 def _fill(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     """Fill the holes of a mask, which are the empty voxels that have no connection to the outside of the grid."""
-    parts, _ = ndimage.label(~np.pad(mask, 1))
-    return (parts != parts[0, 0, 0])[1:-1, 1:-1, 1:-1]
+    components, _ = ndimage.label(~np.pad(mask, 1))
+    return (components != components[0, 0, 0])[1:-1, 1:-1, 1:-1]

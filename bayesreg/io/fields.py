@@ -105,9 +105,9 @@ def _whole_field(transform: SimpleITK.Transform) -> SimpleITK.Image:
     """Compute the displacement field of an ITK transform; a composite is evaluated on the grid of its one field."""
     if transform.GetName() != "CompositeTransform":
         return SimpleITK.DisplacementFieldTransform(transform).GetDisplacementField()
-    parts = SimpleITK.CompositeTransform(transform)
-    transforms = [parts.GetNthTransform(k) for k in range(parts.GetNumberOfTransforms())]
-    inner = [part for part in transforms if part.GetName() == "DisplacementFieldTransform"]
+    composite = SimpleITK.CompositeTransform(transform)
+    transforms = [composite.GetNthTransform(k) for k in range(composite.GetNumberOfTransforms())]
+    inner = [member for member in transforms if member.GetName() == "DisplacementFieldTransform"]
     if len(inner) != 1:
         raise RuntimeError(f"a composite of {len(inner)} fields")
     grid = SimpleITK.DisplacementFieldTransform(inner[0]).GetDisplacementField()

@@ -48,7 +48,7 @@ class Grid(NamedTuple):
     shape : tuple of int
     affine : (4, 4) array
         Voxel index to world RAS, mm.
-    other : (4, 4) array or None
+    qform : (4, 4) array or None
         The q-form of a NIfTI header if it differs from the s-form, which is used.
     remarks : tuple of str
         Messages for the user.
@@ -56,7 +56,7 @@ class Grid(NamedTuple):
 
     shape: tuple[int, ...]
     affine: Float[np.ndarray, "4 4"]
-    other: Float[np.ndarray, "4 4"] | None = None
+    qform: Float[np.ndarray, "4 4"] | None = None
     remarks: tuple[str, ...] = ()
 
 
@@ -72,10 +72,16 @@ def require_memory(shape: Sequence[int], path: Path) -> None:
         )
 
 
-def corners_apart(one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], shape: tuple[int, ...]) -> float:
+def corners_apart(
+    first_affine: Float[np.ndarray, "4 4"], second_affine: Float[np.ndarray, "4 4"], shape: tuple[int, ...]
+) -> float:
     """Compute the largest distance, mm, between the corners of a grid under two affines."""
     corners = np.stack(np.meshgrid(*((0.0, n - 1.0) for n in shape[:3]), indexing="ij"), axis=-1).reshape(-1, 3)
-    return float(np.linalg.norm(corners @ (one - other)[:3, :3].T + (one - other)[:3, 3], axis=1).max())
+    return float(
+        np.linalg.norm(
+            corners @ (first_affine - second_affine)[:3, :3].T + (first_affine - second_affine)[:3, 3], axis=1
+        ).max()
+    )
 
 
 def is_same_grid(a: Image, b: Image) -> bool:

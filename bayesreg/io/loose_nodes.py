@@ -53,8 +53,8 @@ def without_loose_nodes(
             break
     if len(cells) == len(original_cells):
         return points, original_cells
-    used, kept = np.unique(cells, return_inverse=True)
-    return points[used], kept.reshape(-1, 4)
+    used, renumbered = np.unique(cells, return_inverse=True)
+    return points[used], renumbered.reshape(-1, 4)
 
 
 def _contract(

@@ -208,11 +208,11 @@ def save_mesh(
         save_dataset(grid, temporary)
 
 
-def _rows(given: Mapping[str, AnyArray] | None, count: int, what: str) -> dict[str, np.ndarray]:
-    arrays = {name: np.asarray(values) for name, values in (given or {}).items()}
+def _rows(arrays_by_name: Mapping[str, AnyArray] | None, count: int, entity: str) -> dict[str, np.ndarray]:
+    arrays = {name: np.asarray(values) for name, values in (arrays_by_name or {}).items()}
     for name, values in arrays.items():
         if values.shape[:1] != (count,):
-            raise InputError(f"{name} must have {count} rows, one per {what}; got shape {values.shape}")
+            raise InputError(f"{name} must have {count} rows, one per {entity}; got shape {values.shape}")
     return arrays
 
 
@@ -256,14 +256,14 @@ def load_mesh(path: str | Path, names: Sequence[str] = BRAIN) -> TetMesh:
 
 def _require_one_body(mesh: TetMesh, path: Path) -> None:
     """Raise InputError if tetrahedra overlap, as far as shared nodes and faces show it."""
-    cells, times = np.unique(np.sort(mesh.cells, axis=1), axis=0, return_counts=True)
-    if (times > 1).any():
+    cells, counts = np.unique(np.sort(mesh.cells, axis=1), axis=0, return_counts=True)
+    if (counts > 1).any():
         raise InputError(
-            f"mesh {path} holds the tetrahedron of the nodes {cells[times > 1][0].tolist()} more than once"
+            f"mesh {path} holds the tetrahedron of the nodes {cells[counts > 1][0].tolist()} more than once"
         )
-    faces, times = np.unique(np.sort(mesh.cells[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
-    if (times > 2).any():
-        raise InputError(f"mesh {path}: more than two tetrahedra share the face {faces[times > 2][0].tolist()}")
+    faces, counts = np.unique(np.sort(mesh.cells[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
+    if (counts > 2).any():
+        raise InputError(f"mesh {path}: more than two tetrahedra share the face {faces[counts > 2][0].tolist()}")
 
 
 def _attempt(

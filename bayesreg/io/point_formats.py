@@ -149,8 +149,8 @@ def _read_markups(text: str, path: str, space: Space | None) -> Points:
             for point in _require_objects(markup.get("controlPoints", []), "controlPoints", path)
             if point.get("positionStatus", "defined") == "defined"
         ]
-        own = [_position(point, path) for point in defined]
-        points.append(_in_ras(own, str(markup.get("coordinateSystem", "LPS")), path))
+        positions = [_position(point, path) for point in defined]
+        points.append(_in_ras(positions, str(markup.get("coordinateSystem", "LPS")), path))
         names += [str(point.get("label", "")) for point in defined]
     return Points(np.concatenate(points) if points else np.zeros((0, 3)), tuple(names))
 

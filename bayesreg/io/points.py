@@ -85,21 +85,24 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
         return points
     if moving is None:
         raise InputError(f"{path} holds points of one space; give the points of the moving image, too")
-    other = read_points(moving)
-    if other.sd is not None:
+    moving_points = read_points(moving)
+    if moving_points.sd is not None:
         raise InputError(f"{moving} gives an sd; expected it in the file of the fixed points, {path}, for each pair")
-    if len(other.points) != len(points.points):
+    if len(moving_points.points) != len(points.points):
         raise InputError(
-            f"{path} holds {len(points.points)} points and {moving} {len(other.points)}: they are no pairs"
+            f"{path} holds {len(points.points)} points and {moving} {len(moving_points.points)}: they are no pairs"
         )
     return PointPairs(
-        points.points, other.points[_order(points, other, f"{path} and {moving}")], points.names, points.sd
+        points.points,
+        moving_points.points[_order(points, moving_points, f"{path} and {moving}")],
+        points.names,
+        points.sd,
     )
 
 
-def _order(found: Points, other: Points, files: str) -> list[int]:
+def _order(fixed_points: Points, moving_points: Points, files: str) -> list[int]:
     """Find the index in the other file of the partner of each point."""
-    names, others = found.names, other.names
+    names, others = fixed_points.names, moving_points.names
     unique = len(set(names)) == len(names) and len(set(others)) == len(others)
     shared = set(names) & set(others) - {""}
     if not unique or not shared:
@@ -125,14 +128,14 @@ def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
     return points
 
 
-def _require_sound(found: Points | PointPairs, path: Path) -> None:
-    places = found.points if isinstance(found, Points) else np.hstack([found.fixed, found.moving])
+def _require_sound(points: Points | PointPairs, path: Path) -> None:
+    places = points.points if isinstance(points, Points) else np.hstack([points.fixed, points.moving])
     if not len(places):
         raise InputError(f"{path} holds no point")
-    require_printable(found.names, str(path))
+    require_printable(points.names, str(path))
     if not np.isfinite(places).all():
         raise InputError(f"{path}: point {1 + int(np.argwhere(~np.isfinite(places))[0, 0])} is not finite")
-    if found.sd is not None and len(bad := np.flatnonzero(~(np.isfinite(found.sd) & (found.sd > 0)))):
+    if points.sd is not None and len(bad := np.flatnonzero(~(np.isfinite(points.sd) & (points.sd > 0)))):
         raise InputError(
-            f"{path}: every sd must be a positive number of mm, got {found.sd[bad[0]]:g} at point {bad[0] + 1}"
+            f"{path}: every sd must be a positive number of mm, got {points.sd[bad[0]]:g} at point {bad[0] + 1}"
         )

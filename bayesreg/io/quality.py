@@ -132,9 +132,9 @@ def dihedral_angles(
 
 
 def _check_connected(mesh: TetMesh) -> None:
-    parts = _count_parts(len(mesh.points), mesh.cells[:, EDGES].reshape(-1, 2))
-    if parts > 1:
-        raise MeshError(f"the mesh has {parts} separate parts, expected one")
+    components = _count_parts(len(mesh.points), mesh.cells[:, EDGES].reshape(-1, 2))
+    if components > 1:
+        raise MeshError(f"the mesh has {components} separate parts, expected one")
 
 
 def _check_boundary(mesh: TetMesh) -> int:
@@ -148,9 +148,9 @@ def _check_boundary(mesh: TetMesh) -> int:
         )
     _check_fans(faces)
     nodes, index = np.unique(edges, return_inverse=True)
-    parts = _count_parts(len(nodes), index.reshape(-1, 2))
-    if parts > 1:
-        raise MeshError(f"the boundary has {parts} separate surfaces, expected one: the mesh has cavities")
+    components = _count_parts(len(nodes), index.reshape(-1, 2))
+    if components > 1:
+        raise MeshError(f"the boundary has {components} separate surfaces, expected one: the mesh has cavities")
     return (2 - (len(nodes) - len(edges) + len(faces))) // 2
 
 
@@ -166,7 +166,7 @@ def _check_fans(faces: Int[np.ndarray, "faces 3"]) -> None:
     )
     forward = half[half[:, 0] < half[:, 1]]
     backward = half[half[:, 0] > half[:, 1]][:, (1, 0, 3, 2)]
-    forward, backward = (part[np.lexsort((part[:, 1], part[:, 0]))] for part in (forward, backward))
+    forward, backward = (half_edge[np.lexsort((half_edge[:, 1], half_edge[:, 0]))] for half_edge in (forward, backward))
     links = np.concatenate([np.stack([forward[:, k], backward[:, k]], axis=1) for k in (2, 3)])
     pinched = _count_parts(faces.size, links) - len(np.unique(faces))
     if pinched:

@@ -75,10 +75,10 @@ def read_grid(path: str | Path) -> Grid:
 def _is_folder(path: Path) -> bool:
     """Check whether a path is a folder; raise InputError if it does not exist or may not be read."""
     try:
-        folder, there = path.is_dir(), path.exists()
+        folder, exists = path.is_dir(), path.exists()
     except OSError as error:
         raise InputError(f"image {path}: {error.strerror}") from error
-    if not there:
+    if not exists:
         raise InputError(f"image {path}: there is no such file")
     if not os.access(path, os.R_OK):
         raise InputError(f"image {path} may not be read; see its permissions")
@@ -116,19 +116,19 @@ def _grid_of(source: SpatialImage) -> Grid:
     if not isinstance(source, nib.Nifti1Pair):
         analyze = f"an Analyze file does not tell left from right; {_x_runs(affine)}"
         return Grid(shape, affine, None, (analyze,) if isinstance(source, nib.AnalyzeImage) else ())
-    header, remarks, other = source.header, [], None
+    header, remarks, qform = source.header, [], None
     if not (header["sform_code"] or header["qform_code"]):
         remarks.append(f"it says nothing of its orientation (sform and qform code 0); centred, and {_x_runs(affine)}")
     elif header["sform_code"] and header["qform_code"]:
-        affine, other, messages = _choose_form(affine, _qform(header), shape)
+        affine, qform, messages = _choose_form(affine, _qform(header), shape)
         remarks += messages
-    unit, known = _unit(header)
-    if not known:
+    unit, unit_is_known = _unit(header)
+    if not unit_is_known:
         remarks.append("its header has an unknown unit; taken to be mm")
     if MILLIMETRES[unit] != 1:
         remarks.append(f"its header is in units of a {unit}, converted to mm")
     scale = np.diag([*[MILLIMETRES[unit]] * 3, 1.0])
-    return Grid(shape, scale @ affine, None if other is None else scale @ other, tuple(remarks))
+    return Grid(shape, scale @ affine, None if qform is None else scale @ qform, tuple(remarks))
 
 
 def _unit(header: Any) -> tuple[str, bool]:
@@ -200,8 +200,8 @@ def _require_whole(path: Path, expected: int) -> None:
     """
     count = 0
     with gzip.open(path) as file:
-        while part := file.read(2**22):
-            count += len(part)
+        while chunk := file.read(2**22):
+            count += len(chunk)
             if count > 1.1 * expected + 2**20:
                 raise ValueError("it holds far more than its header says")
 

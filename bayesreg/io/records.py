@@ -116,25 +116,25 @@ class Predicted(NamedTuple):
         }
 
     @property
-    def known(self) -> dict[str, AnyArray]:
+    def present_entries(self) -> dict[str, AnyArray]:
         """The entries that are not None, without those of observations."""
         return {name: value for name, value in self._asdict().items() if value is not None and name != "observations"}
 
     def as_arrays(self) -> dict[str, AnyArray]:
         """Collect all entries as named arrays, for files; names of observations' arrays contain a slash."""
-        return {**self.known, **self.observations}
+        return {**self.present_entries, **self.observations}
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, AnyArray]) -> Predicted:
         """Create the record from the arrays of `as_arrays`."""
-        own = {name: value for name, value in arrays.items() if "/" not in name}
-        return cls(**own, observations={name: value for name, value in arrays.items() if "/" in name})
+        entries = {name: value for name, value in arrays.items() if "/" not in name}
+        return cls(**entries, observations={name: value for name, value in arrays.items() if "/" in name})
 
     @property
     def by_cell(self) -> dict[str, AnyArray]:
         """The entries that have one row per element."""
         fields = ("stiffness_mean", "stiffness_sd", "stiffer_probability")
-        return {name: value for name, value in self.known.items() if name in fields}
+        return {name: value for name, value in self.present_entries.items() if name in fields}
 
 
 class Matching(NamedTuple):
@@ -161,10 +161,10 @@ class Matching(NamedTuple):
         return {"pose": pose, "one_contrast": self.one_contrast, "scale": self.scale and list(self.scale)}
 
     @classmethod
-    def of_json(cls, given: Mapping[str, Any]) -> Matching:
+    def of_json(cls, mapping: Mapping[str, Any]) -> Matching:
         """Create the record from the mapping of `as_json`."""
-        scale = None if given["scale"] is None else IntensityScale(*given["scale"])
-        return cls(Pose(np.array(given["pose"])), bool(given["one_contrast"]), scale)
+        scale = None if mapping["scale"] is None else IntensityScale(*mapping["scale"])
+        return cls(Pose(np.array(mapping["pose"])), bool(mapping["one_contrast"]), scale)
 
 
 class Channel(NamedTuple):

@@ -202,8 +202,8 @@ class RunFolder:
         status = self.status()
         if status is not None:
             dropped = [name for name in status.files if name.startswith(f"{within}/")]
-            kept = {name: digests for name, digests in status.files.items() if name not in dropped}
-            self._write(Status(status.stage, kept))
+            remaining = {name: digests for name, digests in status.files.items() if name not in dropped}
+            self._write(Status(status.stage, remaining))
             for name in dropped:
                 self._path_of(name).unlink(missing_ok=True)
 
@@ -290,8 +290,8 @@ def _half_written(folder: Path) -> list[Path]:
 def digest_of(path: Path) -> str | None:
     """Compute the SHA-256 of the content of a file; return None if there is no such file."""
     try:
-        known = path.stat()
-        return _digest_of_file(path, known.st_ino, known.st_size, known.st_mtime_ns)
+        stat = path.stat()
+        return _digest_of_file(path, stat.st_ino, stat.st_size, stat.st_mtime_ns)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return None
 

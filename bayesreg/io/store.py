@@ -36,8 +36,8 @@ def write_inputs(place: Place, inputs: Inputs) -> None:
     for future in saved:
         future.result()
     if inputs.truth is not None:
-        known = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
-        save_arrays(place("inputs/truth.npz"), known)
+        truth_arrays = {key: value for key, value in inputs.truth._asdict().items() if value is not None}
+        save_arrays(place("inputs/truth.npz"), truth_arrays)
     if inputs.boundary is not None:
         save_arrays(place("inputs/boundary.npz"), {"u_boundary": inputs.boundary})
     write_observed(place, inputs.observed)
@@ -147,14 +147,16 @@ def read_run(folder: RunFolder) -> Run:
     if warped is not None and inputs.matching.scale is not None:
         warped = inputs.matching.scale(warped)
     metrics = None if (path := _file(folder, "metrics.json")) is None else read_json(path)
-    known = None if (path := _file(folder, "predicted.npz")) is None else Predicted.of_arrays(load_arrays(path, ANEW))
+    predicted = (
+        None if (path := _file(folder, "predicted.npz")) is None else Predicted.of_arrays(load_arrays(path, ANEW))
+    )
     return Run(
         manifest=manifest,
         u_mean=u_mean,
         u_sd=u_sd,
         warped=warped,
         metrics=metrics,
-        predicted=known,
+        predicted=predicted,
         **inputs._asdict(),
     )
 

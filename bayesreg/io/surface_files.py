@@ -44,17 +44,19 @@ class SurfaceFile(NamedTuple):
     space: Space
     is_said: bool
 
-    def part(self, chosen: Bool[np.ndarray, "k"]) -> SurfaceFile:
+    def selected(self, chosen: Bool[np.ndarray, "k"]) -> SurfaceFile:
         """Select points, the cells with chosen points only, and the parts of lines between chosen points."""
         import pyvista
 
         number = np.cumsum(chosen) - 1
         if isinstance(self.content, pyvista.UnstructuredGrid):
             cells = split_cells(self.content.cells, len(chosen))
-            kept = np.array([chosen[ids].all() for ids in cells], bool)
-            rows = [(len(ids), *number[ids]) for ids, keep in zip(cells, kept, strict=True) if keep]
+            chosen_cells = np.array([chosen[ids].all() for ids in cells], bool)
+            rows = [(len(ids), *number[ids]) for ids, keep in zip(cells, chosen_cells, strict=True) if keep]
             connectivity = np.concatenate([[], *rows]).astype(int)
-            content = pyvista.UnstructuredGrid(connectivity, self.content.celltypes[kept], self.content.points[chosen])
+            content = pyvista.UnstructuredGrid(
+                connectivity, self.content.celltypes[chosen_cells], self.content.points[chosen]
+            )
         else:
             runs = [
                 run
@@ -75,7 +77,7 @@ class SurfaceFile(NamedTuple):
 def _runs(chosen: Bool[np.ndarray, "k"], line: np.ndarray) -> list[np.ndarray]:
     """Split a line into its runs of chosen points."""
     borders = np.flatnonzero(np.diff(chosen[line].astype(int))) + 1
-    return [part for part in np.split(line, borders) if chosen[part].all()]
+    return [run for run in np.split(line, borders) if chosen[run].all()]
 
 
 def read_surface(path: str | Path, space: Space | None = None) -> SurfaceFile:
@@ -163,8 +165,8 @@ def _read_by_vtk(path: Path, content: bytes) -> Any:
         raise ValueError(f"it is cut short, or no {path.suffix} file")
     for cells in kinds:
         offsets, points = (
-            np.asarray(pyvista.convert_array(part)).astype(np.int64)
-            for part in (cells.GetOffsetsArray(), cells.GetConnectivityArray())
+            np.asarray(pyvista.convert_array(array)).astype(np.int64)
+            for array in (cells.GetOffsetsArray(), cells.GetConnectivityArray())
         )
         split_cells(join_cells(offsets, points), dataset.n_points)
     return dataset

@@ -37,15 +37,15 @@ _CELLS = {"VERTICES": "verts", "LINES": "lines", "POLYGONS": "faces", "TRIANGLE_
 class _Cursor:
     """An offset in the content of a file, which every read advances; ValueError if the content ends too early."""
 
-    def __init__(self, content: bytes, at: int, is_text: bool, order: Literal["<", ">"]) -> None:
-        self.content, self.at, self.is_text, self.order = content, at, is_text, order
+    def __init__(self, content: bytes, position: int, is_text: bool, order: Literal["<", ">"]) -> None:
+        self.content, self.position, self.is_text, self.order = content, position, is_text, order
 
     def line(self) -> list[str]:
         """Read the words of the next line that is not empty; return an empty list at the end."""
-        while self.at < len(self.content):
-            end = self.content.find(b"\n", self.at)
+        while self.position < len(self.content):
+            end = self.content.find(b"\n", self.position)
             end = len(self.content) if end < 0 else end
-            words, self.at = self.content[self.at : end].decode("utf-8").split(), end + 1
+            words, self.position = self.content[self.position : end].decode("utf-8").split(), end + 1
             if words:
                 return words
         return []
@@ -54,14 +54,14 @@ class _Cursor:
         if count < 0:
             raise ValueError("a negative number of values")
         if self.is_text:
-            words = list(islice(re.compile(rb"\S+").finditer(self.content, self.at), count))
+            words = list(islice(re.compile(rb"\S+").finditer(self.content, self.position), count))
             if len(words) < count:
                 raise ValueError("it is cut short")
-            self.at = words[-1].end() if words else self.at
+            self.position = words[-1].end() if words else self.position
             return np.array([word[0] for word in words], "S").astype(float if kind[0] == "f" else int).astype(kind)
         stored = np.dtype(kind).newbyteorder(self.order)
-        start, self.at = self.at, self.at + count * stored.itemsize
-        if self.at > len(self.content):
+        start, self.position = self.position, self.position + count * stored.itemsize
+        if self.position > len(self.content):
             raise ValueError("it is cut short")
         return np.frombuffer(self.content, stored, count, start).astype(kind)
 
@@ -76,7 +76,7 @@ class _Cursor:
         texts = []
         for _ in range(count):
             size = 2 ** (3 - (int(self.values("u1", 1)[0]) >> 6))
-            self.at -= 1
+            self.position -= 1
             length = int(self.values(f"u{size}", 1)[0]) & (2 ** (8 * size - 2) - 1)
             texts.append(self.values("u1", length).tobytes().decode("utf-8"))
         return texts
@@ -89,8 +89,8 @@ class _Cursor:
         return join_cells(offsets, self.values(_legacy_type(self.line()[1]), second).astype(np.int64))
 
     def skip(self, pattern: bytes) -> None:
-        if (match := re.compile(pattern, re.DOTALL).match(self.content, self.at)) is not None:
-            self.at = match.end()
+        if (match := re.compile(pattern, re.DOTALL).match(self.content, self.position)) is not None:
+            self.position = match.end()
 
 
 def join_cells(offsets: Int[np.ndarray, "c"], points: Int[np.ndarray, "k"]) -> Int[np.ndarray, "n"]:
@@ -130,17 +130,17 @@ def read_legacy(content: bytes) -> Any:
     if head is None:
         raise ValueError("it does not begin as a surface or grid of VTK's legacy format")
     cursor = _Cursor(content, head.end(), head[2].upper() == b"ASCII", ">")
-    parts: dict[str, np.ndarray] = {}
+    geometry: dict[str, np.ndarray] = {}
     arrays: dict[str, dict[str, Any]] = {"": {}, "POINT_DATA": {}, "CELL_DATA": {}}
     section, rows = "", 0
     while words := cursor.line():
         key = words[0].upper()
         if key == "POINTS":
-            parts["points"] = cursor.values(_legacy_type(words[2]), 3 * int(words[1])).reshape(-1, 3)
+            geometry["points"] = cursor.values(_legacy_type(words[2]), 3 * int(words[1])).reshape(-1, 3)
         elif key in _CELLS:
-            parts[_CELLS[key]] = cursor.cells(int(words[1]), int(words[2]), int(head[1]) >= 5)
+            geometry[_CELLS[key]] = cursor.cells(int(words[1]), int(words[2]), int(head[1]) >= 5)
         elif key == "CELL_TYPES":
-            parts["types"] = cursor.values("i4", int(words[1]))
+            geometry["types"] = cursor.values("i4", int(words[1]))
         elif key in arrays:
             section, rows = key, int(words[1])
         elif key == "FIELD":
@@ -171,7 +171,7 @@ def read_legacy(content: bytes) -> Any:
             cursor.skip(rb".*?(\n\s*\n|\Z)")
         else:
             raise ValueError(f"it has {key[:20]!r} where a word of VTK's is expected")
-    return _dataset(parts, arrays)
+    return _dataset(geometry, arrays)
 
 
 def read_ply(content: bytes) -> Any:
@@ -190,7 +190,7 @@ def read_ply(content: bytes) -> Any:
         elif words and words[0] == "property":
             elements[-1][2].append(words[1:])
     orders: dict[str, Literal["<", ">"]] = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-    parts: dict[str, np.ndarray] = {}
+    geometry: dict[str, np.ndarray] = {}
     cursor = _Cursor(content, head.end(), form == "ascii", orders[form])
     for name, count, properties in elements:
         if count > len(content):
@@ -199,11 +199,11 @@ def read_ply(content: bytes) -> Any:
         names = [words[-1] for words in properties]
         if name == "vertex":
             columns = [names.index(axis) for axis in "xyz"]
-            parts["points"] = np.array([[row[k] for k in columns] for row in rows], float).reshape(-1, 3)
+            geometry["points"] = np.array([[row[k] for k in columns] for row in rows], float).reshape(-1, 3)
         elif name == "face":
             column = names.index("vertex_index" if "vertex_index" in names else "vertex_indices")
-            parts["faces"] = _join([row[column] for row in rows])
-    return _dataset(parts)
+            geometry["faces"] = _join([row[column] for row in rows])
+    return _dataset(geometry)
 
 
 def _ply_value(cursor: _Cursor, words: Sequence[str]) -> Any:
@@ -241,18 +241,18 @@ def _join(cells: Iterable[Any]) -> Int[np.ndarray, "n"]:
     return np.concatenate([np.zeros(0, np.int64), *(np.array([len(cell), *cell], np.int64) for cell in cells)])
 
 
-def _dataset(parts: dict[str, np.ndarray], arrays: dict[str, dict[str, Any]] | None = None) -> Any:
+def _dataset(geometry: dict[str, np.ndarray], arrays: dict[str, dict[str, Any]] | None = None) -> Any:
     """Create a PyVista dataset after a check that its cells only use existing points."""
     import pyvista
 
-    points, types = parts.pop("points", np.zeros((0, 3))), parts.pop("types", None)
-    split = {name: split_cells(cells, len(points)) for name, cells in parts.items()}
-    if types is not None or "cells" in parts:
-        if set(parts) != {"cells"} or types is None or len(types) != len(split["cells"]):
+    points, types = geometry.pop("points", np.zeros((0, 3))), geometry.pop("types", None)
+    split = {name: split_cells(cells, len(points)) for name, cells in geometry.items()}
+    if types is not None or "cells" in geometry:
+        if set(geometry) != {"cells"} or types is None or len(types) != len(split["cells"]):
             raise ValueError("the types of its cells do not fit")
-        dataset = pyvista.UnstructuredGrid(parts["cells"], types.astype(np.uint8), points)
+        dataset = pyvista.UnstructuredGrid(geometry["cells"], types.astype(np.uint8), points)
     else:
-        dataset = pyvista.PolyData(points, **cast(Any, parts))
+        dataset = pyvista.PolyData(points, **cast(Any, geometry))
     for name, target in (("POINT_DATA", "point_data"), ("CELL_DATA", "cell_data"), ("", "field_data")):
         for key, values in (arrays or {}).get(name, {}).items():
             getattr(dataset, target)[key] = values

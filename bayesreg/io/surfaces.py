@@ -186,10 +186,10 @@ class _CoarseGrid(NamedTuple):
 def _without_specks(field: Float[np.ndarray, "A B C"], smallest: float) -> Float[np.ndarray, "A B C"]:
     """Remove parts of a field above 0.5, and holes in them, that have fewer voxels than `smallest`."""
     for inside, level in ((field > 0.5, 0.0), (field <= 0.5, 1.0)):
-        parts, _ = ndimage.label(inside)
-        small = np.bincount(parts.ravel()) < smallest
+        components, _ = ndimage.label(inside)
+        small = np.bincount(components.ravel()) < smallest
         small[0] = False
-        field = np.where(small[parts], np.float32(level), field)
+        field = np.where(small[components], np.float32(level), field)
     return field
 
 

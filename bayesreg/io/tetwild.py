@@ -80,9 +80,9 @@ def tetrahedralize(
     return without_cavities(*_run(arguments, quiet))
 
 
-def _run(given: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
+def _run(arguments: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
     with tempfile.TemporaryDirectory() as folder:
-        np.savez(Path(folder) / "in.npz", **given)
+        np.savez(Path(folder) / "in.npz", **arguments)
         command = [sys.executable, "-c", _PROGRAM, "quiet" if quiet else "loud"]
         done = subprocess.run(command, cwd=folder, capture_output=quiet, text=True, check=False)
         if done.returncode:

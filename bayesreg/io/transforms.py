@@ -42,17 +42,19 @@ def save_transform(
     """
     if not grid.is_orthogonal:
         raise ValueError("ITK's grids have axes at right angles; use Image.on_orthogonal_grid")
-    parts = [_affine(pose), _displacement_field(field, grid)]
+    transforms = [_affine(pose), _displacement_field(field, grid)]
     with replacing(path) as temporary, h5py.File(temporary, "w", track_order=False) as file:
         _write_text(file, "ITKVersion", "5.4.0")
         _write_text(file, "HDFVersion", h5py.version.hdf5_version)
         _write_text(file, "OSName", "")
         _write_text(file, "OSVersion", "")
         _write_text(file, "TransformGroup/0/TransformType", "CompositeTransform_double_3_3")
-        for number, (kind, known, parameters) in enumerate(parts[::-1] if pose_first else parts, start=1):
+        for number, (kind, fixed_parameters, parameters) in enumerate(
+            transforms[::-1] if pose_first else transforms, start=1
+        ):
             group = f"TransformGroup/{number}"
             _write_text(file, f"{group}/TransformType", f"{kind}_double_3_3")
-            file[f"{group}/TransformFixedParameters"] = known
+            file[f"{group}/TransformFixedParameters"] = fixed_parameters
             packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if parameters.size > 100 else {}
             file.create_dataset(f"{group}/TransformParameters", data=parameters, **packed)
 
@@ -74,6 +76,6 @@ def _displacement_field(field: Float[AnyArray, "X Y Z 3"], grid: Image) -> tuple
     """
     affine = convert_affine(grid.affine)
     directions = affine[:3, :3] / grid.voxel_sizes
-    known = np.concatenate([grid.shape, affine[:3, 3], grid.voxel_sizes, directions.ravel()])
+    fixed_parameters = np.concatenate([grid.shape, affine[:3, 3], grid.voxel_sizes, directions.ravel()])
     vectors = np.round(np.asarray(field) / QUANTUM) * QUANTUM * LPS
-    return "DisplacementFieldTransform", known, vectors.transpose(2, 1, 0, 3).astype(np.float32).ravel()
+    return "DisplacementFieldTransform", fixed_parameters, vectors.transpose(2, 1, 0, 3).astype(np.float32).ravel()

@@ -166,7 +166,7 @@ def tissues_of(
     """
     values = {name: np.atleast_1d(np.asarray(entry, int)).tolist() for name, entry in table.items()}
     present, counts = np.unique(image.voxels, return_counts=True)
-    _check_table(values, present.tolist(), path, whole=unlisted == "outside")
+    _check_table(values, present.tolist(), path, require_all=unlisted == "outside")
     listed = {0, *(value for entry in values.values() for value in entry)}
     millilitres = {
         int(value): count * image.voxel_volume / 1e3
@@ -295,7 +295,7 @@ def _storable(voxels: np.ndarray) -> np.ndarray:
     return voxels
 
 
-def _check_table(values: dict[str, list[int]], present: list[int], path: str | Path, whole: bool) -> None:
+def _check_table(values: dict[str, list[int]], present: list[int], path: str | Path, require_all: bool) -> None:
     owner: dict[int, str] = {}
     for name, entry in values.items():
         if not entry:
@@ -307,7 +307,7 @@ def _check_table(values: dict[str, list[int]], present: list[int], path: str | P
     absent = [value for value in owner if value not in present]
     empty = [name for name in tissue_names(values) if not set(values[name]) & set(present)]
     shown = ", ".join(map(str, present[:30])) + (", …" if len(present) > 30 else "")
-    if empty and (whole or len(empty) == len(tissue_names(values))):
+    if empty and (require_all or len(empty) == len(tissue_names(values))):
         listed = ", ".join(f"{name} ({', '.join(map(str, values[name]))})" for name in empty)
         raise InputError(f"label file {path} holds no label of {listed}; it holds {shown}")
     if absent:

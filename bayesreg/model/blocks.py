@@ -190,16 +190,16 @@ class Scale(_Positive):
         """Return the value divided by the factor."""
         return jnp.asarray(value, float) / self.factor
 
-    def times(self, factor: float) -> Scale:
+    def multiplied_by(self, factor: float) -> Scale:
         """Return a scale whose values are those of this scale multiplied by a factor."""
         return Scale(factor * self.median, self.log_sd, factor * self.factor)
 
 
-def scale_block(given: float | ScalePrior) -> Scale:
+def scale_block(value_or_prior: float | ScalePrior) -> Scale:
     """Make the block of a scale from a number, if it is known, or from a prior, if it is inferred."""
-    if isinstance(given, ScalePrior):
-        return Scale(jnp.asarray(given.median), jnp.asarray(given.log_sd))
-    return Scale(jnp.asarray(given))
+    if isinstance(value_or_prior, ScalePrior):
+        return Scale(jnp.asarray(value_or_prior.median), jnp.asarray(value_or_prior.log_sd))
+    return Scale(jnp.asarray(value_or_prior))
 
 
 @jax.tree_util.register_pytree_node_class

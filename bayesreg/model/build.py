@@ -74,16 +74,18 @@ def build_posterior(
     return posterior
 
 
-def require_observations(given: Any) -> list[Any]:
+def require_observations(observations: Any) -> list[Any]:
     """Return the observations as a list; raise InputError if there is none, or one is not an observation."""
-    if not isinstance(given, Sequence):
-        raise InputError(f"observations must be a list, got {type(given).__name__}; put one observation in a list, too")
-    if not len(given):
+    if not isinstance(observations, Sequence):
+        raise InputError(
+            f"observations must be a list, got {type(observations).__name__}; put one observation in a list, too"
+        )
+    if not len(observations):
         raise InputError("there is nothing observed: give observations, such as ImagePair(fixed, moving) or Landmarks")
-    for observation in given:
+    for observation in observations:
         name = getattr(observation, "name", None)
-        known = isinstance(observation, Observation) or callable(getattr(observation, "log", None))
-        if not (known and isinstance(name, str) and name):
+        is_observation = isinstance(observation, Observation) or callable(getattr(observation, "log", None))
+        if not (is_observation and isinstance(name, str) and name):
             raise InputError(
                 f"an observation needs a name (text) and a function log(state); got {type(observation).__name__}: use "
                 "ImagePair, Landmarks, or an object of your own with both"
@@ -91,7 +93,7 @@ def require_observations(given: Any) -> list[Any]:
         # The name becomes part of variable names in files.
         if not name.isidentifier():
             raise InputError(f"an observation is named {name!r}; expected letters, digits and _, such as left_lobe")
-    return list(given)
+    return list(observations)
 
 
 def _require_bounded(posterior: Posterior) -> None:
@@ -119,12 +121,12 @@ def _require_numbers(posterior: Posterior) -> None:
         log = partial(_log_at, term, rest)
         abstract_value = jax.eval_shape(log, rest.u)
         if getattr(abstract_value, "shape", None) != () or not jnp.issubdtype(abstract_value.dtype, jnp.floating):
-            got = (
+            returned = (
                 f"shape {abstract_value.shape} of {abstract_value.dtype}"
                 if hasattr(abstract_value, "shape")
                 else type(abstract_value).__name__
             )
-            raise InputError(f"log(state) of the observation {name!r} must give one real number, got {got}")
+            raise InputError(f"log(state) of the observation {name!r} must give one real number, got {returned}")
         value, slope = jax.value_and_grad(log)(rest.u)
         if jnp.isnan(value) or jnp.isnan(slope).any():
             defect = "is not a number" if jnp.isnan(value) else "has a derivative that is not a number"

@@ -43,7 +43,7 @@ def _ease(problem: Problem, pairs: Mapping[str, Smoothable], sd: float, similari
     easing = {**dict.fromkeys(pairs, similarity), "elastic": elastic}
     powers = {term: problem.terms[term].powers for term in easing if term in problem.terms}
     factors = {name: easing[term] ** power for term, scales in powers.items() for name, power in scales.items()}
-    scales = {name: problem.blocks[name].times(factor) for name, factor in factors.items()}
+    scales = {name: problem.blocks[name].multiplied_by(factor) for name, factor in factors.items()}
     return problem._replace(blocks={**problem.blocks, **scales}, terms={**problem.terms, **smooth})
 
 

@@ -122,9 +122,9 @@ def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
     entries = tuple(np.asarray(body.cell_entry).tolist())
     if body.field is not None or max(entries) >= FEW_ENTRIES:
         return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
-    pattern, parts = _stiffness_parts(body.mesh, entries)
+    pattern, derivatives = _stiffness_parts(body.mesh, entries)
     K = pattern.copy()
-    K.data = parts @ np.concatenate([np.asarray(values[name]) for name in LAME])
+    K.data = derivatives @ np.concatenate([np.asarray(values[name]) for name in LAME])
     return K
 
 
@@ -137,13 +137,13 @@ def _stiffness_parts(
     nothing = np.zeros(len(entries))
     pattern = stiffness(mesh.mesh, np.ones(len(entries)), np.ones(len(entries)))
     pattern.sort_indices()
-    parts = [stiffness(mesh.mesh, indicator, nothing) for indicator in owned] + [
+    derivatives = [stiffness(mesh.mesh, indicator, nothing) for indicator in owned] + [
         stiffness(mesh.mesh, nothing, indicator) for indicator in owned
     ]
-    # All parts must have the same pattern, so zeros are stored.
-    for part in parts:
-        part.sort_indices()
-    return pattern, np.stack([part.data for part in parts], axis=1)
+    # All derivatives must have the same pattern, so zeros are stored.
+    for derivative in derivatives:
+        derivative.sort_indices()
+    return pattern, np.stack([derivative.data for derivative in derivatives], axis=1)
 
 
 class _Response(NamedTuple):
@@ -171,13 +171,13 @@ class _Response(NamedTuple):
         sampled = unknowns_of(np.asarray(body.system.prescribed)[np.asarray(body.sampled_index)])
         free = unknowns_of(np.asarray(body.system.free))
         lam, mu = (np.asarray(by_cell) for by_cell in body.lame_by_cell(values))
-        parts = sampled, free, lam, mu
+        arguments = sampled, free, lam, mu
         if body.field is not None:
             load = _element_forces(body, lam, mu, u) @ (float(values["field_sd"]) * np.asarray(body.field.basis))
-            return cls(sampled, free, *_response(mesh, *parts, load[free]))
+            return cls(sampled, free, *_response(mesh, *arguments, load[free]))
         if len(free) > DENSE_LIMIT:
-            return cls(sampled, free, *_response(mesh, *parts, np.zeros((len(free), 0))))
-        return cls(sampled, free, *_kept_response(mesh, *(tuple(part.tolist()) for part in parts)))
+            return cls(sampled, free, *_response(mesh, *arguments, np.zeros((len(free), 0))))
+        return cls(sampled, free, *_kept_response(mesh, *(tuple(argument.tolist()) for argument in arguments)))
 
     @property
     def modes(self) -> int:
@@ -216,10 +216,10 @@ def _dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:
     return matrix.toarray() if scipy.sparse.issparse(matrix) else matrix
 
 
-def _sum(nodes: int, parts: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
+def _sum(nodes: int, point_curvatures: Iterable[PointCurvature]) -> scipy.sparse.csr_matrix:
     """Sum the curvatures in displacements of points into one in all nodes, with row 3 · node + axis."""
     empty = scipy.sparse.csr_matrix((3 * nodes, 3 * nodes))
-    return sum((_assemble(nodes, part) for part in parts), empty)
+    return sum((_assemble(nodes, point_curvature) for point_curvature in point_curvatures), empty)
 
 
 def _response(

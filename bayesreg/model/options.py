@@ -118,14 +118,14 @@ class ModelConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _take_over_preset(cls, given: Any) -> Any:
-        if not isinstance(given, Mapping):
-            return given
-        preset = dict(PRESETS.get(str(given.get("preset")), {}))
-        prior = by_kind(given.get("elastic_prior"))
+    def _take_over_preset(cls, options: Any) -> Any:
+        if not isinstance(options, Mapping):
+            return options
+        preset = dict(PRESETS.get(str(options.get("preset")), {}))
+        prior = by_kind(options.get("elastic_prior"))
         if isinstance(prior, Mapping) and "kind" not in prior and "elastic_prior" in preset:
-            given = {**given, "elastic_prior": {**preset["elastic_prior"], **prior}}
-        return {**preset, **given}
+            options = {**options, "elastic_prior": {**preset["elastic_prior"], **prior}}
+        return {**preset, **options}
 
     @model_validator(mode="after")
     def _is_proper(self) -> ModelConfig:
@@ -162,13 +162,13 @@ class ModelConfig(Section):
         ------
         ValueError
         """
-        known = self.known(tissues)
+        fixed = self.known(tissues)
         elastic = self.elastic_prior
         case = "a given boundary" if elastic.samples_no_node else f"elastic_prior: {elastic.kind}, normalised,"
         needed = elastic.normalised or elastic.samples_no_node
         for name, tissue in product(get_args(Lame), tissues if needed else ()):
             prior = of_tissue(self, self.priors.get(name), tissue) or PriorConfig()
-            if math.isinf(prior.high) and of_tissue(self, known.get(name), tissue) is None:
+            if math.isinf(prior.high) and of_tissue(self, fixed.get(name), tissue) is None:
                 raise wrong(
                     f"priors.{name}",
                     f"{case} needs a prior with a finite high (r2) for every free parameter, and {name} of "
@@ -192,8 +192,8 @@ def is_reserved_name(name: str) -> bool:
     return name in TAKEN or name.startswith("prior_")
 
 
-def of_tissue(model: ModelConfig, given: Any, tissue: str) -> Any:
+def of_tissue(model: ModelConfig, option: Any, tissue: str) -> Any:
     """Return the option of one tissue, from one value for all or a mapping by tissue; None if it is not given."""
-    if not isinstance(given, Mapping):
-        return given
-    return next(iter(given.values()), None) if model.elasticity == "uniform" else given.get(tissue)
+    if not isinstance(option, Mapping):
+        return option
+    return next(iter(option.values()), None) if model.elasticity == "uniform" else option.get(tissue)

@@ -270,14 +270,14 @@ def lame_parameter(
     entries = {"uniform": 1, "element": len(mesh.cells)}.get(model.elasticity, len(mesh.names))
     prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
     fixed = model.known(mesh.names)
-    known = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
+    fixed_values = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
     if reference is None:
         start = _within(prior, _default_reference(name, mesh, model, entries))
     else:
         start = np.asarray(reference[name], float)
     if start.shape != (entries,) or not (np.isfinite(start) & (start > 0)).all():
         raise InputError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
-    values = np.array([s if k is None else float(k) for s, k in zip(start, known, strict=True)])
+    values = np.array([s if k is None else float(k) for s, k in zip(start, fixed_values, strict=True)])
     alpha, beta = (np.array([float(getattr(p, name)) for p in prior]) for name in ("alpha", "beta"))
     return LameParameter(
         alpha=jnp.asarray(alpha),
@@ -285,7 +285,7 @@ def lame_parameter(
         low=jnp.array([float(p.low) for p in prior]),
         high=jnp.array([float(p.high) for p in prior]),
         log_beta=jnp.asarray(betaln(alpha, beta)),
-        free=FreeEntries(np.array([k is None for k in known])),
+        free=FreeEntries(np.array([k is None for k in fixed_values])),
         at_rest=jnp.asarray(values),
     )
 
@@ -302,15 +302,15 @@ def _within(prior: list[PriorConfig], values: Float[np.ndarray, "entries"]) -> F
     return np.where((values > low) & (values < high), values, inside)
 
 
-def _by_entry(where: str, given: object, default: object, mesh: TetMesh, model: ModelConfig, entries: int) -> list:
+def _by_entry(where: str, option: object, default: object, mesh: TetMesh, model: ModelConfig, entries: int) -> list:
     """Return one option for each entry of λ or μ, from one value for all or a mapping by tissue."""
-    if not isinstance(given, Mapping):
-        return [default if given is None else given] * entries
-    unknown = set(given) - set(mesh.names)
+    if not isinstance(option, Mapping):
+        return [default if option is None else option] * entries
+    unknown = set(option) - set(mesh.names)
     if unknown:
         raise InputError(f"model.{where} names {sorted(unknown)}, but the mesh's tissues are {list(mesh.names)}")
-    if model.elasticity == "uniform" and len(set(given.values())) > 1:
-        raise InputError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(given)}")
+    if model.elasticity == "uniform" and len(set(option.values())) > 1:
+        raise InputError(f"model.{where} gives tissues different values, but elasticity is uniform: {dict(option)}")
     tissues = {"uniform": mesh.names[:1], "element": [mesh.names[t] for t in mesh.tissue]}
-    options = (of_tissue(model, given, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
+    options = (of_tissue(model, option, tissue) for tissue in tissues.get(model.elasticity, mesh.names))
     return [default if value is None else value for value in options]

@@ -38,7 +38,7 @@ class Problem(NamedTuple):
 
     def without_term(self, name: str) -> Problem:
         """Return the problem without one term, if it has this term."""
-        return self._replace(terms={other: term for other, term in self.terms.items() if other != name})
+        return self._replace(terms={term_name: term for term_name, term in self.terms.items() if term_name != name})
 
 
 def registration(problem: Problem, guess: Float[AnyArray, "nodes 3"] | None = None) -> None:

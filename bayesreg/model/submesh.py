@@ -23,7 +23,7 @@ from bayesreg.mesh import TetMesh
 EDGES = tuple(combinations(range(4), 2))
 
 
-def submesh_variance(mesh: TetMesh, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "cells 3"]:
+def discretisation_variance(mesh: TetMesh, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "cells 3"]:
     """Compute the mean square of the discretisation error of a displacement over every tetrahedron, by component.
 
     Parameters
@@ -63,7 +63,7 @@ def _products() -> Float[np.ndarray, "6 6"]:
     """
     means = np.empty((6, 6))
     for p, edge in enumerate(EDGES):
-        for q, other in enumerate(EDGES):
-            powers = np.bincount([*edge, *other], minlength=4)
+        for q, other_edge in enumerate(EDGES):
+            powers = np.bincount([*edge, *other_edge], minlength=4)
             means[p, q] = 16 * 6 * np.prod([factorial(power) for power in powers]) / factorial(7)
     return means

@@ -12,10 +12,10 @@ from matplotlib.ticker import MaxNLocator
 
 from bayesreg.io.atomic import replacing, write_text
 from bayesreg.report import style
-from bayesreg.report.page import Opening, Part, write_page
+from bayesreg.report.page import Opening, PageSection, write_page
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import Verdict, fixed, number
+from bayesreg.report.verdict import Verdict, decimal_text, number
 
 TABLE, PARQUET, PAGE = "cohort.csv", "cohort.parquet", "cohort.html"
 # A cohort of more runs is drawn without their names.
@@ -60,8 +60,8 @@ def write_cohort(table: pd.DataFrame, out: Path) -> None:
         verdicts=[("", Verdict(sound, headline, ""))],
         warnings=failures,
     )
-    parts = [Part("Runs", [_table(finished), _stiffness(finished)])] if len(finished) else []
-    write_page(out / PAGE, opening, parts)
+    sections = [PageSection("Runs", [_table(finished), _stiffness(finished)])] if len(finished) else []
+    write_page(out / PAGE, opening, sections)
 
 
 def _table(finished: pd.DataFrame) -> Table:
@@ -79,8 +79,8 @@ def _table(finished: pd.DataFrame) -> Table:
 
 
 def _text(value: Any) -> str:
-    known = value is not None and np.isfinite(value)
-    return (fixed(value) if abs(value) < 1000 else number(value)) if known else number(None)
+    is_finite = value is not None and np.isfinite(value)
+    return (decimal_text(value) if abs(value) < 1000 else number(value)) if is_finite else number(None)
 
 
 def _stiffness(finished: pd.DataFrame) -> Drawing:

@@ -12,7 +12,7 @@ from bayesreg.report import panels, parameters, style, tables
 from bayesreg.report.convergence import distributions, key_table
 from bayesreg.report.marginals import ratio_panel
 from bayesreg.report.metrics import divergence
-from bayesreg.report.page import Opening, Part, write_page
+from bayesreg.report.page import Opening, PageSection, write_page
 from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
 from bayesreg.report.verdict import approximation
@@ -47,12 +47,12 @@ def write_comparison(runs: Sequence[tuple], path: str | Path) -> None:
     title = " against ".join(named) if len(named) == 2 else "Comparison of " + ", ".join(named)
     verdicts = [(name, study.verdict) for name, study in named.items()]
     opening = Opening("Bayesian elastic registration · comparison", title, verdicts=verdicts, warnings=_warnings(named))
-    parts = [
-        Part("Registration", [*errors, _maps(named)]),
-        Part("Stiffness", [_ratios(named), *stiffness]),
-        Part("Convergence and cost", [key_table(named), distributions(named)]),
+    sections = [
+        PageSection("Registration", [*errors, _maps(named)]),
+        PageSection("Stiffness", [_ratios(named), *stiffness]),
+        PageSection("Convergence and cost", [key_table(named), distributions(named)]),
     ]
-    write_page(path, opening, parts)
+    write_page(path, opening, sections)
 
 
 def _names(studies: Sequence[Study]) -> list[str]:
@@ -87,7 +87,7 @@ def _maps(named: dict[str, Study]) -> Drawing:
     """Draw the paper's Fig. 3: error, standard deviation and divergence of every run on one plane, on common scales."""
     studies = list(named.values())
     first = studies[0].view
-    views, plane = [first.on(study.run) for study in studies], first.main
+    views, plane = [first.view_of(study.run) for study in studies], first.main
     rows = {"posterior sd, mm": [view.norm(plane, view.run.u_sd) for view in views]}
     if all(view.run.truth is not None for view in views):
         rows = {"|ū − u|, mm": [view.norm(plane, panels.error_of(view.run)) for view in views]} | rows
@@ -115,10 +115,10 @@ def _ratios(named: dict[str, Study]) -> Drawing:
     """Draw the paper's Fig. 4 for every run, one row each."""
     with style.look():
         figure = style.new_figure(2.5 * len(named))
-        parts = figure.subfigures(len(named), 1, squeeze=False)
-        for part, (name, study) in zip(parts[:, 0], named.items(), strict=True):
-            part.suptitle(style.literal(name), fontsize=9, weight="bold", x=0.005, ha="left")
-            panels_of_run = part.subplots(1, len(study.parameters), squeeze=False)[0]
+        subfigures = figure.subfigures(len(named), 1, squeeze=False)
+        for subfigure, (name, study) in zip(subfigures[:, 0], named.items(), strict=True):
+            subfigure.suptitle(style.literal(name), fontsize=9, weight="bold", x=0.005, ha="left")
+            panels_of_run = subfigure.subplots(1, len(study.parameters), squeeze=False)[0]
             for panel, group in zip(panels_of_run, study.parameters, strict=True):
                 ratio_panel(panel, study.run, group)
         uri = style.data_uri(figure, "svg")

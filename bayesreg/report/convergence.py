@@ -120,9 +120,9 @@ def _symbolic(name: str) -> str:
 
 
 def _draw_trace(axes: Axes, trace: Trace, total: int) -> None:
-    at = np.linspace(0, total - 1, trace.draws.shape[1])
+    draw_numbers = np.linspace(0, total - 1, trace.draws.shape[1])
     for chain, colour in zip(trace.draws, style.chain_colours(len(trace.draws)), strict=True):
-        axes.plot(at, chain, color=colour, lw=0.55, alpha=0.85)
+        axes.plot(draw_numbers, chain, color=colour, lw=0.55, alpha=0.85)
     axes.set_title(trace.name, fontsize=8.5, pad=3)
     axes.set_title(trace.note, fontsize=7, color=style.MUTED, loc="right", pad=3)
     axes.set_xlim(0, max(1, total - 1))

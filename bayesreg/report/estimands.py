@@ -87,7 +87,9 @@ def estimands(mesh: TetMesh, diagnosed: Diagnosed, posterior: xr.Dataset) -> lis
 def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[Estimand]:
     name = str(draws.name)
     dims = [dim for dim in draws.dims if dim not in ("chain", "draw")]
-    figures = np.stack([np.asarray(part[name].transpose(*dims).to_numpy(), float) for part in diagnosed], axis=-1)
+    figures = np.stack(
+        [np.asarray(statistic[name].transpose(*dims).to_numpy(), float) for statistic in diagnosed], axis=-1
+    )
     sampled = ~np.isnan(figures).all(axis=-1)
     if name == DISPLACEMENT:
         sampled[...] = True
@@ -97,8 +99,8 @@ def _entries(mesh: TetMesh, diagnosed: Diagnosed, draws: xr.DataArray) -> list[E
     naming = _Naming(name, mesh, *_coordinates(draws, dims))
     indices = [tuple(index) for index in np.argwhere(sampled).tolist()]
     places = [naming.place(index) for index in indices]
-    known = [place for place in places if place is not None]
-    words = iter(regions(mesh, np.array(known).reshape(-1, 3)))
+    existing_places = [place for place in places if place is not None]
+    words = iter(regions(mesh, np.array(existing_places).reshape(-1, 3)))
     where = ["" if place is None else next(words) for place in places]
     entries = []
     for index, place, region in zip(indices, places, where, strict=True):

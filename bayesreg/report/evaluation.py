@@ -6,12 +6,12 @@ import numpy as np
 from scipy import stats
 
 from bayesreg.io.records import Predicted
-from bayesreg.model.observations.landmarks_report import surprise
+from bayesreg.model.observations.landmarks_report import region_probability
 from bayesreg.report import style
 from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import fixed
+from bayesreg.report.verdict import decimal_text
 from bayesreg.results.transform import distances_of
 
 LEVELS = (0.5, 0.9, 0.95)
@@ -33,14 +33,14 @@ def evaluation_table(study: Study) -> Table | None:
         )
         return Table("Target registration error", caption, [""], [])
     rows = [
-        [name, *(fixed(float(value)) for value in (x.mean(), np.median(x), np.quantile(x, 0.95), x.max()))]
+        [name, *(decimal_text(float(value)) for value in (x.mean(), np.median(x), np.quantile(x, 0.95), x.max()))]
         for name, x in {
             "By the headers": np.asarray(predicted.evaluation_before)[inside],
             "By the pose alone": np.asarray(predicted.evaluation_posed)[inside],
             "By the posterior mean": after[inside],
         }.items()
     ]
-    probability = _surprise(predicted)
+    probability = _region_probability(predicted)
     shares = [f"{(probability <= level).mean():.0%} lie in their regions of {level:.0%}" for level in LEVELS]
     caption = (
         f"Distances, mm, of predicted places from where {len(probability)} landmarks lie in the moving image. The "
@@ -65,7 +65,7 @@ def evaluation(study: Study) -> Drawing | None:
         return None
     after = np.linalg.norm(predicted.evaluation_residual, axis=1)[inside]
     radius = distances_of(np.asarray(predicted.evaluation_covariance)[inside]).radius
-    probability = np.sort(_surprise(predicted))
+    probability = np.sort(_region_probability(predicted))
     count = len(probability)
     with style.look():
         figure = style.new_figure(3.4)
@@ -101,10 +101,10 @@ def evaluation(study: Study) -> Drawing | None:
     return Drawing("held-out", "Landmarks that were held out", caption, alt, uri)
 
 
-def _surprise(predicted: Predicted) -> np.ndarray:
+def _region_probability(predicted: Predicted) -> np.ndarray:
     """Return, for each held-out landmark in the mesh, the probability of the smallest region that contains it."""
     inside = np.asarray(predicted.evaluation_inside)
     residual, covariance = (
         np.asarray(x)[inside] for x in (predicted.evaluation_residual, predicted.evaluation_covariance)
     )
-    return surprise(residual, covariance)
+    return region_probability(residual, covariance)

@@ -12,7 +12,7 @@ from bayesreg.report.page import Opening, write_page
 from bayesreg.report.sections import SECTIONS
 from bayesreg.report.study import Study
 from bayesreg.report.summary import answers
-from bayesreg.report.verdict import approximation, part, warnings_of
+from bayesreg.report.verdict import approximation, nested_entry, warnings_of
 
 
 def write_report(
@@ -28,7 +28,7 @@ def write_report(
         The HTML file; replaced in one step.
     """
     study = Study(run, idata, rhat, ess_bulk, ess_tail)
-    write_page(path, _opening(study), [section.on(study) for section in SECTIONS if section.applies(study)])
+    write_page(path, _opening(study), [section.page_section(study) for section in SECTIONS if section.applies(study)])
 
 
 def _opening(study: Study) -> Opening:
@@ -49,7 +49,7 @@ def _describe(study: Study) -> str:
     if study.samples_nodes:
         nodes = study.posterior.sizes["node"]
         unknowns = f"Joint posterior of the displacement at {nodes:,} nodes and the elastic parameters"
-    exact = {True: " (exact)", False: " (approximate)"}.get(part(study.manifest, "exact"), "")
-    sampler = part(study.manifest, "sampler", "name")
-    parts = [unknowns, study.elasticity and f"parameters {study.elasticity.lower()}", sampler and f"{sampler}{exact}"]
-    return " · ".join(text for text in parts if text)
+    exact = {True: " (exact)", False: " (approximate)"}.get(nested_entry(study.manifest, "exact"), "")
+    sampler = nested_entry(study.manifest, "sampler", "name")
+    phrases = [unknowns, study.elasticity and f"parameters {study.elasticity.lower()}", sampler and f"{sampler}{exact}"]
+    return " · ".join(text for text in phrases if text)

@@ -14,7 +14,7 @@ from bayesreg.report import style
 from bayesreg.report.estimands import Group, sampled_scales, symbol_of
 from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
-from bayesreg.report.verdict import number, part
+from bayesreg.report.verdict import nested_entry, number
 from bayesreg.tissues import colours_of, label_of
 
 BINS = 32
@@ -84,7 +84,7 @@ def _scale_panel(axes: Axes, study: Study, name: str) -> None:
     histogram(axes, np.asarray(study.posterior[name].transpose("chain", "draw").to_numpy(), float), style.UNIFORM, [])
     symbol = symbol_of(name)
     axes.set_xlabel(f"${symbol}$" if symbol in ("T_s", "T_r") else style.literal(symbol))
-    prior = part(study.manifest, "scales", name)
+    prior = nested_entry(study.manifest, "scales", name)
     if isinstance(prior, Mapping):
         low, high = axes.get_xlim()
         x = np.linspace(max(low, 1e-9 * high), high, 300)
@@ -127,14 +127,14 @@ def _point_out(axes: Axes, edges: np.ndarray, marks: Sequence[Mark], logarithmic
     scale = np.log10 if logarithmic else np.asarray
     first, last = scale(edges[0]), scale(edges[-1])
     for index, mark in enumerate(marks):
-        at = scale(mark.value) if mark.value > 0 or not logarithmic else -np.inf
+        position = scale(mark.value) if mark.value > 0 or not logarithmic else -np.inf
         settings: dict[str, Any] = {"color": mark.colour, "fontsize": 7, "va": "top"}
-        if first - FAR * (last - first) <= at <= last + FAR * (last - first):
+        if first - FAR * (last - first) <= position <= last + FAR * (last - first):
             axes.axvline(mark.value, color=mark.colour, ls=(0, (4, 2)), lw=1.2)
             settings |= {"transform": axes.get_xaxis_transform(), "rotation": 90, "ha": "right"}
             axes.text(mark.value, 0.99, f"{mark.label} ", **settings)
         else:
-            below = at < first
+            below = position < first
             text = f"← {mark.label} {number(mark.value)}" if below else f"{mark.label} {number(mark.value)} →"
             settings |= {"transform": axes.transAxes, "ha": "left" if below else "right"}
             axes.text(0.0 if below else 1.0, 0.98 - 0.09 * index, text, **settings)

@@ -18,7 +18,7 @@ from bayesreg.report.estimands import symbol_of
 from bayesreg.report.places import regions
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import NONE, number, part, place_text
+from bayesreg.report.verdict import NONE, nested_entry, number, place_text
 
 
 def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
@@ -30,19 +30,19 @@ def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
     elastography : bool
         Whether the displacement of the boundary is given; then it has no prior.
     """
-    elastic = part(manifest, "model", "elastic_prior") or {}
+    elastic = nested_entry(manifest, "model", "elastic_prior") or {}
     loads, normalised = elastic.get("kind") == "loads", elastic.get("normalised")
     priors = {
         " + log p(<var>u</var> | λ, μ, random loads)": loads,
         " − <var>E</var><sub>r</sub> / <var>T</var><sub>r</sub>": not loads,
         " − log <var>Z</var>(λ, μ, <var>T</var><sub>r</sub>)": normalised and not loads,
-        " + log p(rigid motion of <var>u</var>)": part(manifest, "model", "rigid_sd") is not None,
+        " + log p(rigid motion of <var>u</var>)": nested_entry(manifest, "model", "rigid_sd") is not None,
     }
     observed = [
         _kind(observation).log_density(str(escape(name))) for name, observation in observations_of(manifest).items()
     ]
     prior = "".join(text for text, holds in priors.items() if holds and not elastography)
-    scales = [f" + log p({_symbol(name)})" for name in part(manifest, "scales") or {}]
+    scales = [f" + log p({_symbol(name)})" for name in nested_entry(manifest, "scales") or {}]
     total = "".join(observed) + prior + " + log p(λ) + log p(μ)" + "".join(scales)
     return Markup(re.sub("^ − ", "−", total).removeprefix(" + "))
 
@@ -95,7 +95,7 @@ def shown_by_kinds(manifest: Mapping[str, Any], mesh: TetMesh, predicted: Predic
 
 def observations_of(manifest: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
     """Return the descriptions of the observations in run.json, by name."""
-    return part(manifest, "observations") or {}
+    return nested_entry(manifest, "observations") or {}
 
 
 def _kind(described: Mapping[str, Any]) -> type[ObservationSection]:

@@ -29,7 +29,7 @@ class Sentences(NamedTuple):
 Item = Drawing | Table | Sentences | Markup
 
 
-class Part(NamedTuple):
+class PageSection(NamedTuple):
     """A section of a page as it is shown."""
 
     title: str
@@ -66,10 +66,10 @@ class Opening(NamedTuple):
     warnings: Sequence[str] = ()
 
 
-def write_page(path: str | Path, opening: Opening, parts: Iterable[Part]) -> None:
+def write_page(path: str | Path, opening: Opening, sections: Iterable[PageSection]) -> None:
     """Write a page; sections without content are left out."""
-    shown = [part for part in parts if part.items]
-    write_text(path, render("page.html", {**opening._asdict(), "parts": shown}))
+    shown = [section for section in sections if section.items]
+    write_text(path, render("page.html", {**opening._asdict(), "sections": shown}))
 
 
 def render(template: str, content: Mapping[str, Any]) -> str:

@@ -53,7 +53,7 @@ class View:
             run, planes_through(run.mesh, run.mesh.points[(u**2).sum(axis=1).argmax()] if point is None else point)
         )
 
-    def on(self, run: Run) -> View:
+    def view_of(self, run: Run) -> View:
         """Make a view of another run on these planes."""
         return View(run, self.planes)
 
@@ -224,9 +224,9 @@ def arrows(axes: Axes, view: View, plane: Plane, u: np.ndarray) -> None:
     stride = max(1, picture.shape[1] // 16)
     slices = (slice(stride // 2, None, stride),) * 2
     across, up = IN_PLANE[plane.axis]
-    at, displacement = plane.points()[slices], picture[slices]
+    points, displacement = plane.points()[slices], picture[slices]
     axes.quiver(
-        *(at[..., across], at[..., up], displacement[..., across], displacement[..., up]),
+        *(points[..., across], points[..., up], displacement[..., across], displacement[..., up]),
         angles="xy",
         scale_units="xy",
         scale=1,

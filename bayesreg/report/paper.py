@@ -54,8 +54,8 @@ def data(study: Study) -> Drawing:
 def result(study: Study) -> Drawing:
     """Draw Fig. 3: error if the truth is known (else |ū|), standard deviation, divergence, warped image."""
     run, view, plane = study.run, study.view, study.view.main
-    known = run.truth is not None
-    first = ("|ū − u|", panels.error_of(run), style.ERROR) if known else ("|ū|", run.u_mean, style.MAGNITUDE)
+    has_truth = run.truth is not None
+    first = ("|ū − u|", panels.error_of(run), style.ERROR) if has_truth else ("|ū|", run.u_mean, style.MAGNITUDE)
     shown = [first, ("posterior sd of u", run.u_sd, style.ERROR)]
     with style.look():
         figure, axes = _rows(plane, 1)
@@ -71,7 +71,7 @@ def result(study: Study) -> Drawing:
     caption = (
         f"Plane: {plane.title}. The standard deviation is the root of the summed variances of the three components."
     )
-    caption += "" if known else " No truth is known."
+    caption += "" if has_truth else " No truth is known."
     return Drawing("result", "Fig. 3: error and uncertainty", caption, "Four panels on one plane.", uri)
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 from bayesreg.report.estimands import SYMBOLS, Group, sampled_scales, symbol_of
 from bayesreg.report.study import Study
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import NONE, number, part, rhat_text, threshold_of
+from bayesreg.report.verdict import NONE, nested_entry, number, rhat_text, threshold_of
 from bayesreg.tissues import label_of
 
 # A parameter is identified if its central 90 % interval spans less than a factor of ten.
@@ -62,12 +62,12 @@ def describe_bounds(draws: np.ndarray, prior: Interval | None = None) -> str:
         "undefined", "fixed", "identified", "weakly identified", "only an upper bound", "only a lower bound" or "not
         identified".
     """
-    known = draws[np.isfinite(draws)]
-    if known.size == 0:
+    finite = draws[np.isfinite(draws)]
+    if finite.size == 0:
         return "undefined"
-    if np.ptp(known) == 0:
+    if np.ptp(finite) == 0:
         return "fixed"
-    first, q01, low, median, high, q99, last = np.quantile(known, (0.025, 0.01, 0.05, 0.5, 0.95, 0.99, 0.975))
+    first, q01, low, median, high, q99, last = np.quantile(finite, (0.025, 0.01, 0.05, 0.5, 0.95, 0.99, 0.975))
     if prior is not None and last - first > PRIOR_SHARE * (prior.high - prior.low):
         return "not identified"
     if median > REACHES_ZERO * q01:
@@ -108,8 +108,8 @@ def parameter_table(study: Study) -> Table:
     groups = [(label_of(group.name), _group_rows(study, index, group)) for index, group in enumerate(study.parameters)]
     rows = []
     for name in sampled_scales(study.posterior):
-        known = part(study.manifest, "scales", name)
-        draws, prior = study.posterior[name].to_numpy(), prior_of_scale(known) if known else None
+        scale_prior = nested_entry(study.manifest, "scales", name)
+        draws, prior = study.posterior[name].to_numpy(), prior_of_scale(scale_prior) if scale_prior else None
         rows.append(_row(study, symbol_of(name), draws, (name, 0), prior, describe_bounds(draws, prior)))
     groups += [("Scales", rows)] if rows else []
     header, caption = list(HEADER), CAPTION
@@ -122,7 +122,7 @@ def parameter_table(study: Study) -> Table:
 
 
 def _group_rows(study: Study, index: int, group: Group) -> list[list[str]]:
-    model = part(study.manifest, "model") or {}
+    model = nested_entry(study.manifest, "model") or {}
     entry = None if group.lam.shape[-1] > 1 else index
     rows = [_row(study, SYMBOLS["ratio"], group.ratio, ("ratio", entry), None, describe_bounds(group.ratio))]
     for name in LAME:
@@ -133,18 +133,23 @@ def _group_rows(study: Study, index: int, group: Group) -> list[list[str]]:
 
 
 def _row(
-    study: Study, symbol: str, draws: np.ndarray, entry: tuple[str, int | None], prior: Interval | None, said: str
+    study: Study,
+    symbol: str,
+    draws: np.ndarray,
+    entry: tuple[str, int | None],
+    prior: Interval | None,
+    description: str,
 ) -> list[str]:
-    known = draws[np.isfinite(draws)]
-    if said in ("fixed", "undefined"):
-        value = number(float(known[0])) if known.size else NONE
-        return [symbol, value, said, *[NONE] * 4]
-    low, median, high = (float(x) for x in np.quantile(known, (0.025, 0.5, 0.975)))
+    finite = draws[np.isfinite(draws)]
+    if description in ("fixed", "undefined"):
+        value = number(float(finite[0])) if finite.size else NONE
+        return [symbol, value, description, *[NONE] * 4]
+    low, median, high = (float(x) for x in np.quantile(finite, (0.025, 0.5, 0.975)))
     rhat, bulk, tail = _figures(study, *entry)
-    said = "the chains disagree" if rhat >= threshold_of(study.manifest) else said
+    description = "the chains disagree" if rhat >= threshold_of(study.manifest) else description
     prior_text = "improper" if prior is None else prior.text
     least = number(float(np.fmin(bulk, tail)))
-    return [symbol, number(median), Interval(low, high).text, prior_text, said, _rhat(rhat), least]
+    return [symbol, number(median), Interval(low, high).text, prior_text, description, _rhat(rhat), least]
 
 
 def _rhat(rhat: float) -> str:

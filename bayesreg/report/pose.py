@@ -7,18 +7,18 @@ import numpy as np
 from bayesreg.report.page import Sentences
 from bayesreg.report.study import Study
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import fixed, part, place_text
+from bayesreg.report.verdict import decimal_text, nested_entry, place_text
 
 NAMES = [
-    f"{what} {axis}, {unit}"
-    for what, unit in (("shift along", "mm"), ("turn about", "°"))
+    f"{motion} {axis}, {unit}"
+    for motion, unit in (("shift along", "mm"), ("turn about", "°"))
     for axis in ("x (R)", "y (A)", "z (S)")
 ]
 
 
 def notes(study: Study) -> Sentences | None:
     """List the findings on pose and contrast from before the search, a sentence each; None without findings."""
-    sentences = part(study.manifest, "appraisal", "notes")
+    sentences = nested_entry(study.manifest, "appraisal", "notes")
     return Sentences("What was found of the images", list(sentences)) if sentences else None
 
 
@@ -26,7 +26,7 @@ def pose_table(study: Study) -> Table:
     """Make a table of the rigid part of the organ's displacement: mean, sd and 95 % interval of its six numbers."""
     draws = np.asarray(study.predicted.motion).reshape(-1, 6)
     figures = np.stack([draws.mean(axis=0), draws.std(axis=0), *np.quantile(draws, (0.025, 0.975), axis=0)], axis=1)
-    rows = [[name, *(fixed(value, 3) for value in row)] for name, row in zip(NAMES, figures, strict=True)]
+    rows = [[name, *(decimal_text(value, 3) for value in row)] for name, row in zip(NAMES, figures, strict=True)]
     caption = (
         f"Shift of the organ’s centre, {place_text(study.predicted.centre)}, and turn about it (world RAS): the rigid "
         "motion nearest to each draw of the displacement, the pose included."

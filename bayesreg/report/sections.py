@@ -23,10 +23,10 @@ from bayesreg.report import (
     trust,
     uncertainty,
 )
-from bayesreg.report.page import Item, Part, render
+from bayesreg.report.page import Item, PageSection, render
 from bayesreg.report.study import Study
 from bayesreg.report.three_d import three_d
-from bayesreg.report.verdict import part
+from bayesreg.report.verdict import nested_entry
 
 Draw = Callable[[Study], Item | list[Item] | None]
 
@@ -51,13 +51,13 @@ class Section(NamedTuple):
     draws: Sequence[Draw]
     applies: Callable[[Study], bool] = _always
 
-    def on(self, study: Study) -> Part:
+    def page_section(self, study: Study) -> PageSection:
         """Draw the section for a run."""
         items: list[Item] = []
         for draw in self.draws:
-            made = draw(study)
-            items += made if isinstance(made, list) else [made] if made else []
-        return Part(self.title, items)
+            drawn = draw(study)
+            items += drawn if isinstance(drawn, list) else [drawn] if drawn else []
+        return PageSection(self.title, items)
 
 
 def _fit(study: Study) -> list[Item]:
@@ -81,7 +81,7 @@ def _model(study: Study) -> list[Item]:
         "formula": observations.formula(study.manifest, elastography),
         "explanations": observations.explanations(study.manifest),
         "images": study.run.fixed is not None,
-        "hard_wall": part(study.manifest, "model", "skull_width") == 0,
+        "hard_wall": nested_entry(study.manifest, "model", "skull_width") == 0,
         "skull": study.run.skull is not None,
         "elastography": elastography,
     }

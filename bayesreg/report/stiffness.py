@@ -42,18 +42,18 @@ def field(study: Study) -> Drawing | None:
     if predicted.stiffness_mean is None:
         return None
     mean, sd = np.asarray(predicted.stiffness_mean), np.asarray(predicted.stiffness_sd)
-    likely, times = np.asarray(predicted.stiffer_probability), float(np.asarray(predicted.stiffer))
+    likely, factor = np.asarray(predicted.stiffer_probability), float(np.asarray(predicted.stiffer))
     span = float(np.abs(np.log(mean)).max()) + 1e-3
     most = int(mean.argmax())
     view = View.of(study.run, mesh.points[mesh.cells[most]].mean(axis=0))
     rows = [
         Row("mean", lambda plane: view.slice(plane).cellwise(mean), style.SIGNED, LogNorm(np.exp(-span), np.exp(span))),
         Row("sd", lambda plane: view.slice(plane).cellwise(sd), style.ERROR, panels.from_zero(sd)),
-        Row(f"P(> {times:g})", lambda plane: view.slice(plane).cellwise(likely), style.MAGNITUDE, Normalize(0, 1)),
+        Row(f"P(> {factor:g})", lambda plane: view.slice(plane).cellwise(likely), style.MAGNITUDE, Normalize(0, 1)),
     ]
     caption = (
         "Stiffness of every tetrahedron over the geometric mean of its tissue: posterior mean, standard deviation, and "
-        f"probability of more than {times:g} times, through the stiffest tetrahedron ({number(float(mean[most]))} ± "
+        f"probability of more than {factor:g} times, through the stiffest tetrahedron ({number(float(mean[most]))} ± "
         f"{number(float(sd[most]))} times)."
     )
     return Drawing(

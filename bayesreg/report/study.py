@@ -19,7 +19,7 @@ from bayesreg.report.grouping import Grouping, grouping
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.report.panels import View
 from bayesreg.report.slices import sample
-from bayesreg.report.verdict import Verdict, part, verdict
+from bayesreg.report.verdict import Verdict, nested_entry, verdict
 from bayesreg.types import InputError
 
 ELASTICITY = {"tissue": "By tissue", "uniform": "Uniform", "element": "By element", "field": "By tissue, with a field"}
@@ -125,7 +125,7 @@ class Study:
     @property
     def is_of_the_paper(self) -> bool:
         """Whether the model is that of the paper."""
-        return part(self.manifest, "model", "preset") == "paper"
+        return nested_entry(self.manifest, "model", "preset") == "paper"
 
     @property
     def samples_nodes(self) -> bool:
@@ -135,7 +135,7 @@ class Study:
     @property
     def elasticity(self) -> str:
         """The variation of the elastic parameters, in words."""
-        return ELASTICITY.get(str(part(self.manifest, "model", "elasticity")), "")
+        return ELASTICITY.get(str(nested_entry(self.manifest, "model", "elasticity")), "")
 
     @property
     def name(self) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesreg.report.places import regions
 from bayesreg.report.study import Study
-from bayesreg.report.verdict import fixed, number, part, percent, place_text
+from bayesreg.report.verdict import decimal_text, nested_entry, number, percent, place_text
 from bayesreg.types import AnyArray
 
 # At a place whose 95 % radius is larger, mm, the result is of little use to a surgeon.
@@ -47,14 +47,14 @@ def _held_out(study: Study) -> list[str]:
     before = np.asarray(predicted.evaluation_before)[inside].mean()
     after = np.linalg.norm(predicted.evaluation_residual, axis=1)[inside].mean()
     return [
-        f"Landmarks that were held out lie {fixed(after, 1)} mm (mean) from their true place; before, "
-        f"{fixed(before, 1)} mm."
+        f"Landmarks that were held out lie {decimal_text(after, 1)} mm (mean) from their true place; before, "
+        f"{decimal_text(before, 1)} mm."
     ]
 
 
 def _fits(study: Study) -> list[str]:
     """Describe the size of the residuals of each observation, relative to the expectation of the model."""
-    observed = part(study.manifest, "observations") or {}
+    observed = nested_entry(study.manifest, "observations") or {}
     return [
         f"Residuals of {name.replace('_', ' ')}: {number(entry['residual_rms'], 2)} times what the model expects."
         for name, entry in observed.items()
@@ -68,8 +68,8 @@ def _pose(study: Study) -> str:
         return "The organ deformed; before and after share one coordinate system."
     motion = pose.about(study.mesh.points.mean(axis=0))
     return (
-        f"The organ lies {fixed(motion.millimetres, 1)} mm and {fixed(motion.degrees, 1)}° from where the header of "
-        "the moving image has it; it deformed besides."
+        f"The organ lies {decimal_text(motion.millimetres, 1)} mm and {decimal_text(motion.degrees, 1)}° from where "
+        "the header of the moving image has it; it deformed besides."
     )
 
 
@@ -77,16 +77,16 @@ def _size(study: Study) -> str:
     length = np.linalg.norm(study.run.u_mean, axis=1)
     middle, most = _quantile(study, length, 0.5), int(length.argmax())
     return (
-        f"Half of the organ moved more than {fixed(middle, 1)} mm; the most, {fixed(length[most], 1)} mm, is at "
-        f"{_place(study, most)}."
+        f"Half of the organ moved more than {decimal_text(middle, 1)} mm; the most, {decimal_text(length[most], 1)} "
+        f"mm, is at {_place(study, most)}."
     )
 
 
 def _certainty(study: Study) -> str:
     near, far = (_quantile(study, study.predicted.reach, level) for level in (0.5, 0.9))
     return (
-        f"With a probability of 95 % a point lies within a radius of its mean place: at most {fixed(near)} mm in half "
-        f"of the organ, at most {fixed(far)} mm in nine tenths."
+        f"With a probability of 95 % a point lies within a radius of its mean place: at most {decimal_text(near)} mm "
+        f"in half of the organ, at most {decimal_text(far)} mm in nine tenths."
     )
 
 
@@ -94,7 +94,7 @@ def _doubt(study: Study) -> str:
     radius = np.asarray(study.predicted.reach)
     least, share = int(radius.argmax()), study.mesh.nodal_volumes / study.mesh.nodal_volumes.sum()
     coarse = float(share[radius > COARSE].sum())
-    text = f"The radius is greatest at {_place(study, least)}: {fixed(radius[least], 1)} mm. "
+    text = f"The radius is greatest at {_place(study, least)}: {decimal_text(radius[least], 1)} mm. "
     text += f"In {percent(coarse)} of the organ it is above {COARSE:g} mm. " if coarse else ""
     return text + "The result says nothing of what lies outside the mesh."
 

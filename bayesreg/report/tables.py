@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from bayesreg.report.metrics import WHOLE
-from bayesreg.report.verdict import fixed, number, percent
+from bayesreg.report.verdict import decimal_text, number, percent
 from bayesreg.tissues import BRAIN, label_of
 
 PAPER_TABLE_1 = {
@@ -46,23 +46,23 @@ def error_tables(
     """Make Tables 1 and 2 and the coverage of runs (name -> metrics), and add the paper's values on request."""
     first_prefix, second_prefix = ("Table 1. ", "Table 2. ") if with_paper else ("", "")
     columns = ("median", "q95", "max")
-    ours = _stages(metrics, "boundary_error", lambda error: [fixed(error.get(key)) for key in columns])
-    paper = [[name, *map(fixed, row)] for name, row in PAPER_TABLE_1.items()]
+    rows = _stages(metrics, "boundary_error", lambda error: [decimal_text(error.get(key)) for key in columns])
+    paper = [[name, *map(decimal_text, row)] for name, row in PAPER_TABLE_1.items()]
     caption = "Distance between estimated and true displacement of the boundary nodes, mm."
     first = Table(
-        first_prefix + "Error on the boundary", caption, ["", "Median", "95 %", "Max"], _beside(ours, paper, with_paper)
+        first_prefix + "Error on the boundary", caption, ["", "Median", "95 %", "Max"], _beside(rows, paper, with_paper)
     )
     regions = (WHOLE, *tissues)
-    ours = _stages(metrics, "mean_squared_error", lambda error: [number(error.get(key)) for key in regions])
-    paper = [[name, *(fixed(row.get(key), 3) for key in regions)] for name, row in PAPER_TABLE_2.items()]
+    rows = _stages(metrics, "mean_squared_error", lambda error: [number(error.get(key)) for key in regions])
+    paper = [[name, *(decimal_text(row.get(key), 3) for key in regions)] for name, row in PAPER_TABLE_2.items()]
     caption = "Mean squared error of the displacement over the domain Ω and each tissue, mm²."
     header = ["", "Ω", *(f"Ω {label_of(name)}" for name in tissues)]
-    second = Table(second_prefix + "Mean squared error", caption, header, _beside(ours, paper, with_paper))
+    second = Table(second_prefix + "Mean squared error", caption, header, _beside(rows, paper, with_paper))
     return [first, second, *_coverage(metrics)]
 
 
-def _beside(ours: list[list[str]], paper: list[list[str]], with_paper: bool) -> list[tuple[str, list[list[str]]]]:
-    return [("Here", ours), ("Paper", paper)] if with_paper else [("", ours)]
+def _beside(rows: list[list[str]], paper: list[list[str]], with_paper: bool) -> list[tuple[str, list[list[str]]]]:
+    return [("Here", rows), ("Paper", paper)] if with_paper else [("", rows)]
 
 
 def _stages(
@@ -77,17 +77,17 @@ def _stages(
             new = [[label, *row] for row in list(cells.values())[:1]]
         else:
             new = [[run if stage == "posterior_mean" else f"{label}: {run}", *row] for run, row in cells.items()]
-        rows += [row for row in new if stage == "posterior_mean" or row[1:] not in [known[1:] for known in rows]]
+        rows += [row for row in new if stage == "posterior_mean" or row[1:] not in [earlier[1:] for earlier in rows]]
     return rows
 
 
 def _coverage(metrics: Mapping[str, Mapping[str, Any]]) -> list[Table]:
     """Make a table of the coverage of true boundary displacements; empty if none was sampled."""
-    known = {name: figures["coverage"] for name, figures in metrics.items() if figures.get("coverage")}
-    if not known:
+    coverage_by_run = {name: figures["coverage"] for name, figures in metrics.items() if figures.get("coverage")}
+    if not coverage_by_run:
         return []
-    levels = list(next(iter(known.values())))
-    rows = [[name, *(percent(shares.get(level)) for level in levels)] for name, shares in known.items()]
+    levels = list(next(iter(coverage_by_run.values())))
+    rows = [[name, *(percent(shares.get(level)) for level in levels)] for name, shares in coverage_by_run.items()]
     header = ["", *(f"{100 * float(level):.0f} %" for level in levels)]
     caption = "Share of the true boundary displacements (each component) inside their central posterior intervals."
     return [Table("Coverage", caption, header, [("", rows)])]

@@ -39,13 +39,13 @@ class Surface(NamedTuple):
     u: Float[np.ndarray, "k 3"]
     faces: Int[np.ndarray, "t 3"]
 
-    def at(self, times: int) -> list[list[float]]:
-        """Return the coordinates x, y and z with the displacement multiplied by `times`."""
-        return np.round(self.points + times * self.u, 2).T.tolist()
+    def coordinates(self, enlargement: int) -> list[list[float]]:
+        """Return the coordinates x, y and z with the displacement multiplied by `enlargement`."""
+        return np.round(self.points + enlargement * self.u, 2).T.tolist()
 
     def drawn(self, **how: Any) -> go.Mesh3d:
         """Return the surface after the displacement."""
-        corners = dict(zip("xyzijk", (*self.at(1), *self.faces.T.tolist()), strict=True))
+        corners = dict(zip("xyzijk", (*self.coordinates(1), *self.faces.T.tolist()), strict=True))
         return go.Mesh3d(**corners, flatshading=False, **how)
 
 
@@ -97,8 +97,12 @@ def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]], labels: 
     """Make the scene without a frame, a slider for the displacement, and buttons for the colours."""
     which = list(range(len(surfaces)))
     steps = [
-        {"label": SHOWN.get(times, f"× {times}"), "method": "restyle", "args": [_moved(surfaces, times), which]}
-        for times in ENLARGED
+        {
+            "label": SHOWN.get(enlargement, f"× {enlargement}"),
+            "method": "restyle",
+            "args": [_moved(surfaces, enlargement), which],
+        }
+        for enlargement in ENLARGED
     ]
     buttons = [
         {"label": name, "method": "restyle", "args": [{key: [value] for key, value in scale.items()}, [0]]}
@@ -125,9 +129,9 @@ def _layout(surfaces: list[Surface], scales: dict[str, dict[str, Any]], labels: 
     }
 
 
-def _moved(surfaces: list[Surface], times: int) -> dict[str, list]:
+def _moved(surfaces: list[Surface], enlargement: int) -> dict[str, list]:
     """Return the coordinates of all surfaces, as a change to the figure."""
-    columns = zip(*(surface.at(times) for surface in surfaces), strict=True)
+    columns = zip(*(surface.coordinates(enlargement) for surface in surfaces), strict=True)
     return dict(zip("xyz", map(list, columns), strict=True))
 
 
@@ -151,8 +155,8 @@ def _ellipsoid(place: Place) -> Surface:
 
 def _label(place: Place) -> dict[str, Any]:
     """Draw the name of a place at its displaced place, in front of the scene."""
-    at = dict(zip("xyz", (place.point + place.region.mean).tolist(), strict=True))
-    return {**at, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6, **LABEL}
+    position = dict(zip("xyz", (place.point + place.region.mean).tolist(), strict=True))
+    return {**position, "text": escape(place.name), "showarrow": False, "xanchor": "left", "xshift": 6, **LABEL}
 
 
 def _fluid_faces(mesh: TetMesh) -> Int[np.ndarray, "t 3"]:

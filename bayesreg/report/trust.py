@@ -8,7 +8,7 @@ from typing import Any
 
 from bayesreg.report.page import Sentences
 from bayesreg.report.study import Study
-from bayesreg.report.verdict import number, part
+from bayesreg.report.verdict import nested_entry, number
 
 
 def explain(study: Study) -> Sentences | None:
@@ -24,8 +24,8 @@ def explain_intervals(manifest: Mapping[str, Any]) -> list[str]:
 
 def _correlated(manifest: Mapping[str, Any]) -> list[str]:
     sentences = []
-    for name, count in (part(manifest, "independent_points") or {}).items():
-        points = part(manifest, "observations", name, "values")
+    for name, count in (nested_entry(manifest, "independent_points") or {}).items():
+        points = nested_entry(manifest, "observations", name, "values")
         if not points or count > 0.99 * points:
             continue
         wider = math.sqrt(points / count)
@@ -40,8 +40,8 @@ def _correlated(manifest: Mapping[str, Any]) -> list[str]:
 def _outliers(manifest: Mapping[str, Any]) -> list[str]:
     similarities = [
         similarity
-        for name in part(manifest, "observations") or {}
-        if (similarity := part(manifest, "observations", name, "options", "similarity"))
+        for name in nested_entry(manifest, "observations") or {}
+        if (similarity := nested_entry(manifest, "observations", name, "options", "similarity"))
     ]
     forgiving = [settings["degrees_of_freedom"] for settings in similarities if settings["kind"] == "student_t"]
     if not forgiving:
@@ -53,7 +53,7 @@ def _outliers(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _folds(manifest: Mapping[str, Any]) -> list[str]:
-    share = part(manifest, "inverted_share_of_draws")
+    share = nested_entry(manifest, "inverted_share_of_draws")
     if not share:
         return []
     return [
@@ -63,7 +63,7 @@ def _folds(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _mesh(manifest: Mapping[str, Any]) -> list[str]:
-    nodes, mesh = (part(manifest, "displacement_sd", name) for name in ("nodes", "mesh"))
+    nodes, mesh = (nested_entry(manifest, "displacement_sd", name) for name in ("nodes", "mesh"))
     if nodes is None or mesh is None:
         return []
     return [

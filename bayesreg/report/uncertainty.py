@@ -15,7 +15,7 @@ from bayesreg.report.slices import IN_PLANE, NAMES, Plane
 from bayesreg.report.study import Study
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import fixed, percent, place_text
+from bayesreg.report.verdict import decimal_text, percent, place_text
 from bayesreg.types import AnyArray
 
 LEVEL = 0.95
@@ -89,14 +89,14 @@ def place_table(study: Study) -> Table:
 def _place_row(place: Place, where: str, far: float) -> list[str]:
     ellipsoid = place.region
     beyond = (np.linalg.norm(place.draws.reshape(-1, 3) - ellipsoid.mean, axis=1) > far).mean()
-    shift = ", ".join(fixed(x, 1) for x in ellipsoid.mean)
-    axes = " × ".join(fixed(x) for x in ellipsoid.semi_axes)
+    shift = ", ".join(decimal_text(x, 1) for x in ellipsoid.mean)
+    axes = " × ".join(decimal_text(x) for x in ellipsoid.semi_axes)
     return [
         place.name,
         place_text(place.point),
         where,
         shift,
-        fixed(float(np.linalg.norm(ellipsoid.mean)), 1),
+        decimal_text(float(np.linalg.norm(ellipsoid.mean)), 1),
         axes,
         percent(beyond),
     ]

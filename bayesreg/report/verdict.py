@@ -42,7 +42,7 @@ class Verdict(NamedTuple):
     detail: str
 
 
-def fixed(value: float | int | None, decimals: int = 2) -> str:
+def decimal_text(value: float | int | None, decimals: int = 2) -> str:
     """Format a number with `decimals` decimals; a dash if it is not finite or missing."""
     return NONE if value is None or not math.isfinite(value) else f"{value:,.{decimals}f}".replace("-", "−")
 
@@ -62,7 +62,7 @@ def duration(seconds: float | int | None) -> str:
     return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def part(manifest: Mapping[str, Any], *keys: str) -> Any:
+def nested_entry(manifest: Mapping[str, Any], *keys: str) -> Any:
     """Return a nested entry of the manifest, or None."""
     value: Any = manifest
     for key in keys:
@@ -72,7 +72,7 @@ def part(manifest: Mapping[str, Any], *keys: str) -> Any:
 
 def threshold_of(manifest: Mapping[str, Any]) -> float:
     """Return the R-hat threshold of the stop rule; 1.01 without a stop rule."""
-    return float(part(manifest, "stopped", "rhat_threshold") or DEFAULT_THRESHOLD)
+    return float(nested_entry(manifest, "stopped", "rhat_threshold") or DEFAULT_THRESHOLD)
 
 
 def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict:
@@ -82,13 +82,13 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
     Both must be low.
     """
     threshold = threshold_of(manifest)
-    reason = str(part(manifest, "stopped", "reason") or "").strip().rstrip(".")
+    reason = str(nested_entry(manifest, "stopped", "reason") or "").strip().rstrip(".")
     stopped = f"It stopped because {reason}. " if reason else ""
     if not entries:
         return Verdict(False, "Not converged: no estimand has a convergence figure.", stopped)
     first, failing = worst(entries, 1)[0], above(entries, threshold)
     named = f"{rhat_text(first.rhat)} ({first.name}{_at(first)})"
-    if not failing and part(manifest, "stopped", "converged") is False:
+    if not failing and nested_entry(manifest, "stopped", "converged") is False:
         headline = (
             f"Not converged by the rule of this run: {_missed_rules(manifest, threshold)}, though the rank-normalised "
             f"R̂ is below {threshold:g}; the greatest is {named}."
@@ -106,15 +106,16 @@ def verdict(manifest: Mapping[str, Any], entries: Sequence[Estimand]) -> Verdict
 
 def _missed_rules(manifest: Mapping[str, Any], threshold: float) -> str:
     """Describe the figures that the stop rule required besides the rank-normalised R-hat, and the figures reached."""
-    wanted = part(manifest, "stopped", "ess_threshold")
+    wanted = nested_entry(manifest, "stopped", "ess_threshold")
     if wanted is None:
         return f"its R̂ (unsplit, as in the paper) is {_unsplit(manifest)}, asked for {threshold:g}"
-    bulk, tail = (part(manifest, "convergence", f"ess_{name}_min") for name in ("bulk", "tail"))
-    return f"the least ESS is {fixed(bulk, 0)} (bulk) and {fixed(tail, 0)} (tail), asked for more than {wanted:g}"
+    bulk, tail = (nested_entry(manifest, "convergence", f"ess_{name}_min") for name in ("bulk", "tail"))
+    least = f"{decimal_text(bulk, 0)} (bulk) and {decimal_text(tail, 0)} (tail)"
+    return f"the least ESS is {least}, asked for more than {wanted:g}"
 
 
 def _unsplit(manifest: Mapping[str, Any]) -> str:
-    return number(part(manifest, "convergence", "rhat_paper_max"), 4)
+    return number(nested_entry(manifest, "convergence", "rhat_paper_max"), 4)
 
 
 def rhat_text(rhat: float) -> str:
@@ -146,7 +147,7 @@ def _least(entries: Sequence[Estimand], figure: str) -> float:
 
 def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterior: xr.Dataset) -> dict[str, str]:
     """Return the key numbers of a run, as text by their labels."""
-    entry, sizes = partial(part, manifest), posterior.sizes
+    entry, sizes = partial(nested_entry, manifest), posterior.sizes
     implied = entry("implied_noise_sd")
     return {
         "Greatest R̂": rhat_text(worst(entries, 1)[0].rhat) + _threshold_text(manifest) if entries else NONE,
@@ -166,7 +167,7 @@ def key_facts(manifest: Mapping[str, Any], entries: Sequence[Estimand], posterio
 
 
 def _threshold_text(manifest: Mapping[str, Any]) -> str:
-    threshold, unsplit = part(manifest, "stopped", "rhat_threshold"), _unsplit(manifest)
+    threshold, unsplit = nested_entry(manifest, "stopped", "rhat_threshold"), _unsplit(manifest)
     text = f" (asked for {threshold:g}" if threshold else " (none asked for"
     return text + (")" if unsplit == NONE else f"; unsplit, as in the paper, {unsplit})")
 
@@ -177,9 +178,9 @@ def _count(value: float | int | None) -> str:
 
 def approximation(manifest: Mapping[str, Any]) -> str:
     """Return a warning about an approximate sampler; empty if the sampler is exact."""
-    if part(manifest, "exact") is not False:
+    if nested_entry(manifest, "exact") is not False:
         return ""
-    sampler = part(manifest, "sampler", "name")
+    sampler = nested_entry(manifest, "sampler", "name")
     return (
         f"The draws come from {sampler or 'an approximate sampler'}, which stands in for the posterior of the model: "
         "even with endless draws it would not give exactly that posterior. Intervals may be too narrow or too wide, "
@@ -200,19 +201,19 @@ def warnings_of(manifest: Mapping[str, Any], mesh: TetMesh, posterior: xr.Datase
     posterior : xarray.Dataset
         With `lam` and `mu`, for Poisson's ratio.
     """
-    of_data = list(part(manifest, "appraisal", "beware") or [])
+    of_data = list(nested_entry(manifest, "appraisal", "warnings") or [])
     of_result = [*_solver(manifest), *_folding(manifest), *_noise(manifest), *_locking(mesh, posterior)]
     return [*of_data, *_equilibrium(manifest), *of_result]
 
 
 def _equilibrium(manifest: Mapping[str, Any]) -> list[str]:
-    doubt = doubt_of_equilibrium(part(manifest, "model"), simulated=bool(part(manifest, "pair")))
-    return [] if doubt is None or part(manifest, "implied_noise_sd") is None else [doubt]
+    doubt = doubt_of_equilibrium(nested_entry(manifest, "model"), simulated=bool(nested_entry(manifest, "pair")))
+    return [] if doubt is None or nested_entry(manifest, "implied_noise_sd") is None else [doubt]
 
 
 def doubt_of_equilibrium(model: Mapping[str, Any] | None, simulated: bool) -> str | None:
     """Return a warning if real images are registered with a strict equilibrium inside; None otherwise."""
-    if simulated or part(model or {}, "elastic_prior", "nodes") != "boundary":
+    if simulated or nested_entry(model or {}, "elastic_prior", "nodes") != "boundary":
         return None
     return (
         "The model has the inside in elastic equilibrium exactly (elastic_prior: {nodes: boundary}), as no organ is: "
@@ -223,7 +224,7 @@ def doubt_of_equilibrium(model: Mapping[str, Any] | None, simulated: bool) -> st
 
 
 def _solver(manifest: Mapping[str, Any]) -> list[str]:
-    failed = part(manifest, "solver", "failed")
+    failed = nested_entry(manifest, "solver", "failed")
     if not failed:
         return []
     return [
@@ -234,7 +235,7 @@ def _solver(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _folding(manifest: Mapping[str, Any]) -> list[str]:
-    inverted = part(manifest, "inverted_elements")
+    inverted = nested_entry(manifest, "inverted_elements")
     if not inverted:
         return []
     which = "1 tetrahedron is" if inverted == 1 else f"{inverted:,} tetrahedra are"
@@ -245,10 +246,10 @@ def _folding(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def _noise(manifest: Mapping[str, Any]) -> list[str]:
-    implied, ratio = part(manifest, "implied_noise_sd"), part(manifest, "residual_to_noise")
+    implied, ratio = nested_entry(manifest, "implied_noise_sd"), nested_entry(manifest, "residual_to_noise")
     if not implied or not ratio or 1 / NOISE_FACTOR <= ratio <= NOISE_FACTOR:
         return []
-    early = part(manifest, "stopped", "converged") is False
+    early = nested_entry(manifest, "stopped", "converged") is False
     return [
         f"T_s implies a noise sd of {number(implied)} (variance T_s / 2w at a quadrature point of weight w), but the "
         f"residual at the mean is {number(ratio, 2)} times as great as such noise: the posterior is too "

@@ -136,14 +136,14 @@ def apply(
 
 
 def _require_sense(
-    given: Mapping[str, Any], around: str, far: Sequence[float], draws: int | None, margins: Sequence[int]
+    inputs: Mapping[str, Any], around: str, far: Sequence[float], draws: int | None, margins: Sequence[int]
 ) -> None:
     """Raise InputError if the options contradict each other."""
-    if all(path is None for path in given.values()):
+    if all(path is None for path in inputs.values()):
         raise InputError("there is nothing to carry: give points, an image, labels or a mesh")
     if around not in get_args(Around):
         raise InputError(f"around is one of {', '.join(get_args(Around))}, got {around!r}")
-    if margins and given["labels"] is None:
+    if margins and inputs["labels"] is None:
         raise InputError("a margin is that of a label: give labels, too")
     if 0 in margins:
         raise InputError("a margin is that of a label, and zero stands for no label")
@@ -167,15 +167,15 @@ def require_folder(out: str | Path) -> Path:
     return out
 
 
-def _require_own_names(how: _How, given: Mapping[str, str | Path | None], like: str | Path | None) -> None:
+def _require_own_names(how: _How, inputs: Mapping[str, str | Path | None], like: str | Path | None) -> None:
     """Raise InputError if an output would replace an input or another output."""
     targets: dict[Path, str] = {}
-    known = {Path(path).resolve() for path in (*given.values(), like) if path is not None}
-    for kind, path in given.items():
+    input_paths = {Path(path).resolve() for path in (*inputs.values(), like) if path is not None}
+    for kind, path in inputs.items():
         if path is None:
             continue
         target = how.target(kind, Path(path))
-        if target.resolve() in known:
+        if target.resolve() in input_paths:
             raise InputError(f"{target} would be replaced by what is made of {path}; name another folder")
         if target in targets:
             raise InputError(f"{targets[target]} and {path} would both be carried to {target}; carry one at a time")
@@ -201,14 +201,14 @@ class _How(NamedTuple):
         stem = Path(source.name.removesuffix(".gz")).stem
         return self.out / f"{stem or 'image'}_in-{self.where}{end}"
 
-    def tell_of_outside(self, inside: Bool[np.ndarray, "k"], what: str) -> None:
+    def tell_of_outside(self, inside: Bool[np.ndarray, "k"], noun: str) -> None:
         """Log how many points lie around the mesh, where nothing was observed."""
         if inside.all():
             return
         then = "the displacement goes on harmonically" if self.around == "harmonic" else "no place is given"
         count = f"{int((~inside).sum()):,} of {len(inside):,}"
         _log.info(
-            "%s %s lie around the mesh, where nothing is known: %s, and how sure it is is not told", count, what, then
+            "%s %s lie around the mesh, where nothing is known: %s, and how sure it is is not told", count, noun, then
         )
 
 
@@ -255,7 +255,7 @@ def _carry_surface(surface: SurfaceFile, path: Path, how: _How, transform: Trans
     if how.around == "missing":
         if not posterior.inside.any():
             raise InputError(f"no point of {path} lies in the mesh, and what lies around it is to be left out")
-        surface, posterior = surface.part(posterior.inside), posterior.part(posterior.inside)
+        surface, posterior = surface.selected(posterior.inside), posterior.selected(posterior.inside)
     values = _values(posterior, how)
     write_surface(target := how.target("mesh", path), surface, values.pop(""), values)
     return [target]
@@ -270,28 +270,34 @@ ENDS = {
 }
 
 
-def _values(found: Spread, how: _How) -> dict[str, np.ndarray]:
+def _values(posterior: Spread, how: _How) -> dict[str, np.ndarray]:
     """Collect the coordinates of every point and the measures of its uncertainty, by column name."""
-    lengths, directions = found.ellipsoids()
+    lengths, directions = posterior.ellipsoids()
     row, column = np.triu_indices(3)
-    places = found.places if how.around == "harmonic" else np.where(found.inside[:, None], found.places, np.nan)
-    values = {"": places, "cov_": found.covariance[:, row, column], "radius95": distances_of(found.covariance).radius}
+    places = (
+        posterior.places if how.around == "harmonic" else np.where(posterior.inside[:, None], posterior.places, np.nan)
+    )
+    values = {
+        "": places,
+        "cov_": posterior.covariance[:, row, column],
+        "radius95": distances_of(posterior.covariance).radius,
+    }
     values |= {"half_axis95_": lengths, "axis": directions.reshape(-1, 9)}
-    values |= {f"p_over_{distance:g}mm": share for distance, share in zip(how.far, found.far, strict=True)}
-    return values | {"in_mesh": found.inside.astype(float)}
+    values |= {f"p_over_{distance:g}mm": share for distance, share in zip(how.far, posterior.far, strict=True)}
+    return values | {"in_mesh": posterior.inside.astype(float)}
 
 
 def _carry_image(image: Image, grid: Image, path: Path, how: _How, transform: Transform) -> list[Path]:
     """Transform an image by the posterior mean with linear interpolation; voxels from beyond its grid are zero."""
-    back, voxels = transform.inverse, np.empty(int(np.prod(grid.shape)), np.float32)
+    inverse, voxels = transform.inverse, np.empty(int(np.prod(grid.shape)), np.float32)
     inside, intensities = np.empty(len(voxels), bool), np.asarray(image.voxels, float)
     for block, places in grid.blocks():
-        source, location = back.place(places)
+        source, location = inverse.place(places)
         # As in ITK, the outermost half voxel takes the nearest value; beyond it the result is zero.
         index = image.world_to_voxel(source).T
         values = ndimage.map_coordinates(intensities, index, order=1, mode="nearest")
         voxels[block] = np.where(image.contains(source), values, 0.0)
-        inside[block] = back.deformer.is_inside(location) & image.contains(source)
+        inside[block] = inverse.deformer.is_inside(location) & image.contains(source)
     _tell_of_nothing(inside, path, how)
     if how.around == "missing":
         voxels[~inside] = np.nan
@@ -320,8 +326,8 @@ def _carry_labels(
         stale.unlink()
     written = [target]
     for value, probability in carried.probabilities():
-        write_nifti(probability, grid.affine, part := folder / f"label-{value}.nii.gz")
-        written.append(part)
+        write_nifti(probability, grid.affine, probability_file := folder / f"label-{value}.nii.gz")
+        written.append(probability_file)
         if value in margins and not (np.nan_to_num(probability) > 1 - MARGIN).any():
             _log.warning("label %d is improbable everywhere, and has no margin", value)
         elif value in margins:

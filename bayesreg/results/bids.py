@@ -33,13 +33,13 @@ def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
     """
     entities = f"sub-{names.subject}" + ("" if names.session is None else f"_ses-{names.session}")
     within = f"{FOLDER}/{entities.replace('_', '/')}/anat"
-    forward, back = (
+    forward, backward = (
         f"from-{a}_to-{b}_mode-image" for a, b in ((names.moving, names.fixed), (names.fixed, names.moving))
     )
     units, space = {"Units": "mm"}, f"space-{names.fixed}"
-    known = {
+    files = {
         MEAN: (f"{forward}_xfm.h5", "Posterior mean transform, ITK composite: a displacement field, then a pose.", {}),
-        MEAN_INVERSE: (f"{back}_xfm.h5", "Its inverse.", {}),
+        MEAN_INVERSE: (f"{backward}_xfm.h5", "Its inverse.", {}),
         "warped_mean.nii.gz": (f"{space}_desc-warped_{names.suffix}.nii.gz", "Resampled by the posterior mean.", {}),
         "displacement_mean.nii.gz": (
             f"{space}_stat-mean_displacement.nii.gz", "Posterior mean displacement, vectors in LPS.", units,
@@ -48,7 +48,7 @@ def write_bids(folder: Path, names: BidsConfig, place: Place) -> None:
             f"{space}_stat-sd_displacement.nii.gz", "Posterior standard deviation by component.", units,
         ),
     }  # fmt: skip
-    for source, (name, description, more) in known.items():
+    for source, (name, description, more) in files.items():
         if not (folder / source).is_file():
             continue
         target = f"{within}/{entities}_{name}"

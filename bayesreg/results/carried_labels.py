@@ -52,8 +52,8 @@ class CarriedLabels:
     def most_probable(self) -> Image:
         """The most frequent label of each voxel over the draws; zero if it is unknown."""
         labels = np.where(self.certain < 0, 0, self.values[self.certain])
-        known = self.certain[self.open] >= 0
-        labels[self.open[known]] = self.values[self.counts[:, known].argmax(axis=0)]
+        is_known = self.certain[self.open] >= 0
+        labels[self.open[is_known]] = self.values[self.counts[:, is_known].argmax(axis=0)]
         return self.grid.with_voxels(labels.reshape(self.grid.shape).astype(np.int32))
 
     def probabilities(self) -> Iterator[tuple[int, Float[np.ndarray, "X Y Z"]]]:
@@ -93,39 +93,39 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
     rank = np.argsort(order)
     numbers = labels.with_voxels(rank[np.asarray(labels.voxels)].astype(np.int16))
 
-    back = transform.inverse
+    inverse = transform.inverse
     distance, box = _distance_to_others(numbers), _box(numbers)
-    reach = _reach(back)
+    reach = _reach(inverse)
     certain, unsure = (np.empty(int(np.prod(grid.shape)), kind) for kind in (np.int16, bool))
     nearby, unresolved = [], []
     for block, places in grid.blocks():
-        source, near = back.place(places)
+        source, near = inverse.place(places)
         certain[block] = numbers.nearest(source)
         if not keep_around:
-            certain[block][~back.deformer.is_inside(near)] = -1
-        sd = back.unresolved_sd(near)
+            certain[block][~inverse.deformer.is_inside(near)] = -1
+        sd = inverse.unresolved_sd(near)
         clearance = np.where(numbers.contains(source), distance.nearest(source), _distance_to_box(numbers, box, source))
         unsure[block] = (clearance <= reach[near.cell] + FURTHEST * sd.max(axis=1)) & (certain[block] >= 0)
         nearby.append(Location(near.cell[unsure[block]], near.barycentric[unsure[block]]))
         unresolved.append(sd[unsure[block]].astype(np.float32))
     open_voxels, unresolved_sd = np.flatnonzero(unsure), np.concatenate(unresolved)
-    cell, barycentric = (np.concatenate(parts) for parts in zip(*nearby, strict=True))
+    cell, barycentric = (np.concatenate(pieces) for pieces in zip(*nearby, strict=True))
     counts = np.zeros((len(values), len(open_voxels)), np.uint16)
     for block in slices(len(open_voxels), max(MOST_COUNTS // len(values), 1)):
-        part = counts[:, block]
+        block_counts = counts[:, block]
         _count(
-            back,
+            inverse,
             numbers,
             grid.centres(open_voxels[block]),
             Location(cell[block], barycentric[block]),
             unresolved_sd[block],
-            part,
+            block_counts,
         )
     return CarriedLabels(grid, values[order], certain, open_voxels, counts, len(transform.draws))
 
 
 def _count(
-    back: Transform,
+    inverse: Transform,
     numbers: Image,
     places: Float[np.ndarray, "k 3"],
     near: Location,
@@ -135,11 +135,11 @@ def _count(
     """Count the labels that every draw gives to points, in place."""
 
     def labels_of(draw: int) -> Int[np.ndarray, "k"]:
-        sources = back.place_by(draw, places, near, unresolved_sd)
+        sources = inverse.place_by(draw, places, near, unresolved_sd)
         return numbers.nearest(sources)
 
     columns = np.arange(len(places))
-    for labels in back.for_each_draw(labels_of):
+    for labels in inverse.for_each_draw(labels_of):
         counts[labels, columns] += 1
 
 
@@ -168,15 +168,15 @@ def _distance_to_box(
     return np.linalg.norm(outside * numbers.voxel_sizes, axis=1)
 
 
-def _reach(back: Transform) -> Float[np.ndarray, "cells"]:
+def _reach(inverse: Transform) -> Float[np.ndarray, "cells"]:
     """Bound the distance, mm, between the sources of a point by a draw and by the posterior mean.
 
     There is one bound for each tetrahedron of the mesh and its surroundings; the last one holds beyond these.
     """
-    surroundings = back.deformer.surroundings
-    mean = surroundings.extend(back.u_mean)
+    surroundings = inverse.deformer.surroundings
+    mean = surroundings.extend(inverse.u_mean)
     away = np.zeros(len(mean))
-    for u in back.draws:
+    for u in inverse.draws:
         away = np.maximum(away, np.linalg.norm(surroundings.extend(u) - mean, axis=1))
     corners = surroundings.points[surroundings.cells]
     moved_corners = corners + mean[surroundings.cells]

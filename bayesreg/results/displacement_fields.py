@@ -14,7 +14,7 @@ from bayesreg.io.fields import save_displacement
 from bayesreg.io.run_folder import Place
 from bayesreg.io.transforms import save_transform
 from bayesreg.mesh import TetMesh
-from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.submesh import discretisation_variance
 from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Pose
 from bayesreg.results.transform import Transform
@@ -76,17 +76,17 @@ def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], gri
     # Around the mesh the displacement is smooth and nothing is observed, so that every n-th voxel is enough.
     mean = _between(displacement_on(transform.mean, _every(grid, step)).field, step, grid.shape)
     covered = covered_voxels(grid, mesh)
-    at = np.ravel_multi_index(tuple(covered.voxel.T), grid.shape)
+    covered_index = np.ravel_multi_index(tuple(covered.voxel.T), grid.shape)
     corners = mesh.cells[covered.cell]
-    mean[at] = np.einsum("ka,kai->ki", covered.barycentric, transform.u_mean[corners])
+    mean[covered_index] = np.einsum("ka,kai->ki", covered.barycentric, transform.u_mean[corners])
     for block, points in grid.blocks():
         mean[block] = pose.displacement(points, mean[block])
     nodal = np.einsum("ka,kai->ki", covered.barycentric, nodal_sd[corners]) ** 2
-    beyond = submesh_variance(mesh, pose.displacement(mesh.points, transform.u_mean))[covered.cell]
+    beyond = discretisation_variance(mesh, pose.displacement(mesh.points, transform.u_mean))[covered.cell]
     sd = np.zeros_like(mean)
-    sd[at] = np.sqrt(nodal + beyond)
-    shape, parts = (*grid.shape, 3), {"nodes": nodal, "mesh": beyond}
-    rms = {name: float(np.sqrt(part.mean())) for name, part in parts.items()}
+    sd[covered_index] = np.sqrt(nodal + beyond)
+    shape, variances = (*grid.shape, 3), {"nodes": nodal, "mesh": beyond}
+    rms = {name: float(np.sqrt(variance.mean())) for name, variance in variances.items()}
     return Moments(mean.reshape(shape), sd.reshape(shape), rms)
 
 
@@ -118,11 +118,11 @@ class OnGrid(NamedTuple):
     locations: list[Location]
 
 
-def displacement_on(displaced: Displaced, grid: Image, known: list[Location] | None = None) -> OnGrid:
+def displacement_on(displaced: Displaced, grid: Image, known_locations: list[Location] | None = None) -> OnGrid:
     """Compute u at the voxel centres of a grid; known locations of these, from another u, save time."""
     field, locations = np.empty((int(np.prod(grid.shape)), 3), np.float32), []
     for index, (block, points) in enumerate(grid.blocks()):
-        location = displaced.deformer.locate(points) if known is None else known[index]
+        location = displaced.deformer.locate(points) if known_locations is None else known_locations[index]
         field[block] = displaced.displacement(points, location)
         locations.append(location)
     return OnGrid(field.reshape(*grid.shape, 3), locations)
@@ -154,10 +154,12 @@ def write_transforms(place: Place, transform: Transform, grid: Image) -> None:
         the tetrahedra, in which the field is linear, it has values only at every second, third, … voxel centre.
     """
     pose, upright = transform.pose, grid.on_orthogonal_grid(order=0)
-    there = _every(upright, _step(transform.mesh, upright))
-    save_transform(place(MEAN), displacement_on(transform.mean, there).field, there, pose)
-    back = around_displaced(there, transform.mesh.points + transform.u_mean)
-    save_transform(place(MEAN_INVERSE), return_on(transform.mean, back).field, back, pose.inverse, pose_first=True)
+    forward_grid = _every(upright, _step(transform.mesh, upright))
+    save_transform(place(MEAN), displacement_on(transform.mean, forward_grid).field, forward_grid, pose)
+    inverse_grid = around_displaced(forward_grid, transform.mesh.points + transform.u_mean)
+    save_transform(
+        place(MEAN_INVERSE), return_on(transform.mean, inverse_grid).field, inverse_grid, pose.inverse, pose_first=True
+    )
     if len(transform.draws):
         _write_ensemble(place, transform, upright)
 
@@ -175,17 +177,22 @@ def _every(grid: Image, step: Int[np.ndarray, "3"]) -> Image:
 
 def _write_ensemble(place: Place, transform: Transform, grid: Image) -> None:
     sizes = np.maximum(grid.voxel_sizes, ENSEMBLE_SPACING * transform.mesh.boundary_edge)
-    there = grid.with_voxels(np.zeros(grid.shape, np.int8)).on_orthogonal_grid(sizes, order=0)
-    back = around_displaced(there, transform.mesh.points + transform.u_mean)
-    located, near = displacement_on(transform.mean, there).locations, return_on(transform.mean, back).locations
-    points, digits = there.grid_points(), len(str(len(transform.draws)))
+    forward_grid = grid.with_voxels(np.zeros(grid.shape, np.int8)).on_orthogonal_grid(sizes, order=0)
+    inverse_grid = around_displaced(forward_grid, transform.mesh.points + transform.u_mean)
+    located, near = (
+        displacement_on(transform.mean, forward_grid).locations,
+        return_on(transform.mean, inverse_grid).locations,
+    )
+    points, digits = forward_grid.grid_points(), len(str(len(transform.draws)))
     for number, u in enumerate(transform.draws, start=1):
         displaced, name = transform.deformer.displaced(u), f"{ENSEMBLE}/draw-{number:0{digits}d}"
-        field = displacement_on(displaced, there, located).field
-        save_transform(place(f"{name}.h5"), field, there, transform.pose)
-        save_displacement(place(f"{name}.nii.gz"), total_displacement(transform.pose, points, field), there.affine)
-        returns = return_on(displaced, back, near).field
-        save_transform(place(f"{name}_inverse.h5"), returns, back, transform.pose.inverse, pose_first=True)
+        field = displacement_on(displaced, forward_grid, located).field
+        save_transform(place(f"{name}.h5"), field, forward_grid, transform.pose)
+        save_displacement(
+            place(f"{name}.nii.gz"), total_displacement(transform.pose, points, field), forward_grid.affine
+        )
+        returns = return_on(displaced, inverse_grid, near).field
+        save_transform(place(f"{name}_inverse.h5"), returns, inverse_grid, transform.pose.inverse, pose_first=True)
 
 
 def total_displacement(

@@ -52,13 +52,13 @@ def nodal_draws(
     if u.shape[2] == len(inputs.mesh.points):
         return u[0]
     body, blocks = body_of(inputs.mesh, with_known_boundary(model, inputs))
-    known = {name: values for name, values in selected.items() if name in blocks}
+    estimands = {name: values for name, values in selected.items() if name in blocks}
 
-    def displacement(draw: dict[str, AnyArray], given: tuple[Body, Blocks]) -> AnyArray:
-        body, blocks = given
+    def displacement(draw: dict[str, AnyArray], body_and_blocks: tuple[Body, Blocks]) -> AnyArray:
+        body, blocks = body_and_blocks
         return state_of(body, blocks, fill(blocks, draw)).u
 
-    displacements = np.concatenate(list(push_forward(displacement, known, (body, blocks))), axis=1)
+    displacements = np.concatenate(list(push_forward(displacement, estimands, (body, blocks))), axis=1)
     return displacements.reshape(-1, *displacements.shape[2:])
 
 

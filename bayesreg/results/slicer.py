@@ -91,9 +91,9 @@ def _write_places(result: Result, transform: Transform, out: Path) -> list[Item]
         return []
     kinds = {"places": (predicted.place_names, predicted.place_points)}
     for name in result.run.manifest["observations"]:
-        known = predicted.of_observation(name)
-        if {"names", "points"} <= set(known):
-            kinds[name] = (np.asarray(known["names"]), known["points"])
+        arrays = predicted.of_observation(name)
+        if {"names", "points"} <= set(arrays):
+            kinds[name] = (np.asarray(arrays["names"]), arrays["points"])
     if predicted.evaluation_names is not None and predicted.evaluation_points is not None:
         inside = np.asarray(predicted.evaluation_inside)
         if inside.any():

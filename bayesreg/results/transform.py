@@ -19,7 +19,7 @@ from bayesreg.fem.deformation import Deformer, Displaced
 from bayesreg.fem.location import Location
 from bayesreg.image import slices
 from bayesreg.mesh import TetMesh
-from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.submesh import discretisation_variance
 from bayesreg.pose import Pose
 
 
@@ -150,7 +150,7 @@ class Transform:
         covariance = np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
         total, volume = np.zeros((len(covariance), 3)), np.zeros(len(covariance))
         for corner in self.mesh.cells.T:
-            np.add.at(total, corner, self.mesh.volumes[:, None] * self._submesh_variance)
+            np.add.at(total, corner, self.mesh.volumes[:, None] * self._discretisation_variance)
             np.add.at(volume, corner, self.mesh.volumes)
         return covariance + (total / volume[:, None])[:, :, None] * np.eye(3)
 
@@ -177,7 +177,9 @@ class Transform:
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
         nodal = np.einsum("ka,kai->ki", share, self._corner_sd[cell]) ** 2
-        variance[inside] = np.maximum(nodal + self._submesh_variance[cell] - np.einsum("kii->ki", drawn[inside]), 0)
+        variance[inside] = np.maximum(
+            nodal + self._discretisation_variance[cell] - np.einsum("kii->ki", drawn[inside]), 0
+        )
         return variance
 
     @cached_property
@@ -185,8 +187,8 @@ class Transform:
         return np.sqrt(np.einsum("maaii->mai", self._cell_covariance))
 
     @cached_property
-    def _submesh_variance(self) -> Float[np.ndarray, "cells 3"]:
-        return submesh_variance(self.mesh, self.u_mean)
+    def _discretisation_variance(self) -> Float[np.ndarray, "cells 3"]:
+        return discretisation_variance(self.mesh, self.u_mean)
 
     @cached_property
     def _cell_covariance(self) -> Float[np.ndarray, "cells 4 4 3 3"]:
@@ -223,7 +225,7 @@ class Spread(NamedTuple):
     far: Float[np.ndarray, "x k"]
     inside: Bool[np.ndarray, "k"]
 
-    def part(self, chosen: Bool[np.ndarray, "k"]) -> Spread:
+    def selected(self, chosen: Bool[np.ndarray, "k"]) -> Spread:
         """Select some of the points."""
         return Spread(self.places[chosen], self.covariance[chosen], self.far[:, chosen], self.inside[chosen])
 
@@ -233,10 +235,10 @@ class Spread(NamedTuple):
         The results are the half-axes, mm, the longest first, and their directions (rows).
         """
         lengths, axes = np.full((len(self.places), 3), np.nan), np.full((len(self.places), 3, 3), np.nan)
-        known = np.isfinite(self.covariance).all(axis=(1, 2))
-        variance, directions = np.linalg.eigh(self.covariance[known])
-        lengths[known] = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 3))[:, ::-1]
-        axes[known] = np.swapaxes(directions, 1, 2)[:, ::-1]
+        is_finite = np.isfinite(self.covariance).all(axis=(1, 2))
+        variance, directions = np.linalg.eigh(self.covariance[is_finite])
+        lengths[is_finite] = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 3))[:, ::-1]
+        axes[is_finite] = np.swapaxes(directions, 1, 2)[:, ::-1]
         return lengths, axes
 
 
@@ -255,18 +257,20 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
     """
     places, near = transform.place(points)
     inside = transform.deformer.is_inside(near)
-    known = np.flatnonzero(inside)
-    location = Location(near.cell[known], near.barycentric[known])
-    square, beyond_far = np.zeros((len(known), 3, 3)), np.zeros((len(far), len(known)))
+    inside_index = np.flatnonzero(inside)
+    location = Location(near.cell[inside_index], near.barycentric[inside_index])
+    square, beyond_far = np.zeros((len(inside_index), 3, 3)), np.zeros((len(far), len(inside_index)))
     sd = transform.unresolved_sd(location)
-    for drawn_places in transform.for_each_draw(lambda draw: transform.place_by(draw, points[known], location, sd)):
-        away = drawn_places - places[known]
+    for drawn_places in transform.for_each_draw(
+        lambda draw: transform.place_by(draw, points[inside_index], location, sd)
+    ):
+        away = drawn_places - places[inside_index]
         square += away[:, :, None] * away[:, None]
         distance = np.linalg.norm(away, axis=1)
         beyond_far += distance > np.reshape(far, (-1, 1))
     count = len(transform.draws)
     covariance, share = np.full((len(points), 3, 3), np.nan), np.full((len(far), len(points)), np.nan)
-    covariance[known], share[:, known] = square / max(count - 1, 1), beyond_far / count
+    covariance[inside_index], share[:, inside_index] = square / max(count - 1, 1), beyond_far / count
     return Spread(places, covariance, share, inside)
 
 
@@ -293,9 +297,9 @@ def distances_of(covariance: Float[np.ndarray, "k 3 3"], far: Sequence[float] = 
     """
     squares = MultivariateNormalQMC(np.zeros(3), rng=np.random.default_rng(0)).random(1024) ** 2
     radius, probability = np.full(len(covariance), np.nan), np.full((len(far), len(covariance)), np.nan)
-    known = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
-    for first in range(0, len(known), 20_000):
-        block = known[first : first + 20_000]
+    finite_index = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
+    for first in range(0, len(finite_index), 20_000):
+        block = finite_index[first : first + 20_000]
         square = np.maximum(np.linalg.eigvalsh(covariance[block]), 0) @ squares.T
         for index, distance in enumerate(far):
             probability[index, block] = (square > distance**2).mean(axis=1)

@@ -159,8 +159,8 @@ class ContactProblem:
         penalty = np.maximum(state.penalty, 1.5 * force)
         first = _stretch(direction, state.direction)
         length = self._line_search(state.u, direction, penalty, floor, gap, first)
-        kept = direction if length == 1 else np.zeros_like(direction)
-        return _State(state.u + length * direction, force, penalty, kept), float(np.abs(direction).max())
+        next_direction = direction if length == 1 else np.zeros_like(direction)
+        return _State(state.u + length * direction, force, penalty, next_direction), float(np.abs(direction).max())
 
     def _result(self, state: _State, floor: np.ndarray, used: int, tolerance: float) -> EnergyMinimum:
         gap, normal = self.gap((self.points + state.u)[self.nodes])

@@ -51,7 +51,7 @@ class SmoothObstacle:
         taps = corner[:, :, None] + np.arange(4)
         block = self._coefficients[taps[:, 0, :, None, None], taps[:, 1, None, :, None], taps[:, 2, None, None, :]]
         value, slope = _bspline(indices - corner)
-        along = [[slope if axis == part else value for axis in range(3)] for part in range(3)]
+        along = [[slope if axis == component else value for axis in range(3)] for component in range(3)]
         gradient = [np.einsum("kabc,ka,kb,kc->k", block, *(w[:, i] for i, w in enumerate(ws))) for ws in along]
         gap = np.einsum("kabc,ka,kb,kc->k", block, *np.moveaxis(value, 1, 0))
         return gap, np.stack(gradient, axis=1) @ self.exact.to_voxel[:3, :3]

@@ -140,8 +140,10 @@ def _filling_intensity(fixed: Image, tissue: Image, mesh: TetMesh) -> float:
     fluids = [index for index, name in enumerate(mesh.names, start=1) if is_fluid(name)]
     values = np.asarray(fixed.voxels)[np.isin(np.asarray(tissue.voxels), fluids or [0])]
     if values.size == 0:
-        what = " or ".join(mesh.names[index - 1] for index in fluids) or "place without tissue"
-        raise InputError(f"free space cannot be filled: the tissue image has no {what} voxel to take an intensity from")
+        voxel_kind = " or ".join(mesh.names[index - 1] for index in fluids) or "place without tissue"
+        raise InputError(
+            f"free space cannot be filled: the tissue image has no {voxel_kind} voxel to take an intensity from"
+        )
     return float(np.median(values))
 
 

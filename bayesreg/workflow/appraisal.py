@@ -39,7 +39,7 @@ class Appraisal(NamedTuple):
         The volumes inside and outside Ω of each tissue, ml.
     likeness : Likeness or None
         None if there is no pair of images from files.
-    beware : tuple of str
+    warnings : tuple of str
         Warnings for the user, one sentence each.
     notes : tuple of str
         Findings and choices, one sentence each.
@@ -47,13 +47,13 @@ class Appraisal(NamedTuple):
 
     millilitres: Mapping[str, tuple[float, float]]
     likeness: Likeness | None
-    beware: tuple[str, ...]
+    warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Convert the appraisal to mappings and lists, for files."""
         likeness = None if self.likeness is None else self.likeness._asdict()
-        remarks = {"beware": list(self.beware), "notes": list(self.notes)}
+        remarks = {"warnings": list(self.warnings), "notes": list(self.notes)}
         return {"millilitres": dict(self.millilitres), "likeness": likeness, **remarks}
 
 
@@ -200,8 +200,8 @@ def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dic
     millilitre = tissue.voxel_volume / 1e3
     counted = ((voxels == index) for index in range(1, len(names) + 1))
     return {
-        name: (float((own & inside).sum() * millilitre), float((own & ~inside).sum() * millilitre))
-        for name, own in zip(names, counted, strict=True)
+        name: (float((of_tissue & inside).sum() * millilitre), float((of_tissue & ~inside).sum() * millilitre))
+        for name, of_tissue in zip(names, counted, strict=True)
     }
 
 
@@ -215,9 +215,9 @@ def explain_left_out(millilitres: Mapping[str, tuple[float, float]]) -> list[str
     ]
 
 
-def _mutual_information(one: Float[np.ndarray, "points"], other: Float[np.ndarray, "points"]) -> float:
-    bounds = [np.quantile(values, (0.005, 0.995)) for values in (one, other)]
-    joint, _, _ = np.histogram2d(np.clip(one, *bounds[0]), np.clip(other, *bounds[1]), bins=BINS)
+def _mutual_information(fixed_values: Float[np.ndarray, "points"], moving_values: Float[np.ndarray, "points"]) -> float:
+    bounds = [np.quantile(values, (0.005, 0.995)) for values in (fixed_values, moving_values)]
+    joint, _, _ = np.histogram2d(np.clip(fixed_values, *bounds[0]), np.clip(moving_values, *bounds[1]), bins=BINS)
     entropies = [_entropy(joint.sum(axis=1)), _entropy(joint.sum(axis=0)), _entropy(joint.ravel())]
     return float(2 * (entropies[0] + entropies[1] - entropies[2]) / (entropies[0] + entropies[1]))
 

@@ -242,9 +242,9 @@ def _client(cluster: ClusterConfig, scheduler: str | None) -> Iterator[Any]:
         workers.scale(cluster.workers)
     else:
         # Dask must not end a worker because of its memory: a restarted run would need as much.
-        own = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": "127.0.0.1:0",
+        options = {"threads_per_worker": 1, "memory_limit": None, "dashboard_address": "127.0.0.1:0",
                "silence_logs": logging.CRITICAL}  # fmt: skip
-        workers = LocalCluster(n_workers=cluster.workers, **own)
+        workers = LocalCluster(n_workers=cluster.workers, **options)
     with workers, Client(workers) as client:
         if cluster.slurm is None:
             client.register_plugin(_deaf_to_interrupts())
@@ -295,11 +295,11 @@ class _Board:
             self._lines[report["name"]], completed=round(100 * min(report["spent"], 1)), figures=rhat + left
         )
 
-    def end(self, task: Task, found: dict[str, Any]) -> None:
+    def end(self, task: Task, status: dict[str, Any]) -> None:
         """Count a run that ended, and print the message of a failed run."""
         if (line := self._lines.pop(task.name, None)) is not None:
             self._bar.remove_task(line)
-        if found["state"] == "failed":
+        if status["state"] == "failed":
             self._failed += 1
-            self._bar.console.print(f"{task.name} failed: {found['message']}", highlight=False, markup=False)
+            self._bar.console.print(f"{task.name} failed: {status['message']}", highlight=False, markup=False)
         self._bar.update(self._all, advance=1, figures=f"{self._failed} failed" if self._failed else "")

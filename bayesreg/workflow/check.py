@@ -96,20 +96,20 @@ class Check:
 
 def describe_inputs(appraisal: Mapping[str, Any]) -> str:
     """Describe the labels and images in words."""
-    beware = appraisal.get("beware", [])
-    verdict = "The configuration can be run, but beware:" if beware else "The configuration is sound."
-    return "\n".join([verdict, *(f"  - {sentence}" for sentence in beware), *_describe(appraisal)])
+    warnings = appraisal.get("warnings", [])
+    verdict = "The configuration can be run, but with warnings:" if warnings else "The configuration is sound."
+    return "\n".join([verdict, *(f"  - {sentence}" for sentence in warnings), *_describe(appraisal)])
 
 
 def _describe(appraisal: Mapping[str, Any]) -> list[str]:
     """Describe the notes, the volumes of the tissues and the likeness of the images, one line each."""
     lines = [f"  {note}" for note in appraisal.get("notes", ())]
     if appraisal.get("millilitres"):
-        parts = (
+        volumes = (
             f"{name} {inside:.4g}" + (f" ({outside:.3g} outside)" if outside >= 0.01 * inside else "")
             for name, (inside, outside) in appraisal["millilitres"].items()
         )
-        lines.append(f"  tissues   {', '.join(parts)} ml in the region to mesh")
+        lines.append(f"  tissues   {', '.join(volumes)} ml in the region to mesh")
     if appraisal.get("likeness"):
         likeness = Likeness(**appraisal["likeness"])
         lines.append(

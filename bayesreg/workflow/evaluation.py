@@ -16,9 +16,9 @@ NAME = "evaluation"
 SAME = 1e-3
 
 
-def require_unseen(held_out: PointPairs, seen: Mapping[str, tuple[AnyArray, AnyArray]]) -> None:
-    """Raise InputError if a held-out landmark is also observed; `seen` holds the observed (fixed, moving) by name."""
-    for name, (fixed, moving) in seen.items():
+def require_unseen(held_out: PointPairs, observed: Mapping[str, tuple[AnyArray, AnyArray]]) -> None:
+    """Raise InputError if a held-out landmark is also observed; `observed` holds the (fixed, moving) points by name."""
+    for name, (fixed, moving) in observed.items():
         away = np.linalg.norm(held_out.fixed[:, None] - np.asarray(fixed), axis=2)
         away += np.linalg.norm(held_out.moving[:, None] - np.asarray(moving), axis=2)
         if count := int((away.min(axis=1) < SAME).sum()):
@@ -41,8 +41,8 @@ def evaluate_landmarks(pairs: PointPairs, transform: Transform, sd: float | None
         Standard deviation of the localisation error of each coordinate, mm; None takes the file's value, else zero.
     """
     predicted = spread(transform, pairs.fixed)
-    own = pairs.sd if sd is None else np.full(len(pairs.fixed), sd)
-    variance = np.zeros(len(pairs.fixed)) if own is None else np.square(own)
+    landmark_sd = pairs.sd if sd is None else np.full(len(pairs.fixed), sd)
+    variance = np.zeros(len(pairs.fixed)) if landmark_sd is None else np.square(landmark_sd)
     return {
         "evaluation_names": np.array([name or str(number) for number, name in enumerate(pairs.names, start=1)]),
         "evaluation_points": pairs.fixed,

@@ -55,15 +55,17 @@ def finish(
         u = nodal_draws(config.model, inputs, draws, most)
         return Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
 
-    many = transform(POINT_DRAWS)
-    predicted = with_unresolved(predicted, many)
+    sampled_transform = transform(POINT_DRAWS)
+    predicted = with_unresolved(predicted, sampled_transform)
     if config.evaluation is not None:
-        held_out = evaluate_landmarks(PointPairs.of_arrays(inputs.observed[NAME]), many, config.evaluation.sd)
+        held_out = evaluate_landmarks(
+            PointPairs.of_arrays(inputs.observed[NAME]), sampled_transform, config.evaluation.sd
+        )
         predicted = predicted._replace(**held_out)
     total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
-    moments = moments_on(many, total_sd, grid)
+    moments = moments_on(sampled_transform, total_sd, grid)
     finished = Run(
-        manifest=manifest(config, inputs, posterior, samples, many.draws, mean, judged, provenance, began)
+        manifest=manifest(config, inputs, posterior, samples, sampled_transform.draws, mean, judged, provenance, began)
         | {"displacement_sd": moments.rms_sd},
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,

@@ -101,5 +101,5 @@ def _handling(handler: Callable[[int, object], None]) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, known in before.items():
-            signal.signal(number, known)
+        for number, previous_handler in before.items():
+            signal.signal(number, previous_handler)

@@ -24,7 +24,7 @@ GAIN = 1.05
 MOST_IGNORED = 0.5
 
 
-class Matched(NamedTuple):
+class MatchedImages(NamedTuple):
     """The fixed and the moving image in one world, with scaled intensities.
 
     Attributes
@@ -39,7 +39,7 @@ class Matched(NamedTuple):
         Measures of the likeness of the two images.
     notes : tuple of str
         Findings about pose, contrast and masks, one sentence each.
-    beware : tuple of str
+    warnings : tuple of str
         Warnings about the masks, one sentence each.
     """
 
@@ -49,7 +49,7 @@ class Matched(NamedTuple):
     moving_ignore: Image | None
     likeness: Likeness
     notes: tuple[str, ...]
-    beware: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def match_images(
@@ -60,7 +60,7 @@ def match_images(
     moving: Image,
     fixed_ignore: Image | None = None,
     moving_ignore: Image | None = None,
-) -> Matched:
+) -> MatchedImages:
     """Find the pose, decide whether both images have one contrast, and scale the intensities of both images.
 
     Parameters
@@ -97,16 +97,16 @@ def match_images(
     one_scale = alike and (data.same_contrast is True or likeness.is_one_scale)
     scale = scales[0] if one_scale else scales[1]
     of_contrast = _describe_contrast(alike, one_scale, likeness, data.same_contrast is None, similarity)
-    of_masks, beware = _describe_ignored(domain, ignored)
+    of_masks, warnings = _describe_ignored(domain, ignored)
     matching = Matching(pose, alike, scale)
     images = scales[0](fixed), scale(moving)
-    return Matched(matching, *images, moving_ignore, likeness, (of_pose, of_contrast, *of_masks), tuple(beware))
+    return MatchedImages(matching, *images, moving_ignore, likeness, (of_pose, of_contrast, *of_masks), tuple(warnings))
 
 
 def match_channel(
     data: FilesData,
     domain: Image,
-    matched: Matched,
+    matched: MatchedImages,
     name: str,
     fixed: Image,
     moving: Image,
@@ -119,7 +119,7 @@ def match_channel(
     data : FilesData
     domain : Image
         Nonzero in Ω, on the grid of the first fixed image.
-    matched : Matched
+    matched : MatchedImages
         The first pair. The mask of its moving image is applied to the further pair, too.
     name : str
         The name of the further pair in error messages.
@@ -160,7 +160,7 @@ def _seen(domain: Image, masks: Iterable[Image | None]) -> Image:
 
 def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple[list[str], list[str]]:
     """Return notes on how much of Ω each mask ignores, and warnings about masks that ignore nothing or most of Ω."""
-    notes, beware = [], []
+    notes, warnings = [], []
     inside = np.asarray(domain.voxels) != 0
     for name, mask in masks.items():
         if mask is None:
@@ -169,14 +169,14 @@ def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple
         millilitres, share = ignored * domain.voxel_volume / 1e3, ignored / np.count_nonzero(inside)
         notes.append(f"Ignored: {millilitres:.3g} ml of the organ in the {name} image.")
         if not ignored:
-            beware.append(
+            warnings.append(
                 f"data.{name}_ignore ignores nothing of the organ: the mask lies elsewhere in the world, or is empty."
             )
         elif share > MOST_IGNORED:
-            beware.append(
+            warnings.append(
                 f"data.{name}_ignore ignores {share:.0%} of the organ; what is not zero in the mask is ignored."
             )
-    return notes, beware
+    return notes, warnings
 
 
 def _scaled(name: str, image: Image, domain: Image) -> Image:
@@ -208,15 +208,17 @@ def _find_pose(
     )
 
 
-def _describe_contrast(alike: bool, one_scale: bool, likeness: Likeness, found: bool, similarity: AnySimilarity) -> str:
-    how = "found" if found else "as data.same_contrast says"
+def _describe_contrast(
+    alike: bool, one_scale: bool, likeness: Likeness, was_measured: bool, similarity: AnySimilarity
+) -> str:
+    how = "found" if was_measured else "as data.same_contrast says"
     shares = (
         f"a straight line explains {likeness.line_share:.0%} of the variance of the moving image, the best map "
         f"{likeness.map_share:.0%}"
     )
     if similarity.serves_any_contrast:
-        what = "the same" if alike else "unlike"
-        return f"Contrast: {what} ({how}; {shares}); compared by {similarity.kind}, which serves any contrast."
+        contrast = "the same" if alike else "unlike"
+        return f"Contrast: {contrast} ({how}; {shares}); compared by {similarity.kind}, which serves any contrast."
     if not alike:
         return f"Contrast: unlike ({how}; {shares}); compared through a map of the fixed image's intensities."
     scale = "on one scale" if one_scale else "each on a scale of its own"

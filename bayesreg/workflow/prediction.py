@@ -85,8 +85,8 @@ def predict(
     shared = posterior.data, *(jnp.asarray(array) for array in arrays)
     key = jax.random.key(seed)
 
-    def forward(draw: dict[str, AnyArray], given: Any) -> dict[str, AnyArray]:
-        data, u_mean, nodes, weights, projection, rotation = given
+    def forward(draw: dict[str, AnyArray], arguments: Any) -> dict[str, AnyArray]:
+        data, u_mean, nodes, weights, projection, rotation = arguments
         number = draw.pop("number")
         state = state_of(data.body, data.blocks, coordinates.fill(data.blocks, draw))
         u = state.u
@@ -106,9 +106,9 @@ def predict(
     thinned = thin(draws, [name for name in posterior.reference() if name in draws], MOST_DRAWS)
     chains, count = thinned["u_boundary"].shape[:2]
     thinned["number"] = np.arange(chains * count, dtype=float).reshape(chains, count)
-    kept: dict[str, list[np.ndarray]] = {}
-    summary = summarise(_keep_aside(push_forward(forward, thinned, shared), kept), (REACH,))
-    whole = {name: np.concatenate(parts, axis=1) for name, parts in kept.items()}
+    pieces_by_name: dict[str, list[np.ndarray]] = {}
+    summary = summarise(_keep_aside(push_forward(forward, thinned, shared), pieces_by_name), (REACH,))
+    kept_arrays = {name: np.concatenate(pieces, axis=1) for name, pieces in pieces_by_name.items()}
     return Predicted(
         chain_mean=summary.chain_mean["u"],
         far_mm=np.array(FAR),
@@ -116,11 +116,11 @@ def predict(
         reach=summary.quantiles["distance"][0],
         place_names=np.array(list(places)),
         place_points=np.array(list(places.values()), float),
-        place_draws=whole.pop("places"),
-        motion=np.concatenate(compose(pose, centre, whole.pop("motion")), axis=-1),
+        place_draws=kept_arrays.pop("places"),
+        motion=np.concatenate(compose(pose, centre, kept_arrays.pop("motion")), axis=-1),
         centre=centre,
         total_sd=None if pose.is_identity else summary.sd["turned"],
-        observations=whole | _summaries(posterior, mean),
+        observations=kept_arrays | _summaries(posterior, mean),
         **(_stiffness(summary) if posterior.data.body.field is not None else {}),
     )
 
@@ -151,20 +151,22 @@ def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
     )
 
 
-def _stiffness(found: Summary) -> dict[str, np.ndarray]:
+def _stiffness(summary: Summary) -> dict[str, np.ndarray]:
     return {
-        "stiffness_mean": found.mean["stiffness"],
-        "stiffness_sd": found.sd["stiffness"],
+        "stiffness_mean": summary.mean["stiffness"],
+        "stiffness_sd": summary.sd["stiffness"],
         "stiffer": np.array(STIFFER),
-        "stiffer_probability": found.mean["stiffer"],
+        "stiffer_probability": summary.mean["stiffer"],
     }
 
 
-def _keep_aside(blocks: Iterator[dict[str, Any]], kept: dict[str, list[np.ndarray]]) -> Iterator[dict[str, Any]]:
-    """Move the small entries of blocks (places, the motion, checks of observations) to `kept`; yield the others."""
+def _keep_aside(
+    blocks: Iterator[dict[str, Any]], pieces_by_name: dict[str, list[np.ndarray]]
+) -> Iterator[dict[str, Any]]:
+    """Move small entries of blocks (places, motion, checks of observations) to `pieces_by_name`; yield the others."""
     for block in blocks:
         for name in [name for name in block if name in ("places", "motion") or "/" in name]:
-            kept.setdefault(name, []).append(block.pop(name))
+            pieces_by_name.setdefault(name, []).append(block.pop(name))
         yield block
 
 

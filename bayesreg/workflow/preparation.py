@@ -35,7 +35,7 @@ from bayesreg.tissues import BRAIN_CLOSING
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.evaluation import NAME, require_unseen
-from bayesreg.workflow.matching import Matched, match_channel, match_images
+from bayesreg.workflow.matching import MatchedImages, match_channel, match_images
 from bayesreg.workflow.meshing import complete_lengths, mesh_of, size_of_organ
 from bayesreg.workflow.prediction import require_inside
 from bayesreg.workflow.simulated_pair import describe_pair, simulate_pair
@@ -130,7 +130,7 @@ def prepare(config: Config) -> Prepared:
     return Prepared(inputs, clock.laps, describe_pair(config, pair), appraisal)
 
 
-def _channels(config: Config, domain: Image, matched: Matched, fixed_ignore: Image | None) -> dict[str, Channel]:
+def _channels(config: Config, domain: Image, matched: MatchedImages, fixed_ignore: Image | None) -> dict[str, Channel]:
     """Match the pairs of images after the first, by their names."""
     assert isinstance(config.data, FilesData)
     channels = {}
@@ -155,7 +155,7 @@ def _ignored(config: Config, which: Literal["fixed", "moving"], image: Image) ->
     return _as_stored(mask)
 
 
-def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image | None) -> Matched | None:
+def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image | None) -> MatchedImages | None:
     """Match the moving image of a pair from files to the fixed image; None without such a pair."""
     data = config.data
     if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
@@ -187,7 +187,7 @@ def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, A
     return observations | {NAME: held_out.as_arrays()}
 
 
-def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched | None) -> Appraisal:
+def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: MatchedImages | None) -> Appraisal:
     """Appraise labels and images before the mesh is built."""
     if matched is None or not isinstance(config.data, FilesData):
         return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
@@ -196,7 +196,7 @@ def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: Matched 
     appraisal = appraise(
         anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale, anatomy.intracranial
     )
-    return appraisal._replace(notes=matched.notes, beware=(*appraisal.beware, *matched.beware))
+    return appraisal._replace(notes=matched.notes, warnings=(*appraisal.warnings, *matched.warnings))
 
 
 def prepared_inputs(config: Config, observations: Sequence[Any] = ()) -> tuple[Inputs, dict[str, Any]]:

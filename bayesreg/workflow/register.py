@@ -111,13 +111,13 @@ def _describe(config: Config, how: str) -> Iterator[str]:
 
 
 def _channel(number: int, pair: str) -> dict[str, str]:
-    parts = pair.split(",")
+    pieces = pair.split(",")
     # A path may also contain a comma.
-    ways = [(Path(",".join(parts[:k])), Path(",".join(parts[k:]))) for k in range(1, len(parts))]
+    ways = [(Path(",".join(pieces[:k])), Path(",".join(pieces[k:]))) for k in range(1, len(pieces))]
     if not ways:
         raise InputError(f"--channel {pair}: expected two paths with a comma between them, FIXED,MOVING")
-    there = next((way for way in ways if way[0].exists() and way[1].exists()), ways[0])
-    fixed, moving = (str(path.absolute()) for path in there)
+    existing = next((way for way in ways if way[0].exists() and way[1].exists()), ways[0])
+    fixed, moving = (str(path.absolute()) for path in existing)
     return {"kind": "images", "name": f"channel_{number}", "fixed": fixed, "moving": moving}
 
 

@@ -35,25 +35,29 @@ class Comparison(NamedTuple):
         The repetition.
     same : bool
         Whether all draws have the same bits.
-    apart : dict
+    greatest_differences : dict
         The greatest difference of a draw, in units of the variable's standard deviation, by variable; only variables
         that differ.
-    moved : dict
+    changed_entries : dict
         The entries of `WHERE` that changed: (then, now) by name.
     """
 
     result: Result
     same: bool
-    apart: dict[str, float]
-    moved: dict[str, tuple[Any, Any]]
+    greatest_differences: dict[str, float]
+    changed_entries: dict[str, tuple[Any, Any]]
 
     @property
     def lines(self) -> list[str]:
         """The comparison in words, one line per difference."""
-        changes = [f"{name} was {then or 'none'}, and is {now or 'none'}" for name, (then, now) in self.moved.items()]
+        changes = [
+            f"{name} was {then or 'none'}, and is {now or 'none'}" for name, (then, now) in self.changed_entries.items()
+        ]
         if self.same:
             return ["the draws are the same, bit for bit", *changes]
-        differences = [f"{name} is up to {distance:.2g} sd apart" for name, distance in self.apart.items()]
+        differences = [
+            f"{name} is up to {distance:.2g} sd apart" for name, distance in self.greatest_differences.items()
+        ]
         return ["the draws are not the same", *differences, *(changes or ["nothing that run.json records tells why"])]
 
 

@@ -119,7 +119,7 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     inputs, provenance = prepared_inputs(config, observations)
     for line in provenance["appraisal"].get("notes", ()):
         _log.info("%s", line)
-    for sentence in provenance["appraisal"].get("beware", ()):
+    for sentence in provenance["appraisal"].get("warnings", ()):
         _log.warning("%s", sentence)
     # The folder is written after all inputs are checked, and before the first step.
     posterior = posterior_of(config, inputs, observations)
@@ -140,11 +140,11 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
 
 
 def _resume(config: Config, folder: RunFolder, progress: Showing, observations: list[Any], began: float) -> Result:
-    known = _resumed_config(folder, config)
+    stored_config = _resumed_config(folder, config)
     provenance = store.read_json(folder.file(PROVENANCE))
     require_same_sources(config, provenance.get("sources", {}), MAY_CHANGE, folder.path)
     finished = folder.stage == "finished"
-    if finished and all(getattr(known, name) == getattr(config, name) for name in MAY_CHANGE):
+    if finished and all(getattr(stored_config, name) == getattr(config, name) for name in MAY_CHANGE):
         _log.info("%s holds a finished run already; another budget (stop) would continue it", folder.path)
         if not folder.is_sound(REPORT):
             report(folder.path)
@@ -158,7 +158,7 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     if finished:
         checkpoints.reopen(folder, to_blocks(posterior.target, load_result(folder.path).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
-    if known.evaluation != config.evaluation:
+    if stored_config.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
     reached = _load_reached(config, inputs, posterior, folder)
@@ -204,15 +204,15 @@ def _warn(config: Config, result: Result) -> None:
 
 def _resumed_config(folder: RunFolder, config: Config) -> Config:
     """Load the configuration of a begun run; InputError if it differs outside the sections `MAY_CHANGE`."""
-    known = load_stored_config(folder.file("config.yaml"))
+    stored_config = load_stored_config(folder.file("config.yaml"))
     sections = {name: getattr(config, name) for name in MAY_CHANGE}
-    if resolved_yaml(known.model_copy(update=sections)) != resolved_yaml(config):
+    if resolved_yaml(stored_config.model_copy(update=sections)) != resolved_yaml(config):
         raise InputError(
             f"{folder.path} holds a run of another configuration; resume it with its own "
             f"({folder.path / 'config.yaml'}), of which only the sections {', '.join(MAY_CHANGE)} may change, or name "
             "another folder"
         )
-    return known
+    return stored_config
 
 
 def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, float | None]:
@@ -226,9 +226,11 @@ def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, flo
     return {name: log if np.isfinite(log) else None for name, log in log_likelihoods.items()}
 
 
-def _require_same_observations(out: Path, provenance: dict[str, Any], posterior: Posterior, given: list[Any]) -> None:
+def _require_same_observations(
+    out: Path, provenance: dict[str, Any], posterior: Posterior, observations: list[Any]
+) -> None:
     """Raise InputError if a run is resumed with other observations than it began with."""
-    begun, now = provenance.get("observations", {}), _fingerprint(posterior, given)
+    begun, now = provenance.get("observations", {}), _fingerprint(posterior, observations)
     advice = "give the same to bayesreg.run(..., observations=[...])"
     if list(begun) != list(now):
         raise InputError(

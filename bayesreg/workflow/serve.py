@@ -120,7 +120,7 @@ class Served:
         return _finite(gradient, f"the gradient of {self.name}").tolist()
 
     def _position(self, parameters: Vectors) -> Any:
-        return jnp.concatenate([jnp.asarray(part, float) for part in parameters]) if parameters else jnp.zeros(0)
+        return jnp.concatenate([jnp.asarray(vector, float) for vector in parameters]) if parameters else jnp.zeros(0)
 
 
 def models_of(posterior: Posterior) -> list[Served]:
@@ -135,16 +135,16 @@ def models_of(posterior: Posterior) -> list[Served]:
         intensities of the moving image at the quadrature points. "start" has no input; its outputs are the parts of the
         position at rest, where a sampler can begin.
     """
-    back, parts = unravel(posterior.target), slices(posterior.target)
-    sizes = [part.stop - part.start for part in parts.values()]
+    unravel_position, blocks = unravel(posterior.target), slices(posterior.target)
+    sizes = [block.stop - block.start for block in blocks.values()]
 
     # The data are an argument, because JAX would compile data of a closure as constants.
     def log_posterior(data: Any, position: Any) -> list[Any]:
-        return [replace(posterior, data=data).logdensity(back(position))[None]]
+        return [replace(posterior, data=data).logdensity(unravel_position(position))[None]]
 
     def forward(data: Any, position: Any) -> list[Any]:
         posterior_with_data = replace(posterior, data=data)
-        estimands, images = posterior_with_data.constrain(back(position)), images_of(data)
+        estimands, images = posterior_with_data.constrain(unravel_position(position)), images_of(data)
         evaluation = posterior_with_data.evaluate(estimands)
         # The displacement is invalid if the solve failed, or was skipped outside the support.
         u = jnp.where(evaluation.solver_failed | evaluation.outside_support, jnp.nan, evaluation.u)
@@ -152,7 +152,7 @@ def models_of(posterior: Posterior) -> list[Served]:
 
     def start(data: Any, _: Any) -> list[Any]:
         at_rest = posterior.target.coordinates.unconstrain(data, posterior.estimands(posterior.reference()))
-        return [jnp.ravel(at_rest[name]) for name in parts]
+        return [jnp.ravel(at_rest[name]) for name in blocks]
 
     functions = {LOG_POSTERIOR: (log_posterior, sizes), "forward": (forward, sizes), "start": (start, [])}
     return [Served(name, function, posterior.data, inputs) for name, (function, inputs) in functions.items()]
@@ -179,7 +179,7 @@ def serve(config: str | Path | Config, port: int = PORT) -> None:
         raise InputError("the package umbridge is missing: pip install 'bayesreg[serve]'") from error
     posterior = posterior_of_run(config)
     models = models_of(posterior)
-    names = ", ".join(f"{name} ({part.stop - part.start})" for name, part in slices(posterior.target).items())
+    names = ", ".join(f"{name} ({block.stop - block.start})" for name, block in slices(posterior.target).items())
     served = ", ".join(model.name for model in models)
     _log.info("inputs: %s; serving %s at http://%s:%d", names, served, LOOPBACK, port)
     # By default umbridge accepts connections from every machine.

@@ -18,13 +18,13 @@ def digests_of_sources(config: Config, but: tuple[str, ...]) -> dict[str, str]:
     return {key: digest for key, path in named if (digest := _digest_of(path)) is not None}
 
 
-def require_same_sources(config: Config, known: Mapping[str, str], but: tuple[str, ...], folder: Path) -> None:
+def require_same_sources(config: Config, digests: Mapping[str, str], but: tuple[str, ...], folder: Path) -> None:
     """Raise InputError if the content of a file changed since the run in a folder was begun.
 
     A missing file is no error: the folder holds the inputs that were made from it.
     """
     now = digests_of_sources(config, but)
-    if changed := [key for key, digest in known.items() if now.get(key, digest) != digest]:
+    if changed := [key for key, digest in digests.items() if now.get(key, digest) != digest]:
         named = dict(_paths(config.model_dump()))
         listed = ", ".join(f"{key} ({named[key]})" for key in changed)
         raise InputError(

@@ -1,4 +1,4 @@
-"""Compiled as the command line has it, before anything imports JAX."""
+"""The benchmarks compile with the settings of the command line, set before anything imports JAX."""
 
 from bayesreg.compilation import compile_quickly
 

@@ -1,9 +1,9 @@
-"""Effective draws per second of the default sampler against the paper's kernel, on the paper's posterior.
+"""Compare effective draws per second of the default sampler and of the paper's kernel, on the paper's posterior.
 
-The kernel cannot be run until its effective sample size can be estimated: a short chain flatters it a thousandfold.
-For a random walk with step variances D, acceptance a and posterior covariance C, entry i gains per step, in the
-diffusion limit, a C_ii / (4 [C D⁻¹ C]_ii) effective draws. Acceptance and steps per second are measured at draws of the
-converged posterior; the formula is checked on a Gaussian of that covariance, where steps are cheap.
+The kernel is too slow for an estimate of its effective sample size from a chain: a short chain overestimates it a
+thousandfold. For a random walk with step variances D, acceptance a and posterior covariance C, entry i gains
+a C_ii / (4 [C D⁻¹ C]_ii) effective draws per step in the diffusion limit. Acceptance and steps per second are measured
+at draws of the converged posterior. The formula is checked on a Gaussian of that covariance, where steps are cheap.
 """
 
 import os
@@ -41,7 +41,7 @@ def bench_effective_draws():
 
 
 def compare_kernels(result):
-    """Of a run by `CONFIG` that has ended."""
+    """Print the speed of both kernels on the posterior of a finished run of `CONFIG`."""
     convergence = result.run.manifest["convergence"]
     seconds = result.run.manifest["timings"]["sampling"]
     posterior = posterior_of(br.load_config(result.folder / "config.yaml"), store.read_inputs(RunFolder(result.folder)))
@@ -59,8 +59,11 @@ def compare_kernels(result):
     )
     print("steps per effective draw: median {:,.0f}, greatest {:,.0f}".format(*np.quantile(1 / ess, [0.5, 1.0])))
     for kind in ("bulk", "tail"):
-        found, least = convergence[f"ess_{kind}_min"] / seconds, ess.min() * rate * CHAINS
-        print(f"least {kind} ESS per second: {found:.3g} against {least:.3g}, {found / least:,.0f} times")
+        default_rate, papers_rate = convergence[f"ess_{kind}_min"] / seconds, ess.min() * rate * CHAINS
+        print(
+            f"least {kind} ESS per second: {default_rate:.3g} against {papers_rate:.3g}, "
+            f"{default_rate / papers_rate:,.0f} times"
+        )
     check_formula(covariance, variances)
 
 
@@ -72,33 +75,33 @@ def covariance_and_steps(draws: xr.Dataset):
 
 
 def estimands_of(posterior, draws):
-    """Of every kept draw of all chains."""
+    """The estimands of every kept draw of all chains."""
     flat = {name: draws[name].values.reshape(-1, *draws[name].shape[2:]) for name in STEPS}
     return jax.vmap(posterior.estimands)({name: jnp.asarray(values, float) for name, values in flat.items()})
 
 
 def papers_acceptance(posterior, draws):
-    """Mean over the posterior of the probability that a step is accepted, and the share of steps in the support."""
+    """Measure the mean acceptance of a step over the posterior, and the share of steps in the support."""
     kernel, places = choose_sampler("rwmh", posterior.target).sampler, estimands_of(posterior.target, draws)
 
     @jax.jit
     def tried(data, place, keys):
-        def one(key):
+        def attempt(key):
             state = kernel.init(data, None, place)
             info = kernel.step(data, None, key, state)[1]
             return info.acceptance_rate, ~info.outside_support
 
-        return jax.lax.map(one, keys)
+        return jax.lax.map(attempt, keys)
 
     count = len(places["u_boundary"])
     keys = jax.random.split(jax.random.key(1), (count, STEPS_TRIED // count + 1))
-    found = [tried(posterior.data, jax.tree.map(lambda x, i=i: x[i], places), keys[i]) for i in range(count)]
-    rates, inside = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    outcomes = [tried(posterior.data, jax.tree.map(lambda x, i=i: x[i], places), keys[i]) for i in range(count)]
+    rates, inside = (np.concatenate(columns) for columns in zip(*outcomes, strict=True))
     return float(np.nan_to_num(rates).mean()), float(inside.mean())
 
 
 def papers_speed(posterior, draws):
-    """Steps per second of each of three chains, from draws of the posterior, in blocks as a run makes them."""
+    """Measure the steps per second of each of three chains, from draws of the posterior, in blocks like a run's."""
     last = jax.tree.map(lambda x: x[-CHAINS:], estimands_of(posterior.target, draws))
     setup = jax.tree.map(lambda x: x.mean(axis=0), last)
     block = block_from(choose_sampler("rwmh", posterior.target), setup, last, STEPS_TIMED // PAPERS_THIN, PAPERS_THIN)
@@ -106,7 +109,7 @@ def papers_speed(posterior, draws):
 
 
 def check_formula(covariance, variances):
-    """A long walk on the Gaussian of that covariance, in the coordinates in which covariance and steps are diagonal."""
+    """Check the formula by a long walk on a Gaussian, in coordinates that make its covariance and steps diagonal."""
     predicted, measured = gaussian_walk(covariance, variances, chains=16, steps=200_000)
     ratio = measured / predicted
     print(

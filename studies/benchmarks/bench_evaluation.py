@@ -1,25 +1,25 @@
-"""One density of every chain, its gradient and its parts, by mesh and number of chains, beside NumPy and SciPy.
+"""Time one density of every chain, its gradient and its operations, by mesh and chains, beside NumPy and SciPy.
 
     make bench ARGS="-k '0.8k'"
 
-"0.8k" and "5k" are brains, the demonstration's pair on a mesh of the paper's size and on a finer one, without skull,
-of which the peers know nothing; the others are balls of three shells, images of 1.5 mm. All boundary nodes are sampled.
-Chains' λ and μ are scattered about the reference by a factor of 1.35; solves end where those of chains end. Chains run
-as those of samplers do, on a processor in groups. Every part is compiled by itself, anew, and its time and memory are
-those of all chains together:
+"0.8k" and "5k" are brains: the demonstration's pair on a mesh of the paper's size and on a finer one, without a skull,
+which the peers do not have. The other meshes are balls of three shells, with images of 1.5 mm. All boundary nodes are
+sampled. λ and μ of the chains are scattered about the reference by a factor of 1.35, and solves have the tolerance of
+chains. Chains run side by side in groups, as those of samplers do. Every operation is compiled separately and anew. Its
+time and memory are those of all chains together:
 
 - density; gradient, with its density;
-- solve: the elastic equilibrium at each chain's own λ, μ and displacements;
-- similarity: displacements to quadrature points, the warped image, the sum of squares; slope, the same with its
+- solve: the elastic equilibrium at λ, μ and the displacements of each chain;
+- similarity: displacements to quadrature points, the warped image, the sum of squares; slope: the same with its
   derivative by all displacements.
 
-The finer the mesh, the fewer the chains: 100k nodes have 2.4 million quadrature points, so that four chains there have
-as many as 64 have at 5k, and 16 at 30k. More would take the memory of the two-core machines that this is for, and
-minutes a round.
+Finer meshes have fewer chains: 100k nodes have 2.4 million quadrature points, so that four chains there have as many
+points as 16 chains at 30k, and 64 chains at 5k. More chains would exceed the memory of a machine with two cores, and
+take minutes for each round.
 
-Peers evaluate one chain after the other on one core, and so one chain is timed, after all of ours of the same mesh. For
-the similarity it is `map_coordinates` alone, handed the points. They end at 5k, where a factor takes seconds;
-`studies.benchmarks.solves` has more of them.
+Peers evaluate one chain after the other on one core. Therefore one chain is timed, after all of bayesreg's cases on the
+same mesh. The peer of the similarity is `map_coordinates` alone, with the points as its input. Peers end at 5k, where a
+factorisation takes seconds; `studies.benchmarks.solves` has more of them.
 """
 
 from __future__ import annotations
@@ -60,31 +60,31 @@ DEMONSTRATION = Path(__file__).parents[2] / "configs" / "quickstart.yaml"
 EDGES_OF_BRAINS = {"0.8k": 15.5, "5k": 7.3}
 BALLS = {"30k": 30_000, "100k": 100_000}
 CHAINS = {"0.8k": (1, 4, 16, 64), "5k": (1, 4, 16, 64), "30k": (1, 4, 16), "100k": (1, 4)}
-PARTS = "density", "gradient", "solve", "similarity", "slope"
+OPERATIONS = "density", "gradient", "solve", "similarity", "slope"
 ROUNDS, ROUNDS_OF_LARGE, PASSES = 9, 5, 7
-FLOOR_AT = 1, 4, 16
+CHAINS_WITH_FLOOR = 1, 4, 16
 
 PROBLEMS = [("0.8k", "linear"), *((mesh, "cubic") for mesh in CHAINS)]
 SIXTEEN = [pytest.param(problem, 16, id=f"{'-'.join(problem)}-16") for problem in PROBLEMS if problem[0] == "0.8k"]
 
 
 def _cases(problem: tuple[str, str]) -> Iterator[Any]:
-    """Ours of a problem before its peers."""
+    """List the cases of bayesreg for a problem, then those of its peers."""
     mesh, interpolation = problem
-    named = "-".join(problem)
+    identifier = "-".join(problem)
     for chains in CHAINS[mesh]:
-        for part in PARTS:
-            # Images have no part in it.
-            if part != "solve" or interpolation == "cubic":
-                yield pytest.param(problem, chains, part, None, id=f"{named}-{chains}-{part}")
+        for operation in OPERATIONS:
+            # The solve does not depend on the images.
+            if operation != "solve" or interpolation == "cubic":
+                yield pytest.param(problem, chains, operation, None, id=f"{identifier}-{chains}-{operation}")
     if mesh in EDGES_OF_BRAINS:
-        for part, names in {"density": list(SOLVERS), "similarity": ["map_coordinates"]}.items():
+        for operation, names in {"density": list(SOLVERS), "similarity": ["map_coordinates"]}.items():
             for name in names:
-                yield pytest.param(problem, 1, part, name, id=f"{named}-1-{part}-{name}")
+                yield pytest.param(problem, 1, operation, name, id=f"{identifier}-1-{operation}-{name}")
 
 
 class Problem(NamedTuple):
-    """A posterior, the names of its mesh and interpolation, and its data as chains have them."""
+    """A posterior, the names of its mesh and interpolation, and its data conditioned for chains."""
 
     mesh: str
     interpolation: str
@@ -92,8 +92,8 @@ class Problem(NamedTuple):
     data: Data
 
     @property
-    def told(self) -> dict[str, Any]:
-        """What the file says of it."""
+    def facts(self) -> dict[str, Any]:
+        """The description of the problem in the JSON file."""
         return {
             "mesh": self.mesh,
             "interpolation": self.interpolation,
@@ -103,24 +103,24 @@ class Problem(NamedTuple):
 
     @property
     def rounds(self) -> int:
-        """Of a benchmark."""
+        """The number of rounds of a benchmark."""
         return ROUNDS if self.mesh == "0.8k" else ROUNDS_OF_LARGE
 
 
 class Places(NamedTuple):
-    """Where chains are: the positions, λ and μ by cell, displacements of prescribed nodes, of all; their iterations."""
+    """The positions of chains: λ and μ by cell, displacements of prescribed and of all nodes, solver iterations."""
 
     positions: dict[str, jax.Array]
     lam: jax.Array
     mu: jax.Array
-    given: jax.Array
+    prescribed: jax.Array
     u: jax.Array
     iterations: jax.Array
 
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_anew() -> Iterator[None]:
-    """Nothing is read from the programs that earlier runs have left."""
+    """Disable the cache of compiled programs."""
     jax.config.update("jax_enable_compilation_cache", False)
     compilation_cache.reset_cache()
     yield
@@ -139,7 +139,7 @@ def places(request: pytest.FixtureRequest, problem: Problem) -> Places:
     return _places(problem.mesh, problem.interpolation, request.param)
 
 
-# Not fixtures of the module: pytest makes those anew for every case, even if problem and chains are the same.
+# Not fixtures of the module: pytest makes such fixtures anew for every case, even with equal parameters.
 @lru_cache(maxsize=1)
 def _problem(mesh: str, interpolation: str) -> Problem:
     _forget()
@@ -149,7 +149,7 @@ def _problem(mesh: str, interpolation: str) -> Problem:
 
 
 def _forget() -> None:
-    """Make room for the next mesh."""
+    """Free the memory for the next mesh."""
     _problem.cache_clear()
     _places.cache_clear()
     jax.clear_caches()
@@ -157,7 +157,7 @@ def _forget() -> None:
 
 @lru_cache(maxsize=1)
 def _pair() -> Inputs:
-    """The demonstration's, made on a mesh of the paper's size."""
+    """The pair of the demonstration, made on a mesh of the paper's size."""
     return prepare(br.load_config(DEMONSTRATION, [f"mesh.edge_length={EDGES_OF_BRAINS['0.8k']}"])).inputs
 
 
@@ -188,60 +188,62 @@ def _places(mesh: str, interpolation: str, chains: int) -> Places:
     def settled(data: Data, position: dict[str, jax.Array]) -> Any:
         values = complete(data.blocks, estimands_of(posterior.target, data, position))
         lam, mu = data.body.lame_by_cell(values)
-        given = data.body.prescribed(values["u_boundary"])
-        found = equilibrium(data.body.system, lam, mu, given)
-        return lam, mu, given, found.u, found.iterations
+        prescribed = data.body.prescribed(values["u_boundary"])
+        state = equilibrium(data.body.system, lam, mu, prescribed)
+        return lam, mu, prescribed, state.u, state.iterations
 
     return Places(positions, *jax.jit(jax.vmap(settled, in_axes=(None, 0)))(problem.data, positions))
 
 
 @pytest.mark.parametrize(
-    ("problem", "places", "part", "peer"),
+    ("problem", "places", "operation", "peer"),
     [case for problem in PROBLEMS for case in _cases(problem)],
     indirect=["problem", "places"],
 )
-def bench_evaluation(problem: Problem, places: Places, part: str, peer: str | None, timed: Callable[..., None]) -> None:
+def bench_evaluation(
+    problem: Problem, places: Places, operation: str, peer: str | None, timed: Callable[..., None]
+) -> None:
     chains = len(places.u)
-    told = {"part": part, "chains": chains, **problem.told}
+    facts = {"part": operation, "chains": chains, **problem.facts}
     if peer is not None:
-        function, arguments = at_one_place(problem, places, peer)
-        timed(function, *arguments, rounds=problem.rounds, peer=peer, **told)
+        function, arguments = peer_at_first_chain(problem, places, peer)
+        timed(function, *arguments, rounds=problem.rounds, peer=peer, **facts)
         return
-    function, rest = program(problem, places, part)
+    function, rest = program(problem, places, operation)
     began = perf_counter()
     compiled = function.lower(problem.data, *rest).compile()
-    told |= {"compiling": perf_counter() - began, **memory(compiled)}
-    if part == "density":
-        told["iterations"] = int(places.iterations.max())
-    if (problem.mesh, problem.interpolation, part) == ("0.8k", "cubic", "density") and chains in FLOOR_AT:
-        least = floor.density_parts(problem.data, chains, told["iterations"])
-        told["floor"] = sum(work.seconds(machine()) for work in least)
-    timed(compiled, problem.data, *rest, rounds=problem.rounds, **told)
+    facts |= {"compiling": perf_counter() - began, **memory(compiled)}
+    if operation == "density":
+        facts["iterations"] = int(places.iterations.max())
+    if (problem.mesh, problem.interpolation, operation) == ("0.8k", "cubic", "density") and chains in CHAINS_WITH_FLOOR:
+        least = floor.density_work(problem.data, chains, facts["iterations"])
+        facts["floor"] = sum(work.seconds(machine()) for work in least)
+    timed(compiled, problem.data, *rest, rounds=problem.rounds, **facts)
 
 
-def program(problem: Problem, places: Places, part: str) -> tuple[Any, tuple[Any, ...]]:
-    """A part of the density of all chains, jitted, as a function of the data and of what is each chain's, and that."""
+def program(problem: Problem, places: Places, operation: str) -> tuple[Any, tuple[Any, ...]]:
+    """Return a jitted operation on all chains as a function of the data and of arguments by chain, and the latter."""
 
-    def solve(data: Data, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
-        return equilibrium(data.body.system, lam, mu, given).u
+    def solve(data: Data, lam: jax.Array, mu: jax.Array, prescribed: jax.Array) -> jax.Array:
+        return equilibrium(data.body.system, lam, mu, prescribed).u
 
     def similarity(data: Data, u: jax.Array) -> jax.Array:
         images = data.terms["images"]
         return images.quadrature.weights @ images.residuals(u) ** 2
 
     density = partial(logdensity, problem.posterior.target)
-    one, each = {
+    function, arguments = {
         "density": (density, (places.positions,)),
         "gradient": (jax.value_and_grad(density, argnums=1), (places.positions,)),
-        "solve": (solve, (places.lam, places.mu, places.given)),
+        "solve": (solve, (places.lam, places.mu, places.prescribed)),
         "similarity": (similarity, (places.u,)),
         "slope": (jax.value_and_grad(similarity, argnums=1), (places.u,)),
-    }[part]
-    return jax.jit(lambda data, *each: side_by_side(partial(one, data), None)(*each)), each
+    }[operation]
+    return jax.jit(lambda data, *arguments: side_by_side(partial(function, data), None)(*arguments)), arguments
 
 
 def memory(compiled: Any) -> dict[str, int]:
-    """Bytes that a program holds while it runs, by what they are for."""
+    """Bytes that a program holds while it runs, by their purpose."""
     used = compiled.memory_analysis()
     kinds = {"temporaries": "temp", "arguments": "argument", "outputs": "output"}
     return {f"{name}_bytes": getattr(used, f"{kind}_size_in_bytes") for name, kind in kinds.items()}
@@ -249,12 +251,12 @@ def memory(compiled: Any) -> dict[str, int]:
 
 @lru_cache
 def machine() -> floor.Machine:
-    """Measured once."""
+    """The speed of this machine, measured once."""
     return floor.measured()
 
 
-def at_one_place(problem: Problem, places: Places, peer: str) -> tuple[Callable[..., Any], list[np.ndarray]]:
-    """A peer, and what it is handed for the first chain; there it finds what we do."""
+def peer_at_first_chain(problem: Problem, places: Places, peer: str) -> tuple[Callable[..., Any], list[np.ndarray]]:
+    """Return a peer and its arguments for the first chain, after a check that its result agrees."""
     posterior, order = problem.posterior, {"linear": 1, "cubic": 3}[problem.interpolation]
     pair = posterior.observations["images"]
     values = posterior.constrain(jax.tree.map(lambda x: x[0], places.positions))
@@ -272,22 +274,22 @@ def at_one_place(problem: Problem, places: Places, peer: str) -> tuple[Callable[
 
 @pytest.mark.parametrize(("problem", "places"), SIXTEEN, indirect=True)
 def bench_ratios(problem: Problem, places: Places, timed: Callable[..., None]) -> None:
-    """What issue 4 asks of 16 chains at the paper's size: a peer's density in ours, and densities in a gradient.
+    """Measure the ratios that issue 4 bounds, with 16 chains at the paper's size.
 
-    A machine that others use has slow spells, in which what runs on both of its cores waits for the slower one.
-    Everything is timed one after the other seven times, medians of nine; the ratios are of the least of these, and
-    those of single passes stand beside them.
+    They are the density of the best peer over bayesreg's, and bayesreg's gradient over its density. On a shared machine
+    a program on both cores sometimes waits for the slower one. Therefore all programs are timed in turn, in seven
+    passes of medians of nine. The ratios are of the least times; the file also has the ratios of single passes.
     """
-    parts = [program(problem, places, part) for part in ("density", "gradient")]
-    ours = [(function, (problem.data, *each)) for function, each in parts]
-    peers = [at_one_place(problem, places, name) for name in SOLVERS]
-    passes = [[_median(function, *given) for function, given in (*ours, *peers)] for _ in range(PASSES)]
-    of_each = [ratios(len(places.u), *seconds) for seconds in passes]
+    programs = [program(problem, places, operation) for operation in ("density", "gradient")]
+    calls = [(function, (problem.data, *each)) for function, each in programs]
+    peers = [peer_at_first_chain(problem, places, name) for name in SOLVERS]
+    passes = [[_median(function, *arguments) for function, arguments in (*calls, *peers)] for _ in range(PASSES)]
+    ratios_of_passes = [ratios(len(places.u), *seconds) for seconds in passes]
     gain, densities = ratios(len(places.u), *np.min(passes, axis=0))
-    told = {"gain": gain, "densities": densities, "passes": of_each, "chains": len(places.u)}
-    timed(ours[0][0], *ours[0][1], rounds=problem.rounds, **told, **problem.told)
+    facts = {"gain": gain, "densities": densities, "passes": ratios_of_passes, "chains": len(places.u)}
+    timed(calls[0][0], *calls[0][1], rounds=problem.rounds, **facts, **problem.facts)
 
 
 def ratios(chains: int, density: float, gradient: float, *peers: float) -> tuple[float, float]:
-    """The best peer's density over ours of one chain, our gradient over our density."""
+    """Return the best peer's density over bayesreg's, for one chain, and bayesreg's gradient over its density."""
     return float(chains * min(peers) / density), float(gradient / density)

@@ -1,10 +1,10 @@
-"""One draw of every sampler on the paper's problem, with the chains of a run of `hmc` where they stand at its end.
+"""Time one draw of every sampler on the paper's problem, from the last state of the chains of a run of `hmc`.
 
     BAYESREG_RUN=DIR make bench ARGS="-k draw"
 
-DIR is the folder of a run of `configs/converged_tissues.yaml` that has ended; without it there is nothing to time. A
-block of draws is timed, made as a run makes it. All samplers but the paper's are given the run's reference, walls and
-steps, so that there is no search and no warm-up. `smc` draws as `hmc` does, once it has tempered.
+DIR is the folder of a finished run of `configs/converged_tissues.yaml`; without it the benchmark is skipped. A block of
+draws is timed, made as a run makes it. All samplers except for the paper's use the reference, walls and steps of the
+run, so that they need no search and no warm-up. `smc` draws as `hmc` does after its tempering.
 """
 
 import os
@@ -28,7 +28,7 @@ from bayesreg.model.posterior import Posterior
 from bayesreg.workflow.assembly import posterior_of
 
 ROUNDS, DRAWS = 5, 3
-# Of the paper's kernel a draw is a step, and few are in the support.
+# A draw of the paper's kernel is one step, and few steps are in the support.
 STEPS, PAPERS_THIN = 1_000, 10
 
 
@@ -44,7 +44,7 @@ class Finished(NamedTuple):
 def finished() -> Finished:
     folder = os.environ.get("BAYESREG_RUN")
     if folder is None:
-        pytest.skip("BAYESREG_RUN names no run that has ended")
+        pytest.skip("BAYESREG_RUN names no finished run")
     run_folder = RunFolder(Path(folder))
     config = br.load_config(run_folder.path / "config.yaml")
     posterior, options = posterior_of(config, store.read_inputs(run_folder)), config.sampler
@@ -54,13 +54,13 @@ def finished() -> Finished:
     arrays.pop("blocks")
     end = checkpoint_from_arrays(arrays, posterior.target, options.name, options.chains, **options.settings)
     draws = br.load_result(folder).idata.posterior.isel(draw=-1)
-    known = posterior.reference()
-    values = {name: jnp.asarray(draws[name].values, float) for name in known if name in draws}
-    return Finished(posterior, end, jax.vmap(lambda each: posterior.estimands(known | each))(values))
+    reference = posterior.reference()
+    values = {name: jnp.asarray(draws[name].values, float) for name in reference if name in draws}
+    return Finished(posterior, end, jax.vmap(lambda each: posterior.estimands(reference | each))(values))
 
 
 def block_from(chosen: Chosen, setup: Any, places: dict[str, jax.Array], draws: int, thin: int) -> Callable[[], Any]:
-    """A block of draws, made as a run makes it, from chains at these places."""
+    """Return a function that makes a block of draws, as a run does, from chains at these places."""
     data = chosen.sampler.data(setup)
     begun = _first(chosen, data, setup, places)
     numbers = np.arange(len(places["u_boundary"]))
@@ -77,5 +77,5 @@ def bench_draw(name: str, finished: Finished, timed: Any) -> None:
     tally = block()[2]
     gradients, densities = (float(getattr(tally, kind).mean()) / count for kind in ("gradients", "densities"))
     chains = len(places["u_boundary"])
-    told = {"sampler": name, "chains": chains, "draws": count, "gradients": gradients, "densities": densities}
-    timed(block, rounds=ROUNDS, nodes=len(posterior.mesh.points), mesh="paper", **told)
+    facts = {"sampler": name, "chains": chains, "draws": count, "gradients": gradients, "densities": densities}
+    timed(block, rounds=ROUNDS, nodes=len(posterior.mesh.points), mesh="paper", **facts)

@@ -12,7 +12,7 @@ from bayesreg.model.observations.images.pair import ImagePair
 from tests.phantoms import ball_mesh, smooth_image
 
 REPETITIONS = 9
-STEPS_PER_SECOND = 50  # What each of three chains should make on two cores; the paper's made 5.
+STEPS_PER_SECOND = 50  # The least speed of each of three chains on two cores; the paper's implementation made 5.
 
 
 def _posterior():

@@ -1,10 +1,11 @@
-"""The share of sampling that keeping draws and state takes, so that a run that is cut off loses one block.
+"""Which share of the sampling time does the storing of draws and state take?
 
     python -m studies.benchmarks.checkpoint_cost CONFIG [--set KEY=VALUE …]
 
-A run from end to end, as the command line makes it. Sampling is all that lies between the first block and the last,
-which compiles; keeping is what comes between a block and the next: its file, that of the state, and the list of files
-(twice each), all flushed to the operating system, as a kill of the process survives it.
+The program makes a complete run, as the command line does. The sampling time is the time from the end of the first
+block, which compiles, to the end of the last. After each block a run writes the file of the block and the file of the
+state, and twice the list of files. All are flushed to the operating system, so that a killed run loses at most one
+block.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from bayesreg.workflow import run as module
 
 
 def main() -> None:
-    """Print the share."""
+    """Print the share of the sampling time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-    given = parser.parse_args()
-    kept: list[float] = []
+    options = parser.parse_args()
+    keeping_seconds: list[float] = []
     ends: list[float] = []
     append, save = checkpoints.StoredBlocks.append, checkpoints.save_state
 
-    def timed(what, *arguments):
+    def timed(function, *arguments):
         began = time.perf_counter()
-        what(*arguments)
-        kept.append(time.perf_counter() - began)
+        function(*arguments)
+        keeping_seconds.append(time.perf_counter() - began)
 
     def keep(*arguments):
         timed(save, *arguments)
@@ -46,12 +47,12 @@ def main() -> None:
         mock.patch.object(checkpoints.StoredBlocks, "append", lambda *arguments: timed(append, *arguments)),
         mock.patch.object(checkpoints, "save_state", keep),
     ):
-        module.run(load_config(given.config, given.overrides), Path(folder) / "run", progress=False)
-    # The first state is that before any draw; of each block the draws are kept, and then the state.
-    blocks = np.array(kept[1:]).reshape(-1, 2).sum(axis=1)
-    whole = ends[-1] - ends[1]
+        module.run(load_config(options.config, options.overrides), Path(folder) / "run", progress=False)
+    # The first state is written before any draw. Each block writes its draws, then the state.
+    blocks = np.array(keeping_seconds[1:]).reshape(-1, 2).sum(axis=1)
+    sampling_seconds = ends[-1] - ends[1]
     print(
-        f"{len(blocks)} blocks: {blocks[1:].sum() / whole:.2%} of {whole:.0f} s; "
+        f"{len(blocks)} blocks: {blocks[1:].sum() / sampling_seconds:.2%} of {sampling_seconds:.0f} s; "
         f"{1e3 * np.median(blocks):.1f} ms a block, the last {1e3 * blocks[-1]:.1f}"
     )
 

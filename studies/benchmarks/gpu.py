@@ -1,10 +1,11 @@
-"""Chains side by side on whatever device JAX has: densities and gradients per second, and effective draws per second.
+"""Measure chains side by side on the device of JAX: densities, gradients and effective draws per second.
 
     python -m studies.benchmarks.gpu RUN [--chains 1 4 16 …] [--sample 4 64 …] [--minutes 3]
 
-RUN is a run's folder, or a pair's that `bayesreg simulate configs/converged_tissues.yaml` made. The first table is of
-one batch of chains spread about the truth, solves ended and preconditioned as those of chains are: medians of five.
-The second is of whole runs of `hmc` by the strict stop rule, the search for the mode and compilation counted.
+RUN is the folder of a run, or of a pair that `bayesreg simulate configs/converged_tissues.yaml` made. The first table
+is for one batch of chains about the truth, with the tolerance and preconditioner of chains; times are medians of five.
+The second table is for whole runs of `hmc` with the strict stop rule; it includes the search for the mode and
+compilation.
 """
 
 from __future__ import annotations
@@ -34,37 +35,37 @@ from bayesreg.workflow.preparation import PROVENANCE
 
 REPEATS = 5
 CHAINS = (1, 4, 16, 64, 256, 1024, 4096)
-# Of the chains about the truth: standard deviations in mm and of the scores of λ, μ.
+# Standard deviations of the chains about the truth: of displacements in mm, and of the scores of λ and μ.
 SPREAD = {"u_boundary": 0.1, "lam": 0.3, "mu": 0.3}
 
 
 def main() -> None:
-    """Both tables."""
+    """Read the command line, and print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--chains", type=int, nargs="*", default=CHAINS)
     parser.add_argument("--sample", type=int, nargs="*", default=(4, 64))
-    parser.add_argument("--minutes", type=float, default=3.0, help="of each run that samples")
-    given = parser.parse_args()
-    device, inputs = jax.devices()[0], store.read_inputs(RunFolder(given.run))
-    # A run knows how many points are independent; a simulated pair has yet to find out.
-    known = store.read_json(given.run / PROVENANCE).get("independent_points")
-    posterior = posterior_of(br.load_config(given.run / "config.yaml"), inputs, (), known)
+    parser.add_argument("--minutes", type=float, default=3.0, help="budget of each run that samples")
+    arguments = parser.parse_args()
+    device, inputs = jax.devices()[0], store.read_inputs(RunFolder(arguments.run))
+    # A run has stored its number of independent points; a simulated pair has not.
+    independent_points = store.read_json(arguments.run / PROVENANCE).get("independent_points")
+    posterior = posterior_of(br.load_config(arguments.run / "config.yaml"), inputs, (), independent_points)
     print(f"{device.device_kind} ({device.platform}), JAX {jax.__version__}", flush=True)
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.mesh.cells)} elements, {len(posterior.sampled)} sampled")
-    if given.chains:
-        throughput(posterior, inputs.truth, given.chains)
-    if given.sample:
-        effective_draws(posterior, given.sample, given.minutes)
+    if arguments.chains:
+        throughput(posterior, inputs.truth, arguments.chains)
+    if arguments.sample:
+        effective_draws(posterior, arguments.sample, arguments.minutes)
 
 
 def throughput(posterior: br.Posterior, truth: Any, sizes: list[int]) -> None:
-    """Densities and gradients per second, and how they grow with the number of chains."""
-    at = posterior.reference()
+    """Print the densities and gradients per second for each number of chains."""
+    values = posterior.reference()
     if truth is not None:
-        at = at | {"u_boundary": jnp.asarray(truth.u[posterior.sampled])}
-    data = posterior.target.condition(posterior.estimands(at))
-    middle = posterior.unconstrain(at)
+        values = values | {"u_boundary": jnp.asarray(truth.u[posterior.sampled])}
+    data = posterior.target.condition(posterior.estimands(values))
+    middle = posterior.unconstrain(values)
     density = jax.jit(jax.vmap(partial(logdensity, posterior.target), (None, 0)))
     gradient = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior.target), argnums=1), (None, 0)))
     print("\n| chains | ms per density | densities per second | ms per gradient | gradients per second | peak memory |")
@@ -81,7 +82,7 @@ def throughput(posterior: br.Posterior, truth: Any, sizes: list[int]) -> None:
 
 
 def _spread(middle: dict[str, Any], chains: int) -> dict[str, Any]:
-    """Positions (chain, …) about one."""
+    """Draw positions (chain, …) about one position."""
     rng = np.random.default_rng(chains)
     return {n: x + SPREAD.get(n, 0.0) * rng.standard_normal((chains, *np.shape(x))) for n, x in middle.items()}
 
@@ -91,19 +92,19 @@ def _seconds(function: Callable[..., Any], *arguments: Any) -> float:
     times = []
     for _ in range(REPEATS):
         began = time.perf_counter()
-        found = jax.block_until_ready(function(*arguments))
+        output = jax.block_until_ready(function(*arguments))
         times.append(time.perf_counter() - began)
-    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(found))
+    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(output))
     return float(np.median(times))
 
 
 def _peak_memory() -> str:
-    known = jax.devices()[0].memory_stats() or {}
-    return f"{known['peak_bytes_in_use'] / 2**30:.1f} GiB" if "peak_bytes_in_use" in known else "–"
+    statistics = jax.devices()[0].memory_stats() or {}
+    return f"{statistics['peak_bytes_in_use'] / 2**30:.1f} GiB" if "peak_bytes_in_use" in statistics else "–"
 
 
 def effective_draws(posterior: br.Posterior, sizes: list[int], minutes: float) -> None:
-    """The least effective sample size per second of runs by the strict rule, and what they say on the way."""
+    """Print the least effective sample size per second of runs with the strict stop rule, and their progress."""
     print(
         "\n| chains | search for the mode and warm-up | in all | draws per chain | greatest R̂ | least ESS bulk / tail "
         "| per second |"
@@ -112,25 +113,25 @@ def effective_draws(posterior: br.Posterior, sizes: list[int], minutes: float) -
     for chains in sizes:
         began = time.perf_counter()
 
-        def told(text: Any, began: float = began) -> None:
+        def report_progress(text: Any, began: float = began) -> None:
             print(f"  {time.perf_counter() - began:.1f} s  {text}", file=sys.stderr, flush=True)
 
         with show_messages():
             first = first_checkpoint(posterior.target, "hmc", chains, seed=0)
         prepared = time.perf_counter() - began
         stop, block = StopRule(rhat=1.01, ess=400, max_seconds=60 * minutes), 100 if chains < 32 else 25
-        found = sample(
+        samples = sample(
             posterior, "hmc", chains, 10_000, block=block, stop=stop, progress=False, resume=(first, []),
-            on_block=lambda index, *_, told=told: told(f"block {index + 1}"),
+            on_block=lambda index, *_, report_progress=report_progress: report_progress(f"block {index + 1}"),
         )  # fmt: skip
         seconds = time.perf_counter() - began
-        judged = convergence(found.idata)
+        judged = convergence(samples.idata)
         rhat = max(float(x.max()) for x in judged.rhat.values())
         bulk, tail = (min(float(x.min()) for x in ess.values()) for ess in (judged.ess_bulk, judged.ess_tail))
-        draws = found.idata.posterior.sizes["draw"]
+        draws = samples.idata.posterior.sizes["draw"]
         print(
             f"| {chains} | {prepared:.0f} s | {seconds:.0f} s | {draws} | {rhat:.3f} | {bulk:.0f} / {tail:.0f} | "
-            f"{bulk / seconds:.2g} / {tail / seconds:.2g} |\n  {found.reason}",
+            f"{bulk / seconds:.2g} / {tail / seconds:.2g} |\n  {samples.reason}",
             flush=True,
         )
 

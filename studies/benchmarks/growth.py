@@ -1,12 +1,13 @@
-"""How the cost of a density, of its gradient, and peak memory grow with the mesh and with the quadrature.
+"""How do the cost of a density, the cost of its gradient and peak memory grow with the mesh and the quadrature?
 
     python -m studies.benchmarks.growth [--nodes 5000 30000 100000] [--chains 4] [--voxels]
 
-A ball of radius 80 mm, three shells, boundary nodes sampled, cubic interpolation of images of 1.5 mm; λ and μ of chains
-are scattered about the reference by a factor of 1.35; solves end where those of chains end. From the smallest mesh to
-the largest a density may grow with the nodes to the power of 1.15 and take 1.5 times the iterations, within 8 GiB.
-Every mesh has a process of its own, so that its peak memory is its own, too. With --voxels the quadrature is every
-voxel of a fixed image of 1 mm, two million of them, on the paper's mesh. Medians of nine.
+The mesh is a ball of radius 80 mm with three shells; its boundary nodes are sampled, and images of 1.5 mm have cubic
+interpolation. λ and μ of the chains are scattered about the reference by a factor of 1.35, and solves have the
+tolerance of chains. From the smallest mesh to the largest, the cost of a density may grow with the nodes to the power
+of 1.15, and the iterations by a factor of 1.5, within 8 GiB. Every mesh has its own process, which gives its peak
+memory. With --voxels the quadrature points are the two million voxels of a fixed image of 1 mm, on a mesh of the
+paper's size. Times are medians of nine.
 """
 
 from __future__ import annotations
@@ -75,17 +76,19 @@ def main() -> None:
 
 
 def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
-    """Seconds and peak memory of this process."""
+    """Measure the seconds and the peak memory of this process."""
     begun = time.perf_counter()
     posterior = phantom(nodes, voxels)
     values = posterior.constrain(posterior.initial(jax.random.key(0)))
     data = posterior.target.condition(posterior.estimands(values))
     positions = scattered(posterior, chains)
     setup = time.perf_counter() - begun
-    many = jax.jit(jax.vmap(partial(logdensity, posterior.target), in_axes=(None, 0)))
-    slopes = jax.jit(jax.vmap(jax.value_and_grad(partial(logdensity, posterior.target), argnums=1), in_axes=(None, 0)))
+    densities = jax.jit(jax.vmap(partial(logdensity, posterior.target), in_axes=(None, 0)))
+    gradients = jax.jit(
+        jax.vmap(jax.value_and_grad(partial(logdensity, posterior.target), argnums=1), in_axes=(None, 0))
+    )
     begun = time.perf_counter()
-    compiled = [function.lower(data, positions).compile() for function in (many, slopes)]
+    compiled = [function.lower(data, positions).compile() for function in (densities, gradients)]
     compiling = time.perf_counter() - begun
     assert np.isfinite(compiled[0](data, positions)).all()
     density, gradient = (_median(function, data, positions) for function in compiled)
@@ -107,7 +110,7 @@ def measured(nodes: int, chains: int, voxels: bool) -> dict[str, Any]:
 
 
 def phantom(nodes: int, voxels: bool) -> Posterior:
-    """The posterior of two smooth images on a ball of about so many nodes."""
+    """The posterior of two smooth images on a ball of about `nodes` nodes."""
     mesh = mesh_of(nodes)
     shape = (184,) * 3 if voxels else (120,) * 3
     fixed, moving = (smooth_image(mesh.points, shape, seed=seed, blur=6.0) for seed in (0, 1))

@@ -1,9 +1,9 @@
-"""Time and memory of all that follows the last draw, by the number of draws: writing, judging, report and `apply`.
+"""Measure time and memory after the last draw, by the number of draws: storing, convergence, report and `apply`.
 
     python -m studies.benchmarks.large_posterior [--nodes 10000] [--chains 4] [--draws 1000 2000]
 
-The draws are made up as they are asked for, autoregressive about rest; all nodes of a ball are sampled. Each length has
-a process of its own. Memory is to be flat, time linear in the draws.
+The draws are synthetic and autoregressive about rest, and all nodes of a ball are sampled. Each number of draws has its
+own process. Memory should be constant, and time linear in the draws.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from tests.phantoms import ball_mesh
 BLOCK, SD, MEMORY_OF_CHAIN = 100, 0.3, 0.9
 
 
-class MadeUp:
-    """Blocks of autoregressive draws, each made when it is asked for."""
+class SyntheticBlocks:
+    """Blocks of autoregressive draws, each made when it is read."""
 
     def __init__(self, posterior: br.Posterior, chains: int, draws: int) -> None:
-        given = posterior.estimands(posterior.reference())
-        self.reference = {name: np.asarray(value) for name, value in given.items()}
+        estimands = posterior.estimands(posterior.reference())
+        self.reference = {name: np.asarray(value) for name, value in estimands.items()}
         self.chains, self.draws = chains, draws
 
     def __len__(self) -> int:
@@ -52,14 +52,14 @@ class MadeUp:
 
     def __getitem__(self, index: int, /) -> Block:
         rng, length = np.random.default_rng(index), min(BLOCK, self.draws - index * BLOCK)
-        found = {}
+        block = {}
         for name, value in self.reference.items():
             noise = rng.standard_normal((self.chains, length, *value.shape), np.float32)
             wave = lfilter([np.sqrt(1 - MEMORY_OF_CHAIN**2)], [1, -MEMORY_OF_CHAIN], noise, axis=1)
-            found[name] = SD * wave if name == "u_boundary" else value * np.exp(SD * wave)
+            block[name] = SD * wave if name == "u_boundary" else value * np.exp(SD * wave)
         lp = rng.standard_normal((self.chains, length))
         counts = np.ones((self.chains, length), int)
-        return found | {
+        return block | {
             "lp": lp, "similarity_energy": lp**2, "strain_energy": lp**2, "acceptance_rate": np.exp(-(lp**2)),
             "solver_iterations": 1.0 * counts, "solver_failed": 0 * counts, "outside_support": 0 * counts,
             "diverging": counts < 0, "n_steps": counts,
@@ -73,7 +73,7 @@ class MadeUp:
 
 
 def spacing_of(nodes: int) -> float:
-    """The spacing with which a ball has about so many nodes."""
+    """The spacing with which a ball has about `nodes` nodes."""
     low, high = 1.0, 30.0
     while high - low > 0.02:
         middle = (low + high) / 2
@@ -82,7 +82,7 @@ def spacing_of(nodes: int) -> float:
 
 
 def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
-    """Print one line."""
+    """Measure one number of draws, and print a line."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path, out = write_pair(folder), RunFolder(folder / "run")
@@ -95,15 +95,15 @@ def measure(nodes: int, chains: int, draws: int, profile: Path | None) -> None:
         posterior = posterior_of(config, inputs)
         nodal = np.ones(inputs.mesh.points.shape)
         samples = Samples(
-            posterior.target, MadeUp(posterior, chains, draws), 0 * nodal, SD * nodal,
+            posterior.target, SyntheticBlocks(posterior, chains, draws), 0 * nodal, SD * nodal,
             {name: np.ones(np.shape(value)) for name, value in posterior.reference().items()},
             jax.tree.map(lambda zeros: np.asarray(zeros) + 1, no_steps((chains,))), None, "made up", 1.0, exact=True,
         )  # fmt: skip
         seconds = []
 
-        def timed(what) -> None:
+        def timed(function) -> None:
             began = time.perf_counter()
-            what()
+            function()
             seconds.append(time.perf_counter() - began)
 
         with out.locked():
@@ -132,14 +132,14 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, default=10_000)
     parser.add_argument("--chains", type=int, default=4)
     parser.add_argument("--draws", type=int, nargs="+", default=[1000, 2000])
-    parser.add_argument("--profile", type=Path, help="write a profile of the last one there")
+    parser.add_argument("--profile", type=Path, help="write a profile to this file, if there is one number of draws")
     options = parser.parse_args()
     if len(options.draws) == 1:
         measure(options.nodes, options.chains, options.draws[0], options.profile)
         return
     for draws in options.draws:
-        words = ["--nodes", options.nodes, "--chains", options.chains, "--draws", draws]
-        subprocess.run([sys.executable, "-m", "studies.benchmarks.large_posterior", *map(str, words)], check=True)
+        arguments = ["--nodes", options.nodes, "--chains", options.chains, "--draws", draws]
+        subprocess.run([sys.executable, "-m", "studies.benchmarks.large_posterior", *map(str, arguments)], check=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Peak memory of a whole run, report included, of 1,000 draws of each chain and of 10,000.
+"""Compare the peak memory of runs, including their report, with 1,000 and with 10,000 draws of each chain.
 
     python -m studies.benchmarks.memory CONFIG [--set KEY=VALUE …] [--draws 1000 10000]
 
-The same mesh for both (--set mesh.file=…), the paper's sampler in four chains, every step kept: the draws of the longer
-run are 330 MB for a thousand estimands.
+Both runs have the same mesh (--set mesh.file=…) and four chains of the paper's sampler, and keep every step. The draws
+of the longer run take 330 MB for a thousand estimands.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ def main() -> None:
 
 
 def peak(config: str, overrides: list[str], draws: int) -> int:
-    """Bytes."""
-    # Never met: all draws of the suspects are judged after every block, and of all estimands at the end.
+    """Measure the peak memory of a run in bytes."""
+    # This rule is never met: the suspect estimands are judged after every block, and all estimands at the end.
     rule = ["stop.rhat=1000", "stop.ess=1e9", f"stop.max_steps={draws}", "stop.max_minutes=null"]
-    own = ["sampler.name=rwmh", "sampler.chains=4", "sampler.thin=1", *rule]
-    words = [word for override in [*overrides, *own] for word in ("--set", override)]
+    settings = ["sampler.name=rwmh", "sampler.chains=4", "sampler.thin=1", *rule]
+    options = [argument for override in [*overrides, *settings] for argument in ("--set", override)]
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-c", "from bayesreg.cli import main; main()", "run", config, "-o", f"{folder}/run"]
-        process = subprocess.Popen([*command, *words, "--quiet"])
+        process = subprocess.Popen([*command, *options, "--quiet"])
         _, status, used = os.wait4(process.pid, 0)
     if (ended := os.waitstatus_to_exitcode(status)) != NOT_CONVERGED:
         sys.exit(f"the run ended with status {ended}")

@@ -1,27 +1,28 @@
-"""The default sampler beside those of other libraries: one log density, one budget of time.
+"""Compare the default sampler with those of other libraries, on one log density and with one budget of time.
 
     python -m studies.benchmarks.other_samplers [RUN] [--minutes 5] [--chains 4] [--samplers numpyro-nuts cuqi-pcn …]
 
-RUN is a run's folder; without it a phantom is registered, a ball pressed in from the side, with a wall above it. All
-chains start at the same places, overdispersed about the mode. The search for it is on nobody's account, its last
-seconds on that of `hmc`. The others sample `bayesreg.inference.target.logdensity`, its elastic solves as for chains of
-`hmc`, in unconstrained coordinates and in those that `hmc` has whitened by the end of its warm-up, which they are
-given.
+RUN is a run's folder. Without it the problem is a phantom: a ball that is pressed in from the side, with a wall above
+it. All chains start at the same places, overdispersed about the mode. The search for the mode is not counted, except
+for its last seconds, which `hmc` pays. The other samplers use `bayesreg.inference.target.logdensity`, with the elastic
+solves of `hmc`'s chains. They run in unconstrained coordinates, and in the coordinates that `hmc` has whitened by the
+end of its warm-up.
 
-- Warm-up counts, and takes the others a third of the budget. Compilation does not, tracing included; it is told.
-- NumPyro's chains are vectorised. It has its diagonal mass and a warm-up of 1,000 transitions, cut off when the third
-  is over, with the mass and the averaged step size that it has by then.
-- Chains of CUQIpy and tinyDA run in threads; of each as many draws are taken as the shortest has, and a transition that
-  is not over in time is dropped. CUQIpy's NUTS is tuned after each transition, other scales every 25. pCN is about
-  N(0, I). Steps are at first 0.008, the paper's, in unconstrained coordinates, and 2.4 / √d in whitened ones.
-- Trees of both No-U-Turn samplers have up to 2¹⁰ − 1 gradients, NumPyro's default.
-- tinyDA's adaptive Metropolis learns a covariance once it has d draws, and draws by Cholesky's factor here: its own way
-  is a singular value decomposition for each draw. Its MALA is handed the gradient with the density: its own way are
-  finite differences.
+- Warm-up counts; that of the other samplers takes a third of the budget. Compilation and tracing do not count; the
+  table shows their time.
+- NumPyro's chains are vectorised. It has a diagonal mass matrix and a warm-up of 1,000 transitions. If a third of the
+  budget is over earlier, the warm-up ends with the mass matrix and the averaged step size of that time.
+- Chains of CUQIpy and tinyDA run in threads. All are cut to the length of the shortest, and a transition that does not
+  end in time is dropped. CUQIpy's NUTS is tuned after each transition, the other scales every 25. pCN is about N(0, I).
+  The first steps are 0.008, as in the paper, in unconstrained coordinates, and 2.4 / √d in whitened ones.
+- The trees of both No-U-Turn samplers have up to 2¹⁰ − 1 gradients, NumPyro's default.
+- tinyDA's adaptive Metropolis learns a covariance after d draws. Here it draws by a Cholesky factor, because its own
+  method computes a singular value decomposition for each draw. Its MALA gets the gradient with the density, because its
+  own method takes finite differences.
 - The skull is a soft wall.
 
-Evaluations are those after the warm-up. Rates in parentheses are worth nothing: chains whose R̂ is above 1.1 have yet
-to meet, and the effective sample size of a short one is about that of so many chains.
+The table counts the evaluations after the warm-up. Rates in parentheses are meaningless: chains whose R̂ is above 1.1
+have not converged, and their effective sample size is about the number of chains.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ from bayesreg.workflow.assembly import posterior_of, start_of
 from tests.phantoms import ball_mesh, flat_skull, smooth_image
 
 BLOCK, TREE_DEPTH, WARM_UP, TUNED_EVERY, ENDLESS = 20, 10, 1_000, 25, 10**9
-INSTALL = {"numpyro": "numpyro", "cuqi": "--no-deps cuqipy", "tinyDA": "--no-deps tinyDA ray, and what it then misses"}
+INSTALL = {"numpyro": "numpyro", "cuqi": "--no-deps cuqipy", "tinyDA": "--no-deps tinyDA ray, and the missing modules"}
 COLUMNS = (
     "sampler, coordinates", "draws per chain", "least ESS bulk / tail", "greatest R̂", "gradients", "densities",
     "seconds", "compiling", "ESS/s", "of that of hmc",
@@ -69,7 +70,7 @@ COLUMNS = (
 
 
 class Problem(NamedTuple):
-    """A log density of flat coordinates, whitened if there is a Gaussian, where chains start, and the first step."""
+    """A log density of flat coordinates, whitened if there is a Gaussian; the starts of chains; and the first step."""
 
     posterior: Any
     data: Any
@@ -79,7 +80,7 @@ class Problem(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Estimands after the warm-up, and how often the density was evaluated with its gradient, and without."""
+    """Estimands after the warm-up, and the number of evaluations with and without the gradient."""
 
     blocks: list[Block]
     gradients: int
@@ -87,43 +88,48 @@ class Drawn(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """Seconds of a clock that stands still while JAX traces and compiles, and of one that goes only then."""
+    """The seconds outside and inside JAX's tracing and compilation, on two clocks."""
 
     clock: float
     compiling: float
 
 
 class OutOfTimeError(Exception):
-    """Ends what has no end of its own."""
+    """The budget of time is over; it ends a sampler that has no other end."""
 
 
 def main() -> None:
     """Print a row for each sampler."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, nargs="?")
-    parser.add_argument("--minutes", type=float, default=5.0, help="for each sampler")
+    parser.add_argument("--minutes", type=float, default=5.0, help="budget of each sampler")
     parser.add_argument("--chains", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--samplers", nargs="*", default=list(PEERS), choices=list(PEERS), metavar="SAMPLER")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jax.monitoring.register_event_duration_secs_listener(_note_compilation)
-    posterior, start = phantom() if given.run is None else _of_run(given.run)
-    places, first, began = prepared(posterior, start, given.chains, given.seed)
+    posterior, start = phantom() if arguments.run is None else _of_run(arguments.run)
+    places, first, began = prepared(posterior, start, arguments.chains, arguments.seed)
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled, {places.shape[1]} unknowns\n")
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
-    seconds, found = 60 * given.minutes, problems(posterior, first, places)
-    ours = told("hmc", default_sampler(posterior, first, began.clock + seconds, given.seed), began)
-    for name in given.samplers:
+    seconds, problems_by_coordinates = 60 * arguments.minutes, problems(posterior, first, places)
+    rate_of_hmc = print_row("hmc", default_sampler(posterior, first, began.clock + seconds, arguments.seed), began)
+    for name in arguments.samplers:
         library = name.split("-")[0]
         try:
             importlib.import_module(library)
         except ImportError as error:
-            print(f"| {name} | left out, {error}: pip install {INSTALL[library]} |", flush=True)
+            print(f"| {name} | not installed, {error}: pip install {INSTALL[library]} |", flush=True)
             continue
-        for coordinates, problem in found.items():
+        for coordinates, problem in problems_by_coordinates.items():
             began = now()
-            told(f"{name}, {coordinates}", PEERS[name](problem, began.clock + seconds, given.seed), began, ours)
+            print_row(
+                f"{name}, {coordinates}",
+                PEERS[name](problem, began.clock + seconds, arguments.seed),
+                began,
+                rate_of_hmc,
+            )
 
 
 def _of_run(folder: Path) -> tuple[br.Posterior, Start]:
@@ -146,7 +152,7 @@ def phantom() -> tuple[br.Posterior, Start]:
 
 
 def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.ndarray, Checkpoint, Moment]:
-    """Flat positions about the mode, where `hmc` warms up to its checkpoint, and when its search last spoke."""
+    """Return flat positions about the mode, `hmc`'s checkpoint after its warm-up, and the end of its search."""
     about_mode = first_checkpoint(posterior.target, "laplace", chains, seed, start)
     heard = [now()]
 
@@ -163,7 +169,7 @@ def prepared(posterior: Any, start: Start, chains: int, seed: int) -> tuple[np.n
 
 
 def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) -> Drawn:
-    """Draws of `hmc`, one block at least."""
+    """Draw with `hmc` until the time is over, one block at least."""
     blocks: list[Block] = []
     with contextlib.suppress(OutOfTimeError):
         sample(
@@ -174,7 +180,7 @@ def default_sampler(posterior: Any, first: Checkpoint, until: float, seed: int) 
 
 
 def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str, Problem]:
-    """The density in unconstrained coordinates, and in those of `hmc` after its warm-up."""
+    """The problem in unconstrained coordinates, and in those of `hmc` after its warm-up."""
     gaussian, middle = first.setup.gaussian, unravel(posterior.target)(first.setup.middle)
     data = posterior.target.condition(estimands_of(posterior.target, posterior.data, middle))
     xi = np.asarray(jax.vmap(partial(whiten, gaussian))(jnp.asarray(places)))
@@ -190,7 +196,7 @@ def position(posterior: Any, gaussian: Gaussian | None, x: jax.Array) -> dict[st
 
 
 def logdensity(posterior: Any, data: Any, gaussian: Gaussian | None, x: jax.Array) -> jax.Array:
-    """Of flat coordinates; whitening is linear, and leaves out a constant."""
+    """The log density of flat coordinates; whitening is linear, so that only a constant is missing."""
     return targets.logdensity(posterior.target, data, position(posterior, gaussian, x))
 
 
@@ -199,7 +205,7 @@ value_and_slope = jax.jit(jax.value_and_grad(logdensity, argnums=3), static_argn
 
 
 def estimands(problem: Problem, draws: np.ndarray) -> list[Block]:
-    """Flat coordinates (chain, draw, …) as a block of draws, if there are any."""
+    """Convert flat coordinates (chain, draw, …) to a block of draws; without draws the list is empty."""
     posterior, data, gaussian = problem[:3]
     every = jax.jit(
         jax.vmap(jax.vmap(lambda x: estimands_of(posterior.target, data, position(posterior, gaussian, x))))
@@ -208,7 +214,7 @@ def estimands(problem: Problem, draws: np.ndarray) -> list[Block]:
 
 
 def numpyro_nuts(problem: Problem, until: float, seed: int) -> Drawn:
-    """NumPyro's No-U-Turn sampler by its kernel, so that the clock can end it after each transition of all chains."""
+    """Run the kernel of NumPyro's No-U-Turn sampler, so that the clock can end it after each transition."""
     from numpyro.infer import NUTS
 
     end_of_warm_up = until - 2 / 3 * (until - now().clock)
@@ -217,12 +223,16 @@ def numpyro_nuts(problem: Problem, until: float, seed: int) -> Drawn:
     first = kernel.init(keys, WARM_UP, init_params=jnp.asarray(problem.starts))
     step = jax.jit(lambda state: kernel.sample(state, (), {}))
     warm = _frozen(deque(_transitions(step, first, WARM_UP, end_of_warm_up), maxlen=1).pop())
-    kept = [(np.asarray(state.z), int(state.num_steps.sum())) for state in _transitions(step, warm, ENDLESS, until)]
-    return Drawn(estimands(problem, np.stack([z for z, _ in kept], axis=1)), sum(steps for _, steps in kept), 0)
+    transitions = [
+        (np.asarray(state.z), int(state.num_steps.sum())) for state in _transitions(step, warm, ENDLESS, until)
+    ]
+    return Drawn(
+        estimands(problem, np.stack([z for z, _ in transitions], axis=1)), sum(steps for _, steps in transitions), 0
+    )
 
 
 def _transitions(step: Callable[[Any], Any], state: Any, most: int, until: float) -> Iterator[Any]:
-    """States by and by, one at least."""
+    """Yield at most `most` states until the time is over, one at least."""
     for _ in range(most):
         state = jax.block_until_ready(step(state))
         yield state
@@ -231,7 +241,7 @@ def _transitions(step: Callable[[Any], Any], state: Any, most: int, until: float
 
 
 def _frozen(state: Any) -> Any:
-    """A state whose warm-up is over, with the averaged step size where it was cut off."""
+    """End the warm-up of a state; if it was cut off, the state gets the averaged step size."""
     adapted = state.adapt_state
     _, log_step_size, _, updates, _ = adapted.ss_state
     averaged = jnp.where((state.i < WARM_UP) & (updates > 0), jnp.exp(log_step_size), adapted.step_size)
@@ -239,20 +249,20 @@ def _frozen(state: Any) -> Any:
 
 
 class Density:
-    """A log density for libraries that ask for one value at a time: it counts, and ends them."""
+    """A log density that counts its evaluations, and raises OutOfTimeError when the time is over."""
 
     def __init__(self, problem: Problem) -> None:
         self.arguments, self.until, self.gradients, self.densities = problem[:3], np.inf, 0, 0
         self._last: tuple[Any, ...] = (None,)
 
     def value(self, x: np.ndarray) -> float:
-        """Log density."""
+        """The log density at flat coordinates."""
         _require_time(self.until)
         self.densities += 1
         return float(value(*self.arguments, np.asarray(x, float)))
 
     def value_and_slope(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The same with its gradient; at the last place again it costs nothing."""
+        """The log density and its gradient; a repeated call at the same place is free."""
         x = np.array(x, float)
         if not np.array_equal(self._last[0], x):
             _require_time(self.until)
@@ -263,7 +273,7 @@ class Density:
 
 
 class Chain(NamedTuple):
-    """What warms a chain up and what samples, both without end, and what gives all draws so far, (draw, …)."""
+    """Functions that warm up and sample a chain without end, and one that returns all draws so far, (draw, …)."""
 
     warm_up: Callable[[], Any]
     sample: Callable[[], Any]
@@ -274,16 +284,16 @@ Begin = Callable[[Density, np.ndarray, float], Chain]
 
 
 def side_by_side(begin: Begin, problem: Problem, until: float, seed: int) -> Drawn:
-    """Chains in threads."""
+    """Run the chains of a problem in threads."""
     for program in (value, value_and_slope):
         jax.block_until_ready(program(*problem[:3], problem.starts[0]))
-    # The libraries draw from the global generator, and their progress bars are not wanted.
+    # The libraries draw from the global generator, and print progress bars to standard error.
     np.random.seed(seed)
     with contextlib.redirect_stderr(io.StringIO()), ThreadPoolExecutor(len(problem.starts)) as threads:
-        found = list(threads.map(lambda start: _walked(begin, problem, start, until), problem.starts))
-    shortest = min(len(draws) for draws, _ in found)
-    gradients, densities = zip(*((density.gradients, density.densities) for _, density in found), strict=True)
-    return Drawn(estimands(problem, np.stack([x[:shortest] for x, _ in found])), sum(gradients), sum(densities))
+        walks = list(threads.map(lambda start: _walked(begin, problem, start, until), problem.starts))
+    shortest = min(len(draws) for draws, _ in walks)
+    gradients, densities = zip(*((density.gradients, density.densities) for _, density in walks), strict=True)
+    return Drawn(estimands(problem, np.stack([x[:shortest] for x, _ in walks])), sum(gradients), sum(densities))
 
 
 def _walked(begin: Begin, problem: Problem, start: np.ndarray, until: float) -> tuple[np.ndarray, Density]:
@@ -303,13 +313,13 @@ def cuqi_nuts(density: Density, start: np.ndarray, step: float) -> Chain:
     from cuqi.sampler import NUTS
 
     class ScalarSlice(NUTS):
-        # Its slice variable is an array of one number, whose comparisons NumPy 2.4 does not turn into integers.
+        # CUQIpy's slice variable is an array of one number; NumPy 2.4 does not convert its comparisons to integers.
         def _BuildTree(self, point: Any, r: Any, slope: Any, energy: Any, log_u: Any, *rest: Any) -> Any:  # noqa: N802
             return super()._BuildTree(point, r, slope, energy, float(np.squeeze(log_u)), *rest)
 
     height, slope = (lambda x: density.value_and_slope(x)[0]), (lambda x: density.value_and_slope(x)[1])
     target = UserDefinedDistribution(len(start), height, slope, name="x")
-    # It counts depths from zero.
+    # CUQIpy counts depths from zero.
     return _of_cuqi(ScalarSlice(target, initial_point=start, max_depth=TREE_DEPTH - 1), 1)
 
 
@@ -318,8 +328,10 @@ def cuqi_pcn(density: Density, start: np.ndarray, step: float) -> Chain:
     from cuqi.likelihood import UserDefinedLikelihood
     from cuqi.sampler import PCN
 
-    left = UserDefinedLikelihood(len(start), lambda x: density.value(x) + 0.5 * float(np.sum(np.square(x))), name="y")
-    target = Posterior(left, Gaussian(np.zeros(len(start)), 1.0, name="x"))
+    likelihood = UserDefinedLikelihood(
+        len(start), lambda x: density.value(x) + 0.5 * float(np.sum(np.square(x))), name="y"
+    )
+    target = Posterior(likelihood, Gaussian(np.zeros(len(start)), 1.0, name="x"))
     return _of_cuqi(PCN(target, scale=min(step, 1.0), initial_point=start), TUNED_EVERY)
 
 
@@ -334,7 +346,7 @@ def _of_cuqi(sampler: Any, every: int) -> Chain:
 def tinyda_mala(density: Density, start: np.ndarray, step: float) -> Chain:
     from tinyDA import MALA
 
-    class GivenGradient(MALA):
+    class SuppliedGradient(MALA):
         def setup_proposal(self, **_: Any) -> None:
             self.d, self.compute_gradient = len(start), lambda link: link.qoi
 
@@ -342,7 +354,7 @@ def tinyda_mala(density: Density, start: np.ndarray, step: float) -> Chain:
         height, slope = density.value_and_slope(x)
         return np.array([height]), slope
 
-    return _of_tinyda(model, GivenGradient(step, adaptive=True, period=TUNED_EVERY), start)
+    return _of_tinyda(model, SuppliedGradient(step, adaptive=True, period=TUNED_EVERY), start)
 
 
 def tinyda_am(density: Density, start: np.ndarray, step: float) -> Chain:
@@ -361,7 +373,7 @@ def tinyda_am(density: Density, start: np.ndarray, step: float) -> Chain:
 
 
 def _of_tinyda(model: Callable[[np.ndarray], Any], proposal: Any, start: np.ndarray) -> Chain:
-    """With a prior of density one, and a model whose output is the log likelihood."""
+    """Make a chain of tinyDA with a flat prior, and a model whose output is the log likelihood."""
     import tinyDA
 
     flat = SimpleNamespace(logpdf=lambda x: 0.0, loglike=lambda output: float(output[0]))
@@ -384,14 +396,14 @@ _compilations: list[tuple[float, float]] = []
 def _note_compilation(event: str, seconds: float, **_: Any) -> None:
     ended = time.perf_counter()
     if event.startswith("/jax/core/compile/"):
-        # A program is traced while the one that calls it is.
+        # The tracing of a program includes that of the programs it calls.
         while _compilations and _compilations[-1][0] >= ended - seconds - 1e-3:
             _compilations.pop()
         _compilations.append((ended - seconds, ended))
 
 
 def now() -> Moment:
-    """What both clocks show."""
+    """The current time of both clocks."""
     compiling = sum(ended - began for began, ended in _compilations)
     return Moment(time.perf_counter() - compiling, compiling)
 
@@ -401,14 +413,17 @@ def _require_time(until: float) -> None:
         raise OutOfTimeError
 
 
-def told(name: str, drawn: Drawn, began: Moment, ours: float | None = None) -> float:
-    """Print a row; the least effective sample size per second."""
+def print_row(name: str, drawn: Drawn, began: Moment, rate_of_hmc: float | None = None) -> float:
+    """Print a row, and return the least effective sample size per second."""
     seconds, compiling = np.subtract(now(), began)
-    found, draws = worst(drawn.blocks), sum(block["u_boundary"].shape[1] for block in drawn.blocks)
-    rate = min(found.ess_bulk, found.ess_tail) / seconds
-    rates = (f"{each:.2g}" if found.rhat < 1.1 else f"({each:.2g})" for each in (rate, rate / (ours or rate or 1)))
+    diagnostics, draws = worst(drawn.blocks), sum(block["u_boundary"].shape[1] for block in drawn.blocks)
+    rate = min(diagnostics.ess_bulk, diagnostics.ess_tail) / seconds
+    rates = (
+        f"{each:.2g}" if diagnostics.rhat < 1.1 else f"({each:.2g})"
+        for each in (rate, rate / (rate_of_hmc or rate or 1))
+    )
     cells = (
-        name, f"{draws:,}", f"{found.ess_bulk:.0f} / {found.ess_tail:.0f}", f"{found.rhat:.3f}",
+        name, f"{draws:,}", f"{diagnostics.ess_bulk:.0f} / {diagnostics.ess_tail:.0f}", f"{diagnostics.rhat:.3f}",
         f"{drawn.gradients:,}", f"{drawn.densities:,}", f"{seconds:.0f}", f"{compiling:.0f}", *rates,
     )  # fmt: skip
     print(f"| {' | '.join(cells)} |", flush=True)

@@ -1,10 +1,11 @@
-"""Where the time of a draw goes, and that of a gradient, at the end of a finished run of `hmc`.
+"""Where does the time of a draw and of a gradient go, at the end of a finished run of `hmc`?
 
     python -m studies.benchmarks.parts RUN [--chains 16]
 
-RUN is a run's folder. A draw is timed with the run's own chains where they stand; density and gradient with so many
-chains, copies of these a little apart. Medians of nine, each part compiled by itself: together they may take less. How
-long that takes stands beside them, with the flags that XLA_FLAGS has.
+RUN is a run's folder. A draw is timed with the chains of the run in their last state; density and gradient are timed
+with --chains chains, which are slightly moved copies of these. Times are medians of nine. Each operation is compiled
+separately, so that the sum may exceed the time of the whole. The second column is the time of compilation, with the
+flags in XLA_FLAGS.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ APART = 0.01  # In whitened coordinates.
 
 
 def main() -> None:
-    """Print a line for each part."""
+    """Print a line for each operation of a draw and of a gradient."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--chains", type=int, default=16)
-    given = parser.parse_args()
-    config = br.load_config(given.run / "config.yaml")
-    posterior, options = posterior_of(config, store.read_inputs(RunFolder(given.run))), config.sampler
-    arrays = checkpoints.load_state(RunFolder(given.run))
+    arguments = parser.parse_args()
+    config = br.load_config(arguments.run / "config.yaml")
+    posterior, options = posterior_of(config, store.read_inputs(RunFolder(arguments.run))), config.sampler
+    arrays = checkpoints.load_state(RunFolder(arguments.run))
     if (
         options.name != "hmc"
         or not isinstance(posterior.images.similarity, SumOfSquaredDifferences)
@@ -61,12 +62,15 @@ def main() -> None:
     print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled, {int(setup.steps)} gradients a draw")
     print(f"\nA draw, {options.chains} chains")
     of_a_draw(posterior, sampler, data, setup, end.state)
-    print(f"\nA gradient, {given.chains} chains")
-    of_a_gradient(posterior, data, setup, end.state.position, given.chains)
+    print(f"\nA gradient, {arguments.chains} chains")
+    of_a_gradient(posterior, data, setup, end.state.position, arguments.chains)
 
 
 def timed(name: str, of_chain: Callable[..., Any], shared: tuple[Any, ...], *chains: Any) -> None:
-    """Print how long a function of what chains share and of what is each chain's takes for all, and to compile."""
+    """Print the time of a function for all chains, and of its compilation.
+
+    `of_chain` takes the arguments in `shared`, then an entry of each array in `chains`.
+    """
     axes = (*[None] * len(shared), *[0] * len(chains))
     lowered = jax.jit(jax.vmap(of_chain, in_axes=axes)).lower(*shared, *chains)
     began = time.perf_counter()
@@ -76,7 +80,7 @@ def timed(name: str, of_chain: Callable[..., Any], shared: tuple[Any, ...], *cha
 
 
 def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -> None:
-    """The whole, then its parts."""
+    """Time a draw, then its operations."""
     keys = jax.random.split(jax.random.key(0), len(state.position))
 
     def begin(data: Any, setup: Any, xi: jax.Array) -> Any:
@@ -86,14 +90,14 @@ def of_a_draw(posterior: Any, sampler: Any, data: Any, setup: Any, state: Any) -
         return _quarter_turn(posterior.target, data, setup, key, state)[0]
 
     shared = data, setup
-    timed("all but its energies", lambda *given: sampler.step(*given)[0], shared, keys, state)
+    timed("all but its energies", lambda *arguments: sampler.step(*arguments)[0], shared, keys, state)
     timed("  trajectory", trajectory, shared, keys, state)
     timed("    a gradient of it", begin, shared, state.position)
     timed("its energies", sampler.observe, shared, state)
 
 
 def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, chains: int) -> None:
-    """Density and gradient, then their parts, each as itself and with its derivative."""
+    """Time density and gradient, then their operations, each without and with its derivative."""
     places = jnp.resize(positions, (chains, positions.shape[1]))
     places += APART * jax.random.normal(jax.random.key(2), places.shape)
 
@@ -105,15 +109,15 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
         values = complete(data.blocks, estimands)
         return *data.body.lame_by_cell(values), data.body.prescribed(values["u_boundary"])
 
-    lam, mu, given = jax.jit(jax.vmap(values_of))(places)
-    u = jax.jit(jax.vmap(lambda *x: equilibrium(data.body.system, *x).u))(lam, mu, given)
-    back = jax.random.normal(jax.random.key(3), u.shape)
+    lam, mu, prescribed = jax.jit(jax.vmap(values_of))(places)
+    u = jax.jit(jax.vmap(lambda *x: equilibrium(data.body.system, *x).u))(lam, mu, prescribed)
+    cotangent = jax.random.normal(jax.random.key(3), u.shape)
 
-    def solve(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array) -> jax.Array:
-        return equilibrium(data.body.system, lam, mu, given).u
+    def solve(data: Any, lam: jax.Array, mu: jax.Array, prescribed: jax.Array) -> jax.Array:
+        return equilibrium(data.body.system, lam, mu, prescribed).u
 
-    def adjoint(data: Any, lam: jax.Array, mu: jax.Array, given: jax.Array, back: jax.Array) -> Any:
-        return jax.vjp(partial(solve, data), lam, mu, given)[1](back)
+    def adjoint(data: Any, lam: jax.Array, mu: jax.Array, prescribed: jax.Array, cotangent: jax.Array) -> Any:
+        return jax.vjp(partial(solve, data), lam, mu, prescribed)[1](cotangent)
 
     def images(data: Any, u: jax.Array) -> jax.Array:
         return data.terms["images"].quadrature.weights @ data.terms["images"].residuals(u) ** 2
@@ -123,8 +127,8 @@ def of_a_gradient(posterior: Any, data: Any, setup: Any, positions: jax.Array, c
 
     timed("density", density, (data, setup), places)
     timed("density and gradient", jax.value_and_grad(density, argnums=2), (data, setup), places)
-    timed("  solve", solve, (data,), lam, mu, given)
-    timed("  solve and adjoint", adjoint, (data,), lam, mu, given, back)
+    timed("  solve", solve, (data,), lam, mu, prescribed)
+    timed("  solve and adjoint", adjoint, (data,), lam, mu, prescribed, cotangent)
     timed("  images", images, (data,), u)
     timed("  images and slope", jax.value_and_grad(images, argnums=1), (data,), u)
     timed("  strain energy", strain, (data,), lam, mu, u)

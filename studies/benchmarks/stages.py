@@ -1,18 +1,18 @@
-"""Whether steps at a frozen factor, or accepted in two stages, could pay: what they would save, and the most it gains.
+"""Would steps with a frozen factor, or acceptance in two stages, make the sampler faster?
 
     python -m studies.benchmarks.stages RUN [--chains 4] [--proposals 400]
 
-RUN is the folder of a run with three tissues that has ended; chains stand at draws of it. Medians of nine.
+RUN is the folder of a finished run with three tissues; the chains start at draws of it. Times are medians of nine.
 
-Frozen: at fixed (λ, μ) the free nodes follow the sampled ones by one matrix R of the chain's own, and the strain energy
-is a quadratic form S. A gradient with R and S given is timed beside the usual one, with solve and adjoint, and so is
-making them by LAPACK. What this takes, over what a gradient saves, is how many gradients each (λ, μ) would have to
-serve.
+Frozen factor: at fixed (λ, μ) a matrix R of each chain gives the free nodes from the sampled ones, and the strain
+energy is a quadratic form S. The program times a gradient with known R and S, the usual gradient with solve and
+adjoint, and the computation of R and S by LAPACK. The time of this computation over the time that a gradient saves is
+the number of gradients for which each (λ, μ) would have to serve.
 
-Two stages: a proposal of the paper's kernel is first held against a density whose solve is one iteration, the reference
-solve from the chain's present displacement, and evaluated in full if it passes (Christen and Fox 2005). Chains run side
-by side, so that the second stage is run if that of any of them is asked for. What is gained is at most full / (first +
-passed · full) times accepted in two stages / accepted.
+Two stages: a proposal of the paper's kernel is first tested with an approximate density, and evaluated in full if it
+passes (Christen and Fox 2005). The approximate density makes one iteration of the solve, from the present displacement
+of the chain. Chains run side by side, so that the second stage runs if the proposal of any chain passes. The gain is at
+most full / (first + passed · full) times accepted in two stages / accepted.
 """
 
 from __future__ import annotations
@@ -42,56 +42,56 @@ from studies.benchmarks.parts import timed
 
 
 def main() -> None:
-    """Print both."""
+    """Read the command line, and print both estimates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--chains", type=int, default=4)
     parser.add_argument("--proposals", type=int, default=400)
-    given = parser.parse_args()
-    posterior = posterior_of(br.load_config(given.run / "config.yaml"), store.read_inputs(RunFolder(given.run)))
-    draws = estimands_of(posterior.target, br.load_result(given.run).idata.posterior.load())
-    every = len(draws["u_boundary"]) // given.chains
-    places = jax.tree.map(lambda x: x[::every][: given.chains], draws)
+    arguments = parser.parse_args()
+    posterior = posterior_of(br.load_config(arguments.run / "config.yaml"), store.read_inputs(RunFolder(arguments.run)))
+    draws = estimands_of(posterior.target, br.load_result(arguments.run).idata.posterior.load())
+    every = len(draws["u_boundary"]) // arguments.chains
+    places = jax.tree.map(lambda x: x[::every][: arguments.chains], draws)
     data = posterior.target.condition(jax.tree.map(lambda x: x.mean(axis=0), draws))
-    print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled; {given.chains} chains")
+    print(f"{len(posterior.mesh.points)} nodes, {len(posterior.sampled)} sampled; {arguments.chains} chains")
     frozen(posterior, data, places)
-    two_stages(posterior, data, places, given.proposals)
+    two_stages(posterior, data, places, arguments.proposals)
 
 
 def frozen(posterior: Posterior, data: Any, places: dict[str, jax.Array]) -> None:
-    """A gradient in the displacements with a chain's own R and S, beside one with solve and adjoint."""
+    """Time a gradient in the displacements with known R and S, beside one with solve and adjoint."""
     chains = len(places["u_boundary"])
     every = jax.vmap(lambda place: complete(posterior.data.blocks, place))(places)
     parameters = [{name: np.asarray(every[name][i]) for name in ("lam", "mu")} for i in range(chains)]
     began = time.perf_counter()
-    made = [matrices(posterior, **each) for each in parameters]
+    matrix_pairs = [matrices(posterior, **each) for each in parameters]
     seconds = time.perf_counter() - began
-    responses, forms = (jnp.asarray(np.stack(each)) for each in zip(*made, strict=True))
+    responses, forms = (jnp.asarray(np.stack(each)) for each in zip(*matrix_pairs, strict=True))
     temperature = [data.blocks[name].reference() for name in ("t_similarity", "t_elastic")]
     images = data.terms["images"]
     free, slots = np.asarray(data.body.system.free), np.asarray(posterior.sampled)
 
-    def usual(data: Any, place: dict[str, jax.Array], u: jax.Array) -> jax.Array:
+    def full_density(data: Any, place: dict[str, jax.Array], u: jax.Array) -> jax.Array:
         return posterior.target.evaluate_estimands(data, place | {"u_boundary": u}).logdensity
 
-    def given(data: Any, response: jax.Array, form: jax.Array, u: jax.Array) -> jax.Array:
+    def frozen_density(data: Any, response: jax.Array, form: jax.Array, u: jax.Array) -> jax.Array:
         nodes = jnp.zeros((len(posterior.mesh.points), 3)).at[slots].set(u)
         nodes = nodes.at[free].set((response @ u.ravel()).reshape(-1, 3))
         similarity = images.quadrature.weights @ images.residuals(nodes) ** 2
         return -similarity / temperature[0] - u.ravel() @ form @ u.ravel() / (2 * temperature[1])
 
     u = places["u_boundary"]
-    by_solve = jax.jit(jax.vmap(jax.grad(usual, argnums=2), (None, 0, 0)))(data, places, u)
-    by_matrix = jax.jit(jax.vmap(jax.grad(given, argnums=3), (None, 0, 0, 0)))(data, responses, forms, u)
+    by_solve = jax.jit(jax.vmap(jax.grad(full_density, argnums=2), (None, 0, 0)))(data, places, u)
+    by_matrix = jax.jit(jax.vmap(jax.grad(frozen_density, argnums=3), (None, 0, 0, 0)))(data, responses, forms, u)
     off = float(jnp.linalg.norm(by_solve - by_matrix) / jnp.linalg.norm(by_solve))
     print(f"\nFrozen; slopes differ by {off:.1e}, that of the rigid prior included")
-    timed("a gradient with solve and adjoint", jax.grad(usual, argnums=2), (data,), places, u)
-    timed("a gradient with R and S given", jax.grad(given, argnums=3), (data,), responses, forms, u)
+    timed("a gradient with solve and adjoint", jax.grad(full_density, argnums=2), (data,), places, u)
+    timed("a gradient with R and S given", jax.grad(frozen_density, argnums=3), (data,), responses, forms, u)
     print(f"making R and S of all chains: {1e3 * seconds:.0f} ms")
 
 
 def matrices(posterior: Posterior, lam: np.ndarray, mu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R = −K_II⁻¹ K_IB and S = K_BB + K_BI R."""
+    """Compute R = −K_II⁻¹ K_IB and S = K_BB + K_BI R."""
     matrix = stiffness(posterior.mesh, lam, mu)
     free, sampled = (unknowns_of(np.asarray(x)) for x in (posterior.data.body.system.free, posterior.sampled))
     factor = scipy.linalg.cho_factor(matrix[free][:, free].toarray(), check_finite=False)
@@ -100,29 +100,31 @@ def matrices(posterior: Posterior, lam: np.ndarray, mu: np.ndarray) -> tuple[np.
 
 
 def two_stages(posterior: Posterior, data: Any, places: dict[str, jax.Array], proposals: int) -> None:
-    """Of proposals in the support: times of both stages, what passes the first, and what is accepted."""
+    """Print the times of both stages, and the shares of proposals in the support that pass and that are accepted."""
     chains = len(places["u_boundary"])
     evaluate = jax.vmap(posterior.target.evaluate_estimands, in_axes=(None, 0, 0))
     states = jax.jit(jax.vmap(posterior.target.evaluate_estimands, in_axes=(None, 0)))(data, places)
-    whole = jax.jit(evaluate).lower(data, places, states.u).compile()
+    full_stage = jax.jit(evaluate).lower(data, places, states.u).compile()
     with mock.patch.object(equilibrium, "MAX_ITERATIONS", 1):
         jax.clear_caches()
-        first = jax.jit(evaluate).lower(data, places, states.u).compile()
+        first_stage = jax.jit(evaluate).lower(data, places, states.u).compile()
     jax.clear_caches()
 
     @jax.jit
     def proposed(key: jax.Array) -> Any:
         keys = jax.random.split(key, chains)
         moves = jax.vmap(lambda key, place: _normal_step(key, place, STEPS))(keys, places)
-        found = jax.tree.map(jnp.add, places, moves)
-        return found, jax.vmap(posterior.target.supports, in_axes=(None, 0))(data, found)
+        candidates = jax.tree.map(jnp.add, places, moves)
+        return candidates, jax.vmap(posterior.target.supports, in_axes=(None, 0))(data, candidates)
 
     images, values = data.terms["images"], posterior.reference()
     times: dict[str, list[float]] = {"first": [], "full": []}
     gains, off, iterations = [], [], []
     for key in jax.random.split(jax.random.key(0), proposals):
         proposal, inside = jax.block_until_ready(proposed(key))
-        rough, exact = (_timed(f, times[n], data, proposal, states.u) for f, n in ((first, "first"), (whole, "full")))
+        rough, exact = (
+            _timed(f, times[n], data, proposal, states.u) for f, n in ((first_stage, "first"), (full_stage, "full"))
+        )
         gain = np.asarray(exact.logdensity - states.logdensity)[np.asarray(inside)]
         similarity = rough.similarity_energy - exact.similarity_energy
         similarity *= images.independent_share / values["t_similarity"]
@@ -141,15 +143,18 @@ def two_stages(posterior: Posterior, data: Any, places: dict[str, jax.Array], pr
     )
     print(f"{passed.mean():.1%}, any of {chains} chains {any_passes:.1%}, accepted in two {both.mean():.1%}")
     alone, together = (full_ms / (first_ms + p * full_ms) for p in (passed.mean(), any_passes))
-    kept = both.mean() / accepted.mean()
-    print(f"gain at most {together * kept:.2f}, and {alone * kept:.2f} if no chain waited for another")
+    acceptance_ratio = both.mean() / accepted.mean()
+    print(
+        f"gain at most {together * acceptance_ratio:.2f}, and {alone * acceptance_ratio:.2f} "
+        "if no chain waited for another"
+    )
 
 
 def _timed(function: Any, seconds: list[float], *arguments: Any) -> Any:
     began = time.perf_counter()
-    found = jax.block_until_ready(function(*arguments))
+    output = jax.block_until_ready(function(*arguments))
     seconds.append(time.perf_counter() - began)
-    return found
+    return output
 
 
 if __name__ == "__main__":

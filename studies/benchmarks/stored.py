@@ -1,7 +1,7 @@
-"""The paper's algorithm as NumPy, SciPy and cholespy do it best: what ours is timed beside.
+"""The fastest form of the paper's algorithm with NumPy, SciPy and cholespy, as a peer of bayesreg.
 
-K is an affine sum of the data of stored matrices of one pattern, every (λ, μ) is factored anew, images are B-splines
-whose coefficients are computed once, and nothing loops over elements or points.
+K is an affine sum of stored matrices of one pattern, and is factored anew for every (λ, μ). Images are B-splines whose
+coefficients are computed once. No Python code loops over elements or points.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ T_SIMILARITY, T_ELASTIC = 0.05, 1e4
 def affine_sum(
     mesh: TetMesh, rows: Int[np.ndarray, "rows"], columns: Int[np.ndarray, "columns"]
 ) -> Callable[[np.ndarray, np.ndarray], scipy.sparse.csr_array]:
-    """λ, μ by tissue to these rows and columns of K."""
-    parts = [
+    """A function from λ and μ by tissue to these rows and columns of K."""
+    submatrices = [
         stiffness(mesh, *pair)[rows][:, columns]
         for e in np.eye(len(mesh.names))
         for pair in ((e, 0 * e), (0 * e, e))
@@ -36,7 +36,7 @@ def affine_sum(
         stiffness(mesh, np.ones(len(mesh.names)), np.ones(len(mesh.names)))[rows][:, columns]
     )
     pattern.data[:] = 1.0
-    stored = np.array([_with_pattern(part, pattern) for part in parts])
+    stored = np.array([_with_pattern(submatrix, pattern) for submatrix in submatrices])
 
     def matrix(lam: np.ndarray, mu: np.ndarray) -> scipy.sparse.csr_array:
         theta = np.column_stack([lam, mu]).ravel()
@@ -46,19 +46,21 @@ def affine_sum(
 
 
 def _with_pattern(matrix: scipy.sparse.csr_matrix, pattern: scipy.sparse.csr_array) -> np.ndarray:
-    """The data of a matrix in the places of a pattern that contains its own."""
-    found = (pattern + matrix).tocsr()
-    found.sort_indices()
+    """The entries of a matrix in the order of a pattern that contains its pattern."""
+    combined = (pattern + matrix).tocsr()
+    combined.sort_indices()
     pattern.sort_indices()
-    return found.data - pattern.data
+    return combined.data - pattern.data
 
 
 def log_density(
     mesh: TetMesh, fixed: Image, moving: Image, order: int, solve: Solve
 ) -> Callable[[np.ndarray, np.ndarray, np.ndarray], float]:
-    """u_B, λ and μ by tissue to the log of eq. (12), priors flat, temperatures those of the paper."""
-    free, given = unknowns_of(mesh.interior), unknowns_of(mesh.boundary)
-    inner, coupling, outer = (affine_sum(mesh, *pair) for pair in ((free, free), (free, given), (given, given)))
+    """A function from u_B, λ and μ by tissue to the log of eq. (12), with flat priors and the paper's temperatures."""
+    free, prescribed = unknowns_of(mesh.interior), unknowns_of(mesh.boundary)
+    inner, coupling, outer = (
+        affine_sum(mesh, *pair) for pair in ((free, free), (free, prescribed), (prescribed, prescribed))
+    )
     count = 4 * len(mesh.cells)
     interpolation = scipy.sparse.csr_array(
         (
@@ -70,16 +72,16 @@ def log_density(
     )
     places, weights = interpolation @ mesh.points, np.repeat(mesh.volumes / 4, 4)
     expected, shown = (_image(image, order) for image in (fixed, moving))
-    seen = expected(places)
+    fixed_values = expected(places)
 
     def density(u_boundary: np.ndarray, lam: np.ndarray, mu: np.ndarray) -> float:
-        known = u_boundary.ravel()
-        load = -coupling(lam, mu) @ known
-        unknown = solve(inner(lam, mu), load)
+        boundary_values = u_boundary.ravel()
+        load = -coupling(lam, mu) @ boundary_values
+        interior_values = solve(inner(lam, mu), load)
         u = np.empty((len(mesh.points), 3))
-        u[mesh.boundary], u[mesh.interior] = u_boundary, unknown.reshape(-1, 3)
-        strain = 0.5 * (known @ (outer(lam, mu) @ known) - unknown @ load)
-        similarity = weights @ (seen - shown(places + interpolation @ u)) ** 2
+        u[mesh.boundary], u[mesh.interior] = u_boundary, interior_values.reshape(-1, 3)
+        strain = 0.5 * (boundary_values @ (outer(lam, mu) @ boundary_values) - interior_values @ load)
+        similarity = weights @ (fixed_values - shown(places + interpolation @ u)) ** 2
         return -similarity / T_SIMILARITY - strain / T_ELASTIC
 
     return density
@@ -99,18 +101,18 @@ def _image(image: Image, order: int) -> Callable[[Float[np.ndarray, "q 3"]], Flo
 
 
 def cholespy_solve(matrix: scipy.sparse.csr_array, load: np.ndarray) -> np.ndarray:
-    """By a new Cholesky factor."""
+    """Solve a system by a new Cholesky factor."""
     from cholespy import CholeskySolverD, MatrixType
 
     indices = (array.astype(np.int32) for array in (matrix.indptr, matrix.indices))
     factor = CholeskySolverD(matrix.shape[0], *indices, matrix.data, MatrixType.CSR)
-    found = np.zeros_like(load)
-    factor.solve(load, found)
-    return found
+    solution = np.zeros_like(load)
+    factor.solve(load, solution)
+    return solution
 
 
 def superlu_solve(matrix: scipy.sparse.csr_array, load: np.ndarray) -> np.ndarray:
-    """By a new LU factor, SuperLU told that the matrix is symmetric and positive."""
+    """Solve a system by a new LU factor, with SuperLU's options for a symmetric positive matrix."""
     symmetric = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     return scipy.sparse.linalg.splu(matrix.tocsc(), **symmetric).solve(load)
 

@@ -1,8 +1,9 @@
-"""What the tolerance of a chain's solves costs and leaves: iterations, and the error of the log density.
+"""How do iterations and the error of the log density depend on the tolerance of a chain's solves?
 
-At forty draws of a finished run, solves preconditioned at the mean of their λ, μ (as Normal scores), like chains'. With
---again the run is repeated, its mesh given and its solves a hundred times as exact, and the two posteriors are
-compared: differences of mean and standard deviation of every estimand, over their Monte Carlo error.
+The program evaluates the density at forty draws of a finished run, with the preconditioner at the mean of their λ and μ
+(as Normal scores), as in chains. With --again it repeats the run on the same mesh with a tolerance a hundred times
+smaller, and compares the two posteriors: it prints differences of the mean and the standard deviation of every
+estimand, over their Monte Carlo error.
 
     python -m studies.benchmarks.tolerance RUN [--again OUT]
 """
@@ -34,61 +35,63 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--again", type=Path, metavar="OUT", help="folder for the run with tighter solves")
-    given = parser.parse_args()
-    at_draws(given.run)
-    if given.again is not None:
-        compare(br.load_result(given.run), tightened(given.run, given.again))
+    arguments = parser.parse_args()
+    compare_tolerances(arguments.run)
+    if arguments.again is not None:
+        compare(br.load_result(arguments.run), tightened(arguments.run, arguments.again))
 
 
 def tightened(folder: Path, out: Path) -> Result:
-    """The run once more, its solves a hundred times as exact."""
+    """Repeat the run with a tolerance that is a hundred times smaller."""
     config = br.load_config(folder / "config.yaml", [f"mesh.file={(folder / 'mesh.vtu').absolute()}"])
     with mock.patch.object(conditioning, "CHAIN_TOLERANCE", conditioning.CHAIN_TOLERANCE / 100):
         return br.run(config, out)
 
 
 def compare(first: Result, second: Result) -> None:
-    """Print how far apart two posteriors are."""
+    """Print the differences between two posteriors."""
     means = [result.run.manifest["solver"]["iterations_mean"] for result in (first, second)]
     print(f"{means[0]:.1f} and {means[1]:.1f} iterations")
     for kind in ("mean", "std"):
-        apart = []
+        distances = []
         for name in ("u_boundary", "lam", "mu"):
             draws = [result.idata.posterior[name].astype(float) for result in (first, second)]
             value = [getattr(each, kind)(("chain", "draw")).values for each in draws]
             error = [az.mcse(each.to_dataset(), method="sd" if kind == "std" else kind)[name].values for each in draws]
             with np.errstate(invalid="ignore"):
-                apart.append(((value[0] - value[1]) / np.hypot(*error)).ravel())
-        found = np.concatenate(apart)
-        found = abs(found[np.isfinite(found)])
-        middle, most = np.median(found), found.max()
-        print(f"{kind} of {len(found)} estimands: {middle:.2f} Monte Carlo errors apart, {most:.2f} at most")
+                distances.append(((value[0] - value[1]) / np.hypot(*error)).ravel())
+        differences = np.concatenate(distances)
+        differences = abs(differences[np.isfinite(differences)])
+        middle, most = np.median(differences), differences.max()
+        print(f"{kind} of {len(differences)} estimands: {middle:.2f} Monte Carlo errors apart, {most:.2f} at most")
 
 
-def at_draws(folder: Path) -> None:
-    """Print a line for each tolerance."""
+def compare_tolerances(folder: Path) -> None:
+    """Print the iterations and the error for each tolerance."""
     posterior = posterior_of(br.load_config(folder / "config.yaml"), store.read_inputs(RunFolder(folder)))
-    draws, known = br.load_result(folder).idata.posterior, posterior.reference()
+    draws, reference = br.load_result(folder).idata.posterior, posterior.reference()
     rng = np.random.default_rng(0)
     places = zip(
         rng.integers(draws.sizes["chain"], size=DRAWS), rng.integers(draws.sizes["draw"], size=DRAWS), strict=True
     )
-    at = [{n: jnp.asarray(draws[n].values[place], float) for n in known if n in draws} for place in places]
-    estimands = [posterior.estimands(known | values) for values in at]
+    sampled_values = [
+        {n: jnp.asarray(draws[n].values[place], float) for n in reference if n in draws} for place in places
+    ]
+    estimands = [posterior.estimands(reference | values) for values in sampled_values]
     positions = [posterior.target.coordinates.unconstrain(posterior.data, e) for e in estimands]
     middle = jax.tree.map(lambda *x: jnp.stack(x).mean(axis=0), *positions)
     data = posterior.target.condition(estimands_of(posterior.target, posterior.data, middle))
     evaluate = jax.jit(posterior.target.evaluate_estimands)
 
-    def found(tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    def evaluated(tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         system = data.body.system._replace(tolerance=jnp.asarray(tolerance))
         tight = data._replace(body=data.body._replace(system=system))
         evaluations = [evaluate(tight, e) for e in estimands]
         return np.array([(float(e.logdensity), int(e.solver_iterations)) for e in evaluations]).T
 
-    exact, _ = found(1e-12)
+    exact, _ = evaluated(1e-12)
     for tolerance in TOLERANCES:
-        logdensity, iterations = found(tolerance)
+        logdensity, iterations = evaluated(tolerance)
         error = abs(logdensity - exact)
         print(
             f"{tolerance:.0e}: {iterations.mean():.1f} iterations, at most {iterations.max():.0f}; error of the log "

@@ -1,8 +1,8 @@
-"""What any uniform model leaves inside, were the true displacement of the boundary given to it.
+"""What is the least error of any uniform model inside, with the true displacement of the boundary?
 
-`python -m studies.benchmarks.uniform_bound RUN` prints the mean squared error in Ω and each tissue, mm², of the elastic
-equilibrium of one λ and one μ for the whole brain, at the λ/μ that leave least; RUN is a run or a simulated pair with
-a known truth. With no internal forces nothing but λ/μ matters.
+`python -m studies.benchmarks.uniform_bound RUN` prints the mean squared error, mm², in Ω and in each tissue, of the
+elastic equilibrium with one λ and one μ for the whole brain, at the best λ/μ. RUN is a run or a simulated pair with a
+known truth. Without internal forces only λ/μ affects the equilibrium.
 """
 
 from __future__ import annotations
@@ -21,19 +21,22 @@ RATIOS = np.concatenate([[0.0], np.geomspace(0.1, 1000, 41)])
 
 
 def least_errors(folder: Path) -> dict[str, tuple[float, float]]:
-    """By part of the brain the least mean squared error, mm², and the λ/μ that leaves it."""
+    """The least mean squared error, mm², and its λ/μ, for each region of the brain."""
     inputs = read_inputs(RunFolder(folder))
     mesh, truth = inputs.mesh, inputs.truth
     assert truth is not None
     u_true = np.asarray(truth.u)
-    found = []
+    errors_by_ratio = []
     for ratio in RATIOS:
         settled = br.solve_interior(mesh, np.array([ratio]), np.array([1.0]), u_true[mesh.boundary])
         assert settled.converged
-        found.append(mean_squared_error(mesh, np.asarray(settled.u), u_true))
-    return {part: min((errors[part], float(r)) for errors, r in zip(found, RATIOS, strict=True)) for part in found[0]}
+        errors_by_ratio.append(mean_squared_error(mesh, np.asarray(settled.u), u_true))
+    return {
+        region: min((errors[region], float(r)) for errors, r in zip(errors_by_ratio, RATIOS, strict=True))
+        for region in errors_by_ratio[0]
+    }
 
 
 if __name__ == "__main__":
-    for part, (error, ratio) in least_errors(Path(sys.argv[1])).items():
-        print(f"{part}: {error:.3f} mm² at λ/μ = {ratio:.3g}")
+    for region, (error, ratio) in least_errors(Path(sys.argv[1])).items():
+        print(f"{region}: {error:.3f} mm² at λ/μ = {ratio:.3g}")

@@ -2,7 +2,7 @@
 
     python -m studies.benchmarks.wall_depth RUN
 
-Counted are the sampled nodes of every fifth draw. A depth is the distance to the surface of the skull, mm.
+The program counts the sampled nodes of every fifth draw. A depth is the distance to the surface of the skull, mm.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 python -m studies.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share external carried]
 
-Its status is 1 where a part fails.
+The program ends with status 1 if an experiment fails.
 """
 
 from __future__ import annotations
@@ -20,45 +20,46 @@ import bayesreg as br
 from studies.calibration import carried, external, figures, geweke, mesh_share, pairs, sbc
 from studies.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, calibrated
 
-# Wrong on purpose, and to be found out: T_s held at 1.5 times its true value, the elastic prior without its normaliser.
+# Errors on purpose, which the tests must detect: T_s fixed at 1.5 times its true value, the elastic prior without its
+# normaliser.
 PLANTED: dict[str, dict[str, Any]] = {
     "T_s 1.5 times too high": {"t_similarity": 1.5 * T_SIMILARITY},
     "not normalised": {"normalised": False},
 }
-# How many steps of each kernel: as many as move its chains by about one standard deviation. A wrong one drifts from
-# where it starts as long as it goes on.
+# The number of steps of each kernel moves its chains by about one standard deviation. The chains of a wrong kernel
+# drift from their start as long as they run.
 GEWEKE_STEPS = {"rwmh": 60, "hmc": 10, "nuts": 10}
 PLANTED_STEPS = 40
 
-# The pairs take most of an hour, and they and what explains them are asked for by name.
+# The other experiments take up to an hour each; --parts names them.
 DEFAULT = ["sbc", "geweke"]
 
 BEGAN = time.perf_counter()
 
 
-def say(text: str) -> None:
-    """Progress, with the minutes so far."""
+def report_progress(text: str) -> None:
+    """Print a message after the minutes since the start."""
     print(f"{(time.perf_counter() - BEGAN) / 60:5.1f} min  {text}", flush=True)
 
 
 def calibrate_by_simulation(out: Path) -> dict[str, Any]:
-    """Ranks and coverage of every variant, and of the planted errors."""
+    """Test the ranks and the coverage of every variant, and of the planted errors."""
     runs: dict[str, sbc.Ranks] = {}
     for name, variant in VARIANTS.items():
-        say(f"calibration: {name}")
-        runs[name] = sbc.calibrate(Simulator(variant), say=say)
+        report_progress(f"calibration: {name}")
+        runs[name] = sbc.calibrate(Simulator(variant), report_progress=report_progress)
     for name, options in PLANTED.items():
-        say(f"calibration, planted error: {name}")
+        report_progress(f"calibration, planted error: {name}")
         variant = VARIANTS["no skull"]
         posterior, settings = calibrated(variant, **options), sbc.Settings(replications=100)
-        runs[name] = sbc.calibrate(Simulator(variant), posterior, settings, say=say)
-    found = {}
+        runs[name] = sbc.calibrate(Simulator(variant), posterior, settings, report_progress=report_progress)
+    summaries = {}
     for name, ranks in runs.items():
         figures.rank_histograms(ranks, out / f"ranks_{name.replace(' ', '_')}.png")
-        found[name] = _summary(ranks, planted=name in PLANTED)
-        say(f"{name}: {found[name]['verdict']}; least p {found[name]['least_p']:.2g}")
+        summaries[name] = _summary(ranks, planted=name in PLANTED)
+        report_progress(f"{name}: {summaries[name]['verdict']}; least p {summaries[name]['least_p']:.2g}")
     figures.coverage(runs, out / "coverage.png")
-    return found
+    return summaries
 
 
 def _summary(ranks: sbc.Ranks, planted: bool) -> dict[str, Any]:
@@ -82,16 +83,16 @@ def _summary(ranks: sbc.Ranks, planted: bool) -> dict[str, Any]:
 
 
 def compare_simulators(out: Path) -> dict[str, Any]:
-    """Geweke's test of each kernel, with the skull, and of a planted error."""
-    simulator, found = Simulator(VARIANTS["skull"]), {}
+    """Run Geweke's test of each kernel with the skull, and of a planted error."""
+    simulator, summaries = Simulator(VARIANTS["skull"]), {}
     trials: dict[str, tuple[str, br.Posterior | None]] = {name: (name, None) for name in GEWEKE_STEPS}
     wrong = calibrated(VARIANTS["skull"], **PLANTED["T_s 1.5 times too high"])
     trials["hmc, T_s 1.5 times too high"] = ("hmc", wrong)
     for name, (sampler, posterior) in trials.items():
-        say(f"Geweke's test: {name}")
+        report_progress(f"Geweke's test: {name}")
         steps = GEWEKE_STEPS[sampler] if posterior is None else PLANTED_STEPS
         result = geweke.compare(simulator, sampler, posterior, steps=steps)
-        found[name] = {
+        summaries[name] = {
             "as_it_should": result.passes == (posterior is None),
             "least_p": float(result.p.min()),
             "statistics": len(result.p),
@@ -100,45 +101,45 @@ def compare_simulators(out: Path) -> dict[str, Any]:
             "moved": result.moved,
             "worst": result.names[int(result.p.argmin())],
         }
-        say(f"{name}: least p {result.p.min():.2g} of {len(result.p)}, acceptance {result.acceptance:.0%}")
-    return found
+        report_progress(f"{name}: least p {result.p.min():.2g} of {len(result.p)}, acceptance {result.acceptance:.0%}")
+    return summaries
 
 
 def register_pairs(out: Path) -> dict[str, Any]:
-    """The calibrated pairs, made on a finer mesh."""
-    return pairs.register_pairs(out, same_mesh=False, say=say)
+    """Register the calibrated pairs, which are made on a finer mesh."""
+    return pairs.register_pairs(out, same_mesh=False, report_progress=report_progress)
 
 
 def register_on_one_mesh(out: Path) -> dict[str, Any]:
-    """The same, made on the mesh that registers them."""
-    return pairs.register_pairs(out, same_mesh=True, say=say)
+    """Register the calibrated pairs on the mesh that made them."""
+    return pairs.register_pairs(out, same_mesh=True, report_progress=report_progress)
 
 
 def share_of_the_mesh(out: Path) -> dict[str, Any]:
-    """λ/μ without images, on meshes other than the body's own."""
-    return mesh_share.measure(out, say)
+    """Fit λ/μ without images, on the mesh of the body and on other meshes."""
+    return mesh_share.measure(out, report_progress)
 
 
 def register_external_pairs(out: Path) -> dict[str, Any]:
-    """Pairs that no model of this project made; each takes some twenty minutes."""
-    return external.register_pairs(out, say)
+    """Register pairs that no model of this project made; each takes about twenty minutes."""
+    return external.register_pairs(out, report_progress)
 
 
 def carry(out: Path) -> dict[str, Any]:
-    """Points and labels, by what `bayesreg apply` tells of them, on the mesh of the truth and where that is finer.
+    """Test the uncertainty of points and labels from `bayesreg apply`, on the mesh of the truth and on a coarser one.
 
-    What is written must not be surer than it may be, and labels not less sure either.
+    Coverage of points must not be too low; coverage of labels must not be too low or too high.
     """
-    found = {}
+    summaries = {}
     for name, finer in {"mesh of the truth": False, "finer truth": True}.items():
-        say(f"points and labels: {name}")
-        cases = carried.measure(finer, say=say)
+        report_progress(f"points and labels: {name}")
+        cases = carried.measure(finer, report_progress=report_progress)
         levels = np.array(carried.LEVELS)
         errors = 3 * np.sqrt(levels * (1 - levels) / len(cases))
         inside = (cases[:, None] <= levels[:, None]).mean(axis=0)
-        names = [f"{way}, {part}" for way in ("there", "back") for part in carried.PARTS] + ["label"]
-        written = inside[:, [0, len(carried.PARTS), -1]]
-        found[name] = {
+        names = [f"{way}, {source}" for way in ("there", "back") for source in carried.COVARIANCES] + ["label"]
+        written = inside[:, [0, len(carried.COVARIANCES), -1]]
+        summaries[name] = {
             "as_it_should": bool(
                 (written > (levels - errors)[:, None]).all() and (inside[:, -1] < levels + errors).all()
             ),
@@ -146,11 +147,11 @@ def carry(out: Path) -> dict[str, Any]:
             "three binomial errors": errors.tolist(),
             "inside": {name: column.tolist() for name, column in zip(names, inside.T, strict=True)},
         }
-        say(json.dumps(found[name]["inside"]))
-    return found
+        report_progress(json.dumps(summaries[name]["inside"]))
+    return summaries
 
 
-PARTS = {
+EXPERIMENTS = {
     "sbc": calibrate_by_simulation,
     "geweke": compare_simulators,
     "pairs": register_pairs,
@@ -162,19 +163,24 @@ PARTS = {
 
 
 def main() -> int:
-    """All parts, or those asked for."""
+    """Run the experiments that --parts names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=DEFAULT)
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    path = given.out / "calibration.json"
-    found = json.loads(path.read_text()) if path.exists() else {}
-    for name in given.parts:
-        found[name] = PARTS[name](given.out)
-        path.write_text(json.dumps(found, indent=2) + "\n")
-    wrong = [f"{part}: {name}" for part in given.parts for name, it in found[part].items() if not it["as_it_should"]]
-    say("everything is calibrated" if not wrong else f"FAILED: {', '.join(wrong)}")
+    parser.add_argument("--parts", nargs="+", choices=EXPERIMENTS, default=DEFAULT)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "calibration.json"
+    results = json.loads(path.read_text()) if path.exists() else {}
+    for name in arguments.parts:
+        results[name] = EXPERIMENTS[name](arguments.out)
+        path.write_text(json.dumps(results, indent=2) + "\n")
+    wrong = [
+        f"{experiment}: {name}"
+        for experiment in arguments.parts
+        for name, result in results[experiment].items()
+        if not result["as_it_should"]
+    ]
+    report_progress("everything is calibrated" if not wrong else f"FAILED: {', '.join(wrong)}")
     return 1 if wrong else 0
 
 

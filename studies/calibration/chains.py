@@ -1,6 +1,7 @@
-"""What calibration and Geweke's test share: chains of many data sets side by side, and the quantities they look at.
+"""Chains of many data sets side by side and their test quantities, for calibration and for Geweke's test.
 
-All data sets share one mesh, one moving image and what is compiled: f at the quadrature points differs alone.
+All data sets share one mesh, one moving image and the compiled programs. They differ only in f at the quadrature
+points.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from bayesreg.inference.gaussian.whitened import Setup, setup_about
 from bayesreg.model.blocks import LAME
 from studies.calibration.simulator import MESH, Simulator, draw_data, observing
 
-# Every third node's displacement is looked at: neighbours say much the same.
+# The displacement of every third node is tested, because neighbours move alike.
 NODES = np.arange(0, len(MESH.boundary), 3)
 
-# So many data sets at a time: what they need together stays in the cache, four times as fast as all at once.
+# The number of data sets at a time: their data fit into the cache, which is four times as fast as all at once.
 BATCH = 20
 
 PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load")
@@ -32,7 +33,7 @@ Estimands = dict[str, Any]
 
 
 def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
-    """What is looked at: parameters, some displacements, E_s and the log density."""
+    """The names of the test quantities: parameters, some displacements, E_s and the log density."""
     labels, blocks = posterior.target.variables.entry_names, posterior.data.blocks
     entries = [f"{name} {labels[i]}" for name in LAME for i in blocks[name].free.index]
     warm = [name for name in PARAMETERS if name not in LAME and name in blocks and blocks[name].is_sampled]
@@ -41,7 +42,7 @@ def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
 
 
 def quantities(estimands: Estimands, evaluation: Any) -> Any:
-    """Their values, in the order of `quantity_names`."""
+    """The values of the test quantities, in the order of `quantity_names`."""
     parameters = [jnp.atleast_1d(estimands[name]) for name in PARAMETERS if name in estimands]
     rest = [estimands["u_boundary"][NODES].ravel(), evaluation.similarity_energy[None], evaluation.logdensity[None]]
     return jnp.concatenate(parameters + rest)
@@ -52,7 +53,7 @@ def quantities_at(posterior: br.Posterior, data: Any, observed: Any, estimands: 
 
 
 def of_posterior(posterior: br.Posterior, estimands: Estimands) -> Estimands:
-    """In the posterior's order, without temperatures that it takes for known."""
+    """The estimands in the order of the posterior, without the temperatures that it keeps fixed."""
     return {name: estimands[name] for name in posterior.estimands(posterior.reference())}
 
 
@@ -63,7 +64,7 @@ def simulated(posterior: br.Posterior, data: Any, truths: Estimands, key: Any) -
 
 
 def prior_reference(simulator: Simulator, posterior: br.Posterior) -> Gaussian:
-    """At rest, with data of its own: any gaussian is exact."""
+    """A Gaussian about rest, for simulated data; the kernel is exact with any Gaussian."""
     truth = simulator.draw_prior(np.random.default_rng(1000), 1)
     observed = simulated(simulator.posterior, simulator.posterior.data, truth, jax.random.key(1000))[0]
     at_rest = ravel_pytree(posterior.unconstrain(posterior.reference()))[0]
@@ -77,11 +78,11 @@ def setups_about(
     step_size: float,
     steps: int,
 ) -> Setup:
-    """The setups of all replications, stacked."""
+    """Stack the setups of all replications."""
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *references)
     size = {"step_size": jnp.asarray(step_size), "steps": jnp.asarray(steps)}
-    found = [make_stand_in(posterior.target, *each) for each in zip(references, middles, strict=True)]
-    normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    stand_ins = [make_stand_in(posterior.target, *each) for each in zip(references, middles, strict=True)]
+    normalisers = jax.tree.map(lambda *leaves: jnp.stack(leaves), *stand_ins)
 
     def about(gaussian: Gaussian, middle: Any) -> Setup:
         return setup_about(posterior.target, gaussian, middle)._replace(**size)
@@ -90,5 +91,5 @@ def setups_about(
 
 
 def condition(posterior: br.Posterior) -> Any:
-    """The data for chains: for all of them about rest."""
+    """The data of all chains, conditioned about rest."""
     return posterior.target.condition(posterior.estimands(posterior.reference()))

@@ -1,4 +1,4 @@
-"""Pictures of a calibration: rank histograms, coverage, intervals of the pairs."""
+"""Figures of a calibration: rank histograms, coverage and intervals of the pairs."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ COLUMNS, DPI = 8, 110
 
 
 def rank_histograms(ranks: Ranks, path: Path) -> None:
-    """One histogram per quantity; 99 % of the bars of a uniform one lie in the band."""
+    """Draw a histogram for each quantity; the band holds 99 % of the bars of uniform ranks."""
     count, rows = len(ranks.place), -(-len(ranks.names) // COLUMNS)
     band = stats.binom(count, 1 / BINS).interval(0.99)
-    found = verdict(ranks.place)
+    uniformity = verdict(ranks.place)
     with look():
         figure = new_figure(1.15 * rows)
         axes = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False)
         for axis in axes.flat:
             axis.set_axis_off()
-        for axis, name, place, p in zip(axes.flat, ranks.names, ranks.place.T, found.histogram, strict=False):
+        for axis, name, place, p in zip(axes.flat, ranks.names, ranks.place.T, uniformity.histogram, strict=False):
             axis.set_axis_on()
             axis.axhspan(*band, color=FAINT, alpha=0.6, lw=0)
-            colour = INK if p > found.threshold else ACCENT
+            colour = INK if p > uniformity.threshold else ACCENT
             axis.hist(place, BINS, (0, 1), color=colour, alpha=0.75, rwidth=0.9)
             axis.axhline(count / BINS, color=MUTED, lw=0.6)
             axis.set_title(f"{name}  p = {p:.2g}", fontsize=7, color=colour)
@@ -37,7 +37,7 @@ def rank_histograms(ranks: Ranks, path: Path) -> None:
 
 
 def coverage(runs: dict[str, Ranks], path: Path) -> None:
-    """Share of the truths inside central intervals, a dot per quantity, with 99 % of the binomial distribution."""
+    """Draw the share of the truths inside central intervals, a dot for each quantity, over 99 % binomial intervals."""
     with look():
         figure = new_figure(2.2)
         axes = figure.subplots(1, len(LEVELS), sharey=True, squeeze=False)[0]
@@ -58,7 +58,7 @@ def coverage(runs: dict[str, Ranks], path: Path) -> None:
 
 
 def intervals(pairs: list[dict[str, Any]], truth: dict[str, float], path: Path) -> None:
-    """95 % and 50 % intervals of λ/μ, pair by pair; beside them those that do not allow for the mesh, if there are."""
+    """Draw the 95 % and 50 % intervals of λ/μ of each pair, and beside them the uncorrected ones, if they exist."""
     with look():
         figure = new_figure(2.6)
         axes = figure.subplots(1, len(truth), squeeze=False)[0]

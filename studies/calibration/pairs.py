@@ -1,11 +1,11 @@
 """Twenty calibrated pairs: do the 95 % intervals of λ/μ contain the truth?
 
-Each pair has its own patch and noise (sd 0.01 on each image), of the MNI152 brain; T_s is inferred. The mesh that makes
-them is finer than the one that registers them, or, to tell what of an error is the mesh's, the same. A node of the
-coarser mesh may lie a millimetre or two outside the body that was pushed, and where that slides along the skull, the
-truth takes the node into it: between different meshes the registration is therefore without a skull. Intervals of pairs
-between different meshes allow for the registering one, by bodies that are made on a third
-(`studies.mesh_error.__main__`).
+All pairs are of the MNI152 brain; each has its own patch and noise (sd 0.01 on each image), and T_s is inferred. The
+mesh that makes the pairs is finer than the registering mesh, or the same, which shows the share of the mesh in an
+error. A node of the coarser mesh may lie a millimetre or two outside the true body. Where the body slides along the
+skull, the true displacement moves this node into the skull: between different meshes the registration therefore has no
+skull. Intervals of pairs between different meshes are corrected for the registering mesh, by bodies that are made on a
+third mesh (`studies.mesh_error.__main__`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from studies.mesh_error.recalibration import Response, recalibrate, response
 COUNT, ENOUGH = 20, 17
 TRUE_LAM, TRUE_MU = np.array([1e-6, 10.0, 30.0]), np.array([1e-6, 1.0, 1.0])
 TISSUES = {"gm": 1, "wm": 2}
-# The pairs are made on the second mesh, the bodies that tell what the first does to λ/μ on the third.
+# The edge lengths of the registering mesh, of the mesh that makes the pairs, and of the mesh that makes the bodies.
 EDGE, MAKING_EDGE, BODIES_EDGE = 22.0, 12.0, 13.0
 BODIES = 30
 DISPLACEMENT, NOISE_SD = 10.0, 0.01
@@ -51,12 +51,12 @@ SECONDS = 90.0
 MODEL = br.ModelConfig()
 IMAGE_OPTIONS = {"similarity": br.SquaredDifferences(temperature=br.ScalePrior(median=0.1)), "interpolation": "cubic"}
 
-Say = Callable[[str], None]
-Made = TypeVar("Made")
+Progress = Callable[[str], None]
+Product = TypeVar("Product")
 
 
 class Anatomy(NamedTuple):
-    """What all pairs share."""
+    """The images and meshes that all pairs share."""
 
     fixed: br.Image
     tissue: br.Image
@@ -67,39 +67,39 @@ class Anatomy(NamedTuple):
 
 @cache
 def brain() -> tuple[AnatomyOfData, br.Image]:
-    """The MNI152 brain, and its part that is meshed."""
-    found = mni152()
-    assert found.intracranial is not None
-    found = found._replace(intracranial=without_ridges(found.intracranial))
-    return found, mesh_domain(found.tissue, found.intracranial)
+    """Return the MNI152 brain, and the domain that is meshed."""
+    atlas = mni152()
+    assert atlas.intracranial is not None
+    atlas = atlas._replace(intracranial=without_ridges(atlas.intracranial))
+    return atlas, mesh_domain(atlas.tissue, atlas.intracranial)
 
 
 def skull() -> br.Image:
-    """Nonzero = forbidden."""
-    found, _ = brain()
-    return forbidden(found.intracranial)
+    """The image of the skull; nonzero voxels are forbidden."""
+    atlas, _ = brain()
+    return forbidden(atlas.intracranial)
 
 
 def meshes(folder: Path, edges: Sequence[float]) -> list[br.TetMesh]:
-    """Meshes of these edge lengths (mm), kept in a folder: fTetWild is not deterministic."""
-    found, domain = brain()
+    """Meshes of these edge lengths (mm), stored in a folder because fTetWild is not deterministic."""
+    atlas, domain = brain()
     for edge in edges:
         path = folder / f"mesh_{edge:g}mm.vtu"
         if not path.exists():
-            save_mesh(build_mesh(found.tissue, found.intracranial, MeshOptions(edge_length=edge), domain), path)
+            save_mesh(build_mesh(atlas.tissue, atlas.intracranial, MeshOptions(edge_length=edge), domain), path)
     return [load_mesh(folder / f"mesh_{edge:g}mm.vtu") for edge in edges]
 
 
 def anatomy(folder: Path, same_mesh: bool) -> Anatomy:
-    """The MNI152 brain, the mesh that makes the pairs and the one that registers them."""
-    found, domain = brain()
+    """The MNI152 brain, the mesh that makes the pairs and the mesh that registers them."""
+    atlas, domain = brain()
     making, registering = meshes(folder, (EDGE if same_mesh else MAKING_EDGE, EDGE))
-    fixed = robust_scale(found.image, domain.voxels != 0)(found.image)
-    return Anatomy(fixed, domain_labels(found.tissue, domain), skull(), making, registering)
+    fixed = robust_scale(atlas.image, domain.voxels != 0)(atlas.image)
+    return Anatomy(fixed, domain_labels(atlas.tissue, domain), skull(), making, registering)
 
 
-def upwards(seed: int, attempt: Callable[[Direction], Made]) -> tuple[Made, Direction]:
-    """What is made of a random direction in the upper half, the first that inverts nothing, and that direction."""
+def upwards(seed: int, attempt: Callable[[Direction], Product]) -> tuple[Product, Direction]:
+    """Call `attempt` with random upward directions until it succeeds; return its result and the direction."""
     rng = np.random.default_rng(seed)
     while True:
         direction = rng.normal(size=3)
@@ -114,46 +114,48 @@ def upwards(seed: int, attempt: Callable[[Direction], Made]) -> tuple[Made, Dire
 
 
 def push(mesh: br.TetMesh) -> dict[str, Any]:
-    """How a patch is pushed: as large a one on every mesh."""
+    """The options of a push, whose patch is equally large on every mesh."""
     patch_nodes = round(PATCH_SHARE * len(mesh.boundary))
     return {"lam": TRUE_LAM, "mu": TRUE_MU, "displacement": DISPLACEMENT, "patch_nodes": patch_nodes}
 
 
 def make(shared: Anatomy, seed: int) -> tuple[SyntheticPair, Direction]:
-    """A pair with a patch of its own."""
+    """Make a pair with its own random patch."""
     options = push(shared.making) | {"noise_sd": NOISE_SD, "seed": seed}
     return upwards(seed, lambda direction: make_pair(*shared[:4], direction=direction, **options))
 
 
-def register_bodies(folder: Path, say: Say = print) -> Response:
-    """What the registering mesh does to λ/μ, by bodies of a third mesh; each is a file of its own."""
+def register_bodies(folder: Path, report_progress: Progress = print) -> Response:
+    """Measure the response of the registering mesh by bodies of a third mesh, each stored in a file."""
     shared = anatomy(folder, same_mesh=False)
     (making,) = meshes(folder, [BODIES_EDGE])
     lam, mu = (dict(zip(making.names, values.tolist(), strict=True)) for values in (TRUE_LAM, TRUE_MU))
     subject = Subject(*shared[:3], making, shared.registering, MODEL, IMAGE_OPTIONS, lam, mu, DISPLACEMENT, NOISE_SD)
-    found = []
+    bodies = []
     for seed in range(1, BODIES + 1):
         path = folder / f"body_{seed:02d}.json"
         if not path.exists():
             write_text(path, json.dumps(register_body(subject, seed)._asdict()) + "\n")
-        found.append(json.loads(path.read_text()))
-        say(f"body {seed} of {BODIES}: λ/μ {found[-1]['true']}, found {found[-1]['found']} {found[-1]['failed']}")
-    return response(*(np.array([list(body[key].values()) for body in sound(found)]) for key in ("true", "found")))
+        bodies.append(json.loads(path.read_text()))
+        report_progress(
+            f"body {seed} of {BODIES}: λ/μ {bodies[-1]['true']}, found {bodies[-1]['found']} {bodies[-1]['failed']}"
+        )
+    return response(*(np.array([list(body[key].values()) for body in sound(bodies)]) for key in ("true", "found")))
 
 
-def allowing_for(known: Response, pair: dict[str, Any], seed: int) -> dict[str, list[float]]:
-    """Quantiles of λ/μ that allow for the mesh, each tissue's draws made of its quantiles on the mesh."""
+def allowing_for(curve: Response, pair: dict[str, Any], seed: int) -> dict[str, list[float]]:
+    """Correct quantiles of λ/μ for the mesh; draws of each tissue are interpolated from its quantiles."""
     rng = np.random.default_rng(seed)
     levels = rng.uniform(QUANTILES[0], QUANTILES[-1], (200, len(TISSUES)))
-    found = [
+    log_ratios = [
         np.interp(level, QUANTILES, np.log(pair["ratio"][name])) for level, name in zip(levels.T, TISSUES, strict=True)
     ]
-    own = recalibrate(known, np.exp(np.column_stack(found)), seed)
-    return dict(zip(TISSUES, np.quantile(own, QUANTILES, axis=0).T.tolist(), strict=True))
+    recalibrated = recalibrate(curve, np.exp(np.column_stack(log_ratios)), seed)
+    return dict(zip(TISSUES, np.quantile(recalibrated, QUANTILES, axis=0).T.tolist(), strict=True))
 
 
 def register(shared: Anatomy, pair: SyntheticPair, seed: int) -> dict[str, Any]:
-    """Intervals of λ/μ on the mesh, and how well the sampling and the model do."""
+    """Register a pair; return the intervals of λ/μ on the mesh, and diagnostics of the sampling and the model."""
     skull = shared.skull if shared.making.digest == shared.registering.digest else None
     images = br.ImagePair(pair.fixed, pair.moving, **IMAGE_OPTIONS)
     posterior = br.build_posterior(shared.registering, [images], MODEL, skull)
@@ -184,34 +186,36 @@ def covers(pair: dict[str, Any], tissue: str) -> bool:
 
 
 def truth() -> dict[str, float]:
-    """λ/μ of each solid tissue."""
+    """The true λ/μ of each solid tissue."""
     return {name: float(TRUE_LAM[entry] / TRUE_MU[entry]) for name, entry in TISSUES.items()}
 
 
-def register_pairs(out: Path, same_mesh: bool = False, say: Say = print, count: int = COUNT) -> dict[str, Any]:
-    """All pairs, and whether enough intervals contain the truth, for GM and for WM.
+def register_pairs(
+    out: Path, same_mesh: bool = False, report_progress: Progress = print, count: int = COUNT
+) -> dict[str, Any]:
+    """Register all pairs, and tell for GM and for WM whether enough intervals contain the truth.
 
-    Each pair is a file of its own, so that what was cut short goes on where it was.
+    Each pair is stored in a file, so that an interrupted study continues with the next pair.
     """
-    shared, found, name = anatomy(out, same_mesh), [], "same_mesh" if same_mesh else "pair"
-    known = None if same_mesh else register_bodies(out, say)
+    shared, results, name = anatomy(out, same_mesh), [], "same_mesh" if same_mesh else "pair"
+    curve = None if same_mesh else register_bodies(out, report_progress)
     for seed in range(1, count + 1):
         path = out / f"{name}_{seed:02d}.json"
         if not path.exists():
             pair, direction = make(shared, seed)
-            one = register(shared, pair, seed) | {"direction": direction, "seed": seed}
-            write_text(path, json.dumps(one) + "\n")
-            # Compiled samplers are never freed, and some forty of them exhaust a process's memory maps.
+            result = register(shared, pair, seed) | {"direction": direction, "seed": seed}
+            write_text(path, json.dumps(result) + "\n")
+            # JAX never frees compiled samplers, and about forty of them exhaust the memory maps of a process.
             jax.clear_caches()
-        found.append(json.loads(path.read_text()))
-        if known is not None:
-            found[-1] |= {"ratio": allowing_for(known, found[-1], seed), "ratio_on_the_mesh": found[-1]["ratio"]}
-        inside = ", ".join(f"{name} {'in' if covers(found[-1], name) else 'OUT'}" for name in TISSUES)
-        say(f"pair {seed} of {count}: {inside}; R̂ of λ {found[-1]['rhat_of_ratio']:.3f}")
-    figures.intervals(found, truth(), out / f"{name}s.png")
-    covered = {name: sum(covers(pair, name) for pair in found) for name in TISSUES}
+        results.append(json.loads(path.read_text()))
+        if curve is not None:
+            results[-1] |= {"ratio": allowing_for(curve, results[-1], seed), "ratio_on_the_mesh": results[-1]["ratio"]}
+        inside = ", ".join(f"{name} {'in' if covers(results[-1], name) else 'OUT'}" for name in TISSUES)
+        report_progress(f"pair {seed} of {count}: {inside}; R̂ of λ {results[-1]['rhat_of_ratio']:.3f}")
+    figures.intervals(results, truth(), out / f"{name}s.png")
+    covered = {name: sum(covers(pair, name) for pair in results) for name in TISSUES}
     enough = ENOUGH * count / COUNT
     return {
-        name: {"as_it_should": covered[name] >= enough, "covered": covered[name], "of": count, "pairs": found}
+        name: {"as_it_should": covered[name] >= enough, "covered": covered[name], "of": count, "pairs": results}
         for name in TISSUES
     }

@@ -1,9 +1,9 @@
 """Simulation-based calibration: the rank of the truth among posterior draws is uniform over draws of the model.
 
-Talts et al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018; test quantities that
-look at the data too, here E_s and log p, after Modrák et al., Bayesian Analysis 2023. All replications share one mesh,
-one moving image and what is compiled, and run side by side; f at the quadrature points differs, and the
-Gaussian about which the sampler moves.
+The method is that of Talts et al., "Validating Bayesian inference algorithms with simulation-based calibration", 2018.
+Test quantities that depend on the data, here E_s and log p, follow Modrák et al., Bayesian Analysis 2023. All
+replications share one mesh, one moving image and the compiled programs, and run side by side. They differ in f at the
+quadrature points, and in the Gaussian about which the sampler moves.
 """
 
 from __future__ import annotations
@@ -46,24 +46,25 @@ BINS = 10
 LEVELS = (0.5, 0.9)
 SIGNIFICANCE = 0.01
 
-Say = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 class Settings(NamedTuple):
-    """How the posterior of each replication is sampled, by one chain.
+    """The settings of the one chain that samples the posterior of each replication.
 
     Attributes
     ----------
     replications : int
     stages, approach : int
-        How often a chain makes so many transitions to come to where the posterior is, about a Gaussian taken at its
-        mode and, from the second time on, where it came to the time before.
+        A chain approaches the posterior in `stages` stages of `approach` transitions. The first stage moves about a
+        Gaussian at the mode, each later stage about a Gaussian at the places that the chain has reached.
     warm_up, draws : int
-        Transitions about that, not kept and kept.
+        The numbers of discarded and of kept transitions in the last stage.
     step_size, steps : float, int
-        Of the trajectories about it; the step is the greatest that a chain takes, and where its tuning starts.
+        The step size and the number of steps of a trajectory. The tuning of the step size starts here, and never goes
+        beyond.
     target_acceptance : float
-        To which each chain's step is tuned in all transitions that are not kept.
+        The acceptance to which the step size of each chain is tuned in all transitions that are not kept.
     """
 
     replications: int = 400
@@ -80,18 +81,18 @@ SETTINGS = Settings()
 
 
 class Ranks(NamedTuple):
-    """What a calibration found (arrays, the replications leading).
+    """The ranks and diagnostics of a calibration; the first axis of each array is the replication.
 
     Attributes
     ----------
     names : tuple of str
-        Of the k quantities.
+        The names of the k quantities.
     place : (r, k) array
         (rank of the truth + uniform) / (thinned draws + 1): uniform on (0, 1) if the posterior is right.
     ess : (r, k) array
-        Effective draws; to as many each posterior was thinned.
+        The numbers of effective draws, to which each posterior is thinned.
     rhat : (r, k) array
-        Split R̂ of the chains.
+        The split R̂ of the chains.
     acceptance : (r,) array
     """
 
@@ -109,7 +110,7 @@ class Sampled(NamedTuple):
     ----------
     quantities : (draw, r, k) array
     u : (draw, r, n, 3) array
-        Displacement of every node, mm.
+        The displacement of every node, mm.
     acceptance : (r,) array
         The mean over the draws.
     """
@@ -120,16 +121,16 @@ class Sampled(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Tests of uniform ranks; a quantity fails below a significance shared out over all of them (Bonferroni).
+    """Tests of uniform ranks; the significance level is divided by the number of quantities (Bonferroni).
 
     Attributes
     ----------
     histogram : (k,) array
-        p-value of χ² over `BINS` bins.
+        The p-values of χ² over `BINS` bins.
     coverage : (levels, k) array
-        Share of the truths inside the central intervals.
+        The shares of the truths inside the central intervals.
     coverage_p : (levels, k) array
-        p-value of that share under the binomial distribution, two-sided.
+        The two-sided p-values of these shares under the binomial distribution.
     """
 
     histogram: np.ndarray
@@ -143,12 +144,12 @@ class Verdict(NamedTuple):
 
     @property
     def threshold(self) -> float:
-        """Of a p-value."""
+        """The least p-value with which a quantity passes."""
         return SIGNIFICANCE / len(self.histogram)
 
 
 def verdict(place: np.ndarray) -> Verdict:
-    """Whether the ranks (r, k) are uniform."""
+    """Test whether the ranks (r, k) are uniform."""
     counts = np.stack([np.histogram(column, BINS, (0, 1))[0] for column in place.T])
     inside = np.stack([(abs(place - 0.5) < level / 2).sum(axis=0) for level in LEVELS])
     p = [
@@ -164,16 +165,16 @@ def calibrate(
     settings: Settings = SETTINGS,
     seed: int = 0,
     sampler: str = "hmc",
-    say: Say = lambda text: None,
+    report_progress: Progress = lambda text: None,
 ) -> Ranks:
-    """Ranks of truths drawn by the simulator among draws of a posterior, its own or one that errs."""
+    """Rank truths from the simulator among draws of its posterior, or of another, wrong one."""
     posterior = simulator.posterior if posterior is None else posterior
     rng = np.random.default_rng(seed)
     truths = simulator.draw_prior(rng, settings.replications)
     key_data, key_chains = jax.random.split(jax.random.key(seed))
     observed = simulated(simulator.posterior, simulator.posterior.data, truths, key_data)
     starts = of_posterior(posterior, simulator.draw_prior(rng, settings.replications))
-    sampled = sample(posterior, observed, starts, key_chains, settings, sampler, say)
+    sampled = sample(posterior, observed, starts, key_chains, settings, sampler, report_progress)
     at_truth = jax.jit(jax.vmap(partial(quantities_at, posterior), in_axes=(None, 0, 0)))
     true = np.asarray(at_truth(posterior.data, observed, of_posterior(posterior, truths)))
     return _ranks(quantity_names(posterior), true, sampled.quantities, sampled.acceptance, rng)
@@ -186,80 +187,80 @@ def sample(
     key: Any,
     settings: Settings = SETTINGS,
     sampler: str = "hmc",
-    say: Say = lambda text: None,
+    report_progress: Progress = lambda text: None,
 ) -> Sampled:
     """Sample the posterior of each of the data sets (r, q), one chain each, from draws of the prior."""
     kernel = choose_sampler(sampler, posterior.target).sampler
-    say("a mode for each replication")
+    report_progress("a mode for each replication")
     targets = [replace(posterior, data=observing(posterior.data, f)).target for f in observed]
     modes = _modes(targets, starts)
     visited = modes[:, None]
     key, key_flight = jax.random.split(key)
     for stage in range(settings.stages + 1):
-        say(f"a Gaussian for each replication, {stage + 1} of {settings.stages + 1}")
+        report_progress(f"a Gaussian for each replication, {stage + 1} of {settings.stages + 1}")
         about = visited[:, [0, -1]]
         references = [average_gaussian(*each) for each in zip(targets, about, strict=True)]
         setup = setups_about(posterior, references, about.mean(axis=1), settings.step_size, settings.steps)
         if stage == 0:
             states = _scattered(posterior, posterior.data, setup, observed, jax.random.split(key_flight, len(modes)))
         key_stage = jax.random.fold_in(key, stage)
-        states, places, *found = _run(
-            kernel, posterior, setup, observed, states, key_stage, settings, stage == settings.stages, say
+        states, places, *outputs = _run(
+            kernel, posterior, setup, observed, states, key_stage, settings, stage == settings.stages, report_progress
         )
         visited = np.concatenate([modes[:, None], np.moveaxis(places[len(places) // 2 :], 0, 1)], axis=1)
-    quantities, u, acceptance = (each[settings.warm_up :] for each in found)
+    quantities, u, acceptance = (each[settings.warm_up :] for each in outputs)
     return Sampled(quantities, u, acceptance.mean(axis=0))
 
 
 def _modes(targets: list[PosteriorTarget], starts: Estimands) -> np.ndarray:
     """Flat positions (r, d) of the modes of all replications, from draws of the prior."""
-    found = []
+    modes = []
     for k, target in enumerate(targets):
         start = target.coordinates.unconstrain(target.data, {name: x[k] for name, x in starts.items()})
-        found.append(settle(target, np.asarray(ravel_pytree(start)[0])))
-    return np.stack(found)
+        modes.append(settle(target, np.asarray(ravel_pytree(start)[0])))
+    return np.stack(modes)
 
 
 @partial(jax.jit, static_argnums=0)
 def _scattered(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, keys: Any) -> Estimands:
-    """A draw of each Gaussian.
+    """Draw from the Gaussian of each replication.
 
-    At a mode the elastic energy is far less than at any draw, and a T_r that comes from there is slow to recover.
+    The elastic energy at a mode is far less than at any draw, and T_r recovers slowly in a chain that starts there.
     """
 
-    def one(given: Any) -> Estimands:
-        setup, observed, key = given
+    def draw(replication: Any) -> Estimands:
+        setup, observed, key = replication
         xi = jax.random.normal(key, setup.middle.shape)
         return estimands_of(
             posterior.target, observing(data, observed), whitened_position(posterior.target, setup.gaussian, xi)
         )
 
-    return jax.lax.map(one, (setup, observed, keys), batch_size=BATCH)
+    return jax.lax.map(draw, (setup, observed, keys), batch_size=BATCH)
 
 
 @partial(jax.jit, static_argnums=0)
 def _begin(kernel: Sampler, data: Any, setup: Setup, observed: Any, starts: Estimands) -> Any:
-    def one(given: Any) -> Any:
-        setup, observed, start = given
+    def initial_state(replication: Any) -> Any:
+        setup, observed, start = replication
         return kernel.init(observing(data, observed), setup, start)
 
-    return jax.lax.map(one, (setup, observed, starts), batch_size=BATCH)
+    return jax.lax.map(initial_state, (setup, observed, starts), batch_size=BATCH)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _advance(  # type: ignore[no-untyped-def]
     kernel: Sampler, posterior: br.Posterior, data: Any, setup: Setup, observed: Any, keys: Any, states: Any
 ):
-    def one(given: Any) -> Any:
-        setup, observed, key, state = given
+    def transition(replication: Any) -> Any:
+        setup, observed, key, state = replication
         here = observing(data, observed)
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
         place = ravel_pytree(posterior.target.coordinates.unconstrain(data, drawn.estimands))[0]
-        seen = quantities(drawn.estimands, drawn.evaluation), drawn.evaluation.u
-        return state, drawn.estimands, place, *seen, info.acceptance_rate
+        recorded = quantities(drawn.estimands, drawn.evaluation), drawn.evaluation.u
+        return state, drawn.estimands, place, *recorded, info.acceptance_rate
 
-    return jax.lax.map(one, (setup, observed, keys, states), batch_size=BATCH)
+    return jax.lax.map(transition, (setup, observed, keys, states), batch_size=BATCH)
 
 
 def _run(
@@ -271,37 +272,37 @@ def _run(
     key: Any,
     settings: Settings,
     last: bool,
-    say: Say,
+    report_progress: Progress,
 ) -> tuple[Estimands, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where the chains end; flat positions, quantities, u and acceptances, the steps leading, then the replications.
+    """Return the ends of the chains, and flat positions, quantities, u and acceptances, (step, replication, …).
 
-    Each chain's step is tuned on its own, by dual averaging as in production: where one step served all replications,
-    some chains stood still.
+    The step size of each chain is tuned separately, by dual averaging as in production: with one step size for all
+    replications some chains did not move.
     """
     data = condition(posterior)
     tuned, steps = (settings.warm_up, settings.warm_up + settings.draws) if last else (settings.approach,) * 2
     begin, update, final = dual_averaging_adaptation(settings.target_acceptance)
     averaging = jax.vmap(begin)(setup.step_size)
     states = _begin(kernel, data, setup, observed, starts)
-    kept = []
+    history = []
     for step in range(steps):
         size = jnp.exp(averaging.log_step_size) if step < tuned else final(averaging)
         setup = setup._replace(step_size=jnp.minimum(size, settings.step_size))
         keys = jax.random.split(jax.random.fold_in(key, step), len(observed))
-        states, ends, *found = _advance(kernel, posterior, data, setup, observed, keys, states)
-        kept.append([np.asarray(x) for x in found])
+        states, ends, *outputs = _advance(kernel, posterior, data, setup, observed, keys, states)
+        history.append([np.asarray(x) for x in outputs])
         if step < tuned:
-            averaging = jax.vmap(update)(averaging, jnp.nan_to_num(found[-1]))
+            averaging = jax.vmap(update)(averaging, jnp.nan_to_num(outputs[-1]))
         if step % 20 == 0:
-            size, rate = np.median(setup.step_size), kept[-1][-1].mean()
-            say(f"transition {step} of {steps}, acceptance {rate:.0%}, step {size:.2g}")
-    return ends, *(np.stack(x) for x in zip(*kept, strict=True))
+            size, rate = np.median(setup.step_size), history[-1][-1].mean()
+            report_progress(f"transition {step} of {steps}, acceptance {rate:.0%}, step {size:.2g}")
+    return ends, *(np.stack(x) for x in zip(*history, strict=True))
 
 
 def _ranks(
     names: tuple[str, ...], true: np.ndarray, draws: np.ndarray, acceptance: np.ndarray, rng: np.random.Generator
 ) -> Ranks:
-    """Each quantity of each replication, thinned to as many draws as are independent."""
+    """Rank each quantity of each replication among its draws, thinned to independent ones."""
     chain = draws[None]
     ess = effective_sample_size(chain)
     # Draws that alternate about their mean are worth more than independent ones, and may be estimated below zero.

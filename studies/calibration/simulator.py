@@ -1,11 +1,11 @@
 """The model as a simulator: parameters and displacements from the prior, the fixed image at the quadrature points.
 
-(λ, μ, T_s, T_r) come from their priors; u_B from the Gaussian of precision S / T_r, S the Schur complement of K, and
-that of `rigid_sd` in the six rigid motions, which S leaves free; f_q = m(x_q + u(x_q)) + noise of the squared scale
-T_s / (2 w_q). With random loads, whose sizes come from their priors, the displacements of all nodes have the precision
-K D⁻¹ K in place of S / T_r, and the noise is Student's t. The skull belongs to the likelihood: a draw with nodes in it
-is rejected whole, (λ, μ, u) together. The prior is drawn by the oracle's matrices and NumPy, and shares no code with
-the density under test.
+(λ, μ, T_s, T_r) come from their priors. u_B comes from a Gaussian whose precision is S / T_r, with the Schur complement
+S of K, plus the precision of `rigid_sd` in the six rigid motions, which S leaves free. f_q is m(x_q + u(x_q)) plus
+noise of the squared scale T_s / (2 w_q). With random loads, whose sizes come from their priors, the displacements of
+all nodes have the precision K D⁻¹ K in place of S / T_r, and the noise is Student's t. The skull belongs to the
+likelihood: a draw (λ, μ, u) with nodes in the skull is rejected. The prior is drawn by the oracle's matrices and NumPy,
+and shares no code with the density under test.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from tests.phantoms import box_mesh, flat_skull, smooth_image
 
 MESH = box_mesh(2)
 LAME = ("lam", "mu")
-# Displacements of about half a millimetre in a box of 20 mm, seen through noise of sd 0.014 in a picture of contrast
-# one whose waves are too long for several modes; the wall is met by two draws of three.
+# Displacements are about half a millimetre in a box of 20 mm. The noise has sd 0.014, the image contrast one, and its
+# waves are too long for several modes. Two of three draws touch the wall.
 RIGID_SD, T_SIMILARITY, T_ELASTIC = 0.3, 0.008, 3.0
-# Of the same size inside, and at the surface.
+# Loads that cause displacements of the same size inside and at the surface.
 BODY_LOAD, SURFACE_LOAD = 0.25, 0.6
 DEGREES_OF_FREEDOM = 4.0
 LOG_SD = 0.5
@@ -65,7 +65,7 @@ class Variant(NamedTuple):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of the model and of the pair of images (`tests.options`)."""
+        """The options of the model and of the pair of images (`tests.options`)."""
         elastic: dict[str, Any] = {"t_elastic": T_ELASTIC, "normalised": True}
         if self.loads:
             elastic = {"similarity": "student_t", "degrees_of_freedom": DEGREES_OF_FREEDOM}
@@ -99,13 +99,13 @@ def calibrated(variant: Variant, **planted: Any) -> br.Posterior:
 
 
 class Simulator:
-    """Draws of (parameters, displacements) from the prior and of data given these.
+    """A simulator of parameters and displacements from the prior, and of data given these.
 
     Parameters
     ----------
     variant : Variant
     mesh : TetMesh
-        Whose nodes are displaced: that of the posterior, or a finer one of the same box.
+        The mesh whose nodes are displaced: the mesh of the posterior, or a finer one of the same box.
     """
 
     def __init__(self, variant: Variant, mesh: TetMesh = MESH) -> None:
@@ -115,34 +115,37 @@ class Simulator:
     @cached_property
     def unit_stiffness(self) -> dict[str, np.ndarray]:
         """K of λ = 1, and of μ = 1, in one tissue: (3n, 3n) for each."""
-        found = {}
+        matrices = {}
         for name in LAME:
             of_tissue = []
             for tissue in range(len(self.mesh.names)):
                 here = (self.mesh.tissue == tissue).astype(float)
                 lam, mu = (here, 0 * here) if name == "lam" else (0 * here, here)
                 of_tissue.append(paper.stiffness(self.mesh.points, self.mesh.cells, lam, mu).toarray())
-            found[name] = np.stack(of_tissue)
-        return found
+            matrices[name] = np.stack(of_tissue)
+        return matrices
 
     def stiffness(self, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
         """K of all nodes, (3n, 3n)."""
         return np.tensordot(lam, self.unit_stiffness["lam"], 1) + np.tensordot(mu, self.unit_stiffness["mu"], 1)
 
     def elastic_precision(self, values: dict[str, Any]) -> np.ndarray:
-        """The precision of the displacements of the sampled nodes but for rigid motions, which it leaves free."""
+        """The precision of the displacements of the sampled nodes, without that of the rigid motions."""
         if not self.variant.loads:
             return self.schur_complement(values["lam"], values["mu"]) / values.get("t_elastic", T_ELASTIC)
         K, variances = self.stiffness(values["lam"], values["mu"]), np.zeros(len(self.mesh.points))
         for cell in self.mesh.cells:
             variances[cell] += values["body_load"] ** 2 * paper.volume(self.mesh.points[cell]) / 4
         for a, b, c in self.mesh.boundary_faces:
-            side, other = self.mesh.points[b] - self.mesh.points[a], self.mesh.points[c] - self.mesh.points[a]
-            variances[[a, b, c]] += values["surface_load"] ** 2 * np.linalg.norm(np.cross(side, other)) / 6
+            first_edge, second_edge = (
+                self.mesh.points[b] - self.mesh.points[a],
+                self.mesh.points[c] - self.mesh.points[a],
+            )
+            variances[[a, b, c]] += values["surface_load"] ** 2 * np.linalg.norm(np.cross(first_edge, second_edge)) / 6
         return K @ (K / np.repeat(variances, 3)[:, None])
 
     def schur_complement(self, lam: np.ndarray, mu: np.ndarray) -> np.ndarray:
-        """S of the boundary, (3b, 3b)."""
+        """The Schur complement S of the boundary, (3b, 3b)."""
         K = self.stiffness(lam, mu)
         boundary = (3 * self.mesh.boundary[:, None] + np.arange(3)).ravel()
         interior = np.setdiff1d(np.arange(len(K)), boundary)
@@ -150,7 +153,7 @@ class Simulator:
         return K[np.ix_(boundary, boundary)] - coupling.T @ np.linalg.solve(K[np.ix_(interior, interior)], coupling)
 
     def draw_displacement(self, rng: np.random.Generator, values: dict[str, Any]) -> Any:
-        """The sampled nodes' of the untruncated Gaussian prior, (b, 3) in mm."""
+        """Draw the displacements of the sampled nodes from the untruncated Gaussian prior, (b, 3) in mm."""
         nodes = np.arange(len(self.mesh.points)) if self.variant.loads else self.mesh.boundary
         rigid = paper.rigid_modes(self.mesh.points[nodes]) / (RIGID_SD * np.sqrt(len(nodes)))
         precision = self.elastic_precision(values) + rigid @ rigid.T
@@ -158,7 +161,7 @@ class Simulator:
         return solve_triangular(factor, rng.normal(size=len(factor)), lower=True, trans=1).reshape(-1, 3)
 
     def draw_parameters(self, rng: np.random.Generator) -> dict[str, Any]:
-        """λ, μ (all entries) and the scales of the prior."""
+        """Draw λ, μ (all entries) and the scales from their priors."""
         values: dict[str, Any] = {}
         for name in LAME:
             free = self.posterior.data.blocks[name].free.index
@@ -169,7 +172,7 @@ class Simulator:
         return values
 
     def draw_prior(self, rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
-        """Estimands, the draws leading: parameters and displacements, kept as often as the skull lets them pass."""
+        """Draw parameters and displacements; the skull rejects some. The first axis of each array is the draw."""
         draws: list[dict[str, Any]] = []
         while len(draws) < count:
             values = self.draw_parameters(rng)
@@ -183,7 +186,7 @@ class Simulator:
 
 
 def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> Any:
-    """The fixed image at the quadrature points, given the parameters and the displacements: the likelihood."""
+    """Draw the fixed image at the quadrature points from the likelihood, given parameters and displacements."""
     u, images = (
         posterior.target.evaluate_estimands(without_normaliser(posterior.target, data), estimands).u,
         data.terms["images"],
@@ -196,5 +199,5 @@ def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> A
 
 
 def observing(data: Any, fixed_values: Any) -> Any:
-    """The problem with another fixed image, given at the quadrature points."""
+    """Replace the fixed image of the problem by values at the quadrature points."""
     return data.with_term("images", data.terms["images"]._replace(fixed_values=fixed_values))

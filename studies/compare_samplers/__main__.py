@@ -2,7 +2,7 @@
 
     python -m studies.compare_samplers CONFIG -o DIR [--samplers hmc,nuts] [--minutes 5] [--set KEY=VALUE …]
 
-Prints a table; DIR/samplers.json holds the figures, and DIR/config.yaml what they belong to.
+The program prints a table. It writes the same numbers to DIR/samplers.json, and the configuration to DIR/config.yaml.
 """
 
 from __future__ import annotations
@@ -40,20 +40,22 @@ def compare_samplers(
     minutes: float = 5.0,
     progress: bool = True,
 ) -> list[Efficiency]:
-    """Draw from one posterior with each of several samplers, and write what an effective draw costs.
+    """Draw from one posterior with each of several samplers, and write the cost of an effective draw.
 
     Parameters
     ----------
     config : path or Config
-        Its sampler's settings are that sampler's; the others have their defaults, and the same number of chains.
+        Its `sampler` section applies to the sampler of that name. The others have their default settings, and the same
+        number of chains.
     out : path
-        A folder, new or empty: samplers.json, config.yaml.
+        A new or empty folder for samplers.json and config.yaml.
     samplers : sequence of str
-        Names in `bayesreg.inference.samplers.registry.SAMPLERS`; each searches for the mode and warms up by itself.
+        Names in `bayesreg.inference.samplers.registry.SAMPLERS`. Each sampler makes its own search for the mode and its
+        own warm-up.
     minutes : float
-        Budget of each, positive; one that meets the rule of `config.stop` ends earlier.
+        The budget of each sampler, positive. A sampler ends earlier if it meets the rule of `config.stop`.
     progress : bool
-        Say what is being done.
+        Print the progress.
 
     Returns
     -------
@@ -77,22 +79,22 @@ def compare_samplers(
     efficiencies: list[Efficiency] = []
     for name in samplers:
         console.print(f"{name}:")
-        own = config.sampler if config.sampler.name == name else sampler_section(name)
-        budget = Budget(config.sampler.chains, max(config.stop.max_steps // own.thin, 4), rule)
+        section = config.sampler if config.sampler.name == name else sampler_section(name)
+        budget = Budget(config.sampler.chains, max(config.stop.max_steps // section.thin, 4), rule)
         efficiencies.append(
             measure_efficiency(
                 posterior,
                 name,
                 budget,
                 config.seed,
-                thin=own.thin,
-                block=own.block or BLOCK,
+                thin=section.thin,
+                block=section.block or BLOCK,
                 start=start,
-                **own.settings,
+                **section.settings,
             )
         )
         console.print(f"  {efficiencies[-1].note or f'{efficiencies[-1].seconds:.0f} s'}")
-        # After each: a comparison that is cut off has shown the samplers up to there.
+        # The file is written after each sampler, so that an interrupted comparison keeps its results.
         Path(out).mkdir(parents=True, exist_ok=True)
         rows = [efficiency._asdict() for efficiency in efficiencies]
         write_json(Path(out) / "samplers.json", {**setting._asdict(), "samplers": rows})
@@ -123,16 +125,21 @@ def _rule(stop: StopConfig) -> str:
 
 
 def main() -> None:
-    """Read the command line, and compare."""
+    """Read the command line, and compare the samplers."""
     parser = argparse.ArgumentParser(prog="python -m studies.compare_samplers")
     parser.add_argument("config", metavar="CONFIG")
     parser.add_argument("-o", "--out", required=True, metavar="DIR")
     parser.add_argument("--samplers", default=",".join(SAMPLERS), help="names with commas between; default: all")
     parser.add_argument("--minutes", type=float, default=5.0, help="budget of each sampler")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override an entry")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with show_messages():
-        compare_samplers(load_config(given.config, given.set), given.out, given.samplers.split(","), given.minutes)
+        compare_samplers(
+            load_config(arguments.config, arguments.set),
+            arguments.out,
+            arguments.samplers.split(","),
+            arguments.minutes,
+        )
 
 
 if __name__ == "__main__":

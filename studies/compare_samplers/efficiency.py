@@ -1,4 +1,4 @@
-"""The cost of a sampler's draws: effective draws per second and per evaluation, and how far a budget led."""
+"""The cost of a sampler's draws: effective draws per second and per evaluation within one budget."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from bayesreg.types import InputError
 
 
 class Efficiency(NamedTuple):
-    """How one sampler did on one posterior within one budget; None is what could not be found.
+    """The efficiency of one sampler on one posterior within one budget; None stands for an unknown value.
 
     Attributes
     ----------
     sampler : str
     exact : bool or None
     note : str
-        Why it did not run; empty where it did.
+        The reason why the sampler did not run; empty if it ran.
     draws : int
-        Kept, of all chains together.
+        The number of kept draws of all chains together.
     rhat : float or None
         The greatest rank-normalised split R̂ of all estimands.
     ess_bulk, ess_tail : float or None
-        The least of all estimands.
+        The least effective sample size of all estimands.
     ess_per_second, ess_per_second_in_all : float or None
-        The smaller of the two least, over `sampling_seconds`, and over `seconds`.
+        The smaller of `ess_bulk` and `ess_tail` over `sampling_seconds`, and over `seconds`.
     ess_per_evaluation : float or None
-        Over gradients and densities, those of the warm-up left out.
+        The smaller of `ess_bulk` and `ess_tail` over the sum of `gradients` and `densities`.
     gradients, densities : int
         Evaluations with gradient and without, of all chains together, after the warm-up.
     acceptance : float or None
     preparing_seconds : float
-        Search for the mode and warm-up, the compilation of both included.
+        The time of the search for the mode and of the warm-up; it includes their compilation.
     sampling_seconds : float or None
-        Drawing without compilation: the first block, which compiles, is taken to cost what the others do. None where
-        there is no second one.
+        The time of drawing without compilation. The first block compiles, and is assumed to take as long as the others.
+        It is None if there is only one block.
     seconds : float
-        All of it.
+        The time of everything.
     seconds_to_rule : float or None
-        When the stop rule was met, all included; None where it was not.
+        The time of everything until the stop rule was met; None if it was not met.
     """
 
     sampler: str
@@ -74,9 +74,9 @@ class Budget(NamedTuple):
     ----------
     chains : int
     draws : int
-        Most kept draws of each chain.
+        The greatest number of kept draws of each chain.
     stop : StopRule
-        With the seconds that it may take, and the rule whose time is asked for.
+        The stop rule, with the greatest number of seconds.
     """
 
     chains: int
@@ -96,9 +96,10 @@ def measure_efficiency(
     progress: bool = False,
     **settings: Any,
 ) -> Efficiency:
-    """Sample within a budget and reckon; see `bayesreg.inference.chains.run.sample` for the options.
+    """Sample within a budget, and measure the efficiency.
 
-    A sampler that cannot run on this posterior is no error: its `note` says why.
+    `bayesreg.inference.chains.run.sample` explains the options. If the sampler cannot run on this posterior, the result
+    has a `note` with the reason, and no error is raised.
     """
     ends: list[tuple[int, float]] = []
 
@@ -145,7 +146,10 @@ def _reckon(sampler: str, samples: Samples, preparing: float, ends: list[tuple[i
 
 
 def sampling_seconds(ends: list[tuple[int, float]]) -> float | None:
-    """Seconds of drawing without compilation, from draws so far and seconds at the end of every block."""
+    """Seconds of drawing without compilation.
+
+    `ends` holds the number of draws and the seconds, from the start, at the end of every block.
+    """
     (first, compiled), (last, finished) = ends[0], ends[-1]
     return None if last == first else (finished - compiled) * last / (last - first)
 

@@ -1,4 +1,4 @@
-"""The table of what effective draws cost with each sampler."""
+"""The table of the cost of effective draws with each sampler."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Setting(NamedTuple):
         The name of the posterior.
     chains : int
     minutes : float
-        Budget of each.
+        The budget of each sampler.
     rule : str
         The stop rule in words.
     """
@@ -33,15 +33,15 @@ class Setting(NamedTuple):
 
 
 def efficiency_table(efficiencies: Sequence[Efficiency], setting: Setting) -> Table:
-    """A row for each sampler, exact ones first, the most effective draws per second first."""
+    """Make a row for each sampler: exact samplers first, ordered by their effective draws per second."""
     ranked = sorted(efficiencies, key=lambda e: -(e.ess_per_second or e.ess_per_second_in_all or 0.0))
     exact = [_row(efficiency) for efficiency in ranked if efficiency.exact is not False]
     approximate = [_row(efficiency) for efficiency in ranked if efficiency.exact is False]
     caption = (
-        f"One posterior, {setting.chains} chains and {setting.minutes:g} minutes for each sampler, which stops earlier "
-        f"if its rule is met ({setting.rule}). ESS and R̂ are the worst of all estimands. All in: with the search for "
-        "the mode, the warm-up and all compilation. An evaluation is one of the density with its gradient, or without "
-        "for samplers that take none. An R̂ far above one makes the ESS beside it worthless."
+        f"Each sampler has {setting.chains} chains and {setting.minutes:g} minutes on one posterior; it stops earlier "
+        f"if it meets the stop rule ({setting.rule}). ESS and R̂ are the worst of all estimands. “All in” includes the "
+        "search for the mode, the warm-up and all compilation. An evaluation is one of the density with its gradient, "
+        "or of the density alone for samplers without gradients. An ESS is worthless if its R̂ is far above one."
     )
     groups = [(title, rows) for title, rows in (("Exact", exact), ("Approximate", approximate)) if rows]
     return Table("Cost of effective draws", caption, list(HEADER), groups)

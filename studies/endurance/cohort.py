@@ -1,10 +1,10 @@
-"""A cohort of small subjects, some of them broken, of whose workers one is killed again and again.
+"""Run a cohort of small subjects, some of them broken, and kill two of its worker processes.
 
     python -m studies.endurance.cohort -o DIR [--subjects 24] [--external]
 
-24 subjects on three workers, one of which is killed twice, and three broken subjects: 21 right results, three named
-failures, and nothing that had ended is run twice. With --external the workers are those of a scheduler that this
-program starts. Its status is 1 where that is not so.
+Three of 24 subjects are broken, and three workers run them all. The program expects 21 right results and three named
+failures, and that no finished subject is run twice. Otherwise it ends with status 1. With --external it starts a Dask
+scheduler and its workers first.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BROKEN = {"data.fixed": "none.nii.gz", "data.moving": "damaged.nii.gz", "sampler
 
 
 def write_cohort(folder: Path, subjects: int, workers: int, steps: int) -> Path:
-    """The files of a cohort, whose last three subjects are broken each in its own way; the path of its file."""
+    """Write a cohort whose last three subjects are broken, each in its own way; return the path of cohort.yaml."""
     write_pair(folder, steps)
     rows = [{"subject": f"s{k:02d}", "seed": str(k)} for k in range(subjects)]
     if subjects > len(BROKEN):
@@ -47,7 +47,7 @@ def write_cohort(folder: Path, subjects: int, workers: int, steps: int) -> Path:
 
 
 def kill_workers(out: Path, times: int, killed: list[int]) -> None:
-    """Kill the process that holds the lock of a run which has drawn something, so many times."""
+    """Kill `times` processes, each while it holds the lock of a run that has stored draws."""
     while len(killed) < times:
         time.sleep(1.0)
         for state in out.glob("*/draws"):
@@ -61,30 +61,33 @@ def kill_workers(out: Path, times: int, killed: list[int]) -> None:
 
 
 def _holders(lock: Path) -> list[int]:
-    """Processes that have a file open."""
-    found = []
+    """Return the ids of the processes that have a file open."""
+    process_ids = []
     for process in Path("/proc").iterdir():
         if process.name.isdecimal():
             try:
-                if any(os.readlink(one) == str(lock.absolute()) for one in (process / "fd").iterdir()):
-                    found.append(int(process.name))
+                if any(os.readlink(descriptor) == str(lock.absolute()) for descriptor in (process / "fd").iterdir()):
+                    process_ids.append(int(process.name))
             except OSError:
                 continue
-    return found
+    return process_ids
 
 
 def main() -> int:
-    """As above."""
+    """Run the cohort and print what became of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--subjects", type=int, default=24)
     parser.add_argument("--steps", type=int, default=4000)
     parser.add_argument("--external", action="store_true")
-    given = parser.parse_args()
-    cohort, out = write_cohort(given.out, given.subjects, workers=3, steps=given.steps), given.out.absolute() / "runs"
+    arguments = parser.parse_args()
+    cohort, out = (
+        write_cohort(arguments.out, arguments.subjects, workers=3, steps=arguments.steps),
+        arguments.out.absolute() / "runs",
+    )
     programs: list[subprocess.Popen] = []
     address = None
-    if given.external:
+    if arguments.external:
         address = "tcp://127.0.0.1:8791"
         programs.append(subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "8791",
                                           "--host", "127.0.0.1", "--no-dashboard"]))  # fmt: skip
@@ -96,23 +99,25 @@ def main() -> int:
     killer.start()
     try:
         table = batch(cohort, out, address)
-        ended = {path: digest_of(path) for path in out.glob("*/posterior.nc")}
-        again = batch(cohort, out, address, progress=False)
+        digests = {path: digest_of(path) for path in out.glob("*/posterior.nc")}
+        second_table = batch(cohort, out, address, progress=False)
     finally:
         for program in programs:
             program.terminate()
-    untouched = all(digest_of(path) == digest for path, digest in ended.items())
+    untouched = all(digest_of(path) == digest for path, digest in digests.items())
     states = table["state"].value_counts().to_dict()
     print(table[["folder", "state", "message"]].to_string())
-    untouched = untouched and again["state"].equals(table["state"])
+    untouched = untouched and second_table["state"].equals(table["state"])
     print(f"killed {len(killed)} workers; {states}; nothing run twice: {untouched}")
-    shutil.rmtree(given.out / "alone", ignore_errors=True)
+    shutil.rmtree(arguments.out / "alone", ignore_errors=True)
     with quick_reports():
-        br.run(br.load_config(given.out / "run.yaml", ["seed=1"]), given.out / "alone", progress=False)
-    same = contents(given.out / "alone" / "posterior.nc") == contents(out / "s01" / "posterior.nc")
-    print(f"s01 is as if it had been run alone: {same}")
-    right = states == {"finished": given.subjects - 3, "failed": 3} and untouched and same and len(killed) == 2
-    return int(not right)
+        br.run(br.load_config(arguments.out / "run.yaml", ["seed=1"]), arguments.out / "alone", progress=False)
+    same_as_alone = contents(arguments.out / "alone" / "posterior.nc") == contents(out / "s01" / "posterior.nc")
+    print(f"s01 equals a run of s01 alone: {same_as_alone}")
+    as_expected = (
+        states == {"finished": arguments.subjects - 3, "failed": 3} and untouched and same_as_alone and len(killed) == 2
+    )
+    return int(not as_expected)
 
 
 if __name__ == "__main__":

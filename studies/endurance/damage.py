@@ -1,10 +1,10 @@
-"""Damage each file of an interrupted and of a finished run in turn, and look what is made of that.
+"""Damage each file of an interrupted run and of a finished run in turn, and use the run afterwards.
 
     python -m studies.endurance.damage -o DIR
 
-Each is truncated, emptied, deleted, and has one byte turned. Then an interrupted run is resumed; a finished one is
-opened with its draws, gets its report anew, and is given a greater budget. What comes of it must be what comes of a
-folder that is sound, or one InputError. Its status is 1 where it is not.
+Each file is truncated, emptied and deleted, and one of its bits is flipped. Then the interrupted run is resumed. The
+finished run is opened with its draws, resumed, reported again, and resumed with a greater budget. The result must be
+that of an undamaged folder, or one InputError. Otherwise the program ends with status 1.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
 
 
 def quick_reports() -> Any:
-    """Reports of one word: the pictures take longer than these runs."""
+    """Replace reports by one word, because the figures take longer than these runs."""
     return mock.patch("bayesreg.report.html.write_report", lambda *arguments: arguments[-1].write_text("report"))
 
 
 def interrupt(config: Path, out: Path) -> None:
-    """Leave a run after some blocks."""
+    """Interrupt a run after `MIDDLE` blocks."""
     save = checkpoints.save_state
 
-    def cut_off(where: RunFolder, arrays: dict[str, np.ndarray], *rest: object) -> None:
-        save(where, arrays, *rest)
+    def cut_off(folder: RunFolder, arrays: dict[str, np.ndarray], *rest: object) -> None:
+        save(folder, arrays, *rest)
         if arrays["blocks"] == MIDDLE:
             raise KeyboardInterrupt
 
@@ -76,16 +76,16 @@ def interrupt(config: Path, out: Path) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    given = parser.parse_args()
-    config = write_pair(given.out, steps=160)
-    more = br.load_config(config, ["stop.max_steps=200"])
+    arguments = parser.parse_args()
+    config = write_pair(arguments.out, steps=160)
+    longer_config = br.load_config(config, ["stop.max_steps=200"])
     for name in ("finished", "interrupted", "longer"):
-        shutil.rmtree(given.out / name, ignore_errors=True)
+        shutil.rmtree(arguments.out / name, ignore_errors=True)
     with quick_reports():
-        br.run(config, given.out / "finished", progress=False)
-        interrupt(config, given.out / "interrupted")
-        br.run(more, given.out / "longer", progress=False)
-    expected, longer = (contents(given.out / name / "posterior.nc") for name in ("finished", "longer"))
+        br.run(config, arguments.out / "finished", progress=False)
+        interrupt(config, arguments.out / "interrupted")
+        br.run(longer_config, arguments.out / "longer", progress=False)
+    expected, longer = (contents(arguments.out / name / "posterior.nc") for name in ("finished", "longer"))
 
     def resume(folder: Path) -> bool:
         br.run(config, folder, resume=True, progress=False)
@@ -96,7 +96,7 @@ def main() -> int:
         return bool(result.idata.posterior.sizes["draw"]) and contents(folder / "posterior.nc") == expected
 
     def draw_more(folder: Path) -> bool:
-        br.run(more, folder, resume=True, progress=False)
+        br.run(longer_config, folder, resume=True, progress=False)
         return contents(folder / "posterior.nc") == longer
 
     def report_anew(folder: Path) -> bool:
@@ -105,26 +105,26 @@ def main() -> int:
     failures = 0
     trials = {"interrupted": [resume], "finished": [open_result, resume, report_anew, draw_more]}
     with quick_reports():
-        for state, looks in trials.items():
-            files = sorted(path.relative_to(given.out / state) for path in (given.out / state).rglob("*"))
+        for state, checks in trials.items():
+            files = sorted(path.relative_to(arguments.out / state) for path in (arguments.out / state).rglob("*"))
             for file in files:
-                if not (given.out / state / file).is_file() or file.name == ".lock":
+                if not (arguments.out / state / file).is_file() or file.name == ".lock":
                     continue
                 for damage, spoil in DAMAGES.items():
-                    for look in looks:
-                        folder = given.out / "damaged"
+                    for check in checks:
+                        folder = arguments.out / "damaged"
                         shutil.rmtree(folder, ignore_errors=True)
-                        shutil.copytree(given.out / state, folder)
+                        shutil.copytree(arguments.out / state, folder)
                         if (folder / file).stat().st_size:
                             spoil(folder / file)
                         try:
-                            told = "sound" if look(folder) else "WRONG NUMBERS"
+                            outcome = "sound" if check(folder) else "WRONG NUMBERS"
                         except InputError as error:
-                            told = f"told: {str(error).replace(str(folder), 'DIR')}"
+                            outcome = f"InputError: {str(error).replace(str(folder), 'DIR')}"
                         except Exception as error:
-                            told = f"TRACEBACK: {error!r}"
-                        failures += told.startswith(("WRONG", "TRACE"))
-                        print(f"{state} {file} {damage}, {look.__name__}: {told}", flush=True)
+                            outcome = f"TRACEBACK: {error!r}"
+                        failures += outcome.startswith(("WRONG", "TRACE"))
+                        print(f"{state} {file} {damage}, {check.__name__}: {outcome}", flush=True)
     print(f"{failures} failed")
     return int(failures > 0)
 

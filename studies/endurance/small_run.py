@@ -1,4 +1,4 @@
-"""A run of a few seconds on a stored mesh, stopped by its steps, that is killed and damaged here."""
+"""A run that takes a few seconds: it has a stored mesh, and stops after a fixed number of steps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CENTRE = np.array([5.0, -3.0, 8.0])
 
 
 def write_pair(folder: Path, steps: int = 240) -> Path:
-    """The files of a pair, and its configuration, whose path is returned."""
+    """Write the files of a pair and a configuration, and return the path of the configuration."""
     folder.mkdir(parents=True, exist_ok=True)
     affine = np.diag([-4.0, 4.0, 4.0, 1.0])
     affine[:3, 3] = CENTRE + np.array([50.0, -50.0, -50.0])
@@ -28,14 +28,14 @@ def write_pair(folder: Path, steps: int = 240) -> Path:
     noise = np.random.default_rng(0).normal(size=grid.shape)
     fixed = grid.with_voxels(100 + 400 * np.array([0.05, 0.2, 0.5, 0.8])[labels] + 20 * noise * (labels > 0))
     moving = fixed.with_voxels(np.asarray(fixed.interpolate(points + np.array([0.0, 0.8, 0.0]))))
-    given = {"fixed": fixed, "moving": moving, "labels": grid.with_voxels(labels.astype(np.int8)),
+    images = {"fixed": fixed, "moving": moving, "labels": grid.with_voxels(labels.astype(np.int8)),
              "intracranial": grid.with_voxels((radius < 46).astype(np.uint8))}  # fmt: skip
-    for name, image in given.items():
+    for name, image in images.items():
         br.save_image(image, folder / f"{name}.nii.gz")
     br.save_mesh(ball_mesh(radius=38), folder / "mesh.vtu")
     config = {
         "seed": 3,
-        "data": {"source": "files", **{name: f"{name}.nii.gz" for name in given},
+        "data": {"source": "files", **{name: f"{name}.nii.gz" for name in images},
                  "label_table": {"csf": [1], "gm": [2], "wm": [3]}},
         "mesh": {"file": "mesh.vtu"},
         "model": {"preset": "paper"},
@@ -48,13 +48,13 @@ def write_pair(folder: Path, steps: int = 240) -> Path:
 
 
 def start(*arguments: str | Path) -> subprocess.Popen[str]:
-    """The command line, in a process of its own."""
+    """Start the command line in a new process."""
     command = [*BAYESREG, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 
 def finish(*arguments: str | Path) -> tuple[int, str]:
-    """Its status, and what it said to standard error."""
+    """Run the command line; return its exit status and its standard error."""
     process = start(*arguments)
-    _, said = process.communicate()
-    return process.returncode, said
+    _, error_output = process.communicate()
+    return process.returncode, error_output

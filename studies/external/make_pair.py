@@ -2,21 +2,21 @@
 
     BAYESREG_DATA=… python -m studies.external.make_pair {sag,gravity,resect} -o PAIR [--seed 1] [--bias 0.15] …
 
-Colin27 (T1, 1 mm) is moved by a field that is no equilibrium of linear tetrahedra:
+A field that is no equilibrium of linear tetrahedra moves Colin27 (T1, 1 mm):
 
-- sag: a smooth analytic sinking under a craniotomy, with a squeeze towards the midline; no mechanics at all;
-- gravity: weight, not motion of the boundary: a body force on trilinear hexahedra of 5 mm in GM, WM and CSF of Poisson
-  ratio 0.45, held at the base, free to leave the skull and stopped by it;
-- resect: gravity, and a cavity: a ball of tissue is gone, and its walls have fallen in by a quarter.
+- sag is a smooth analytic sinking under a craniotomy, with a squeeze towards the midline, without any mechanics;
+- gravity is a body force on trilinear hexahedra of 5 mm in GM, WM and CSF with Poisson ratio 0.45; the base is held,
+  and the brain is free to leave the skull but cannot enter it;
+- resect is gravity with a cavity: a ball of tissue is removed, and its walls fall in by a quarter of its radius.
 
-m(x + u(x)) = f(x) wherever tissue is left; what the brain leaves behind is fluid; skull and scalp stay where they are.
-It shares no code with bayesreg. The folder PAIR holds
+m(x + u(x)) = f(x) wherever tissue remains. Fluid fills the space that the brain leaves; skull and scalp do not move.
+This module shares no code with bayesreg. The folder PAIR holds
 
 - fixed, moving, labels and intracranial, and cavity (on the moving grid) of a resection, each .nii.gz;
-- truth.npz: u, (X, Y, Z, 3) in mm, world RAS, on the fixed grid; valid, where it holds; walls, valid and within 10 mm
-  of the wall of a cavity;
-- points.csv: 60 places in tissue, fixed x, y, z and moving x, y, z in mm, RAS, which no registration is given;
-- pair.json: what was asked for, and what came of it.
+- truth.npz: u, (X, Y, Z, 3) in mm, world RAS, on the fixed grid; valid, the voxels where u is right; walls, the valid
+  voxels within 10 mm of the wall of a cavity;
+- points.csv: 60 places in tissue, fixed x, y, z and moving x, y, z in mm, RAS, which no registration uses;
+- pair.json: the options, and the properties of the pair.
 """
 
 from __future__ import annotations
@@ -38,63 +38,63 @@ Kind = Literal["sag", "gravity", "resect"]
 KINDS = ("sag", "gravity", "resect")
 
 T1, LABELS = "colin27_t1_1mm_unedited.nii.gz", "brainweb_crisp_1mm.nii.gz"
-# Of BrainWeb.
+# The labels of BrainWeb.
 CSF, GM, WM, GLIA = 1, 2, 3, 8
-# Intensities of Colin27.
+# Intensities of Colin27 in fluid and in white matter.
 FLUID, WHITE = 40.0, 145.0
-# A T2 image of the same: dark and bright change places.
+# T1 intensities and their T2 counterparts: dark and bright change places.
 T1_VALUES, T2_VALUES = [0, 24, 40, 54, 109, 145, 255], [5, 160, 150, 150, 95, 70, 60]
-# μ up to a factor, of CSF, GM and WM, the sd of its log between cells, and ν.
+# The relative Young's moduli of CSF, GM and WM, the sd of their logarithm between cells, and ν.
 YOUNG, YOUNG_LOG_SD, POISSON = (0.15, 1.0, 1.6), 0.1, 0.45
-# mm: edge of a hexahedron; radius of a resection and how far below the surface its centre lies.
+# The edge of a hexahedron, the radius of a resection, and the depth of its centre, mm.
 EDGE, RADIUS, DEPTH = 5, 14.0, 16
-# Stiffness of the springs that hold the base, and of the skull where the brain presses against it.
+# The stiffness of the springs that hold the base, and of the skull where the brain presses against it.
 HELD, PRESSED = 50.0, 20.0
 
 CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 class Anatomy(NamedTuple):
-    """Colin27 and what of it may move."""
+    """Colin27 and its masks."""
 
     # (X, Y, Z)
     t1: np.ndarray
-    # (X, Y, Z), those of BrainWeb
+    # (X, Y, Z), the labels of BrainWeb
     labels: np.ndarray
-    # (X, Y, Z): inside of the skull, and the brain with the fluid between its folds.
+    # (X, Y, Z): the inside of the skull, and the brain with the fluid between its folds.
     intracranial: np.ndarray
     hull: np.ndarray
     # Voxel index to world RAS, mm.
     affine: np.ndarray
 
     def values(self, array: np.ndarray, points: np.ndarray, order: int = 1, prefilter: bool = True) -> np.ndarray:
-        """Values of an array on this grid at points, (..., 3) in mm, world RAS."""
+        """Interpolate an array on this grid at points, (..., 3) in mm, world RAS."""
         inverse = np.linalg.inv(self.affine)
-        at = (points @ inverse[:3, :3].T + inverse[:3, 3]).reshape(-1, 3).T
-        return ndi.map_coordinates(array, at, order=order, mode="nearest", prefilter=prefilter).reshape(
+        indices = (points @ inverse[:3, :3].T + inverse[:3, 3]).reshape(-1, 3).T
+        return ndi.map_coordinates(array, indices, order=order, mode="nearest", prefilter=prefilter).reshape(
             points.shape[:-1]
         )
 
     def vectors(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """The same of a field of vectors, (X, Y, Z, 3)."""
+        """Interpolate a field of vectors, (X, Y, Z, 3), at points."""
         return np.stack([self.values(field[..., i], points) for i in range(3)], axis=-1)
 
     def world(self, voxels: np.ndarray) -> np.ndarray:
-        """Voxel indices, (..., 3), to mm, world RAS."""
+        """Convert voxel indices, (..., 3), to mm, world RAS."""
         return voxels @ self.affine[:3, :3].T + self.affine[:3, 3]
 
 
 class Site(NamedTuple):
-    """Where the skull is open, mm, world RAS."""
+    """The opening of the skull, mm, world RAS."""
 
     place: np.ndarray
-    # Unit vector from the centre of the brain towards it.
+    # Unit vector from the centre of the brain towards the opening.
     outwards: np.ndarray
     centre: np.ndarray
 
 
 def read_anatomy(data: Path) -> Anatomy:
-    """BrainWeb's labels and the T1 of Colin27 from a folder."""
+    """Read BrainWeb's labels and the T1 image of Colin27 from a folder."""
     t1, crisp = (nib.load(data / name) for name in (T1, LABELS))
     labels = np.asarray(crisp.dataobj).astype(np.uint8)
     inside = _largest(np.isin(labels, (CSF, GM, WM, GLIA)))
@@ -105,7 +105,7 @@ def read_anatomy(data: Path) -> Anatomy:
 
 
 def site_of(anatomy: Anatomy, rng: np.random.Generator) -> Site:
-    """A random place on the upper surface of the brain."""
+    """Draw a random place on the upper surface of the brain."""
     world = anatomy.world(np.argwhere(anatomy.hull))
     centre = world.mean(0)
     d = np.array([rng.choice([-1, 1]) * rng.uniform(0.4, 0.9), rng.uniform(-0.6, 0.6), rng.uniform(0.4, 0.9)])
@@ -115,7 +115,7 @@ def site_of(anatomy: Anatomy, rng: np.random.Generator) -> Site:
 
 
 def sag(X: np.ndarray, site: Site, amplitude: float, rng: np.random.Generator) -> np.ndarray:
-    """Displacement at points X, (..., 3) in mm: a bell of sinking at the site, another of squeezing by the midline."""
+    """Displacement at points X, (..., 3) in mm: a Gaussian sinking at the site, and a squeeze by the midline."""
     d = site.outwards
     down = -0.6 * d + np.array([rng.uniform(-0.3, 0.3), -0.5, -0.35])
     down /= np.linalg.norm(down)
@@ -129,13 +129,13 @@ def sag(X: np.ndarray, site: Site, amplitude: float, rng: np.random.Generator) -
 def gravity(
     anatomy: Anatomy, site: Site, amplitude: float, rng: np.random.Generator, removed: np.ndarray | None = None
 ) -> np.ndarray:
-    """Displacement of every voxel of a brain under its weight, (X, Y, Z, 3) in mm, the greatest about `amplitude`.
+    """Displacement of every voxel of a brain under its weight, (X, Y, Z, 3), at most about `amplitude`, mm.
 
     Parameters
     ----------
     anatomy, site, amplitude, rng
     removed : (X, Y, Z) array of booleans, optional
-        Tissue that is gone: it has no weight and next to no stiffness.
+        The removed tissue, which has no weight and almost no stiffness.
     """
     shape = np.array(anatomy.t1.shape) // EDGE + 1
     filled = _largest(_voxels_of_cells(anatomy.hull, shape) > EDGE**3 / 2)
@@ -157,15 +157,15 @@ def gravity(
     weight = np.zeros((len(world), 3))
     shares = np.repeat((~gone)[tuple(cells.T)] * EDGE**3 / 8, 8)
     np.add.at(weight, nodes_of_cells.ravel(), shares[:, None] * down)
-    # What buoyancy no longer carries: all of it at the height of the opening and above, none 60 mm below.
+    # Buoyancy carries the full weight 60 mm below the opening, and none of it at its height and above.
     weight *= np.clip(1 + ((world - site.place) @ -down) / 60, 0, 1)[:, None]
     outer = np.bincount(nodes_of_cells.ravel(), minlength=len(world)) < 8
     K = _stiffness(nodes_of_cells, young[tuple(cells.T)])
-    return _between_nodes(_at_rest(K, weight, outer, world, anatomy, amplitude), nodes, shape, anatomy.t1.shape)
+    return _between_nodes(_equilibrium(K, weight, outer, world, anatomy, amplitude), nodes, shape, anatomy.t1.shape)
 
 
 def hexahedron(lam: float, mu: float, edge: float) -> np.ndarray:
-    """Stiffness of a trilinear hexahedron, (24, 24), by 2 × 2 × 2 points."""
+    """Stiffness of a trilinear hexahedron, (24, 24), by quadrature at 2 × 2 × 2 points."""
     signs = CORNERS * 2 - 1
     C = np.zeros((6, 6))
     C[:3, :3] = lam
@@ -184,16 +184,16 @@ def hexahedron(lam: float, mu: float, edge: float) -> np.ndarray:
 
 
 def _stiffness(nodes_of_cells: np.ndarray, young: np.ndarray) -> csr_matrix:
-    of_one = hexahedron(POISSON / (1 + POISSON) / (1 - 2 * POISSON), 0.5 / (1 + POISSON), EDGE)
+    unit_stiffness = hexahedron(POISSON / (1 + POISSON) / (1 - 2 * POISSON), 0.5 / (1 + POISSON), EDGE)
     unknowns = (3 * nodes_of_cells[:, :, None] + np.arange(3)).reshape(len(nodes_of_cells), 24)
     rows, columns = np.repeat(unknowns, 24, 1).ravel(), np.tile(unknowns, (1, 24)).ravel()
-    return coo_matrix(((young[:, None, None] * of_one).ravel(), (rows, columns))).tocsr()
+    return coo_matrix(((young[:, None, None] * unit_stiffness).ravel(), (rows, columns))).tocsr()
 
 
-def _at_rest(
+def _equilibrium(
     K: csr_matrix, weight: np.ndarray, outer: np.ndarray, world: np.ndarray, anatomy: Anatomy, amplitude: float
 ) -> np.ndarray:
-    """Displacement of the nodes, mm, under as much of the weight as moves them by `amplitude`; the skull may press."""
+    """Displacement of the nodes, mm, with the weight scaled to move them by `amplitude`, in contact with the skull."""
     n = len(world)
     height = world[:, 2]
     base = np.where(height < np.percentile(height, 6), HELD, 0.0)
@@ -219,18 +219,18 @@ def _at_rest(
 
 
 def _between_nodes(u: np.ndarray, nodes: np.ndarray, shape: np.ndarray, grid: tuple[int, ...]) -> np.ndarray:
-    """From the nodes to the voxels, without the kinks between cells."""
-    coarse, known = np.zeros((*(shape + 1), 3)), np.zeros(shape + 1)
+    """Interpolate from the nodes to the voxels, and smooth the kinks between cells."""
+    coarse, has_value = np.zeros((*(shape + 1), 3)), np.zeros(shape + 1)
     coarse[tuple(nodes.T)] = u
-    known[tuple(nodes.T)] = 1
-    coarse = coarse[tuple(ndi.distance_transform_edt(known == 0, return_distances=False, return_indices=True))]
-    at = np.stack(np.meshgrid(*[(np.arange(size) + 0.5) / EDGE for size in grid], indexing="ij")).reshape(3, -1)
-    fine = [ndi.map_coordinates(coarse[..., i], at, order=3, mode="nearest").reshape(grid) for i in range(3)]
+    has_value[tuple(nodes.T)] = 1
+    coarse = coarse[tuple(ndi.distance_transform_edt(has_value == 0, return_distances=False, return_indices=True))]
+    indices = np.stack(np.meshgrid(*[(np.arange(size) + 0.5) / EDGE for size in grid], indexing="ij")).reshape(3, -1)
+    fine = [ndi.map_coordinates(coarse[..., i], indices, order=3, mode="nearest").reshape(grid) for i in range(3)]
     return np.stack([ndi.gaussian_filter(component, 1.5) for component in fine], -1)
 
 
 def falling_in(away: np.ndarray) -> np.ndarray:
-    """Displacement about a cavity, mm, at places relative to its centre: walls fall in by a quarter of the radius."""
+    """Displacement, mm, at places relative to the centre of a cavity; its walls fall in by a quarter of its radius."""
     r = np.linalg.norm(away, axis=-1, keepdims=True)
     return -0.25 * RADIUS * np.exp(-np.maximum(r - RADIUS, 0) / 10) * away / np.maximum(r, RADIUS / 2)
 
@@ -243,7 +243,7 @@ def moved(
     Returns
     -------
     (X, Y, Z) arrays
-        The image; where what was removed is now; and by how much the search for where a voxel came from is off, mm.
+        The image; the mask of the cavity; and the error of the inverse of x + u(x) at each voxel, mm.
     """
     # x + u(x) = X
     x = X - u
@@ -262,7 +262,7 @@ def moved(
 
 
 def shaded(image: np.ndarray, X: np.ndarray, centre: np.ndarray, strength: float) -> np.ndarray:
-    """The image times a smooth shading, its sides and ends darker or brighter by about half of `strength`."""
+    """Multiply the image by a smooth shading, which changes its sides and ends by about half of `strength`."""
     c = (X - centre) / 90
     return image * (1 + strength * (0.6 * c[..., 0] - 0.5 * c[..., 1] + 0.4 * c[..., 2] * c[..., 0]))
 
@@ -276,17 +276,17 @@ class Slices(NamedTuple):
     thickness: float
 
     def centres(self, off: float = 0.0) -> np.ndarray:
-        """Of the voxels, mm, world RAS, moved along the slices' normal by a share of the thickness."""
+        """Centres of the voxels, mm, world RAS, moved along the normal of the slices by `off` thicknesses."""
         return (_indices(self.size) + np.array([0, 0, off])) @ self.affine[:3, :3].T + self.affine[:3, 3]
 
     def of(self, image: np.ndarray, anatomy: Anatomy) -> np.ndarray:
-        """An image on the grid of the anatomy, averaged over the thickness."""
+        """Resample an image from the grid of the anatomy, averaged over the thickness."""
         edges = np.linspace(-0.5, 0.5, max(int(self.thickness * 2), 1) + 1)
         return np.mean([anatomy.values(image, self.centres(off)) for off in (edges[1:] + edges[:-1]) / 2], 0)
 
 
 def slices_about(X: np.ndarray, thickness: float) -> Slices:
-    """Slices through all of a head."""
+    """Make slices that cover the whole head."""
     t = np.deg2rad(12)
     turned = np.array([[np.cos(t), 0, np.sin(t)], [0, 1, 0], [-np.sin(t), 0, np.cos(t)]]) @ np.diag([-1, 1, 1])
     size = np.array([190, 220, int(200 / thickness)])
@@ -296,16 +296,16 @@ def slices_about(X: np.ndarray, thickness: float) -> Slices:
     return Slices(affine, size, thickness)
 
 
-def misalignment(centre: np.ndarray, much: float, rng: np.random.Generator) -> np.ndarray:
-    """A rigid motion, (4, 4), about the centre by so many degrees, and by so many mm."""
+def misalignment(centre: np.ndarray, magnitude: float, rng: np.random.Generator) -> np.ndarray:
+    """A random rigid motion, (4, 4), about the centre by `magnitude` degrees and `magnitude` mm."""
     T = np.eye(4)
-    if much:
+    if magnitude:
         axis = rng.normal(size=3)
         axis /= np.linalg.norm(axis)
-        k, t = np.cross(np.eye(3), axis), np.deg2rad(much)
+        k, t = np.cross(np.eye(3), axis), np.deg2rad(magnitude)
         T[:3, :3] = np.eye(3) + np.sin(t) * k + (1 - np.cos(t)) * k @ k
         shift = rng.normal(size=3)
-        T[:3, 3] = centre - T[:3, :3] @ centre + much * shift / np.linalg.norm(shift)
+        T[:3, 3] = centre - T[:3, :3] @ centre + magnitude * shift / np.linalg.norm(shift)
     return T
 
 
@@ -322,7 +322,7 @@ def make_pair(
     thick: float = 0.0,
     rigid: float = 0.0,
 ) -> dict[str, Any]:
-    """Write a pair and return what pair.json says of it.
+    """Write a pair and return the content of its pair.json.
 
     Parameters
     ----------
@@ -330,12 +330,12 @@ def make_pair(
     data : path
         Folder of BrainWeb's labels and Colin27's T1.
     out : path
-        Folder of the pair; made if need be.
+        Folder of the pair, which is created if it does not exist.
     seed : int
     amplitude : float
         Greatest displacement, mm.
     noise : float
-        sd on each image, white matter being 1.
+        sd on each image, relative to white matter.
     bias : float
         Strength of a smooth shading of the moving image.
     contrast : {"t1", "t2"}
@@ -343,7 +343,7 @@ def make_pair(
     thick : float
         Thickness of the slices of an oblique, left-handed moving grid, mm; 0 is the fixed grid.
     rigid : float
-        Misalignment in the header of the moving image: so many mm and degrees.
+        Misalignment in the header of the moving image, in mm and in degrees.
     """
     rng = np.random.default_rng(seed)
     anatomy = read_anatomy(data)
@@ -369,7 +369,7 @@ def make_pair(
     T = misalignment(site.centre, rigid, rng)
     total = (X + u) @ T[:3, :3].T + T[:3, 3] - X
 
-    # Not where x + u(x) cannot be inverted, nor where it leaves the skull.
+    # The truth is not valid where x + u(x) cannot be inverted or lies outside the skull.
     held = anatomy.values(anatomy.intracranial.astype(float), X + u) > 0.5
     valid = anatomy.hull & (anatomy.values(off, X + u) < 0.05) & held
     walls = np.zeros(valid.shape, bool)
@@ -420,7 +420,7 @@ def make_pair(
 
 
 def _indices(shape: Iterable[int]) -> np.ndarray:
-    """Of all voxels of a grid, (X, Y, Z, 3)."""
+    """Indices of all voxels of a grid, (X, Y, Z, 3)."""
     return np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), -1)
 
 
@@ -430,12 +430,12 @@ def _bell(X: np.ndarray, centre: np.ndarray, width: float) -> np.ndarray:
 
 def _largest(mask: np.ndarray) -> np.ndarray:
     """The largest connected part of a mask."""
-    parts, _ = ndi.label(mask)
-    return parts == np.bincount(parts.ravel())[1:].argmax() + 1
+    components, _ = ndi.label(mask)
+    return components == np.bincount(components.ravel())[1:].argmax() + 1
 
 
 def _voxels_of_cells(mask: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """How many voxels of the mask each cell of the coarse grid holds."""
+    """The number of voxels of the mask in each cell of the coarse grid."""
     cells = np.ravel_multi_index((np.argwhere(mask) // EDGE).T, shape)
     return np.bincount(cells, minlength=np.prod(shape)).reshape(shape)
 
@@ -445,7 +445,7 @@ def _save(array: np.ndarray, affine: np.ndarray, path: Path, kind: type) -> None
 
 
 def data_folder() -> Path:
-    """That of BAYESREG_DATA; ends the program where it does not hold both files."""
+    """The folder that BAYESREG_DATA names; the program ends if it does not hold both files."""
     folder = Path(os.environ.get("BAYESREG_DATA") or ".")
     missing = [name for name in (T1, LABELS) if not (folder / name).is_file()]
     if missing:
@@ -456,21 +456,21 @@ def data_folder() -> Path:
 
 
 def main() -> None:
-    """Make a pair and print what came of it."""
+    """Make a pair and print its properties."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", choices=KINDS)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--data", type=Path, help="folder of the two images, else that of BAYESREG_DATA")
+    parser.add_argument("--data", type=Path, help="folder of the two images; default: BAYESREG_DATA")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--amplitude", type=float, default=10.0, help="greatest displacement, mm")
-    parser.add_argument("--noise", type=float, default=0.03, help="sd on each image, white matter being 1")
+    parser.add_argument("--noise", type=float, default=0.03, help="sd on each image, relative to white matter")
     parser.add_argument("--bias", type=float, default=0.0, help="strength of a smooth shading of the moving image")
     parser.add_argument("--contrast", choices=("t1", "t2"), default="t1", help="t2: dark and bright change places")
     parser.add_argument("--thick", type=float, default=0.0, help="slice thickness of an oblique moving grid, mm")
     parser.add_argument("--rigid", type=float, default=0.0, help="misalignment in the moving header, mm and degrees")
-    asked = vars(parser.parse_args())
-    data = asked.pop("data") or data_folder()
-    print(json.dumps(make_pair(asked.pop("kind"), data, asked.pop("out"), **asked)))
+    options = vars(parser.parse_args())
+    data = options.pop("data") or data_folder()
+    print(json.dumps(make_pair(options.pop("kind"), data, options.pop("out"), **options)))
 
 
 if __name__ == "__main__":

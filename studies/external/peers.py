@@ -1,12 +1,12 @@
-"""Register a pair of `studies.external.make_pair` by a peer of bayesreg.
+"""Register a pair of `studies.external.make_pair` with a peer of bayesreg.
 
     python -m studies.external.peers {Demons,B-spline,SyN} PAIR -o OUT
 
 OUT/displacement_mean.nii.gz is then an ITK displacement field on the grid of the fixed image: mm, LPS, fixed to moving.
-Every peer is given what a good user begins with: images without their shading (N4), and the mask of the inside of the
-skull. Where pair.json says that the moving image is misaligned, B-splines and SyN have a rigid stage of their own (SyN
-an affine one after it); where it is of another contrast, they compare by mutual information; and a cavity is outside of
-the mask of the moving image. Demons know none of these, and are not run there.
+Every peer gets the inputs of a good user: images without their shading (N4), and the mask of the inside of the skull.
+If pair.json says that the moving image is misaligned, B-splines and SyN have a rigid stage (SyN also has an affine
+one). If the contrasts differ, they compare by mutual information. A cavity is outside the mask of the moving image.
+Demons have no such options, and do not run on such pairs.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ import numpy as np
 FIELD = "displacement_mean.nii.gz"
 THREADS = 2
 
-# (folder of the pair, file of the field) → None
+# A peer takes the folder of the pair, and writes the file of the field.
 Peer = Callable[[Path, Path], None]
 
 
 def without_shading(pair: Path, out: Path) -> None:
-    """Write both images of a pair, divided by their bias fields (N4 on one voxel of 4 × 4 × 4), and its mask."""
+    """Write both images of a pair, divided by their bias fields (N4 on voxels of 4 mm), and its mask."""
     import SimpleITK
 
     inside = SimpleITK.ReadImage(str(pair / "intracranial.nii.gz"), SimpleITK.sitkUInt8)
@@ -49,25 +49,26 @@ def without_shading(pair: Path, out: Path) -> None:
         SimpleITK.WriteImage(cavity == 0, str(out / "outside_cavity.nii.gz"))
 
 
-class Known(NamedTuple):
-    """What a user knows of a pair."""
+class PairFacts(NamedTuple):
+    """The facts that a user knows of a pair."""
 
     misaligned: bool
-    one_contrast: bool
-    # Of the moving image, where there is a cavity.
+    same_contrast: bool
+    # The mask of the moving image, if there is a cavity.
     mask: Path | None
 
     @classmethod
-    def of(cls, pair: Path) -> Known:
+    def of(cls, pair: Path) -> PairFacts:
         facts, mask = json.loads((pair / "pair.json").read_text()), pair / "outside_cavity.nii.gz"
         return cls(facts.get("rigid", 0) > 0, facts.get("contrast", "t1") == "t1", mask if mask.exists() else None)
 
 
 def demons(pair: Path, field: Path) -> None:
-    """Diffeomorphic Demons of SimpleITK on three levels, the field smoothed by 1.5 voxels after each iteration.
+    """Register by the diffeomorphic Demons of SimpleITK on three levels.
 
-    The histogram of the moving image is first matched to that of the fixed one, since Demons compare intensities. They
-    know no mask; on images without the skull and what is outside of it the error was greater.
+    The field is smoothed by 1.5 voxels after each iteration. The histogram of the moving image is first matched to that
+    of the fixed one, because Demons compare intensities. Demons use no mask; on images without the skull and the scalp
+    their error was greater.
     """
     import SimpleITK
 
@@ -87,7 +88,7 @@ def demons(pair: Path, field: Path) -> None:
 
 
 def _coarser(image: SimpleITK.Image, factor: int) -> SimpleITK.Image:
-    """Every so many voxels of the smoothed image, mm being voxels here."""
+    """Smooth an image of voxels of 1 mm, and keep every `factor`-th voxel."""
     import SimpleITK
 
     if factor == 1:
@@ -96,22 +97,22 @@ def _coarser(image: SimpleITK.Image, factor: int) -> SimpleITK.Image:
 
 
 def b_spline(pair: Path, field: Path) -> None:
-    """Cubic B-splines of elastix, 16 mm between control points, on four levels, by normalised correlation in the mask.
+    """Register by the cubic B-splines of elastix, by normalised correlation in the mask.
 
-    The rest are elastix's defaults, adaptive stochastic gradient descent among them, but for twice the iterations (500)
-    and five times the samples (10,000).
+    There are 16 mm between control points, on four levels. The other settings are elastix's defaults, with adaptive
+    stochastic gradient descent, except for twice the iterations (500) and five times the samples (10,000).
     """
     import itk
 
     fixed, moving = (itk.imread(str(pair / f"{name}.nii.gz"), itk.F) for name in ("fixed", "moving"))
     inside = itk.imread(str(pair / "intracranial.nii.gz"), itk.UC)
-    parameters, known = itk.ParameterObject.New(), Known.of(pair)
-    if known.misaligned:
+    parameters, facts = itk.ParameterObject.New(), PairFacts.of(pair)
+    if facts.misaligned:
         parameters.AddParameterMap(parameters.GetDefaultParameterMap("rigid", 4))
-    masks = {} if known.mask is None else {"moving_mask": itk.imread(str(known.mask), itk.UC)}
+    masks = {} if facts.mask is None else {"moving_mask": itk.imread(str(facts.mask), itk.UC)}
     settings = dict(parameters.GetDefaultParameterMap("bspline", 4, 16.0)) | {
         "Registration": ["MultiResolutionRegistration"],
-        "Metric": ["AdvancedNormalizedCorrelation" if known.one_contrast else "AdvancedMattesMutualInformation"],
+        "Metric": ["AdvancedNormalizedCorrelation" if facts.same_contrast else "AdvancedMattesMutualInformation"],
         "GridSpacingSchedule": ["8", "4", "2", "1"],
         "Interpolator": ["BSplineInterpolator"],
         "NumberOfSpatialSamples": ["10000"],
@@ -119,47 +120,49 @@ def b_spline(pair: Path, field: Path) -> None:
         "WriteResultImage": ["false"],
     }
     parameters.AddParameterMap(settings)
-    _, found = itk.elastix_registration_method(
+    _, transform = itk.elastix_registration_method(
         fixed, moving, parameter_object=parameters, fixed_mask=inside, number_of_threads=THREADS, **masks
     )
-    # It also writes a field of its own, by default into the current folder.
-    u = itk.transformix_deformation_field(moving, found, output_directory=str(pair))
+    # transformix also writes its own file, by default into the current folder.
+    u = itk.transformix_deformation_field(moving, transform, output_directory=str(pair))
     itk.imwrite(u, str(field))
 
 
 def syn(pair: Path, field: Path) -> None:
-    """SyN of ANTs as antsRegistrationSyNQuick.sh calls it, which compares by mutual information, in the mask.
+    """Register by SyN of ANTs with the settings of antsRegistrationSyNQuick.sh: mutual information in the mask.
 
-    Without its rigid and its affine stage where the images are aligned.
+    If the images are aligned, the rigid and the affine stage are left out.
     """
     import ants
 
     fixed, moving, inside = (
         ants.image_read(str(pair / f"{name}.nii.gz")) for name in ("fixed", "moving", "intracranial")
     )
-    known = Known.of(pair)
-    masks = {"mask": inside} | ({} if known.mask is None else {"moving_mask": ants.image_read(str(known.mask))})
-    stages = {} if known.misaligned else {"initial_transform": "Identity"}
-    kind = "antsRegistrationSyNQuick[s]" if known.misaligned else "antsRegistrationSyNQuick[so]"
-    found = ants.registration(fixed, moving, type_of_transform=kind, **masks, **stages)
-    whole = ants.apply_transforms(fixed, moving, found["fwdtransforms"], compose=str(field.with_suffix("")) + "_")
-    shutil.move(whole, field)
+    facts = PairFacts.of(pair)
+    masks = {"mask": inside} | ({} if facts.mask is None else {"moving_mask": ants.image_read(str(facts.mask))})
+    stages = {} if facts.misaligned else {"initial_transform": "Identity"}
+    kind = "antsRegistrationSyNQuick[s]" if facts.misaligned else "antsRegistrationSyNQuick[so]"
+    registration = ants.registration(fixed, moving, type_of_transform=kind, **masks, **stages)
+    composed = ants.apply_transforms(
+        fixed, moving, registration["fwdtransforms"], compose=str(field.with_suffix("")) + "_"
+    )
+    shutil.move(composed, field)
 
 
 PEERS: dict[str, Peer] = {"Demons": demons, "B-spline": b_spline, "SyN": syn}
 
 
 def main() -> None:
-    """Register a pair."""
+    """Read the command line, and register a pair."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("peer", choices=PEERS)
     parser.add_argument("pair", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as prepared:
-        without_shading(given.pair, Path(prepared))
-        PEERS[given.peer](Path(prepared), given.out / FIELD)
+        without_shading(arguments.pair, Path(prepared))
+        PEERS[arguments.peer](Path(prepared), arguments.out / FIELD)
 
 
 if __name__ == "__main__":

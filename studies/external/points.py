@@ -1,8 +1,8 @@
-"""How often the ellipsoids of `bayesreg apply` hold the points of a pair, and how often by the draws alone.
+"""How often do the ellipsoids of `bayesreg apply`, and those of the draws alone, contain the points of a pair?
 
     python -m studies.external.points PAIR RUN
 
-PAIR is a folder of `studies.external.make_pair`, whose points.csv the run never saw.
+PAIR is a folder of `studies.external.make_pair`. The run did not use its points.csv.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from bayesreg.io.points import read_point_pairs
-from bayesreg.model.observations.landmarks_report import surprise
-from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.observations.landmarks_report import region_probability
+from bayesreg.model.submesh import discretisation_variance
 from bayesreg.results.nodal_draws import transform_of
 from bayesreg.results.result import load_result
 
@@ -25,14 +25,14 @@ def main() -> None:
     pair, run = map(Path, sys.argv[1:3])
     points, transform = read_point_pairs(pair / "points.csv"), transform_of(load_result(run))
     places, near = transform.place(points.fixed)
-    # Along the axes of the fixed image's world, as the covariance of u.
+    # The errors are along the axes of the world of the fixed image, as the covariance of u.
     away = (points.moving - places) @ transform.pose.rotation
     covariance = transform.covariance(near)
-    submesh = submesh_variance(transform.mesh, transform.u_mean)[near.cell]
+    submesh = discretisation_variance(transform.mesh, transform.u_mean)[near.cell]
     drawn = covariance + (submesh - transform.unresolved_sd(near) ** 2)[:, :, None] * np.eye(3)
     print(f"{len(places)} points, mean error {np.linalg.norm(away, axis=1).mean():.3f} mm")
-    for name, one in {"ellipsoids of points.csv": covariance, "of the draws alone": drawn}.items():
-        inside = surprise(away, one)
+    for name, matrix in {"ellipsoids of points.csv": covariance, "of the draws alone": drawn}.items():
+        inside = region_probability(away, matrix)
         print(name, *(f"{(inside <= level).mean():.0%} in the {level:.0%}" for level in LEVELS), sep="  ")
 
 

@@ -1,11 +1,11 @@
-"""How often the pose of a rigid pair lies in its intervals.
+"""How often do the intervals of a pose contain the truth of a rigid pair?
 
     BAYESREG_DATA=… python -m studies.external.pose -o runs/pose [--seeds 20] [--millimetres 20] [--degrees 15]
 
-Colin27 is scanned twice: the second time turned and shifted, on a grid of its own, by cubic splines of the image and
-not by its header, with noise of 0.03 of white matter's intensity on each. `bayesreg.run` is given both files, labels,
-mask and one coarse mesh for all. The truth are six numbers a seed; counted are those inside the central 50, 90 and 95 %
-of the draws of the rigid part of the displacement.
+Two scans of Colin27 are simulated. Cubic splines turn and shift the second one on its voxel grid, so that its header
+does not tell the motion. Each has noise of 0.03 of the intensity of white matter. `bayesreg.run` gets both files,
+labels, mask and one coarse mesh for all pairs. The truth has six numbers for each seed. The program counts those inside
+the central 50, 90 and 95 % of the draws of the rigid motion.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ SETTINGS = ("mesh.edge_length=30.0", "observations=[{kind: images, most_points: 
 
 
 def rigid_motion(seed: int, millimetres: float, degrees: float, centre: np.ndarray) -> np.ndarray:
-    """A rigid motion about a centre in a random direction, (4, 4), mm."""
+    """A rigid motion, (4, 4) in mm, about a centre, with a random axis and a random shift."""
     axis, shift = (way / np.linalg.norm(way) for way in np.random.default_rng(seed).normal(size=(2, 3)))
     return np.asarray(Motion(millimetres * shift, degrees * axis).pose(centre).matrix)
 
 
 def write_pair(out: Path, data: Path, seed: int, millimetres: float, degrees: float) -> np.ndarray:
-    """Write the files of a pair; return its motion."""
+    """Write the files of a pair, and return its rigid motion."""
     rng, anatomy = np.random.default_rng(1000 + seed), read_anatomy(data)
     t1, affine = anatomy.t1, anatomy.affine
     centre = anatomy.world(np.argwhere(anatomy.hull)).mean(axis=0)
     motion = rigid_motion(seed, millimetres, degrees, centre)
-    # The voxels of the second scan, where they were in the first: X = T x.
-    back = np.linalg.inv(affine) @ np.linalg.inv(motion) @ affine
-    moved = ndi.affine_transform(t1, back[:3, :3], back[:3, 3], order=3, mode="nearest")
+    # The place in the first scan of each voxel of the second: X = T x.
+    inverse = np.linalg.inv(affine) @ np.linalg.inv(motion) @ affine
+    moved = ndi.affine_transform(t1, inverse[:3, :3], inverse[:3, 3], order=3, mode="nearest")
     tissues = np.where(anatomy.labels == GLIA, GM, anatomy.labels) * anatomy.intracranial
     out.mkdir(parents=True, exist_ok=True)
     for name, voxels in {
@@ -57,14 +57,14 @@ def write_pair(out: Path, data: Path, seed: int, millimetres: float, degrees: fl
 
 
 def register(out: Path, data: Path, seed: int, millimetres: float, degrees: float, mesh: Path) -> dict[str, Any]:
-    """What a run makes of one pair: error, mm, and where each of the six numbers lies among its draws."""
+    """Register a pair; return the error, mm, and the rank of each of the six numbers among its draws."""
     folder = out / f"pair{seed}"
     motion = write_pair(folder, data, seed, millimetres, degrees)
     names = ("fixed", "moving", "labels", "intracranial")
     files = {name: str((folder / f"{name}.nii.gz").absolute()) for name in names}
-    own_mesh = [f"mesh.file={mesh.absolute()}"] if mesh.exists() else []
+    mesh_option = [f"mesh.file={mesh.absolute()}"] if mesh.exists() else []
     table = {"csf": [1], "gm": [2], "wm": [3]}
-    config = make_config({"data": {"source": "files", "label_table": table, **files}}, [*SETTINGS, *own_mesh])
+    config = make_config({"data": {"source": "files", "label_table": table, **files}}, [*SETTINGS, *mesh_option])
     result = br.run(config, out / f"run{seed}", progress=False)
     if not mesh.exists():
         mesh.write_bytes((out / f"run{seed}" / "mesh.vtu").read_bytes())
@@ -84,27 +84,29 @@ def register(out: Path, data: Path, seed: int, millimetres: float, degrees: floa
 
 
 def main() -> None:
-    """Register the pairs that are not finished, and count."""
+    """Register the pairs that are not finished, and print the coverage."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--millimetres", type=float, default=20.0)
     parser.add_argument("--degrees", type=float, default=15.0)
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    found = []
-    for seed in range(1, given.seeds + 1):
-        kept = given.out / f"{seed}.json"
-        if not kept.exists():
-            one = register(given.out, data_folder(), seed, given.millimetres, given.degrees, given.out / "mesh.vtu")
-            kept.write_text(json.dumps(one))
-        found.append(json.loads(kept.read_text()))
-        print(json.dumps(found[-1]), flush=True)
-    ranks = np.array([one["rank"] for one in found])
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    results = []
+    for seed in range(1, arguments.seeds + 1):
+        path = arguments.out / f"{seed}.json"
+        if not path.exists():
+            result = register(
+                arguments.out, data_folder(), seed, arguments.millimetres, arguments.degrees, arguments.out / "mesh.vtu"
+            )
+            path.write_text(json.dumps(result))
+        results.append(json.loads(path.read_text()))
+        print(json.dumps(results[-1]), flush=True)
+    ranks = np.array([result["rank"] for result in results])
     for level in LEVELS:
         inside = np.abs(ranks - 0.5) < level / 2
         print(f"inside {level:.0%}: {inside.sum()} of {inside.size}")
-    print(f"mean error {np.mean([one['error'] for one in found]):.3f} mm")
+    print(f"mean error {np.mean([result['error'] for result in results]):.3f} mm")
 
 
 if __name__ == "__main__":

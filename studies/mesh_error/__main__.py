@@ -2,9 +2,9 @@
 
     python -m studies.mesh_error RUN -o DIR [--bodies 24]
 
-Bodies of random λ/μ are pushed on a finer mesh and registered on the run's (docs/model.md#λμ-and-the-mesh). Prints λ/μ
-as the run has it, and allowing for the mesh; DIR/ratios.svg shows it, with the bodies. Bodies are kept in DIR: what was
-cut off goes on, and more can be added.
+Bodies of random λ/μ are pushed on a finer mesh and registered on the run's mesh (docs/model.md#λμ-and-the-mesh). The
+program prints λ/μ as the run found it, and λ/μ corrected for the mesh. DIR/ratios.svg shows both, with the bodies. DIR
+keeps the bodies, so that an interrupted study continues, and a greater --bodies adds more.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from bayesreg.report.tables import Table
 from bayesreg.results.result import Result, load_result
 from bayesreg.types import InputError
 from studies.mesh_error.bodies import Subject, register_body, sought_tissues
-from studies.mesh_error.ratios import allowing, draw_ratios, enough, mesh_table, sound
+from studies.mesh_error.ratios import correct_for_mesh, draw_ratios, enough, mesh_table, sound
 from studies.mesh_error.recalibration import least_bodies
 from studies.terminal import in_terminal
 
@@ -36,12 +36,12 @@ FINER = 0.6
 
 
 def mesh_error(folder: str | Path, out: str | Path, bodies: int = 24, progress: bool = True) -> Table:
-    """How far λ/μ of a finished run may be the mesh's own, by simulation.
+    """Measure by simulation how much the mesh of a finished run changes its λ/μ.
 
     Parameters
     ----------
     folder : path
-        Folder of a finished run with elasticity by tissue, a boundary that is sampled, and an intracranial mask.
+        Folder of a finished run with elasticity by tissue, a sampled boundary and an intracranial mask.
     out : path
         A folder for the bodies (bodies.json), their mesh (finer.vtu) and the figure (ratios.svg).
     bodies : int
@@ -52,12 +52,12 @@ def mesh_error(folder: str | Path, out: str | Path, bodies: int = 24, progress: 
     Returns
     -------
     Table
-        λ/μ as the run has it, and allowing for the mesh.
+        λ/μ as the run found it, and corrected for the mesh.
 
     Raises
     ------
     InputError
-        If the folder holds no such run, there are too few bodies, or the registrations of too many fail.
+        If the folder holds no such run, `bodies` is too small, or too many registrations fail.
     """
     result, out = load_result(folder), Path(out)
     _require_ratios(result)
@@ -71,17 +71,17 @@ def mesh_error(folder: str | Path, out: str | Path, bodies: int = 24, progress: 
         registered.append(register_body(subject, seed)._asdict())
         write_json(out / BODIES, registered)
     if not enough(registered):
-        why = next(body["failed"] for body in reversed(registered) if body["failed"])
+        reason = next(body["failed"] for body in reversed(registered) if body["failed"])
         raise InputError(
-            f"only {len(sound(registered))} of {len(registered)} bodies are registered, {least} are needed; {why}"
+            f"only {len(sound(registered))} of {len(registered)} bodies are registered, {least} are needed; {reason}"
         )
-    allowed = allowing(result.mesh, dataset(result.idata, "posterior"), registered)
-    draw_ratios(allowed).savefig(out / "ratios.svg")
-    return mesh_table(allowed)
+    correction = correct_for_mesh(result.mesh, dataset(result.idata, "posterior"), registered)
+    draw_ratios(correction).savefig(out / "ratios.svg")
+    return mesh_table(correction)
 
 
 def _require_ratios(result: Result) -> None:
-    """Raise InputError where a run has no λ/μ by tissue that could be the mesh's, or no body can be pushed."""
+    """Raise InputError if the run does not sample λ/μ by tissue, or if no body can be pushed."""
     run, model = result.run, model_of(result.run.config)
     if model.elasticity != "tissue" or not sought_tissues(model, run.mesh.names):
         raise InputError(
@@ -127,7 +127,7 @@ def _subject(result: Result, making: TetMesh) -> Subject:
 
 
 def _finer(result: Result, out: Path) -> TetMesh:
-    """The mesh that makes the bodies; kept, since none is made twice alike."""
+    """The mesh that makes the bodies; it is stored, because meshing is not deterministic."""
     path = out / "finer.vtu"
     if not path.exists():
         run = result.run
@@ -151,8 +151,8 @@ def main() -> None:
     parser.add_argument("run", metavar="RUN", help="folder of a finished run")
     parser.add_argument("-o", "--out", required=True, metavar="DIR")
     parser.add_argument("--bodies", type=int, default=24, help="how many to simulate in all")
-    given = parser.parse_args()
-    table = mesh_error(given.run, given.out, given.bodies)
+    arguments = parser.parse_args()
+    table = mesh_error(arguments.run, arguments.out, arguments.bodies)
     Console().print(in_terminal(table), table.caption)
 
 

@@ -1,4 +1,4 @@
-"""Bodies of known stiffness, moved on a finer mesh and registered on the one in question."""
+"""Bodies of known stiffness, deformed on a finer mesh and registered on the mesh under test."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from bayesreg.tissues import is_fluid
 from bayesreg.types import InputError
 from studies.mesh_error.recalibration import RANGE
 
-# How far the μ of a body may lie from that of the run, as a factor, and its push, as a share of the run's.
+# The greatest ratio of a body's μ to the run's; the range of a body's displacement as a share of the run's.
 FACTOR, PUSH = 1.5, (0.85, 1.15)
-# Directions that are tried for one body: along some a tetrahedron inverts, or the skull is in the way.
+# The number of directions that are tried for one body: some invert a tetrahedron, or the skull is in the way.
 ATTEMPTS = 30
 # Share of the nodes on the boundary that are pushed.
 PATCH_SHARE = 0.045
@@ -37,17 +37,17 @@ class Subject(NamedTuple):
     Attributes
     ----------
     fixed, tissue, skull : Image
-        As `make_pair` takes them.
+        The images that `make_pair` takes.
     making, registering : TetMesh
-        A finer mesh, and the one in question.
+        The finer mesh that makes the bodies, and the mesh under test.
     model : ModelConfig
-        Of the registration.
+        The model of the registration.
     image_options : mapping
         How the pair of images is compared (`bayesreg.ImagePair`).
     lam, mu : mapping
-        Tissue name to the value of a fluid, or to one about which those of a solid tissue lie.
+        The value of each fluid, and the centre of the values of each solid tissue, by tissue name.
     displacement, noise_sd, smoothing_mm : float
-        How far a patch moves, mm; the noise on each image; the width of a smoothing of `fixed` beforehand.
+        The displacement of a patch, mm; the noise on each image; the width of the smoothing of `fixed`.
     """
 
     fixed: Image
@@ -71,10 +71,10 @@ class Body(NamedTuple):
     ----------
     seed : int
     true, found : dict
-        Tissue to λ/μ, of the body and at the mode of its posterior on the registering mesh; of tissues whose λ/μ the
-        registration has to find; a fluid is none of them.
+        λ/μ by tissue: of the body, and at the mode of its posterior on the registering mesh. They hold the solid
+        tissues whose λ/μ is unknown.
     failed : str
-        Why the registration cannot be counted; empty if it can.
+        The reason why the registration failed; empty if it succeeded.
     """
 
     seed: int
@@ -85,22 +85,27 @@ class Body(NamedTuple):
 
 def sought_tissues(model: ModelConfig, names: tuple[str, ...]) -> list[str]:
     """Solid tissues of which λ or μ is free."""
-    known = [model.known(names).get(parameter) for parameter in ("lam", "mu")]
-    return [name for name in names if not is_fluid(name) and not all(of_tissue(model, given, name) for given in known)]
+    known_parameters = [model.known(names).get(parameter) for parameter in ("lam", "mu")]
+    return [
+        name
+        for name in names
+        if not is_fluid(name) and not all(of_tissue(model, values, name) for values in known_parameters)
+    ]
 
 
 def register_body(subject: Subject, seed: int) -> Body:
-    """A body of random λ/μ, pushed somewhere, and what its registration finds.
+    """Push a body of random λ/μ in a random direction, and register it.
 
-    Without a skull: where a body slides along it, it may hold nodes of the registering mesh that lie a little outside.
+    The registration has no skull: where the body slides along the skull, nodes of the registering mesh may lie a little
+    outside.
     """
     rng = np.random.default_rng(seed)
     names, model = subject.registering.names, subject.model
-    lam, mu, known = dict(subject.lam), dict(subject.mu), model.known(names)
+    lam, mu, known_parameters = dict(subject.lam), dict(subject.mu), model.known(names)
     low, high = np.log(RANGE)
     for name in names:
         ratio, factor = float(np.exp(rng.uniform(low, high))), FACTOR ** float(rng.uniform(-1, 1))
-        lam_known, mu_known = (of_tissue(model, known.get(parameter), name) for parameter in ("lam", "mu"))
+        lam_known, mu_known = (of_tissue(model, known_parameters.get(parameter), name) for parameter in ("lam", "mu"))
         if not is_fluid(name):
             mu[name] = mu_known or (lam_known / ratio if lam_known else mu[name] * factor)
             lam[name] = lam_known or ratio * mu[name]
@@ -113,12 +118,12 @@ def register_body(subject: Subject, seed: int) -> Body:
     except InputError as error:
         return Body(seed, true, {}, str(error))
     ratios = np.asarray(values["lam"]) / np.asarray(values["mu"])
-    found = {name: float(ratios[names.index(name)]) for name in tissues}
+    estimated = {name: float(ratios[names.index(name)]) for name in tissues}
     if inverted:
-        return Body(seed, true, found, f"the search for the mode turned tetrahedra inside out ({inverted})")
-    if not all(0 < ratio < np.inf for ratio in found.values()):
+        return Body(seed, true, estimated, f"the search for the mode turned tetrahedra inside out ({inverted})")
+    if not all(0 < ratio < np.inf for ratio in estimated.values()):
         return Body(seed, true, {}, "the search has no end")
-    return Body(seed, true, found)
+    return Body(seed, true, estimated)
 
 
 def _push(
@@ -127,7 +132,7 @@ def _push(
     lam: Float[np.ndarray, "tissues"],
     mu: Float[np.ndarray, "tissues"],
 ) -> SyntheticPair:
-    """A pair with a patch of its own in the upper half, where a brain is free."""
+    """Make a pair whose patch lies in the upper half, where a brain can move."""
     patch_nodes = max(round(PATCH_SHARE * len(subject.making.boundary)), 3)
     for _ in range(ATTEMPTS):
         direction = rng.normal(size=3)
@@ -150,7 +155,7 @@ def _push(
 
 
 def _mode(posterior: Posterior) -> tuple[dict[str, Any], int]:
-    """Values at the mode, and how many tetrahedra it turns inside out."""
+    """Return the values at the mode, and the number of tetrahedra that it turns inside out."""
     rest = np.asarray(ravel_pytree(posterior.unconstrain(posterior.reference()))[0])
     values = posterior.constrain(unravel(posterior.target)(jnp.asarray(find_mode(posterior.target, rest))))
     mesh, u = posterior.mesh, np.asarray(posterior.evaluate(values).u)

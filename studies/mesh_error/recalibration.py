@@ -1,10 +1,10 @@
-"""Intervals that allow for an error which simulations know: what is found of a stiffness whose truth is known.
+"""Intervals of λ/μ that are corrected for the error of the mesh, by simulated bodies whose λ/μ is known.
 
-A registration finds on its mesh a λ/μ that differs, for all bodies in much the same way, from that of the body: linear
-tetrahedra are too stiff where a tissue hardly changes its volume, and the boundary is displaced between its nodes, too.
-Bodies with known λ/μ show by how much (an approximation error in the sense of Kaipio and Somersalo 2007, "Statistical
-inverse problems: discretization, model reduction and inverse crimes"). Here x = μ/λ, the compressibility of a tissue
-against its shear: a mesh adds to it, so that the largest λ/μ suffer most.
+The λ/μ that a registration finds on its mesh differs from the true one in much the same way for all bodies: linear
+tetrahedra are too stiff where a tissue hardly changes its volume, and the boundary also moves between its nodes. Bodies
+of known λ/μ show the size of this approximation error (Kaipio and Somersalo 2007, "Statistical inverse problems:
+discretization, model reduction and inverse crimes"). Here x = μ/λ is the compressibility of a tissue relative to its
+shear. A mesh adds to x, so that the error of the largest λ/μ is the greatest.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from scipy.special import logsumexp
 
 from bayesreg.types import InputError
 
-# λ/μ of which nothing is known, and of the bodies: log-uniform, from a Poisson ratio of 0.25 to one of 0.498.
+# The range of the log-uniform prior of λ/μ, and of the λ/μ of the bodies: Poisson ratios from 0.25 to 0.498.
 RANGE = (1.0, 300.0)
 CANDIDATES = 20_000
 MOST_DRAWS = 200
-# No curve is known better than that, in the logarithm.
+# The least uncertainty of a curve, in the logarithm.
 LEAST_SCATTER = 0.02
-# Candidates are drawn anew, so often, where others had more than this share of the greatest weight.
+# The number of times that candidates are drawn, each time in the range of those with at least this relative weight.
 ROUNDS, LEAST_WEIGHT = 3, 1e-6
 
 
@@ -35,13 +35,13 @@ class Response(NamedTuple):
     Attributes
     ----------
     offset : (t,) array
-        Compressibility that is found of an incompressible body.
+        The compressibility that a registration finds of an incompressible body.
     slope : (t, t) array
-        Row: what is found; column: what is true.
+        The rows are the found compressibilities, the columns the true ones.
     scatter : (t, t) array
-        Covariance of the logarithm between bodies, the average uncertainty of the curve included.
+        The covariance of the logarithm between bodies; it includes the average uncertainty of the curve.
     degrees_of_freedom : int
-        Those of Student's distribution of a further body's scatter.
+        The degrees of freedom of Student's t distribution of a new body's scatter.
     """
 
     offset: Float[np.ndarray, "tissues"]
@@ -55,16 +55,16 @@ class Response(NamedTuple):
 
 
 def least_bodies(tissues: int) -> int:
-    """How many bodies it takes: four for each unknown of a tissue's curve."""
+    """The least number of bodies: four for each unknown of a tissue's curve."""
     return 4 * (tissues + 1)
 
 
-def response(true: Float[np.ndarray, "bodies tissues"], found: Float[np.ndarray, "bodies tissues"]) -> Response:
-    """How what is found of λ/μ depends on the truth, from simulated registrations.
+def response(true: Float[np.ndarray, "bodies tissues"], estimated: Float[np.ndarray, "bodies tissues"]) -> Response:
+    """Fit the dependence of the estimated λ/μ on the true λ/μ, from simulated registrations.
 
     Parameters
     ----------
-    true, found : (k, t) arrays
+    true, estimated : (k, t) arrays
         λ/μ of each tissue, positive.
 
     Raises
@@ -72,13 +72,13 @@ def response(true: Float[np.ndarray, "bodies tissues"], found: Float[np.ndarray,
     InputError
         If there are fewer bodies than `least_bodies`, or a ratio is not positive and finite.
     """
-    true, found = np.asarray(true, float), np.asarray(found, float)
+    true, estimated = np.asarray(true, float), np.asarray(estimated, float)
     bodies, tissues = true.shape
     if bodies < least_bodies(tissues):
         raise InputError(f"{tissues} tissues need {least_bodies(tissues)} simulated bodies or more, got {bodies}")
-    if not all(np.isfinite(values).all() and (values > 0).all() for values in (true, found)):
+    if not all(np.isfinite(values).all() and (values > 0).all() for values in (true, estimated)):
         raise InputError("the ratios of simulated bodies must be positive and finite")
-    design, wanted = np.column_stack([np.ones(bodies), 1 / true]), -np.log(found)
+    design, wanted = np.column_stack([np.ones(bodies), 1 / true]), -np.log(estimated)
     curves = np.array([_curve(design, wanted[:, tissue], 1 + tissue) for tissue in range(tissues)])
     free = bodies - design.shape[1]
     residual = wanted - np.log(design @ curves.T)
@@ -87,50 +87,50 @@ def response(true: Float[np.ndarray, "bodies tissues"], found: Float[np.ndarray,
 
 
 def _curve(
-    design: Float[np.ndarray, "bodies unknowns"], wanted: Float[np.ndarray, "bodies"], own: int
+    design: Float[np.ndarray, "bodies unknowns"], logarithms: Float[np.ndarray, "bodies"], own_column: int
 ) -> Float[np.ndarray, "unknowns"]:
-    """Offset and slopes, none negative, of least squares in the logarithm."""
-    first = np.full(design.shape[1], 1e-3)
-    first[own] = 1.0
-    # A trace of offset keeps the logarithm finite.
-    least = np.array([1e-9] + [0.0] * (len(first) - 1))
-    return least_squares(lambda curve: np.log(design @ curve) - wanted, first, bounds=(least, np.inf)).x
+    """Fit an offset and slopes, none of them negative, by least squares in the logarithm."""
+    start = np.full(design.shape[1], 1e-3)
+    start[own_column] = 1.0
+    # A tiny offset keeps the logarithm finite.
+    lower_bounds = np.array([1e-9] + [0.0] * (len(start) - 1))
+    return least_squares(lambda curve: np.log(design @ curve) - logarithms, start, bounds=(lower_bounds, np.inf)).x
 
 
 def recalibrate(
-    known: Response, found: Float[np.ndarray, "draws tissues"], seed: int = 0
+    curve: Response, estimated: Float[np.ndarray, "draws tissues"], seed: int = 0
 ) -> Float[np.ndarray, "candidates tissues"]:
-    """Draws of the body's own λ/μ, given draws of what the registration found.
+    """Draw from the distribution of a body's true λ/μ, given draws of the λ/μ that its registration found.
 
     Parameters
     ----------
-    known : Response
-    found : (n, t) array
-        Draws of a posterior, positive; evenly spaced ones are used, at most 200.
+    curve : Response
+    estimated : (n, t) array
+        Draws of a posterior, positive. At most 200 of them are used, evenly spaced.
     seed : int
 
     Returns
     -------
     (20000, t) array
-        Equally likely, with repetitions. The prior is log-uniform on `RANGE`.
+        Draws of equal weight, with repetitions. The prior is log-uniform on `RANGE`.
 
     Raises
     ------
     InputError
-        If there is no draw.
+        If `estimated` is empty.
     """
-    if not len(found):
-        raise InputError("there is no draw of which every tissue has a λ/μ")
-    rng, tissues = np.random.default_rng(seed), len(known.offset)
-    some = found[np.linspace(0, len(found) - 1, min(len(found), MOST_DRAWS)).round().astype(int)]
-    student = stats.multivariate_t(np.zeros(tissues), known.scatter, df=known.degrees_of_freedom)
+    if not len(estimated):
+        raise InputError("there is no draw with a λ/μ of every tissue")
+    rng, tissues = np.random.default_rng(seed), len(curve.offset)
+    thinned = estimated[np.linspace(0, len(estimated) - 1, min(len(estimated), MOST_DRAWS)).round().astype(int)]
+    student = stats.multivariate_t(np.zeros(tissues), curve.scatter, df=curve.degrees_of_freedom)
     low, high = (np.full(tissues, end) for end in np.log(RANGE))
     for _ in range(ROUNDS):
         candidates = rng.uniform(low, high, (CANDIDATES, tissues))
-        expected = known(np.exp(-candidates))
-        weight = logsumexp([student.logpdf(-np.log(draw) - expected) for draw in some], axis=0)
+        expected = curve(np.exp(-candidates))
+        weight = logsumexp([student.logpdf(-np.log(draw) - expected) for draw in thinned], axis=0)
         heavy = candidates[weight > weight.max() + np.log(LEAST_WEIGHT)]
-        # The new range reaches half as far again, so that nothing between two candidates is cut off.
+        # The margin keeps values between two candidates inside the new range.
         margin = (heavy.max(axis=0) - heavy.min(axis=0)) / 2 + (high - low) / CANDIDATES ** (1 / tissues)
         low = np.maximum(heavy.min(axis=0) - margin, low)
         high = np.minimum(heavy.max(axis=0) + margin, high)

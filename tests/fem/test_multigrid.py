@@ -13,7 +13,7 @@ import scipy.sparse.linalg
 import bayesreg as br
 from bayesreg.fem import equilibrium, preconditioners
 from bayesreg.fem.elasticity import rigid_modes, stiffness, unknowns_of
-from bayesreg.fem.multigrid import Multigrid, multigrid
+from bayesreg.fem.multigrid import Multigrid, build_multigrid
 from bayesreg.inference.target import logdensity
 from tests.options import posterior_of
 from tests.phantoms import LAM, MU, PAPER_LAM, PAPER_MU, ball_mesh, smooth_image
@@ -26,7 +26,7 @@ def problem(spacing):
     mesh = ball_mesh(spacing=spacing)
     free = unknowns_of(mesh.interior)
     matrix = stiffness(mesh, LAM, MU)[free][:, free]
-    return mesh, matrix, multigrid(matrix, rigid_modes(mesh.points[mesh.interior]))
+    return mesh, matrix, build_multigrid(matrix, rigid_modes(mesh.points[mesh.interior]))
 
 
 def test_it_has_levels_and_ends_in_a_dense_inverse():
@@ -99,7 +99,7 @@ def test_conjugate_gradients_need_few_iterations(spacing, reference, factor, mos
 def test_the_same_matrix_has_the_same_hierarchy():
     """Bit by bit: else the same seed would not give the same draws, and nothing compiled would serve again."""
     mesh, matrix, cycle = problem(8.0)
-    again = multigrid(matrix, rigid_modes(mesh.points[mesh.interior]))
+    again = build_multigrid(matrix, rigid_modes(mesh.points[mesh.interior]))
     for array, expected in zip(jax.tree.leaves(again), jax.tree.leaves(cycle), strict=True):
         np.testing.assert_array_equal(array, expected)
 
@@ -112,7 +112,7 @@ def test_what_has_no_solution_is_said(broken):
     if broken != "nothing held":
         matrix[4] = matrix[:, 4] = 0.0 if broken == "empty" else np.nan
     with pytest.raises(br.InputError, match="the interior stiffness is singular"):
-        multigrid(matrix.tocsr(), rigid_modes(mesh.points[nodes]))
+        build_multigrid(matrix.tocsr(), rigid_modes(mesh.points[nodes]))
 
 
 def test_slopes_of_a_large_mesh(monkeypatch):

@@ -146,7 +146,7 @@ def test_scales_come_to_the_maximum_of_their_evidence(temperature, noise, first)
     for _ in range(10):
         maximum = maximise_evidence(target, flat, target.quadratic_curvature(None, *[at(target, flat)] * 2))
         flat = maximum.flat
-        if maximum.moved < 1e-3:
+        if maximum.greatest_change < 1e-3:
             break
     best = minimize(lambda logs: -log_evidence(logs), np.zeros(2), tol=1e-9).x
     np.testing.assert_allclose(flat[:2], best, atol=1e-2)

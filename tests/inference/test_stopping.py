@@ -47,8 +47,8 @@ def test_the_rule_holds_of_all_estimands(asked):
     verdict = judge(RULE, checkpoint, blocks)
     assert verdict.holds
     assert asked == [5, 63]
-    assert verdict.found.worst == worst(blocks)
-    assert f"greatest R̂ {verdict.found.worst.rhat:.3f}" in reason(RULE, checkpoint, verdict, DRAWS)
+    assert verdict.figures.worst == worst(blocks)
+    assert f"greatest R̂ {verdict.figures.worst.rhat:.3f}" in reason(RULE, checkpoint, verdict, DRAWS)
 
 
 @pytest.mark.parametrize("node", [0, 17])
@@ -56,7 +56,7 @@ def test_the_suspect_is_judged_alone(asked, node):
     checkpoint, blocks = drawn(shift=0.35, node=node)
     verdict = judge(RULE, checkpoint, blocks)
     assert asked == [5]
-    assert (verdict.holds, verdict.found) == (False, None)
+    assert (verdict.holds, verdict.figures) == (False, None)
     # Sorted by name: the three of lam stand before it.
     assert worst(blocks, np.array([3 + 3 * node + 1])).rhat == worst(blocks).rhat > RULE.rhat
     verdict = judge_all(RULE, checkpoint, blocks)
@@ -73,7 +73,7 @@ def test_what_no_suspect_shows_is_seen_with_all(asked):
     verdict = judge(RULE, checkpoint, blocks)
     assert asked == [5, 63]
     assert not verdict.holds
-    assert verdict.found.worst == worst(blocks)
+    assert verdict.figures.worst == worst(blocks)
 
 
 def test_nothing_is_said_of_one_chain_or_of_no_estimand():

@@ -43,7 +43,7 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
     tuning = Tuning(60, 0.75, quarter_turns=True)
     outcomes = {}
     for apart in (True, False):
-        setup, points = tune(None, Walk(), Steps(), starts, jax.random.key(0), tuning, apart=apart)
+        setup, points = tune(None, Walk(), Steps(), starts, jax.random.key(0), tuning, per_chain=apart)
         outcomes[apart] = float(setup.step_size), float(points["u_boundary"][3, 0])
     assert outcomes[True][1] < 3
     # With one step for all it stands where it began, and the others pay for it.

@@ -156,13 +156,13 @@ def test_forms_at_odds_are_told_and_the_s_form_is_taken(tmp_path, caplog):
     nib.save(source, tmp_path / "a.nii")
     volume = read_volume(tmp_path / "a.nii")
     check(volume, sform)
-    np.testing.assert_allclose(read_grid(tmp_path / "a.nii").other, AFFINE, atol=1e-4)
+    np.testing.assert_allclose(read_grid(tmp_path / "a.nii").qform, AFFINE, atol=1e-4)
     assert f"corners up to {corners_apart(sform, AFFINE, SHAPE):.3g} mm apart; the s-form is taken" in caplog.text
 
 
 def test_forms_that_agree_are_not_mentioned(tmp_path, caplog):
     read_volume(nifti(tmp_path / "a.nii"))
-    assert read_grid(tmp_path / "a.nii").other is None
+    assert read_grid(tmp_path / "a.nii").qform is None
     assert not caplog.records
 
 

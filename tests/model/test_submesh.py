@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesreg.fem.elements import gauss_quadrature
-from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.submesh import discretisation_variance
 from tests.phantoms import ball_mesh, refined
 
 MESH = refined(refined(ball_mesh(spacing=30.0)))
@@ -28,11 +28,11 @@ def squared_error(mesh):
 
 def test_a_linear_field_is_followed():
     u = MESH.points @ np.random.default_rng(0).normal(size=(3, 3)) + 1.0
-    np.testing.assert_allclose(submesh_variance(MESH, u), 0.0, atol=1e-20)
+    np.testing.assert_allclose(discretisation_variance(MESH, u), 0.0, atol=1e-20)
 
 
 def test_it_is_the_error_of_interpolation_inside():
     inside = ~np.isin(MESH.cells, MESH.boundary).any(axis=1)
-    variance = submesh_variance(MESH, smooth(MESH.points))[inside].mean(axis=0)
+    variance = discretisation_variance(MESH, smooth(MESH.points))[inside].mean(axis=0)
     expected = squared_error(MESH)[inside].mean(axis=0)
     np.testing.assert_allclose(variance, expected, rtol=0.25)

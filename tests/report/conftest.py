@@ -243,7 +243,7 @@ def manifest(uniform: bool, converged: bool) -> dict:
         "steps_per_second_per_chain": 63.4,
         "residual_sd": 0.0151,
         "implied_noise_sd": 0.0146,
-        "appraisal": {"beware": ["A fifth of the organ is ignored."], "notes": []},
+        "appraisal": {"warnings": ["A fifth of the organ is ignored."], "notes": []},
         "observations": {
             "images": {
                 "kind": "images",

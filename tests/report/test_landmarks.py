@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesreg.model.observations.landmarks_report import distance_figure, landmark_table, surprise
+from bayesreg.model.observations.landmarks_report import distance_figure, landmark_table, region_probability
 from bayesreg.report.observations import _drawing
 from tests.phantoms import box_mesh
 
@@ -22,10 +22,10 @@ def summary(residual, covariance):
     return arrays if residual is None else {**arrays, "left_out_residual": residual, "left_out_covariance": covariance}
 
 
-def test_surprise_is_uniform_where_the_covariance_is_right():
+def test_region_probability_is_uniform_where_the_covariance_is_right():
     rng = np.random.default_rng(0)
     root = np.tril(rng.normal(size=(3, 3))) + 2 * np.eye(3)
-    levels = surprise(rng.normal(size=(4000, 3)) @ root.T, np.broadcast_to(root @ root.T, (4000, 3, 3)))
+    levels = region_probability(rng.normal(size=(4000, 3)) @ root.T, np.broadcast_to(root @ root.T, (4000, 3, 3)))
     assert stats.kstest(levels, "uniform").pvalue > 1e-3
 
 

@@ -9,7 +9,16 @@ import xarray as xr
 import bayesreg as br
 from bayesreg.report import verdict as verdict_module
 from bayesreg.report.estimands import Estimand
-from bayesreg.report.verdict import approximation, duration, fixed, key_facts, number, percent, verdict, warnings_of
+from bayesreg.report.verdict import (
+    approximation,
+    decimal_text,
+    duration,
+    key_facts,
+    number,
+    percent,
+    verdict,
+    warnings_of,
+)
 from tests.phantoms import box_mesh
 
 
@@ -114,7 +123,7 @@ def test_an_empty_manifest_gives_dashes():
 
 
 def test_warnings_about_the_data_come_first():
-    manifest = {"appraisal": {"beware": ["The images are hardly alike."]}, "inverted_elements": 1}
+    manifest = {"appraisal": {"warnings": ["The images are hardly alike."]}, "inverted_elements": 1}
     first, second = warnings_of(manifest, box_mesh(), elastic([1.0] * 3, [1.0] * 3))
     assert first == "The images are hardly alike."
     assert second.startswith("1 tetrahedron")
@@ -193,8 +202,8 @@ def test_numbers(value, text):
 
 
 def test_other_formats():
-    assert fixed(2.4) == "2.40"
-    assert fixed(None) == "–"
+    assert decimal_text(2.4) == "2.40"
+    assert decimal_text(None) == "–"
     assert percent(0.0871) == "8.7 %"
     assert [duration(x) for x in (4.26, 59.0, 119.6, 3725.0, None)] == [
         "4.3 s",

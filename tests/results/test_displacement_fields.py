@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.io.fields import load_displacement
-from bayesreg.model.submesh import submesh_variance
+from bayesreg.model.submesh import discretisation_variance
 from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Motion, Pose
 from bayesreg.results.displacement_fields import MEAN_STEP, SD_STEP, STEP_AROUND, moments_on, write_transforms
@@ -212,7 +212,7 @@ def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow(linea
     assert np.percentile(away, 99) < around
     assert away.max() < 5 * around
     total = transform.pose.displacement(transform.mesh.points, transform.u_mean)
-    expected = np.sqrt(0.04 + submesh_variance(transform.mesh, total)[covered.cell])
+    expected = np.sqrt(0.04 + discretisation_variance(transform.mesh, total)[covered.cell])
     np.testing.assert_allclose(total_sd[index], expected, rtol=1e-5)
     assert sd_by_cause["nodes"] == pytest.approx(0.2)
     assert sd_by_cause["nodes"] ** 2 + sd_by_cause["mesh"] ** 2 == pytest.approx(

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.calibration.external import PAIRS, Found, summarise
+from studies.calibration.external import PAIRS, PairResult, summarise
 
 
 def pair(share, ratio=(1.2, 1.9)):
     shares = np.array([share - 0.4, share, share + 0.04])
-    return Found(shares - 0.1, shares, 1.0, np.array([0.1, 0.3, 2.0]), np.array(ratio), True)
+    return PairResult(shares - 0.1, shares, 1.0, np.array([0.1, 0.3, 2.0]), np.array(ratio), True)
 
 
 def test_the_mean_over_pairs_is_judged_and_its_error_told():

@@ -19,19 +19,19 @@ SCORES = {
     "given_share": 0.987,
 }
 OURS = SCORES | {"coverage_50_90_95": [0.51, 0.9, 0.949], "sd_over_rms_error": 1.02}
-PAIR = table.Asked("sag", 11, 0.15)
+PAIR = table.PairRequest("sag", 11, 0.15)
 
 
 def test_pairs_are_named():
-    assert table.Asked.read("sag:11:0.15") == PAIR
+    assert table.PairRequest.read("sag:11:0.15") == PAIR
     assert PAIR.name == "sag-11-0.15"
     assert [pair.name for pair in table.DEFAULT] == [
         "sag-11-0", "sag-12-0.15", "sag-13-0.25", "gravity-11-0", "gravity-12-0.15", "gravity-13-0.25",
     ]  # fmt: skip
     with pytest.raises(argparse.ArgumentTypeError, match="none of sag, gravity, resect"):
-        table.Asked.read("twist:1:0")
+        table.PairRequest.read("twist:1:0")
     with pytest.raises(argparse.ArgumentTypeError, match="no KIND:SEED:BIAS"):
-        table.Asked.read("sag:1")
+        table.PairRequest.read("sag:1")
 
 
 def test_tables():

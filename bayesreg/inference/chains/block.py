@@ -78,7 +78,7 @@ def run_block(
     -------
     state, moments, tally
         As in a `Checkpoint`, after the block.
-    kept : dict of (c, length, ...) arrays
+    draws : dict of (c, length, ...) arrays
         The draws. Rates and counts cover the steps between each draw and the draw before it.
     """
     kernel = chosen.sampler
@@ -127,9 +127,9 @@ def _in_step(
     """Run a block in which all chains take each step at the same time."""
 
     def one_draw(carry: tuple[Any, Moments], draw: AnyArray) -> tuple[tuple[Any, Moments], tuple[Any, Tally]]:
-        def one_step(i: AnyArray | int, found: tuple[Any, Tally]) -> tuple[Any, Tally]:
-            state, info = step(draw * thin + i, found[0])
-            return state, count_step(found[1], info)
+        def one_step(i: AnyArray | int, state_and_tally: tuple[Any, Tally]) -> tuple[Any, Tally]:
+            state, info = step(draw * thin + i, state_and_tally[0])
+            return state, count_step(state_and_tally[1], info)
 
         state, moments = carry
         state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))

@@ -39,13 +39,13 @@ def side_by_side(chain: Callable, devices: Mesh | None) -> Callable:
 
     The arrays that the function closes over are copied to each device.
     """
-    many = partial(_in_groups, chain)
+    grouped = partial(_in_groups, chain)
     if devices is None:
-        return many
+        return grouped
     # JAX would otherwise require a distinction between values that vary with the device and values that do not, such as
     # the zeros with which a sum begins.
     share = PartitionSpec(_AXIS)
-    return jax.shard_map(many, mesh=devices, in_specs=share, out_specs=share, check_vma=False)
+    return jax.shard_map(grouped, mesh=devices, in_specs=share, out_specs=share, check_vma=False)
 
 
 def _in_groups(chain: Callable, *each: Any) -> Any:

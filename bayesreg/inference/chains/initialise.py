@@ -82,9 +82,9 @@ def _admissible(target: Target, field: np.ndarray, fraction: float) -> AnyArray:
     return jnp.asarray(chosen[:, None] * field)
 
 
-def _with_entries(values: AnyArray, given: Mapping[str, float] | None, target: Target, name: str) -> AnyArray:
+def _with_entries(values: AnyArray, start_values: Mapping[str, float] | None, target: Target, name: str) -> AnyArray:
     values, names = np.array(values), list(target.variables.coords["tissue"])
-    for entry, value in (given or {}).items():
+    for entry, value in (start_values or {}).items():
         if entry not in names:
             raise InputError(f"start.{name} names {entry!r}; the entries are {', '.join(names[:8])}")
         values[names.index(entry)] = value
@@ -99,12 +99,12 @@ def require_numbers(points: Estimands) -> None:
                 raise InputError(f"chain {chain} cannot start: {name} is not a number there; give another start")
 
 
-def require_density(found: Evaluation) -> None:
+def require_density(evaluation: Evaluation) -> None:
     """Raise InputError if the density is zero at the start point of a chain (leading axis)."""
-    for chain in np.flatnonzero(~np.isfinite(found.logdensity)):
+    for chain in np.flatnonzero(~np.isfinite(evaluation.logdensity)):
         why = "a node lies in the skull, or a parameter outside its prior's range or without end"
-        if not found.outside_support[chain]:
-            why = "the elastic solve failed" if found.solver_failed[chain] else "it is not a number"
+        if not evaluation.outside_support[chain]:
+            why = "the elastic solve failed" if evaluation.solver_failed[chain] else "it is not a number"
         raise InputError(
             f"chain {chain} cannot start: its density is zero because {why}; "
             "give another start field or fraction, or other start parameters"

@@ -92,7 +92,7 @@ class SamplingProgress(NoProgress):
         self._bar.update(self._task, completed=draws, figures=figures, left=left)
 
 
-def draws_until(seen: Sequence[tuple[int, float]], threshold: float | None) -> float | None:
+def draws_until(checks: Sequence[tuple[int, float]], threshold: float | None) -> float | None:
     """Estimate the number of draws of each chain at which R̂ falls to a threshold; None if it cannot be estimated.
 
     R̂ − 1 is inversely proportional to the number of draws once the chains no longer depend on their start points. The
@@ -100,11 +100,11 @@ def draws_until(seen: Sequence[tuple[int, float]], threshold: float | None) -> f
 
     Parameters
     ----------
-    seen : sequence of (int, float)
+    checks : sequence of (int, float)
         The draws and the greatest R̂ at every check so far.
     threshold : float, optional
     """
-    latest = [draws * (rhat - 1) for draws, rhat in seen[-5:] if np.isfinite(rhat) and rhat > 1]
+    latest = [draws * (rhat - 1) for draws, rhat in checks[-5:] if np.isfinite(rhat) and rhat > 1]
     if threshold is None or not latest:
         return None
     return float(np.median(latest)) / (threshold - 1)

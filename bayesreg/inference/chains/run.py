@@ -321,7 +321,7 @@ def _gather_samples(
     verdict: Verdict,
     draws: int,
 ) -> Samples:
-    if stop.ess is not None and verdict.found is None:
+    if stop.ess is not None and verdict.figures is None:
         # The last check may have been some blocks ago.
         verdict = judge_all(stop, checkpoint, blocks)
     mean, sd = pool(checkpoint.moments)
@@ -337,5 +337,5 @@ def _gather_samples(
         reason=reason(stop, checkpoint, verdict, draws),
         seconds=float(checkpoint.seconds),
         exact=exact,
-        figures=verdict.found,
+        figures=verdict.figures,
     )

@@ -46,7 +46,7 @@ class Verdict(NamedTuple):
     """Whether a stop rule holds, and the figures of all estimands if they were computed."""
 
     holds: bool
-    found: Figures | None = None
+    figures: Figures | None = None
 
 
 def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
@@ -86,10 +86,10 @@ def _suspects(rhat: Mapping[str, AnyArray]) -> np.ndarray:
     return np.argsort(-np.concatenate([rhat[name].ravel() for name in sorted(rhat)]), kind="stable")[:SUSPECTS]
 
 
-def _meets(found: Worst, stop: StopRule) -> bool:
+def _meets(worst: Worst, stop: StopRule) -> bool:
     if stop.rhat is None or stop.ess is None:
         return False
-    return found.rhat < stop.rhat and min(found.ess_bulk, found.ess_tail) > stop.ess
+    return worst.rhat < stop.rhat and min(worst.ess_bulk, worst.ess_tail) > stop.ess
 
 
 def out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
@@ -108,8 +108,8 @@ def reason(stop: StopRule, checkpoint: Checkpoint, verdict: Verdict, draws: int)
         greatest = greatest_rhat(scale_reduction(checkpoint.moments)["estimands"])
         state, rule = f"greatest unsplit R̂ {greatest:.3f}", f"it below {stop.rhat}"
     else:
-        assert verdict.found is not None
-        worst = verdict.found.worst
+        assert verdict.figures is not None
+        worst = verdict.figures.worst
         state = f"greatest R̂ {worst.rhat:.3f}, least ESS {worst.ess_bulk:.0f} (bulk), {worst.ess_tail:.0f} (tail)"
         rule = f"R̂ below {stop.rhat} and both ESS above {stop.ess:g}"
     if verdict.holds:

@@ -90,10 +90,10 @@ def _judge(draws: xr.DataArray) -> list[xr.DataArray]:
     """Compute R̂, bulk and tail ESS of one variable."""
     draws = draws.transpose("chain", "draw", ...)
     like = draws.isel(chain=0, draw=0, drop=True)
-    parts = [_diagnose(part.to_numpy().reshape(*part.shape[:2], -1)) for part in _parts(draws)]
+    figures_by_block = [_diagnose(block.to_numpy().reshape(*block.shape[:2], -1)) for block in _parts(draws)]
     return [
         xr.DataArray(np.concatenate([np.zeros(0), *pieces]).reshape(like.shape), like.coords, like.dims, like.name)
-        for pieces in zip(*parts, strict=True)
+        for pieces in zip(*figures_by_block, strict=True)
     ]
 
 
@@ -114,8 +114,12 @@ def figures(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Figur
 
     Estimands are numbered in the order of their names; the entries of each are numbered in C order.
     """
-    parts = [_diagnose(part) for part in _columns(blocks, chosen)] if len(blocks) else []
-    return Figures(*map(np.concatenate, zip(*parts, strict=True))) if parts else Figures(*(np.zeros(0),) * 3)
+    figures_by_block = [_diagnose(columns) for columns in _columns(blocks, chosen)] if len(blocks) else []
+    return (
+        Figures(*map(np.concatenate, zip(*figures_by_block, strict=True)))
+        if figures_by_block
+        else Figures(*(np.zeros(0),) * 3)
+    )
 
 
 def worst(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Worst:
@@ -123,7 +127,7 @@ def worst(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None = None) -> Worst:
     return figures(blocks, chosen).worst
 
 
-def labelled(target: Target, blocks: Blocks, found: Figures) -> Convergence:
+def labelled(target: Target, blocks: Blocks, all_figures: Figures) -> Convergence:
     """Convert the figures of all estimands to datasets, equal to those that `convergence` returns for these draws."""
     first = blocks[0]
     names, statistics = _names(first), {name: np.zeros((1, 1)) for name in STATISTICS}
@@ -133,13 +137,13 @@ def labelled(target: Target, blocks: Blocks, found: Figures) -> Convergence:
     def variables(figure: np.ndarray) -> xr.Dataset:
         """Arrange one figure of each estimand as the variables of one draw."""
         entries = zip(names, np.split(figure, ends), shapes, strict=True)
-        block = {name: part.reshape(1, 1, *shape) for name, part, shape in entries}
+        block = {name: values.reshape(1, 1, *shape) for name, values, shape in entries}
         data = dataset(to_inference_data(target, [block | statistics]), "posterior")
         return data.isel(chain=0, draw=0, drop=True).drop_vars(DERIVED, errors="ignore")
 
     # An entry that does not depend on the estimands is known.
-    zeros, ones = (variables(np.full(found.rhat.shape, value)) for value in (0.0, 1.0))
-    return Convergence(*(variables(figure).where(zeros != ones) for figure in found))
+    zeros, ones = (variables(np.full(all_figures.rhat.shape, value)) for value in (0.0, 1.0))
+    return Convergence(*(variables(figure).where(zeros != ones) for figure in all_figures))
 
 
 def _columns(blocks: Blocks, chosen: Int[np.ndarray, "k"] | None) -> Iterator[np.ndarray]:
@@ -173,9 +177,9 @@ def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
     width = max(1, AT_ONCE // (chains * length))
 
     def judge(low: int) -> Figures:
-        part = draws[..., low : low + width].astype(float)
-        varying = part.min(axis=(0, 1)) != part.max(axis=(0, 1))
-        data = xr.Dataset({"draws": (["chain", "draw", "estimand"], part)})
+        block = draws[..., low : low + width].astype(float)
+        varying = block.min(axis=(0, 1)) != block.max(axis=(0, 1))
+        data = xr.Dataset({"draws": (["chain", "draw", "estimand"], block)})
         # ArviZ divides zero by zero if all draws of an estimand are equal.
         with np.errstate(invalid="ignore"):
             diagnostics = az.rhat(data), az.ess(data, method="bulk"), az.ess(data, method="tail")
@@ -184,5 +188,5 @@ def _diagnose(draws: Float[np.ndarray, "chain draw k"]) -> Figures:
     # On a shared machine the process may be allowed to use only some of the cores.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with ThreadPoolExecutor(min(MOST_THREADS, cores)) as pool:
-        parts = list(pool.map(judge, range(0, count, width)))
-    return Figures(*map(np.concatenate, zip(*parts, strict=True)))
+        figures_by_block = list(pool.map(judge, range(0, count, width)))
+    return Figures(*map(np.concatenate, zip(*figures_by_block, strict=True)))

@@ -26,13 +26,13 @@ def zero_moments(like: Any) -> Moments:
     return Moments(jnp.zeros(()), zeros, zeros)
 
 
-def update(moments: Moments, draw: Any, times: AnyArray | int = 1) -> Moments:
-    """Add a draw to the moments, counted `times` times (West 1979)."""
-    count = moments.count + times
-    share = times / jnp.maximum(count, 1)
+def update(moments: Moments, draw: Any, weight: AnyArray | int = 1) -> Moments:
+    """Add a draw to the moments, counted `weight` times (West 1979)."""
+    count = moments.count + weight
+    share = weight / jnp.maximum(count, 1)
     mean = jax.tree.map(lambda m, x: m + share * (x - m), moments.mean, draw)
     squares = jax.tree.map(
-        lambda s, x, old, new: s + times * (x - old) * (x - new), moments.squares, draw, moments.mean, mean
+        lambda s, x, old, new: s + weight * (x - old) * (x - new), moments.squares, draw, moments.mean, mean
     )
     return Moments(count, mean, squares)
 
@@ -56,8 +56,8 @@ def extend(moments: Moments, block: Any) -> Moments:
 
     def squares(old: AnyArray, x: np.ndarray, old_mean: AnyArray) -> np.ndarray:
         between = (before * more / total).reshape(-1, *(1,) * (x.ndim - 2))
-        own = x.mean(axis=1)
-        return old + ((x - own[:, None]) ** 2).sum(axis=1) + between * (own - old_mean) ** 2
+        block_mean = x.mean(axis=1)
+        return old + ((x - block_mean[:, None]) ** 2).sum(axis=1) + between * (block_mean - old_mean) ** 2
 
     return Moments(
         total,

@@ -75,21 +75,21 @@ def thin(posterior: xr.Dataset, names: Iterable[str], most: int) -> dict[str, np
         within = chosen[(chosen >= first) & (chosen < first + STRETCH)] - first
         if len(within):
             stretch = variables.isel(draw=slice(first, first + STRETCH))
-            for name, parts in parts_by_name.items():
-                parts.append(np.asarray(stretch[name].to_numpy()[:, within], float))
-    return {name: np.concatenate(parts, axis=1) for name, parts in parts_by_name.items()}
+            for name, pieces in parts_by_name.items():
+                pieces.append(np.asarray(stretch[name].to_numpy()[:, within], float))
+    return {name: np.concatenate(pieces, axis=1) for name, pieces in parts_by_name.items()}
 
 
-def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, block: int = BLOCK) -> Iterator[Any]:
+def push_forward(function: Callable[..., Any], draws: Draws, shared: Any = None, block: int = BLOCK) -> Iterator[Any]:
     """Evaluate a function at every draw, block by block.
 
     Parameters
     ----------
     function : callable
-        (one draw, given) → a pytree of arrays; traceable by JAX.
+        (one draw, shared) → a pytree of arrays; traceable by JAX.
     draws : mapping
         Arrays (chain, draw, …).
-    given : pytree
+    shared : pytree
         A further argument, the same for all draws.
     block : int
         Draws evaluated side by side.
@@ -105,7 +105,7 @@ def push_forward(function: Callable[..., Any], draws: Draws, given: Any = None, 
     for first in range(0, total, stretch):
         # The last draw fills up the last stretch, because JAX would compile another shape again.
         chosen = np.minimum(np.arange(first, first + stretch), total - 1)
-        outputs = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, given)
+        outputs = batched({name: jnp.asarray(values[:, chosen]) for name, values in draws.items()}, shared)
         wanted = slice(total - first)
         yield jax.tree.map(lambda leaf, wanted=wanted: np.asarray(leaf)[:, wanted], outputs)
 
@@ -115,19 +115,25 @@ def summarise(blocks: Iterable[Any], probabilities: Sequence[float] = (0.025, 0.
 
     One block and `MOST_KEPT` draws of each chain are in memory at a time.
     """
-    moments, kept, stride, count = None, None, 1, 0
+    moments, retained, stride, count = None, None, 1, 0
     for block in blocks:
         moments = extend(_nothing(block) if moments is None else moments, block)
         chosen = slice(-count % stride, None, stride)
-        thinned = jax.tree.map(lambda leaf, part=chosen: leaf[:, part], block)
-        kept = thinned if kept is None else jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), kept, thinned)
+        thinned = jax.tree.map(lambda leaf, chosen=chosen: leaf[:, chosen], block)
+        retained = (
+            thinned
+            if retained is None
+            else jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), retained, thinned)
+        )
         count += jax.tree.leaves(block)[0].shape[1]
-        while jax.tree.leaves(kept)[0].shape[1] > MOST_KEPT:
-            kept, stride = jax.tree.map(lambda leaf: leaf[:, ::2], kept), 2 * stride
+        while jax.tree.leaves(retained)[0].shape[1] > MOST_KEPT:
+            retained, stride = jax.tree.map(lambda leaf: leaf[:, ::2], retained), 2 * stride
     if moments is None:
         raise ValueError("there is no draw to summarise")
     mean, sd = pool(moments)
-    return Summary(mean, sd, moments.mean, jax.tree.map(lambda leaf: np.quantile(leaf, probabilities, (0, 1)), kept))
+    return Summary(
+        mean, sd, moments.mean, jax.tree.map(lambda leaf: np.quantile(leaf, probabilities, (0, 1)), retained)
+    )
 
 
 def _nothing(block: Any) -> Moments:

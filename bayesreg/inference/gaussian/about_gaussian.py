@@ -178,7 +178,7 @@ def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyAr
     key_settle, key_tune = jax.random.split(key)
     first = _setup_on_average(target, mode, points)
     first = first._replace(stand_in=make_stand_in(target, first.gaussian, first.middle))
-    _, points = tune(_condition(target, first), walk, first, points, key_settle, stage, apart=True)
+    _, points = tune(_condition(target, first), walk, first, points, key_settle, stage, per_chain=True)
     # The stand-in is accurate far about both middles.
     second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
     return tune(_condition(target, second), walk, second, points, key_tune, stage)
@@ -219,7 +219,7 @@ def _setup_on_average(target: Target, mode: AnyArray, points: Any) -> Setup:
 def _scatter_all(target: Target, modes: Modes, keys: AnyArray) -> Any:
     """Draw the estimands at which each chain starts, about the mode of the chain."""
     starts = [_scatter(target, modes.gaussians[mode], key) for mode, key in zip(modes.chains, keys, strict=True)]
-    return jax.tree.map(lambda *parts: jnp.stack(parts), *starts)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
 
 
 def _scatter(target: Target, gaussian: Gaussian, key: AnyArray) -> Any:

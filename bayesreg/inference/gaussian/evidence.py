@@ -70,14 +70,14 @@ class Found(NamedTuple):
     ----------
     flat : (d,) array
         The hyperparameters at the maximum of their evidence, with the displacements of highest density given them.
-    moved : float
+    greatest_change : float
         The greatest change of the hyperparameters, in their standard deviations.
     units : (k, k) array or None
         The directions of these standard deviations, one in each column; None before a search.
     """
 
     flat: Float[np.ndarray, "dimension"]
-    moved: float
+    greatest_change: float
     units: Float[np.ndarray, "hyperparameters hyperparameters"] | None = None
 
 
@@ -149,14 +149,14 @@ def evidence(
     data = target.mode_search.quadratic_part(target.data)
     start = np.array(about.flat)
     start[about.entries] = theta
-    own, rows = marked(target, "u_boundary"), marked(target, "field", "u_boundary")
+    is_displacement, rows = marked(target, "u_boundary"), marked(target, "field", "u_boundary")
     # θ is the same at both points, and so is the normaliser, which may be costly.
     plain = without_normaliser(target, data)
     log_normaliser, push_of_normaliser = normaliser_and_slope(target, start)
     slope = height_and_slope(target, plain, start)[1]
     precision = regular(about.images + dense(_curvature(target, start, start)))
     factor = scipy.linalg.cho_factor(precision, lower=True, check_finite=False)
-    moving = own[rows]
+    moving = is_displacement[rows]
     push = np.where(moving, (about.slope + slope)[rows], 0.0)
     # The field does not move, because the rest is not quadratic in it.
     inner = factor if moving.all() else scipy.linalg.cho_factor(precision[np.ix_(moving, moving)], lower=True)
@@ -209,17 +209,17 @@ def volume_at(
     entries = np.flatnonzero(mark_hyperparameters(target)).tolist()
     covariance = _inverse(scipy.linalg.cho_factor(curvature, lower=True)[0])
 
-    def at(steps: dict[int, float]) -> float:
+    def trace_at(steps: dict[int, float]) -> float:
         return trace(covariance, _curvature(target, _moved(flat, steps), flat))
 
-    centre_trace = at({})
-    alone = {(k, way): at({k: way * STEP}) for k in entries for way in (1, -1)}
+    centre_trace = trace_at({})
+    alone = {(k, way): trace_at({k: way * STEP}) for k in entries for way in (1, -1)}
     traces = np.zeros((len(entries), len(entries)))
     for row, k in enumerate(entries):
         traces[row, row] = alone[k, 1] + alone[k, -1] - 2 * centre_trace
-        for column, other in enumerate(entries[:row]):
-            both = at({k: STEP, other: STEP}) + at({k: -STEP, other: -STEP})
-            alone_sum = sum(alone[entry, way] for entry in (k, other) for way in (1, -1))
+        for column, other_entry in enumerate(entries[:row]):
+            both = trace_at({k: STEP, other_entry: STEP}) + trace_at({k: -STEP, other_entry: -STEP})
+            alone_sum = sum(alone[entry, way] for entry in (k, other_entry) for way in (1, -1))
             traces[row, column] = traces[column, row] = (both - alone_sum + 2 * centre_trace) / 2
     return Volume(covariance, traces / STEP**2, partial(slopes_of_curvature, target, flat, np.array(entries)))
 

@@ -110,6 +110,6 @@ class Volume:
         squares = np.zeros(self.second_traces.shape)
         for row, share in enumerate(shares):
             turned = np.ascontiguousarray(share.T)
-            for column, other in enumerate(shares[: row + 1]):
-                squares[row, column] = squares[column, row] = np.vdot(turned, other)
+            for column, other_share in enumerate(shares[: row + 1]):
+                squares[row, column] = squares[column, row] = np.vdot(turned, other_share)
         return (self.second_traces - squares) / 2

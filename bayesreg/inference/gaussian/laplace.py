@@ -63,7 +63,7 @@ def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimensio
     # A generator keeps one curvature in memory, which holds more than these two arrays.
     curvatures = (_curvature(target, target.data, flat) for flat in flats)
     pairs = [(point_curvature.gauss_newton, point_curvature.remainder) for point_curvature in curvatures]
-    approximate, remainder = (np.mean(parts, axis=0) for parts in zip(*pairs, strict=True))
+    approximate, remainder = (np.mean(matrices, axis=0) for matrices in zip(*pairs, strict=True))
     curvature = _add_convexly(regular(approximate), remainder)
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
     return recentre(target, gaussian_of(flats[0], precision), flats)
@@ -153,8 +153,8 @@ def _curvature(target: Target, data: Any, flat: Float[np.ndarray, "dimension"]) 
     return target.mode_search.curvature(data, estimands)
 
 
-def _require_an_end(found: bool | np.bool_) -> None:
-    if not found:
+def _require_an_end(has_end: bool | np.bool_) -> None:
+    if not has_end:
         raise InputError(
             "the search for the mode has no end: λ, μ or a temperature runs away; fix one more of them, or give it a "
             "narrower prior"
@@ -186,15 +186,15 @@ def _jointly(
         return precision
     rows = -hessian_rows(target, data, flat, entries)
     _require_an_end(np.isfinite(rows).all())
-    cross, own = rows[:, curved], (rows[:, entries] + rows[:, entries].T) / 2
+    cross, diagonal_block = rows[:, curved], (rows[:, entries] + rows[:, entries].T) / 2
     hyperparameters = np.flatnonzero(mark_hyperparameters(target)[entries])
     if len(hyperparameters):
         volume = volume_at(target, flat, curvature)
-        own[np.ix_(hyperparameters, hyperparameters)] += volume.excess if at_draws else volume.curvature
+        diagonal_block[np.ix_(hyperparameters, hyperparameters)] += volume.excess if at_draws else volume.curvature
     inner = cross @ scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[np.ix_(curved, curved)]), cross.T)
     least = ravel_pytree(target.coordinates.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
     unit = np.sqrt(np.asarray(least)[entries])
-    values, vectors = np.linalg.eigh((own - inner) / np.outer(unit, unit))
+    values, vectors = np.linalg.eigh((diagonal_block - inner) / np.outer(unit, unit))
     vectors *= unit[:, None]
     convex = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
     precision[np.ix_(entries, entries)] = convex + (inner + inner.T) / 2

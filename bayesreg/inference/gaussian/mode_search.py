@@ -98,13 +98,15 @@ def settle(
         balanced = balance_field(target, improved, partial(_factor, target, improved))
         shift = np.abs(balanced - before)[~resting].max()
         # Once the hyperparameters have settled, the other coordinates move too little to change them.
-        if better.moved < SETTLED_SD:
+        if better.greatest_change < SETTLED_SD:
             better = better._replace(flat=balanced)
         else:
             # The units are reused if the last search did not end at its bounds.
-            better = _improve_hyperparameters(target, balanced, better.units if better.moved < FARTHEST else None)
+            better = _improve_hyperparameters(
+                target, balanced, better.units if better.greatest_change < FARTHEST else None
+            )
         before = balanced
-        if shift < SETTLED and better.moved < SETTLED_SD:
+        if shift < SETTLED and better.greatest_change < SETTLED_SD:
             return better.flat
     if repeats == REPEATS:
         _log.warning("mode: not settled")

@@ -49,7 +49,7 @@ def search_modes(target: Target, points: Any, each: bool) -> Modes:
     modes = []
     for chain in range(chains):
         _log.info("chain %d:", chain)
-        modes.append(find_mode(target, _flat(target, jax.tree.map(lambda x, at=chain: x[at], points))))
+        modes.append(find_mode(target, _flat(target, jax.tree.map(lambda x, index=chain: x[index], points))))
     return report_modes(target, tell_apart(target, np.stack(modes)))
 
 
@@ -57,20 +57,20 @@ def temper(target: Target, points: Any) -> Target:
     """Temper the target near the mode found from the mean of the start points, if it is not tempered yet."""
     if target.mode_search is None or target.mode_search.tempering is None:
         return target
-    there = settle(target, approach(target, _middle(target, points)), repeats=FEW)
-    return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(there))))
+    near_mode = settle(target, approach(target, _middle(target, points)), repeats=FEW)
+    return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(near_mode))))
 
 
-def tell_apart(target: Target, found: Float[np.ndarray, "chains dimension"]) -> Modes:
+def tell_apart(target: Target, flat_modes: Float[np.ndarray, "chains dimension"]) -> Modes:
     """Group the modes of all chains into distinct ones, by their distance in standard deviations (see `SAME`)."""
-    heights = [_height(target, mode) for mode in found]
+    heights = [_height(target, mode) for mode in flat_modes]
     gaussians: list[Gaussian] = []
-    chains = [0] * len(found)
+    chains = [0] * len(flat_modes)
     for chain in np.argsort(heights)[::-1]:
-        distances = [distance(gaussian, found[chain]) for gaussian in gaussians]
+        distances = [distance(gaussian, flat_modes[chain]) for gaussian in gaussians]
         if not distances or min(distances) > SAME:
             distances = [*distances, 0.0]
-            gaussians.append(laplace(target, found[chain]))
+            gaussians.append(laplace(target, flat_modes[chain]))
         chains[chain] = int(np.argmin(distances))
     return Modes(gaussians, chains)
 

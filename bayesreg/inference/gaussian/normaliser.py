@@ -122,7 +122,7 @@ def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> Stand
         value, slope = normaliser_and_slope(target, position)
         coordinates, change = _coordinates_and_change(target, target.data, jnp.asarray(position), jnp.asarray(entries))
         samples.append((value, unit * slope[entries], np.asarray(coordinates), np.asarray(change) * unit))
-    values, slopes, coordinates, changes = (np.stack(parts) for parts in zip(*samples, strict=True))
+    values, slopes, coordinates, changes = (np.stack(columns) for columns in zip(*samples, strict=True))
     centre, spread = coordinates.mean(axis=0), coordinates.std(axis=0)
     z, changes = (coordinates - centre) / spread, changes / spread[:, None]
     rows = [terms_of(stand_in.factors, point)[None] for point in z]
@@ -146,10 +146,10 @@ def _coordinates_and_change(
 ) -> tuple[Float[AnyArray, "coordinates"], Float[AnyArray, "coordinates entries"]]:
     """Compute the smooth coordinates at a flat position, and their derivatives by some of its entries."""
 
-    def there(some: AnyArray) -> AnyArray:
+    def coordinates_of(some: AnyArray) -> AnyArray:
         return smooth_coordinates(target, data, flat.at[entries].set(some))
 
-    return there(flat[entries]), jax.jacfwd(there)(flat[entries])
+    return coordinates_of(flat[entries]), jax.jacfwd(coordinates_of)(flat[entries])
 
 
 def delay_acceptance(
@@ -175,10 +175,10 @@ def delay_acceptance(
     def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Any]:
         key_steps, key_accept = jax.random.split(key)
 
-        def one(kernel: Any, key: AnyArray) -> tuple[Any, Any]:
+        def one_step(kernel: Any, key: AnyArray) -> tuple[Any, Any]:
             return step(data, setup, key, kernel)
 
-        proposed, infos = jax.lax.scan(one, state.kernel, jax.random.split(key_steps, TOGETHER))
+        proposed, infos = jax.lax.scan(one_step, state.kernel, jax.random.split(key_steps, TOGETHER))
         info = together(infos)
         current_flat, proposed_flat = flat_of(setup, state.kernel), flat_of(setup, proposed)
         true = log_normaliser(data, proposed_flat)
@@ -186,7 +186,7 @@ def delay_acceptance(
         probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
         accepted = jax.random.uniform(key_accept) < probability
         candidate = Delayed(proposed, true)
-        kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
-        return kept, info._replace(acceptance_rate=info.acceptance_rate * probability)
+        next_state = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
+        return next_state, info._replace(acceptance_rate=info.acceptance_rate * probability)
 
     return whole_step

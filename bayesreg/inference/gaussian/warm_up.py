@@ -61,7 +61,7 @@ class Walking(Protocol):
 
 
 def tune(
-    data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, apart: bool = False
+    data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, per_chain: bool = False
 ) -> tuple[Any, Any]:  # fmt: skip
     """Tune the step size; return the setup with it, and the estimands of the chains at the end.
 
@@ -74,14 +74,14 @@ def tune(
         The estimands at which chains start, with chains as the leading axis.
     key : PRNG key
     tuning : Tuning
-    apart : bool
+    per_chain : bool
         Whether each chain has a step size of its own, and trajectories have at most `FEW_STEPS` steps. A chain that
         starts where the density is steep then takes short steps until it has left that region. With one step size for
         all chains, it would not move, or would shorten the steps of the others.
     """
     keys = jax.random.split(key, tuning.warm_up)
     first = jax.vmap(partial(walk.init, data, setup))(starts)
-    points, sizes, rates = _run(walk, tuning, data, setup, first, keys, jnp.asarray(apart))
+    points, sizes, rates = _run(walk, tuning, data, setup, first, keys, jnp.asarray(per_chain))
     setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     _log.info("warm-up: step %.2g%s, acceptance %.0f%%", float(setup.step_size), trajectory, 100 * late)
@@ -96,26 +96,26 @@ def _run(
     setup: Any,
     first: Any,
     keys: AnyArray,
-    apart: AnyArray,
+    per_chain: AnyArray,
 ) -> tuple[Any, AnyArray, AnyArray]:
     """Run the transitions; return estimands and step size of each chain, and the acceptance of each transition."""
     begin, update, final = dual_averaging_adaptation(tuning.acceptance)
     chains = len(jax.tree.leaves(first)[0])
 
-    def moved(state: Any, size: AnyArray, key: AnyArray) -> Any:
+    def step_chain(state: Any, size: AnyArray, key: AnyArray) -> Any:
         now = _with_step_size(tuning, setup, size)
         few = jnp.minimum(now.steps, FEW_STEPS)
-        return walk.step(data, now._replace(steps=jnp.where(apart, few, now.steps)), key, state)
+        return walk.step(data, now._replace(steps=jnp.where(per_chain, few, now.steps)), key, state)
 
-    def one(carry: Any, key: AnyArray) -> Any:
+    def one_transition(carry: Any, key: AnyArray) -> Any:
         states, averaging = carry
-        states, info = jax.vmap(moved)(states, jnp.exp(averaging.log_step_size), jax.random.split(key, chains))
+        states, info = jax.vmap(step_chain)(states, jnp.exp(averaging.log_step_size), jax.random.split(key, chains))
         rates = jnp.nan_to_num(info.acceptance_rate)
-        averaging = jax.vmap(update)(averaging, jnp.where(apart, rates, rates.mean()))
+        averaging = jax.vmap(update)(averaging, jnp.where(per_chain, rates, rates.mean()))
         return (states, averaging), rates.mean()
 
     averaging = jax.vmap(begin)(jnp.full(chains, setup.step_size))
-    (states, averaging), rates = jax.lax.scan(one, (first, averaging), keys)
+    (states, averaging), rates = jax.lax.scan(one_transition, (first, averaging), keys)
     return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates
 
 

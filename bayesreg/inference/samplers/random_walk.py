@@ -63,7 +63,9 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
         logdensity = jnp.where(inside, evaluation.logdensity, -jnp.inf)
         kernel = blackjax.additive_step_random_walk(lambda _: logdensity, lambda *_: move)
         kernel_state, kernel_info = kernel.step(key_accept, state.kernel)
-        kept = jax.tree.map(lambda new, old: jnp.where(kernel_info.is_accepted, new, old), evaluation, state.evaluation)
+        next_evaluation = jax.tree.map(
+            lambda new, old: jnp.where(kernel_info.is_accepted, new, old), evaluation, state.evaluation
+        )
         info = Info(
             acceptance_rate=kernel_info.acceptance_rate,
             outside_support=~inside,
@@ -73,7 +75,7 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
             gradients=jnp.zeros((), int),
             densities=inside.astype(int),
         )
-        return State(kernel_state, kept), info
+        return State(kernel_state, next_evaluation), info
 
     return Sampler(
         # The setup is the mean of the start points: the data are prepared for their neighbourhood.

@@ -62,7 +62,7 @@ class Chosen:
         object.__setattr__(self, "sampler", SAMPLERS[self.name].make(self.target, self.settings))
 
 
-def choose_sampler(name: str, target: Target, **given: Any) -> Chosen:
+def choose_sampler(name: str, target: Target, **settings: Any) -> Chosen:
     """Make the named sampler for a target with these settings.
 
     Raises
@@ -73,7 +73,7 @@ def choose_sampler(name: str, target: Target, **given: Any) -> Chosen:
     if name not in SAMPLERS:
         raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
     record = SAMPLERS[name].settings
-    plain = {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in given.items()}
+    plain = {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in settings.items()}
     try:
         return Chosen(name, target, record(**plain))
     except ValidationError as error:

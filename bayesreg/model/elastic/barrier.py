@@ -66,9 +66,9 @@ class Barrier(NamedTuple):
         bending = np.asarray(jax.vmap(jax.grad(jax.grad(cost)))(jnp.asarray(shares[below]))) / float(self.least) ** 2
         vectors = np.sqrt(bending)[:, None, None] * by_node
         nodes = np.asarray(self.elements.cells)[:, below].T.reshape(-1, 1)
-        own = np.broadcast_to(np.eye(4)[0], (len(nodes), 4))
+        weights = np.broadcast_to(np.eye(4)[0], (len(nodes), 4))
         shared = SharedCurvature(np.repeat(np.arange(len(below)), 4), vectors.reshape(1, -1, 3), np.ones(1))
-        return PointCurvature(np.broadcast_to(nodes, own.shape), own, np.zeros((len(nodes), 3, 3)), shared)
+        return PointCurvature(np.broadcast_to(nodes, weights.shape), weights, np.zeros((len(nodes), 3, 3)), shared)
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Return zero: the remainder is smaller than the Gauss–Newton part by the factor J, below the least share."""

@@ -94,9 +94,9 @@ class SoftSkull(NamedTuple):
         It is n nᵀ / width² in Ω_SK, where n is the gradient of the signed distance, and zero outside.
         """
         normal = jax.grad(lambda u: self.depth(u).sum())(values["u_boundary"]) / self.width
-        own = jnp.broadcast_to(jnp.eye(4)[0], (len(self.nodes), 4))
-        nodes = jnp.broadcast_to(self.nodes[:, None], own.shape)
-        return PointCurvature(nodes, own, normal[:, :, None] * normal[:, None])
+        weights = jnp.broadcast_to(jnp.eye(4)[0], (len(self.nodes), 4))
+        nodes = jnp.broadcast_to(self.nodes[:, None], weights.shape)
+        return PointCurvature(nodes, weights, normal[:, :, None] * normal[:, None])
 
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Return zeros, 1/mm²: the second derivatives of the distance are neglected, as the skull is nearly flat."""

@@ -72,7 +72,7 @@ class Landmarks:
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3 or not shapes[0][0]:
             raise InputError(f"{name}: fixed_points and moving_points must both have shape (k, 3), got {shapes}")
         count = shapes[0][0]
-        if not all(np.isfinite(part).all() for part in (self.fixed_points, self.moving_points)):
+        if not all(np.isfinite(points).all() for points in (self.fixed_points, self.moving_points)):
             raise InputError(f"{name}: every coordinate must be a finite number")
         if isinstance(labels, str) or (labels is not None and len(labels) != count):
             raise InputError(f"{name}: labels must be a list of {count}, one for each point; got {labels!r:.60}")
@@ -117,9 +117,9 @@ class Landmarks:
         return Recorded(xr.DataArray(np.asarray(term.shift), coords, list(coords), attrs=attributes))
 
 
-def _points(given: Any, name: str) -> np.ndarray:
+def _points(points: Any, name: str) -> np.ndarray:
     try:
-        return np.asarray(given, float)
+        return np.asarray(points, float)
     except (TypeError, ValueError):
         raise InputError(f"{name}: points must be numbers in an array of shape (k, 3)") from None
 

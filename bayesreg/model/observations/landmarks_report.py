@@ -15,14 +15,16 @@ from bayesreg.types import AnyArray
 LEVELS = (0.5, 0.95)
 
 
-def surprise(residual: Float[AnyArray, "k 3"], covariance: Float[AnyArray, "k 3 3"]) -> Float[np.ndarray, "k"]:
+def region_probability(
+    residual: Float[AnyArray, "k 3"], covariance: Float[AnyArray, "k 3 3"]
+) -> Float[np.ndarray, "k"]:
     """Return the probability of a residual nearer to zero than this one, by its covariance; NaN if not finite."""
     residual, covariance = np.asarray(residual), np.asarray(covariance)
-    known = np.isfinite(covariance).all(axis=(1, 2))
+    is_finite = np.isfinite(covariance).all(axis=(1, 2))
     probability = np.full(len(residual), np.nan)
-    r = residual[known]
-    squared = np.einsum("ki,ki->k", r, np.linalg.solve(covariance[known], r[..., None])[..., 0])
-    probability[known] = stats.chi2(3).cdf(squared)
+    r = residual[is_finite]
+    squared = np.einsum("ki,ki->k", r, np.linalg.solve(covariance[is_finite], r[..., None])[..., 0])
+    probability[is_finite] = stats.chi2(3).cdf(squared)
     return probability
 
 
@@ -44,7 +46,7 @@ def _left_out_cells(summary: Arrays, k: int) -> list[Any]:
     residual = summary["left_out_residual"][k]
     if not np.isfinite(residual).all():
         return ["not determined", None]
-    inside = surprise(residual[None], summary["left_out_covariance"][k : k + 1])[0]
+    inside = region_probability(residual[None], summary["left_out_covariance"][k : k + 1])[0]
     return [float(np.linalg.norm(residual)), f"{100 * inside:.1f} %"]
 
 
@@ -56,12 +58,12 @@ def _caption(summary: Arrays) -> str:
     if "left_out_residual" not in summary:
         return f"{text} They were not left out in turn, as up to 60 are where nodes are sampled."
     residual = summary["left_out_residual"]
-    known = np.isfinite(residual).all(axis=1)
-    if not known.any():
+    is_finite = np.isfinite(residual).all(axis=1)
+    if not is_finite.any():
         return f"{text} Left out, no landmark is determined by the other observations."
-    inside = surprise(residual, summary["left_out_covariance"])[known]
+    inside = region_probability(residual, summary["left_out_covariance"])[is_finite]
     shares = [f"{(inside <= level).mean():.0%} of the landmarks lie in their {level:.0%} region" for level in LEVELS]
-    mean = np.linalg.norm(residual[known], axis=1).mean()
+    mean = np.linalg.norm(residual[is_finite], axis=1).mean()
     return (
         f"{text} Left out: the same distance where all other observations predict the landmark, at the mean stiffness; "
         f"its mean is {mean:.3g} mm. Its region: the share of the prediction that lies nearer. "

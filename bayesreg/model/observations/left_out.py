@@ -64,7 +64,7 @@ def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -
     residual, sd = np.asarray(term.shift) - predicted, np.asarray(term.sd(values))
     shares = [_shares(H + trace * np.trace(H) * np.eye(len(H)), A, sd) for trace in (TRACE, MORE * TRACE)]
     left_out = [_without(*landmark) for landmark in zip(residual, *shares, sd, strict=True)]
-    return LeftOut(*(np.stack(parts) for parts in zip(*left_out, strict=True)))
+    return LeftOut(*(np.stack(fields) for fields in zip(*left_out, strict=True)))
 
 
 def _shares(
@@ -81,8 +81,8 @@ def _without(
     residual: Float[np.ndarray, "3"], share: Float[np.ndarray, "3 3"], less: Float[np.ndarray, "3 3"], sd: float
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Compute the residual without the landmark, and its covariance; `less` is its share with more regularisation."""
-    others, kept = (np.linalg.eigvalsh(np.eye(3) - own_share).min() for own_share in (share, less))
-    if kept > 2 * others:
+    least, least_regularised = (np.linalg.eigvalsh(np.eye(3) - own_share).min() for own_share in (share, less))
+    if least_regularised > 2 * least:
         return np.full(3, np.nan), np.full((3, 3), np.inf)
     left = np.linalg.inv(np.eye(3) - share)
     return left @ residual, sd**2 * left

@@ -54,20 +54,20 @@ def _as_section(value: object, info: Any) -> ObservationSection:
         return value
     if not isinstance(value, Mapping):
         raise ValueError("expected keys with values, such as kind: landmarks")
-    known = ", ".join(kinds())
+    listed = ", ".join(kinds())
     if "kind" not in value:
-        raise ValueError(f"the kind is missing; expected one of {known}")
+        raise ValueError(f"the kind is missing; expected one of {listed}")
     if value["kind"] not in kinds():
-        raise ValueError(f"there is no kind of observation {value['kind']!r:.60}; expected one of {known}")
+        raise ValueError(f"there is no kind of observation {value['kind']!r:.60}; expected one of {listed}")
     return kinds()[value["kind"]].model_validate(value, context=info.context)
 
 
-def _require_different_names(given: list[Any]) -> list[Any]:
-    names = [section.name for section in given]
+def _require_different_names(sections: list[Any]) -> list[Any]:
+    names = [section.name for section in sections]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"two observations are named {name}; give one of them another name")
-    return given
+    return sections
 
 
 AnyObservation = Annotated[SerializeAsAny[ObservationSection], BeforeValidator(_as_section)]

@@ -77,19 +77,21 @@ def contrast_functions(
     return np.stack([np.asarray(image.interpolate(positions)) for image in smooth], axis=1)
 
 
-def explained_shares(one: Float[np.ndarray, "points"], other: Float[np.ndarray, "points"]) -> tuple[float, float]:
-    """Compute how well the intensities `one` predict the intensities `other` at the same points.
+def explained_shares(
+    predictor: Float[np.ndarray, "points"], response: Float[np.ndarray, "points"]
+) -> tuple[float, float]:
+    """Compute how well the intensities `predictor` predict the intensities `response` at the same points.
 
     Returns
     -------
     tuple of float
-        Two shares of the variance of `other`: the share that a straight line in `one` explains, with a minus sign if
-        the line falls, and the share that splines of `one` explain.
+        Two shares of the variance of `response`: the share that a straight line in `predictor` explains, with a minus
+        sign if the line falls, and the share that splines of `predictor` explain.
     """
-    correlation = float(np.corrcoef(one, other)[0, 1])
-    functions = np.stack([spline(one) for spline in _splines(one)], axis=1)
-    left = other - functions @ _fit(functions, other)
-    return correlation * abs(correlation), float(max(1 - left.var() / other.var(), 0.0))
+    correlation = float(np.corrcoef(predictor, response)[0, 1])
+    functions = np.stack([spline(predictor) for spline in _splines(predictor)], axis=1)
+    left = response - functions @ _fit(functions, response)
+    return correlation * abs(correlation), float(max(1 - left.var() / response.var(), 0.0))
 
 
 def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"], tissue: Image | None) -> Iterator[Image]:

@@ -290,14 +290,14 @@ def _chain(
     return PointCurvature(term.nodes, term.quadrature.barycentric, matrices, shared)
 
 
-def _subtract(one: ValueCurvature, other: ValueCurvature) -> ValueCurvature:
+def _subtract(minuend: ValueCurvature, subtrahend: ValueCurvature) -> ValueCurvature:
     """Subtract one curvature from another; both have the same groups, or neither has groups."""
-    diagonal = one.diagonal - other.diagonal
-    if one.shared is None or other.shared is None:
+    diagonal = minuend.diagonal - subtrahend.diagonal
+    if minuend.shared is None or subtrahend.shared is None:
         return ValueCurvature(diagonal)
-    vectors = jnp.concatenate([one.shared.vectors, other.shared.vectors])
-    signs = jnp.concatenate([one.shared.signs, -other.shared.signs])
-    return ValueCurvature(diagonal, SharedCurvature(one.shared.groups, vectors, signs))
+    vectors = jnp.concatenate([minuend.shared.vectors, subtrahend.shared.vectors])
+    signs = jnp.concatenate([minuend.shared.signs, -subtrahend.shared.signs])
+    return ValueCurvature(diagonal, SharedCurvature(minuend.shared.groups, vectors, signs))
 
 
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:

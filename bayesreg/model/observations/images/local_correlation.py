@@ -146,13 +146,13 @@ class WindowCorrelation(NamedTuple):
         return self._curvature(fit, pair.weights * pair.shares, fit.residuals)
 
     def _curvature(
-        self, found: LocalFit, weights: Float[AnyArray, "points"], residuals: Float[AnyArray, "points"]
+        self, fit: LocalFit, weights: Float[AnyArray, "points"], residuals: Float[AnyArray, "points"]
     ) -> ValueCurvature:
-        of_mean = weights * found.gain
-        of_gain = weights * (residuals - found.gain * found.moving) / jnp.sqrt(found.variance + self.ridge)
-        vectors = jnp.sqrt(2 / found.volume) * jnp.stack([of_mean, of_gain])
+        of_mean = weights * fit.gain
+        of_gain = weights * (residuals - fit.gain * fit.moving) / jnp.sqrt(fit.variance + self.ridge)
+        vectors = jnp.sqrt(2 / fit.volume) * jnp.stack([of_mean, of_gain])
         shared = SharedCurvature(self.windows.label, vectors, -jnp.ones(2))
-        return ValueCurvature(2 * weights * found.gain**2, shared)
+        return ValueCurvature(2 * weights * fit.gain**2, shared)
 
     def variance(self) -> Scalar:
         """Return the mean variance (N − 2K) / N."""

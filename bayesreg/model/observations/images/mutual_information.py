@@ -55,7 +55,7 @@ class Histogram(NamedTuple):
     moving: Float[AnyArray, "points bins"]
     count: Scalar
 
-    def surprise(self) -> Float[AnyArray, "bins bins"]:
+    def log_conditional(self) -> Float[AnyArray, "bins bins"]:
         """Return log(P_ij / P_j): the log probability of the bins of f, given those of m."""
         return jnp.log(self.joint) - jnp.log(self.joint.sum(axis=0))
 
@@ -85,7 +85,9 @@ class JointInformation(NamedTuple):
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return the energy −T_s N I."""
         histogram = self.histogram(pair)
-        information = (histogram.joint * (histogram.surprise() - jnp.log(histogram.joint.sum(axis=1))[:, None])).sum()
+        information = (
+            histogram.joint * (histogram.log_conditional() - jnp.log(histogram.joint.sum(axis=1))[:, None])
+        ).sum()
         return -self.temperature * histogram.count * information
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
@@ -104,7 +106,7 @@ class JointInformation(NamedTuple):
         """Return T_s times the observed Fisher information: the square of each point's ∂ log p(f_q | m_q) / ∂m_q."""
         histogram = self.histogram(pair)
         slope = jax.jvp(lambda m: _bins(m, self.moving_range), (pair.moving,), (jnp.ones_like(pair.moving),))[1]
-        score = ((histogram.fixed @ histogram.surprise()) * slope).sum(axis=1)
+        score = ((histogram.fixed @ histogram.log_conditional()) * slope).sum(axis=1)
         return ValueCurvature(self.temperature * pair.weights / pair.weights.mean() * pair.shares * score**2)
 
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:

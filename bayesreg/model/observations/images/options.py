@@ -65,12 +65,12 @@ class ImageOptions(Section):
         return self
 
 
-def with_preset(preset: str, given: Mapping[str, Any]) -> dict[str, Any]:
+def with_preset(preset: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the given options, completed by the options of a preset that are compatible with them."""
     chosen = dict(PRESETS[preset])
-    if "similarity" in given:
+    if "similarity" in options:
         usual = chosen.pop("similarity", {"kind": "ssd"})
-        similarity = by_kind(given["similarity"])
+        similarity = by_kind(options["similarity"])
         if isinstance(similarity, SimilaritySettings):
             similarity = {"kind": similarity.kind, **similarity.model_dump(exclude_unset=True)}
         if isinstance(similarity, Mapping):
@@ -79,5 +79,5 @@ def with_preset(preset: str, given: Mapping[str, Any]) -> dict[str, Any]:
                 chosen.pop("intensity_map", None)
             # Mutual information has no noise to infer.
             temperature = {} if kind == "mi" else {key: usual[key] for key in ("temperature",) if key in usual}
-            given = {**given, "similarity": {"kind": kind, **temperature, **similarity}}
-    return {**chosen, **given}
+            options = {**options, "similarity": {"kind": kind, **temperature, **similarity}}
+    return {**chosen, **options}

@@ -114,21 +114,21 @@ class ImagePair:
         return self.prepared(mesh, preset).on(mesh)
 
 
-def _require_options(name: str, given: dict[str, Any]) -> None:
+def _require_options(name: str, options: dict[str, Any]) -> None:
     """Raise InputError if options are wrong for every preset; the preset of the model is not known yet."""
     errors = []
     for preset in PRESETS:
         try:
-            _options_of(name, preset, given)
+            _options_of(name, preset, options)
         except InputError as error:
             errors.append(error)
     if len(errors) == len(PRESETS):
         raise errors[0]
 
 
-def _options_of(name: str, preset: str, given: dict[str, Any]) -> ImageOptions:
+def _options_of(name: str, preset: str, options: dict[str, Any]) -> ImageOptions:
     try:
-        return ImageOptions(**with_preset(preset, given))
+        return ImageOptions(**with_preset(preset, options))
     except ValidationError as error:
         details = error.errors(include_url=False)[0]
         key = ".".join(map(str, details["loc"])) or str(details.get("ctx", {}).get("key", "options"))

@@ -62,11 +62,11 @@ def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
     inside = cells >= 0
     if not inside.any():
         raise InputError("no voxel centre of the fixed image lies inside the mesh: quadrature 'voxels' has no points")
-    kept = np.flatnonzero(inside)
-    volume = fixed.voxel_volume * len(kept)
-    if most is not None and len(kept) > most:
-        kept = np.sort(np.random.default_rng(0).choice(kept, most, replace=False))
-    return quadrature_at(mesh, cells[kept], barycentric[kept], np.full(len(kept), volume / len(kept)))
+    chosen = np.flatnonzero(inside)
+    volume = fixed.voxel_volume * len(chosen)
+    if most is not None and len(chosen) > most:
+        chosen = np.sort(np.random.default_rng(0).choice(chosen, most, replace=False))
+    return quadrature_at(mesh, cells[chosen], barycentric[chosen], np.full(len(chosen), volume / len(chosen)))
 
 
 def seen_points(
@@ -89,5 +89,7 @@ def seen_points(
         raise InputError("nothing is left to compare: all of the mesh lies in fixed_ignore, or beyond the moving image")
     if mask.all():
         return quadrature
-    kept = (np.asarray(part)[mask] for part in (quadrature.cells, quadrature.barycentric, quadrature.weights))
-    return quadrature_at(mesh, *kept)
+    visible_arrays = (
+        np.asarray(array)[mask] for array in (quadrature.cells, quadrature.barycentric, quadrature.weights)
+    )
+    return quadrature_at(mesh, *visible_arrays)

@@ -156,9 +156,9 @@ class StudentTNoise(Pointwise):
         freedom, it equals eq. (1); a large residual adds only its logarithm.
         """
         nu = self.degrees_of_freedom
-        surprise = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
+        log_terms = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
         # A product of vectors, as in eq. (1).
-        return temperature * (nu + 1) / 2 * (pair.shares @ surprise)
+        return temperature * (nu + 1) / 2 * (pair.shares @ log_terms)
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Return 2 w (ν + 1)/(ν + 3) times the weights (ν + 1)/(ν + z²) of iteratively reweighted least squares.

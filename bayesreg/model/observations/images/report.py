@@ -89,10 +89,10 @@ def _draw_residual(summary: Arrays, tissues: Sequence[str], expected: ExpectedNo
     reach = float(np.clip(np.quantile(np.abs(z), 0.995) * 1.15, 4.5, None))
     edges = np.linspace(-reach, reach, BINS + 1)
     for index, (tissue, colour) in enumerate(zip(tissues, colours_of(tissues), strict=True)):
-        own = z[summary["residual_tissue"] == index]
-        if len(own) >= LEAST_POINTS:
-            density = np.histogram(own, edges)[0] / len(own) / np.diff(edges)
-            label = f"{style.literal(label_of(tissue))}, sd {own.std():.2g}"
+        residuals = z[summary["residual_tissue"] == index]
+        if len(residuals) >= LEAST_POINTS:
+            density = np.histogram(residuals, edges)[0] / len(residuals) / np.diff(edges)
+            label = f"{style.literal(label_of(tissue))}, sd {residuals.std():.2g}"
             first.stairs(density, edges, color=colour, lw=1.3, label=label)
     x = np.linspace(-reach, reach, 300)
     first.fill_between(x, expected.density(x), color=style.FAINT, lw=0, label=expected.name, zorder=0)
