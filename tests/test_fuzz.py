@@ -141,6 +141,7 @@ def _load(folder, text):
 
 @fuzz(200)
 @given(text=configurations())
+@pytest.mark.long
 def test_configurations_are_read_or_refused(tmp_path, text):
     _load(tmp_path, text)
 

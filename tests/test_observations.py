@@ -105,6 +105,7 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
         assert "Before and after" not in page
 
 
+@pytest.mark.long
 def test_landmarks_are_held_out(folder, tmp_path):
     """Points that no observation names are compared with the result, and change nothing of it."""
     table = (folder / "pairs.csv").read_text().splitlines()
@@ -180,6 +181,7 @@ def require_images_are_predicted(result):
     assert set(result.idata.log_likelihood.data_vars) == {"vessel"}
 
 
+@pytest.mark.long
 def test_landmarks_with_images_and_an_inferred_sd_go_on_where_they_were_cut_off(folder, tmp_path):
     observed = [{"kind": "images"}, {"kind": "landmarks", "file": "plain.csv", "sd": {"median": 0.5}, "name": "vessel"}]
     sections = {"sampler": {"name": "laplace", "chains": 2, "block": 5}}

@@ -296,6 +296,7 @@ def test_check_estimates_without_writing(folder):
     assert "MB on the device" in text
 
 
+@pytest.mark.long
 def test_uniform_beside_tissues(finished, folder):
     uniform = br.load_config(folder / "run.yaml", ["model.elasticity=uniform"])
     result = br.run(uniform, folder / "uniform", progress=False)
@@ -345,6 +346,7 @@ def test_a_synthetic_pair_brings_its_truth(synthetic, folder, kind):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_elastography_samples_the_elastic_parameters_alone(synthetic, folder):
     out = folder / "elastography"
     overrides = ["known_boundary=truth", PROPER, "start.field=identity"]
@@ -429,6 +431,7 @@ class MeanDisplacement:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_observation_from_outside_goes_through_run_resume_and_report(folder, tmp_path):
     def config(steps):
         settings = [

@@ -194,6 +194,7 @@ def test_chosen_places_are_where_their_names_say():
     assert [name for name in places if name.startswith("middle")] == ["middle of CSF", "middle of GM", "middle of WM"]
 
 
+@pytest.mark.long
 def test_replicates_follow_students_t_where_the_model_does():
     """The data are drawn from the model: no discrepancy is extreme, as all were with Normal replicates."""
     rng, nu = np.random.default_rng(1), 3.0

@@ -62,7 +62,9 @@ def anatomy(names: dict[str, float], seed: int = 0) -> tuple[br.Image, br.Image,
     return *images, grid.with_voxels(np.where(index > 0, 1 + 2 * index, 0).astype(np.int16))
 
 
-@pytest.fixture(scope="module", params=["liver", "five", pytest.param("one", marks=pytest.mark.long)])
+@pytest.fixture(
+    scope="module", params=["liver", *(pytest.param(name, marks=pytest.mark.long) for name in ("five", "one"))]
+)
 def case(request, tmp_path_factory):
     """The names, and a run on files with a report; that of the liver makes its own mesh."""
     names, folder = SHELLS[request.param], tmp_path_factory.mktemp(request.param)

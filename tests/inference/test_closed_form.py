@@ -128,7 +128,7 @@ def test_density_is_the_gaussian():
             assert difference == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.fixture(scope="module", params=["rwmh", "hmc", "nuts", "laplace"])
+@pytest.fixture(scope="module", params=["rwmh", "hmc", pytest.param("nuts", marks=pytest.mark.long), "laplace"])
 def result(request):
     """Laplace's approximation of a Gaussian is the Gaussian. Where trajectories are long the skull is out of reach."""
     posterior = walled(FAR) if request.param in ("hmc", "nuts") else problem().posterior
@@ -190,7 +190,11 @@ def exact_draws(width: float) -> np.ndarray:
     return np.concatenate(accepted)
 
 
-@pytest.fixture(scope="module", params=[("rwmh", 0.0, {"sigma_u": 0.22}), ("hmc", WIDTH, {})], ids=["rwmh", "hmc"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(("rwmh", 0.0, {"sigma_u": 0.22}), marks=pytest.mark.long), ("hmc", WIDTH, {})],
+    ids=["rwmh", "hmc"],
+)
 def beside_wall(request):
     """The width of the wall, the sampler's draws, and exact ones."""
     sampler, width, settings = request.param

@@ -1,10 +1,12 @@
 """The formula that the cost of the paper's kernel is reckoned with."""
 
 import numpy as np
+import pytest
 
 from tests.inference.random_walk import ess_per_step, gaussian_walk
 
 
+@pytest.mark.long
 def test_the_formula_is_that_of_a_long_walk():
     """Within a third, for it is a limit; in few dimensions, the entries correlated and of different widths."""
     rng = np.random.default_rng(0)

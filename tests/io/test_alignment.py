@@ -49,7 +49,9 @@ def off(estimate, pose):
     return np.linalg.norm(estimate.place(points) - pose.place(points), axis=1).mean()
 
 
-@pytest.mark.parametrize(("millimetres", "degrees"), [(8.0, 8.0), (20.0, 15.0), (300.0, 20.0)])
+@pytest.mark.parametrize(
+    ("millimetres", "degrees"), [(8.0, 8.0), pytest.param(20.0, 15.0, marks=pytest.mark.long), (300.0, 20.0)]
+)
 def test_a_rigid_motion_is_found(millimetres, degrees):
     pose = motion(millimetres, degrees)
     alignment = find_pose(FIXED, moved(pose), MASK)
@@ -81,6 +83,7 @@ def test_what_is_ignored_does_not_mislead():
     assert off(alignment.pose, pose) < 0.3
 
 
+@pytest.mark.long
 def test_a_mask_of_a_small_grid_ignores_what_it_holds_alone():
     """In both images, and what is bright there, such as metal, has no say."""
     pose = motion(8.0, 8.0, seed=3)
@@ -98,6 +101,7 @@ def test_a_mask_of_a_small_grid_ignores_what_it_holds_alone():
     assert off(find_pose(metal, moving, MASK, fixed_ignore=mask).pose, pose) < 0.3
 
 
+@pytest.mark.long
 def test_the_same_images_give_the_same_pose():
     moving = moved(motion(8.0, 8.0))
     first_matrix, second_matrix = (find_pose(FIXED, moving, MASK).pose.matrix for _ in range(2))

@@ -1,6 +1,7 @@
 """Boundary nodes that few tetrahedra hold."""
 
 import numpy as np
+import pytest
 from scipy.spatial import Delaunay
 
 from bayesreg.io import meshing
@@ -82,6 +83,7 @@ def test_a_node_inside_may_be_held_by_four():
     assert len(without_loose_nodes(points, cells)[0]) == len(points)
 
 
+@pytest.mark.long
 def test_no_edge_may_be_contracted_that_changes_the_topology():
     """By the links, and by contracting it and looking at the whole mesh."""
     mesh = mesh_of(*with_ears(POINTS, CELLS))

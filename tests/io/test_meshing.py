@@ -211,6 +211,7 @@ class TestFiles:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("load", [mni152, pytest.param(brainweb, marks=needs_brainweb)], ids=["mni152", "brainweb"])
 def test_a_brain_gets_about_the_paper_s_mesh(load):
     anatomy = load()

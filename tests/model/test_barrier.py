@@ -71,7 +71,7 @@ def test_its_curvature_is_that_of_the_linearised_volumes(shift):
     np.testing.assert_allclose(curvature, curved.reshape(curvature.shape), rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("least", [0.0, 0.1])
+@pytest.mark.parametrize("least", [0.0, pytest.param(0.1, marks=pytest.mark.long)])
 def test_the_mode_has_no_inverted_tetrahedron(least):
     """Landmarks that pull a node through the opposite faces; without the barrier it goes there."""
     mesh = box_mesh()

@@ -155,6 +155,7 @@ def test_residuals_temper_the_likelihood_where_that_is_wanted(caplog):
     assert temper_target(tempered.target, 2, 0) is tempered.target
 
 
+@pytest.mark.long
 def test_a_search_goes_on_where_the_tempering_has_led_to():
     tempered = temper_target(posterior(independent_points="residual").target, 2, 0)
     start, search_start = (

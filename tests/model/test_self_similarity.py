@@ -129,6 +129,7 @@ def test_the_curvature_is_the_hessian():
     assert np.linalg.eigvalsh(hessian.gauss_newton).min() > 0
 
 
+@pytest.mark.long
 def test_the_mode_of_a_pair_of_unlike_contrast_is_near():
     assert error_of(moved(other_contrast), one_contrast=False, similarity="mind") < 0.5
 

@@ -57,6 +57,7 @@ ALIKE, INVERTED = 1, 2
 QUICK = {"chains": 4, "draws": 200}
 
 
+@pytest.mark.long
 def test_an_inverted_contrast_is_registered_where_squared_differences_fail():
     start = np.median(np.linalg.norm(phantom()[3], axis=1))
     alike, *_ = registered("ssd", ALIKE, "laplace", **QUICK)
