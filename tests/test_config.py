@@ -388,3 +388,21 @@ def test_an_override_names_the_first_observation_where_none_is_listed(write):
     (images,) = config.observations
     assert (images.similarity.kind, images.intensity_map, images.quadrature) == ("lncc", None, "voxels")
     assert config.model.elastic_prior.kind == "loads"
+
+
+@pytest.mark.parametrize("name", ["hmc", "nuts", "smc", "laplace"])
+def test_a_sampler_that_follows_the_gradient_is_refused_beside_a_hard_wall(write, name):
+    text = SMALL + "model: {skull_width: 0}\n"
+    expected = "expected model.skull_width: 0.5, or the paper's model and sampler, model.preset: paper and sampler.name"
+    assert expected in complaint(write(text + f"sampler: {name}\n"))
+    assert expected in complaint(write(text))
+    assert load_config(write(text + "sampler: rwmh\n")).sampler.name == "rwmh"
+
+
+def test_another_quadrature_leaves_out_what_needs_voxels(write):
+    options = load_config(write(FILES + "observations: [{kind: images, quadrature: gauss4}]\n")).image_options
+    assert (options.most_points, options.independent_points, options.interpolation) == (None, None, "cubic")
+
+
+def test_a_key_of_another_kind_of_observation_is_not_suggested(write):
+    assert "this kind has no such key" in complaint(write(SMALL + "observations: [{kind: images, sd: 2}]\n"))

@@ -1,5 +1,7 @@
 """The notebooks run from top to bottom, as a plain program: no kernel, no network."""
 
+import ast
+import importlib
 import json
 import os
 import subprocess
@@ -21,3 +23,14 @@ def test_notebook_runs(name):
     done = subprocess.run([sys.executable, "-c", code], cwd=FOLDER, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "nodes" in done.stdout
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.ipynb")))
+def test_what_a_notebook_imports_exists(name):
+    """The notebooks themselves run with the long tests."""
+    cells = json.loads((FOLDER / name).read_text(encoding="utf-8"))["cells"]
+    tree = ast.parse("\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module.startswith("bayesreg")]
+    for node in imports:
+        module = importlib.import_module(node.module)
+        assert all(hasattr(module, alias.name) for alias in node.names)

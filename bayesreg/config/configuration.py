@@ -106,7 +106,7 @@ class Config(Section):
     """The model; preset: registration is the default for data from files, preset: paper for synthetic pairs."""
     sampler: Annotated[
         SamplerConfig,
-        Field(discriminator="name"),
+        Field(discriminator="name", validate_default=True),
         BeforeValidator(name_hmc_where_unnamed),
     ] = Hmc()
     start: StartConfig = StartConfig()
@@ -212,6 +212,18 @@ class Config(Section):
         if names is not None:
             model.require_proper_priors(names)
         return model
+
+    @field_validator("sampler")
+    @classmethod
+    def _meets_a_soft_wall(cls, sampler: SamplerConfig, info: ValidationInfo) -> SamplerConfig:
+        model, has_skull = info.data.get("model"), info.data.get("simulate") is not None
+        has_skull |= getattr(info.data.get("data"), "intracranial", None) is not None
+        if model is not None and model.skull_width == 0 and has_skull and sampler.name != "rwmh":
+            raise ValueError(
+                "samplers that follow the gradient need a soft wall of the skull; expected model.skull_width: 0.5, or "
+                "the paper's model and sampler, model.preset: paper and sampler.name: rwmh"
+            )
+        return sampler
 
     @field_validator("start")
     @classmethod

@@ -138,6 +138,8 @@ def _message(details: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def _unknown(key: str, fields: dict[str, FieldInfo]) -> str:
+    if key in fields:
+        return "this kind has no such key"
     close = difflib.get_close_matches(key, fields, n=1)
     return f"unknown key; did you mean {close[0]}?" if close else f"unknown key; known are {', '.join(fields)}"
 

@@ -70,5 +70,7 @@ def sampler_section(name: str) -> SamplerConfig:
 
 
 def name_hmc_where_unnamed(value: object) -> object:
-    """Add the name hmc to a section without a name."""
+    """Add the name hmc to a section without a name; a text is the name alone."""
+    if isinstance(value, str):
+        return {"name": value}
     return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value

@@ -211,7 +211,8 @@ def require_soft_wall(target: Target) -> None:
     if target.hard_wall is not None:
         raise InputError(
             "samplers that follow the gradient need a soft wall of the skull, and model.skull_width is 0: set it to "
-            "half a voxel, model.skull_width: 0.5, or take the paper's sampler, sampler.name: rwmh"
+            "half a voxel, model.skull_width: 0.5, or take the paper's model and sampler, model.preset: paper and "
+            "sampler.name: rwmh"
         )
 
 

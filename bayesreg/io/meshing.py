@@ -139,9 +139,11 @@ def build_mesh(
             _log.debug("mesh made: %s", check_mesh(mesh, labels))
             return mesh
         except ValueError as error:
-            _log.warning("mesh %d of at most %d is not sound: %s", attempt, options.attempts, error)
+            _log.warning("mesh %d of at most %d failed its check: %s", attempt, options.attempts, error)
             last = error
-    raise MeshError(f"none of {options.attempts} meshes is sound; the last one: {last}") from last
+    raise MeshError(
+        f"none of {options.attempts} meshes is sound; the last one: {last}; try a smaller mesh.edge_length"
+    ) from last
 
 
 def tissue_of_cells(

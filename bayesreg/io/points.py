@@ -84,7 +84,10 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
             raise InputError(f"{path} holds both points of each pair; expected no second file, got {moving}")
         return points
     if moving is None:
-        raise InputError(f"{path} holds points of one space; give the points of the moving image, too")
+        raise InputError(
+            f"{path} holds points of one space; give the points of the moving image, too, or a CSV with the columns "
+            "fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z"
+        )
     moving_points = read_points(moving)
     if moving_points.sd is not None:
         raise InputError(f"{moving} gives an sd; expected it in the file of the fixed points, {path}, for each pair")

@@ -23,7 +23,7 @@ def describe_observations(posterior: Posterior, values: Values) -> dict[str, dic
     dict
         A dict for each observation, by its name. It has the "kind" of the observation, the "title" of the kind, its
         "options" if it has any, and the "log" of its term. If the term provides its residuals, it has their number,
-        "values", and the root of their mean square in units of their variance, "residual_rms". It also has the entries
+        "values", and their root mean square in units of their sd, "residual_rms". It also has the entries
         that the observation's method `describe` returns.
     """
     filled = posterior.fill(values)

@@ -54,7 +54,7 @@ class Standardised(Protocol):
     """A term that provides its residuals; the report shows their root mean square."""
 
     def standardised_residual(self, state: State) -> AnyArray:
-        """Return the residuals in units of their standard deviation; their mean square is about one in the model."""
+        """Return the residuals in units of their sd; if the model holds, their mean square is about one."""
 
 
 class SharedCurvature(NamedTuple):

@@ -26,7 +26,7 @@ class Grouping(NamedTuple):
     label : (chains,) int array
         Group of each chain, numbered from 0 in the order of their first chains.
     drifting : (chains,) bool array
-        Whether the halves of a chain differ, as in a chain that has not arrived yet.
+        Whether the halves of a chain differ, as in a chain that has not converged yet.
     """
 
     label: Int[np.ndarray, "chains"]
@@ -73,7 +73,7 @@ def thin(posterior: xr.Dataset) -> xr.Dataset:
 
 
 def _separation(means: np.ndarray, variances: np.ndarray, i: int, j: int) -> Float[np.ndarray, "estimands"]:
-    """Return the distance of two means in standard deviations; zero if both chains stand still at one value."""
+    """Return the distance of two means in standard deviations; zero if both chains are constant and equal."""
     gap, within = np.abs(means[i] - means[j]), np.sqrt((variances[i] + variances[j]) / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(gap > 0, gap / within, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -19,6 +20,8 @@ from bayesreg.report.places import regions
 from bayesreg.report.style import Drawing
 from bayesreg.report.tables import Table
 from bayesreg.report.verdict import NONE, nested_entry, number, place_text
+
+_log = logging.getLogger(__name__)
 
 
 def formula(manifest: Mapping[str, Any], elastography: bool) -> Markup:
@@ -99,7 +102,12 @@ def observations_of(manifest: Mapping[str, Any]) -> Mapping[str, Mapping[str, An
 
 
 def _kind(described: Mapping[str, Any]) -> type[ObservationSection]:
-    """Return the class of a kind of observation; the base class if the kind is not registered."""
+    """Return the class of a kind of observation; the base class, with a warning, if the kind is not registered."""
+    if described["kind"] not in kinds():
+        _log.warning(
+            "the report leaves out tables and figures of %s: no installed package registers this kind of observation",
+            described["kind"],
+        )
     return kinds().get(described["kind"], ObservationSection)
 
 

@@ -34,7 +34,10 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
     sigma = {"u_boundary": settings.sigma_u, "lam": settings.sigma_lam, "mu": settings.sigma_mu}
     warm = [name for name in target.coordinates.reference() if name not in sigma]
     if warm:
-        raise InputError(f"rwmh has no step for {', '.join(sorted(warm))}; use the sampler hmc")
+        raise InputError(
+            f"rwmh has no step for {', '.join(sorted(warm))}; use the sampler hmc, or model.preset: paper with known "
+            "temperatures"
+        )
 
     def init(data: Any, _: Any, estimands: Estimands) -> State:
         evaluation = target.evaluate_estimands(data, estimands)

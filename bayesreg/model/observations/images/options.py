@@ -68,6 +68,8 @@ class ImageOptions(Section):
 def with_preset(preset: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the given options, completed by the options of a preset that are compatible with them."""
     chosen = dict(PRESETS[preset])
+    if options.get("quadrature", "voxels") != "voxels":
+        chosen = {name: value for name, value in chosen.items() if name not in ("most_points", "independent_points")}
     if "similarity" in options:
         usual = chosen.pop("similarity", {"kind": "ssd"})
         similarity = by_kind(options["similarity"])

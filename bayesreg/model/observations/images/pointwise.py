@@ -10,6 +10,7 @@ import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Float
 from pydantic import Field
+from scipy import stats
 
 from bayesreg.model.term import SharedCurvature
 from bayesreg.settings import KnownOrInferred, Section
@@ -197,6 +198,11 @@ class SimilaritySettings(Section):
     # E_s in the report, and the description of its residual if that is not f − m(x + u).
     formula: ClassVar[str]
     residual: ClassVar[str] = ""
+    has_heavy_tails: ClassVar[bool] = False
+
+    def noise(self) -> tuple[str, Any]:
+        """Return the distribution of standardised residuals in the model: its name, and SciPy's object."""
+        return "standard Normal", stats.norm()
 
 
 class SquaredDifferences(SimilaritySettings):
@@ -220,9 +226,15 @@ class StudentT(SimilaritySettings):
         "<var>w</var>: Student’s t"
     )
 
+    has_heavy_tails = True
+
     kind: Literal["student_t"] = "student_t"
     degrees_of_freedom: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
     """ν, above 2: the fewer, the heavier the tails; many are Gaussian."""
+
+    def noise(self) -> tuple[str, Any]:
+        """Return Student's t, see `SimilaritySettings.noise`."""
+        return f"Student’s t with ν = {self.degrees_of_freedom:g}", stats.t(self.degrees_of_freedom)
 
     def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> StudentTNoise:
         """Make the similarity at these points; see `AnySimilarity`."""

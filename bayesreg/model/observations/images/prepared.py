@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
-from scipy import stats
 
 from bayesreg.image import Image
 from bayesreg.interpolation import Interpolator
@@ -24,7 +23,7 @@ from bayesreg.model.observations.images.intensity_map import SHARE, shading_basi
 from bayesreg.model.observations.images.likelihood import ComparedImages, Comparison, shading_name
 from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.model.observations.images.points import quadrature_of, require_overlap, seen_points, visibility
-from bayesreg.model.observations.images.pointwise import Intensities, StudentT
+from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.model.observations.images.self_similarity import AlternatingImages, describe_self_similarity
 from bayesreg.model.observations.observation import Placed, Recorded
 from bayesreg.model.state import State
@@ -145,12 +144,12 @@ class PreparedPair:
 
         "noise_sd" is the sd that T_s implies at a point of average weight; "residual_sd" is that of the residual.
         "residual_to_noise" is the ratio of the residual to the noise that T_s implies: a ratio of sds, or of medians
-        with Student's t, since a few outliers with small weights would dominate the sd.
+        with heavy tails, since a few outliers with small weights would dominate the sd.
         """
         z = np.asarray(term.scaled_residual(state.u, state.values))
         similarity = self.options.similarity
-        if isinstance(similarity, StudentT):
-            ratio = np.median(np.abs(z)) / stats.t(similarity.degrees_of_freedom).ppf(0.75)
+        if similarity.has_heavy_tails:
+            ratio = np.median(np.abs(z)) / similarity.noise()[1].ppf(0.75)
         else:
             ratio = np.std(z) / np.sqrt(term.similarity.variance())
         return {

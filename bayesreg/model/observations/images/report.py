@@ -7,9 +7,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from bayesreg.model.observations.images.discrepancies import DISCREPANCIES
+from bayesreg.model.observations.images.similarity import SIMILARITIES
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
 from bayesreg.printable import number
 from bayesreg.tissues import colours_of, label_of
@@ -36,10 +36,8 @@ class ExpectedNoise(NamedTuple):
 
 def noise_of(similarity: Mapping[str, Any]) -> ExpectedNoise:
     """Return the noise of a similarity, given by its settings, in units of the scale √(T_s / 2w)."""
-    if similarity["kind"] == "student_t":
-        nu = float(similarity["degrees_of_freedom"])
-        return ExpectedNoise(f"Student’s t with ν = {nu:g}", stats.t(nu).pdf, float(2 * stats.t.sf(3, nu)))
-    return ExpectedNoise("standard Normal", stats.norm.pdf, float(2 * stats.norm.sf(3)))
+    name, distribution = SIMILARITIES[similarity["kind"]](**similarity).noise()
+    return ExpectedNoise(name, distribution.pdf, float(2 * distribution.sf(3)))
 
 
 def check_table(name: str, summary: Arrays) -> ReportTable:
