@@ -117,7 +117,7 @@ def labels_everywhere(tissue: Image, names: Sequence[str]) -> Image:
 
 
 def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X Y Z"]:
-    """Return the main connected part of a mask, without parts below 1 % of it.
+    """Return the main connected part of a mask; remove parts below 1 % of the mask.
 
     Raise MeshError if the mask is empty or has several large parts.
     """

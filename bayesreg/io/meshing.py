@@ -59,7 +59,7 @@ class MeshOptions:
     skull_gap : float
         Least distance of the boundary nodes from the outside of the intracranial mask, mm.
     closing : float
-        Radius of the closing that makes the hull if the tissues include a fluid, mm.
+        Radius of the ball that closes the solid tissues to a hull, mm; used only if a tissue is a fluid.
     stop_energy : float
         Quality at which fTetWild may stop (AMIPS energy, 3 at best). Half this value takes several times as long.
     threads : int

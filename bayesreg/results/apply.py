@@ -131,7 +131,7 @@ def apply(
     transform = transform.inverse if inverse else transform
     _log.info("%s", _describe(transform))
     if len(transform.draws) < FEW_DRAWS:
-        _log.warning("%d draws tell little of how sure this is; %d are few", len(transform.draws), FEW_DRAWS)
+        _log.warning("%d draws give a rough uncertainty; %d are few", len(transform.draws), FEW_DRAWS)
     return [path for task in tasks for path in task(transform)]
 
 
@@ -208,7 +208,7 @@ class _How(NamedTuple):
         then = "the displacement goes on harmonically" if self.around == "harmonic" else "no place is given"
         count = f"{int((~inside).sum()):,} of {len(inside):,}"
         _log.info(
-            "%s %s lie around the mesh, where nothing is known: %s, and how sure it is is not told", count, noun, then
+            "%s %s lie around the mesh, where nothing is known: %s; no uncertainty is given", count, noun, then
         )
 
 

@@ -61,7 +61,7 @@ class Result:
 
     @property
     def pose(self) -> Motion | None:
-        """The rigid part of the displacement, including the pose from before sampling, for some draws of every chain.
+        """The rigid part of some draws of every chain; it includes the pose that was found before sampling.
 
         It has the translation of the mesh's centre, mm, and the rotation vector about the centre, degrees, each
         (chains, draws, 3). None for a run of a version that did not store it.

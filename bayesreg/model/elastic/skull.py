@@ -1,4 +1,4 @@
-"""The skull constraint: no sampled node lies in the forbidden region Ω_SK (hard), or none lies deep in it (soft)."""
+"""The skull. Hard: no sampled node lies in the region Ω_SK. Soft: a penalty grows with the depth in it."""
 
 from __future__ import annotations
 
