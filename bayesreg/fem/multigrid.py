@@ -28,8 +28,8 @@ DEGREE = 2
 # Two nodes are strongly connected if their block of the matrix has at least this norm, relative to the geometric mean
 # of the norms of their diagonal blocks. Only strong connections put nodes into one aggregate.
 STRENGTH = 0.08
-# K_II counts as singular if the least eigenvalue of the coarsest matrix, scaled to a unit diagonal, is at most this. The
-# coarsest level represents rigid motions exactly up to rounding, so it shows whether K_II resists them.
+# K_II counts as singular if the least eigenvalue of the coarsest matrix, scaled to a unit diagonal, is at most this.
+# The coarsest level represents rigid motions exactly up to rounding, so it shows whether K_II resists them.
 SINGULAR_BELOW = 1e-13
 
 

@@ -207,9 +207,7 @@ class _How(NamedTuple):
             return
         then = "the displacement goes on harmonically" if self.around == "harmonic" else "no place is given"
         count = f"{int((~inside).sum()):,} of {len(inside):,}"
-        _log.info(
-            "%s %s lie around the mesh, where nothing is known: %s; no uncertainty is given", count, noun, then
-        )
+        _log.info("%s %s lie around the mesh, where nothing is known: %s; no uncertainty is given", count, noun, then)
 
 
 def _describe(transform: Transform) -> str:
