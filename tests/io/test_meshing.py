@@ -81,7 +81,7 @@ class TestBuildMesh:
         monkeypatch.setattr(meshing, "tetrahedralize", sometimes)
         again = build_mesh(*phantom, OPTIONS)
         np.testing.assert_array_equal(again.points, mesh.points)
-        assert "mesh 1 of at most 3 is not sound: no luck" in caplog.text
+        assert "mesh 1 of at most 3 failed its check: no luck" in caplog.text
 
     def test_takes_a_region_made_already(self, phantom, mesh, monkeypatch):
         domain = mesh_domain(*phantom)
