@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
 
@@ -32,20 +34,9 @@ class Info(NamedTuple):
     densities: AnyArray
 
 
-def together(infos: Info) -> Info:
-    """Summarise the stacked reports of several transitions in one.
-
-    Rates are averaged and costs are added. A flag is set if it is set for at least one of the transitions.
-    """
-    return Info(
-        acceptance_rate=infos.acceptance_rate.mean(),
-        outside_support=infos.outside_support.any(),
-        solver_failed=infos.solver_failed.any(),
-        solver_iterations=infos.solver_iterations.sum(),
-        diverging=infos.diverging.any(),
-        gradients=infos.gradients.sum(),
-        densities=infos.densities.sum(),
-    )
+def joined(first: Info, second: Info) -> Info:
+    """Join the reports of two transitions: rates and costs are added, and a flag is set if one of both is set."""
+    return jax.tree.map(lambda a, b: a | b if a.dtype == bool else a + b, first, second)
 
 
 class Draw(NamedTuple):

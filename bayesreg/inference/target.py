@@ -125,6 +125,10 @@ class ModeSearch(Protocol):
         """
 
     @property
+    def separable(self) -> Sequence[str]:
+        """The names of hyperparameters on which, at a fixed "u_boundary", only `quadratic_part` depends."""
+
+    @property
     def search_start(self) -> Estimands | None:
         """Estimands near the mode, where the search begins; None if it begins where the chains start."""
 

@@ -57,6 +57,15 @@ class ModeSearch:
             names += [name for name in LAME if len(self.data.blocks[name].free.index) <= FEW_ENTRIES]
         return tuple(name for name in names if name in self.data.blocks and self.data.blocks[name].is_sampled)
 
+    @property
+    def separable(self) -> tuple[str, ...]:
+        """The hyperparameters on which the images do not depend at fixed sampled displacements.
+
+        λ and μ are among them if every node is sampled; else nodes follow the sampled ones as λ and μ have it.
+        """
+        has_followers = len(self.data.body.system.free) > 0
+        return tuple(name for name in self.hyperparameters if not (has_followers and name in LAME))
+
     def continuation(self) -> Iterator[Problem]:
         """Yield problems of growing difficulty that lead to this one, in the displacements; none after an approach."""
         if self.search_start is not None:

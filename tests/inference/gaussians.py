@@ -65,6 +65,7 @@ class ModeSearch:
         self.data = data
 
     hyperparameters = ()
+    separable = ()
     search_start = tempering = None
 
     def continuation(self):

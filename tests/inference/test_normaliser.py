@@ -16,6 +16,7 @@ from bayesreg.inference.chains.initialise import starting_points
 from bayesreg.inference.gaussian.density import log_normaliser_at, mark_normaliser
 from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.normaliser import (
+    ACCURATE,
     REACH,
     TOGETHER,
     Delayed,
@@ -26,7 +27,7 @@ from bayesreg.inference.gaussian.normaliser import (
     smooth_coordinates,
 )
 from bayesreg.inference.gaussian.whitened import setup_about
-from bayesreg.inference.kernel import Info, together
+from bayesreg.inference.kernel import Info, joined
 from bayesreg.inference.layout import slices
 from bayesreg.inference.samplers.hamiltonian import hmc
 from bayesreg.inference.samplers.settings import Hmc
@@ -112,7 +113,7 @@ def test_many_parameters_have_a_stand_in_of_lower_degree(monkeypatch):
     assert approximate == pytest.approx(true, rel=0.02)
 
 
-def log_normaliser(data, flat):
+def log_normaliser(data, setup, flat):
     return 1.5 * jnp.sin(2 * flat[0])
 
 
@@ -120,7 +121,7 @@ def log_normaliser(data, flat):
 def test_draws_are_of_the_density_with_the_normaliser(coefficients):
     """Whatever the stand-in: against sums over a grid."""
     factors = jnp.array([[0, 0], [0, 1], [1, 1]])
-    approximate = StandIn(jnp.zeros(1), jnp.ones(1), jnp.array(5.0), factors, jnp.array(coefficients))
+    approximate = StandIn(jnp.zeros(1), jnp.ones(1), jnp.array(5.0), factors, jnp.array(coefficients), jnp.array(1.0))
     kernel = blackjax.additive_step_random_walk(
         lambda x: -0.5 * (x @ x) + approximate(x), blackjax.mcmc.random_walk.normal(jnp.array([1.5]))
     )
@@ -133,11 +134,13 @@ def test_draws_are_of_the_density_with_the_normaliser(coefficients):
     def stand_in(data, setup, flat):
         return approximate(flat)
 
-    whole_step = delay_acceptance(step, lambda setup, state: state.position, log_normaliser, stand_in)
+    whole_step = delay_acceptance(
+        step, lambda setup, state: state.position, log_normaliser, stand_in, lambda setup: approximate.is_accurate
+    )
 
     def chain(key):
         first = kernel.init(jnp.zeros(1))
-        state = Delayed(first, log_normaliser(None, jnp.zeros(1)))
+        state = Delayed(first, log_normaliser(None, None, jnp.zeros(1)))
         _, positions = jax.lax.scan(
             lambda state, key: (lambda new: (new, new.kernel.position[0]))(whole_step(None, None, key, state)[0]),
             state,
@@ -156,14 +159,19 @@ def test_draws_are_of_the_density_with_the_normaliser(coefficients):
         assert error < 0.03
 
 
-def test_a_chain_knows_the_whole_density_where_it_stands():
+@pytest.mark.parametrize(("error", "steps"), [(1.0, TOGETHER), (0.0, 1)])
+def test_a_chain_knows_the_whole_density_where_it_stands(error, steps):
+    """An accurate stand-in takes the place of the normaliser, and then a step is one trajectory."""
     post = posterior()
     sampler = hmc(post.target, Hmc())
     estimands = post.estimands(post.reference())
     flat = jax.flatten_util.ravel_pytree(post.target.coordinates.unconstrain(post.data, estimands))[0]
     gaussian = Gaussian(flat, 0.05 * jnp.eye(len(flat)))
     setup = setup_about(post.target, gaussian, flat)
-    setup = setup._replace(stand_in=make_stand_in(post.target, gaussian, flat), step_size=jnp.asarray(0.3))
+    fitted = make_stand_in(post.target, gaussian, flat)
+    assert fitted.error < ACCURATE
+    stand_in = fitted._replace(error=jnp.asarray(error))
+    setup = setup._replace(stand_in=stand_in, step_size=jnp.asarray(0.3))
 
     @jax.jit
     def moved(data, setup, key):
@@ -177,11 +185,12 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 
     observed, gradients = moved(sampler.data(setup), setup, jax.random.key(0))
     # Those of trajectories of one step.
-    assert (gradients == TOGETHER).all()
+    assert (gradients == steps).all()
     expected = jax.vmap(lambda estimands: post.target.evaluate_estimands(post.data, estimands).logdensity)(
         observed.estimands
     )
-    np.testing.assert_allclose(observed.evaluation.logdensity, expected, rtol=1e-9)
+    tolerance = {"rtol": 1e-9} if error else {"rtol": 0, "atol": ACCURATE}
+    np.testing.assert_allclose(observed.evaluation.logdensity, expected, **tolerance)
     assert (observed.estimands["u_boundary"] != 0).any(axis=(1, 2)).all()
 
 
@@ -201,9 +210,10 @@ def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     assert (true - approximate).std() < 0.05
 
 
-def test_several_transitions_are_told_of_together():
-    flags, counts = jnp.array([False, True]), jnp.array([3, 4])
-    joint = together(Info(jnp.array([0.5, 1.0]), flags, ~flags, counts, flags & ~flags, counts, 0 * counts))
-    assert joint.acceptance_rate == 0.75
+def test_the_reports_of_two_transitions_are_joined():
+    rates, flags, counts = jnp.array([0.5, 1.0]), jnp.array([False, True]), jnp.array([3, 4])
+    infos = [Info(rates[k], flags[k], ~flags[k], counts[k], flags[0], counts[k], 0 * counts[k]) for k in range(2)]
+    joint = joined(*infos)
+    assert joint.acceptance_rate == 1.5
     assert (bool(joint.outside_support), bool(joint.solver_failed), bool(joint.diverging)) == (True, True, False)
     assert (int(joint.solver_iterations), int(joint.gradients), int(joint.densities)) == (7, 7, 0)

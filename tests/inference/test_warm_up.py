@@ -34,6 +34,9 @@ class Walk:
         state, info = kernel(key, state, density, setup.step_size, jnp.ones(3), setup.steps)
         return state, Moved(info.acceptance_rate)
 
+    def move_hyperparameters(self, data, setup, key, state):
+        return state
+
     def estimands(self, data, setup, state):
         return {"u_boundary": state.position}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 import pytest
@@ -10,6 +11,7 @@ from numpyro.infer.util import log_density
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.model.observations.images.pointwise import Intensities, StudentTNoise
 from bayesreg.model.program import registration
 from tests.options import image_options_of, model_of
 from tests.phantoms import LAM, MU, ball_mesh, smooth_image
@@ -84,3 +86,13 @@ def test_replicates_have_the_variance_of_the_noise(options, noise):
     assert np.ptp(sd) > 0.1 * sd.mean()
     mean_sd = np.sqrt(3.0 / (2 * weights.mean())) * noise.std()
     assert post.images.noise_sd(3.0) == pytest.approx(mean_sd)
+
+
+@pytest.mark.parametrize("nu", [2.5, 4.0, 30.0])
+def test_the_noise_of_students_t_has_scipys_distribution(nu):
+    nothing = jnp.zeros(20_000)
+    pair = Intensities(nothing, nothing, jnp.ones(20_000))
+    draws = np.asarray(StudentTNoise(nu).draw(jax.random.key(0), pair))
+    assert np.isfinite(draws).all()
+    assert stats.kstest(draws, stats.t(nu).cdf).pvalue > 0.01
+    assert abs(np.corrcoef(draws[1:], draws[:-1])[0, 1]) < 0.05

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayesreg.inference.gaussian.density import height_and_slope, log_normaliser_at
+from bayesreg.inference.gaussian.hyperparameters import move_hyperparameters
 from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, slope_at
 from bayesreg.inference.gaussian.modes import Modes, search_modes
 from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, make_stand_in
@@ -92,6 +93,16 @@ class Walk:
         )
         return state, info
 
+    def step_and_move(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
+        """Move a chain by one transition, and then its hyperparameters."""
+        key_step, key_move = jax.random.split(key)
+        state, info = self.step(data, setup, key_step, state)
+        return self.move_hyperparameters(data, setup, key_move, state), info
+
+    def move_hyperparameters(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> Any:
+        """Move hyperparameters with the displacements fixed."""
+        return move_hyperparameters(self.target, data, setup, key, state)
+
     def estimands(self, data: Any, setup: Setup, state: Any) -> dict[str, AnyArray]:
         """Compute the current estimands of a chain."""
         return estimands_of(self.target, data, whitened_position(self.target, setup.gaussian, state.position))
@@ -158,8 +169,12 @@ def about_gaussian(
 
     data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
-    # An approximate sampler does not need the exact normaliser.
-    return _with_normaliser(target, sampler) if has_costly_normaliser(target) and exact else sampler
+    # An approximate sampler needs neither the exact normaliser nor other moves.
+    if not exact:
+        return sampler
+    if has_costly_normaliser(target):
+        return _with_normaliser(target, sampler, walk)
+    return sampler._replace(step=walk.step_and_move)
 
 
 def _condition(target: Target, setup: Setup) -> Any:
@@ -184,14 +199,17 @@ def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyAr
     return tune(_condition(target, second), walk, second, points, key_tune, stage)
 
 
-def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
+def _with_normaliser(target: Target, sampler: Sampler, walk: Walk) -> Sampler:
     """Turn a sampler of the density with the stand-in into a sampler of the density with the normaliser."""
 
-    assert target.normaliser is not None
-    normaliser = target.normaliser
+    def log_normaliser(data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
+        # All chains share the setup, so that an accurate stand-in alone is computed.
+        true, approximate = partial(log_normaliser_at, target, data), partial(stand_in_at, target, data, setup)
+        return jax.lax.cond(setup.stand_in.is_accurate, approximate, true, flat)
 
     def init(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
-        return Delayed(sampler.init(data, setup, estimands), normaliser.log(data, estimands))
+        kernel = sampler.init(data, setup, estimands)
+        return Delayed(kernel, log_normaliser(data, setup, flat_of(setup, kernel)))
 
     def observe(data: Any, setup: Setup, state: Delayed) -> Draw:
         estimands, evaluation = sampler.observe(without_normaliser(target, data), setup, state.kernel)
@@ -200,8 +218,18 @@ def _with_normaliser(target: Target, sampler: Sampler) -> Sampler:
     def flat_of(setup: Setup, state: Any) -> AnyArray:
         return setup.gaussian.place(state.position)
 
-    true, approximate = partial(log_normaliser_at, target), partial(stand_in_at, target)
-    step = delay_acceptance(sampler.step, flat_of, true, approximate)
+    def step(data: Any, setup: Setup, key: AnyArray, state: Delayed) -> tuple[Delayed, Info]:
+        key_step, key_move = jax.random.split(key)
+        state, info = tested_step(data, setup, key_step, state)
+        kernel = walk.move_hyperparameters(data, setup, key_move, state.kernel)
+        # Without an accurate stand-in the parameters of the normaliser do not move.
+        moved = stand_in_at(target, data, setup, flat_of(setup, kernel))
+        return Delayed(kernel, jnp.where(setup.stand_in.is_accurate, moved, state.log_normaliser)), info
+
+    approximate = partial(stand_in_at, target)
+    tested_step = delay_acceptance(
+        sampler.step, flat_of, log_normaliser, approximate, lambda setup: setup.stand_in.is_accurate
+    )
     return sampler._replace(init=init, step=step, observe=observe)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -43,6 +44,10 @@ class Gaussian(NamedTuple):
     def place(self, xi: AnyArray) -> AnyArray:
         """Map whitened coordinates ξ to a flat position."""
         return self.centre + self.factor @ xi
+
+    def whiten(self, change: AnyArray) -> AnyArray:
+        """Map a change of the flat position to the change of the whitened coordinates."""
+        return jax.scipy.linalg.solve_triangular(self.factor, change, lower=False)
 
 
 def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Gaussian:
@@ -92,13 +97,14 @@ def _add_convexly(
     """Add a curvature to a positive definite one, and make the sum positive definite.
 
     In coordinates that whiten the first, eigenvalues of the sum are replaced by their absolute values, and by
-    `LEAST_RATIO` if these are smaller.
+    `LEAST_RATIO` if these are smaller. Only eigenvalues below `LEAST_RATIO` are computed; there are few or none.
     """
     lower = np.linalg.cholesky(approximate)
     half = scipy.linalg.solve_triangular(lower, remainder, lower=True)
-    values, vectors = np.linalg.eigh(scipy.linalg.solve_triangular(lower, half.T, lower=True))
+    whitened = scipy.linalg.solve_triangular(lower, half.T, lower=True)
+    values, vectors = scipy.linalg.eigh(whitened, subset_by_value=(-np.inf, LEAST_RATIO - 1))
     vectors = lower @ vectors
-    return (vectors * np.maximum(np.abs(1 + values), LEAST_RATIO)) @ vectors.T
+    return approximate + remainder + (vectors * (np.maximum(np.abs(1 + values), LEAST_RATIO) - 1 - values)) @ vectors.T
 
 
 def gaussian_of(

@@ -4,7 +4,8 @@ The normaliser of the elastic prior depends on the parameters only, and is a smo
 kernel that is reversible for the density with the stand-in makes a proposal. The proposal is accepted with the ratio of
 the normaliser to the stand-in at the proposal, divided by the same ratio at the current state. This is exact (the
 surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005). A test of several transitions at once
-is exact, too, because repeated transitions of a reversible kernel are reversible; they cost one normaliser together.
+is exact, too, because repeated transitions of a reversible kernel are reversible; they cost one normaliser together. A
+stand-in that is as accurate as the elastic solves needs no test.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bayesreg.inference.gaussian.density import mark_normaliser, normaliser_and_slope
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.kernel import together
+from bayesreg.inference.kernel import Info, joined
 from bayesreg.inference.layout import dimension, unravel
 from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
@@ -37,6 +38,11 @@ REDUNDANCY = 2
 # The number of transitions that are tested at once: one normaliser costs as much as several transitions, and the test
 # seldom rejects a good stand-in.
 TOGETHER = 4
+# A stand-in with a smaller error replaces the normaliser without a test. Elastic solves cause errors of this size, too
+# (`bayesreg.model.conditioning`).
+ACCURATE = 0.02
+# The number of points at which the error is measured, and their distance from the middle, in standard deviations.
+CHECKS, CHECKED_REACH = 12, 2.5
 
 
 class StandIn(NamedTuple):
@@ -51,6 +57,8 @@ class StandIn(NamedTuple):
     factors : (terms, degree) int array
         The factors of each term: 0 stands for the number 1, and i + 1 for z_i.
     coefficients : (terms,) array
+    error : scalar
+        The greatest error at points that the fit has not used; infinite before the fit.
     """
 
     centre: Float[AnyArray, "coordinates"]
@@ -58,6 +66,7 @@ class StandIn(NamedTuple):
     reach: Scalar
     factors: Int[AnyArray, "terms degree"]
     coefficients: Float[AnyArray, "terms"]
+    error: Scalar
 
     def __call__(self, coordinates: Float[AnyArray, "coordinates"]) -> Scalar:
         """Evaluate the polynomial at smooth coordinates."""
@@ -65,6 +74,11 @@ class StandIn(NamedTuple):
         near = z * jnp.minimum(1.0, self.reach / jnp.sqrt((z**2).sum() + 1e-12))
         value, change = jax.jvp(self._polynomial, (near,), (z - near,))
         return value + change
+
+    @property
+    def is_accurate(self) -> Bool[AnyArray, ""]:
+        """Whether the stand-in can replace the normaliser without a test."""
+        return self.error < ACCURATE
 
     def _polynomial(self, z: Float[AnyArray, "coordinates"]) -> Scalar:
         return terms_of(self.factors, z) @ self.coefficients
@@ -77,7 +91,7 @@ class Delayed(NamedTuple):
     ----------
     kernel : state of the kernel
     log_normaliser : scalar
-        The logarithm of the true normaliser at the state of the chain.
+        The logarithm of the normaliser, or of an accurate stand-in, at the state of the chain.
     """
 
     kernel: Any
@@ -103,7 +117,7 @@ def no_stand_in(target: Target) -> StandIn:
     degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
     factors = np.array(list(combinations_with_replacement(range(count + 1), degree)))
     zeros, ones = jnp.zeros(count), jnp.ones(count)
-    return StandIn(zeros, ones, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)))
+    return StandIn(zeros, ones, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)), jnp.asarray(jnp.inf))
 
 
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
@@ -113,12 +127,17 @@ def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> Stand
         return stand_in
     entries, middle = np.flatnonzero(mark_normaliser(target)), np.asarray(middle)
     unit, rng = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), np.random.default_rng(0)
+
+    def position_within(reach: float) -> Float[np.ndarray, "dimension"]:
+        """Choose a position in a random direction of the parameters, at most so far from the middle."""
+        direction, position = rng.normal(size=len(entries)), np.array(middle)
+        position[entries] += unit * reach * rng.uniform() * direction / np.linalg.norm(direction)
+        return position
+
     samples = []
     # The 2 makes sure that a linear polynomial is fitted at several points, too.
     for _ in range(2 + REDUNDANCY * len(stand_in.factors) // (len(entries) + 1)):
-        direction = rng.normal(size=len(entries))
-        position = np.array(middle)
-        position[entries] += unit * REACH * rng.uniform() * direction / np.linalg.norm(direction)
+        position = position_within(REACH)
         value, slope = normaliser_and_slope(target, position)
         coordinates, change = _coordinates_and_change(target, target.data, jnp.asarray(position), jnp.asarray(entries))
         samples.append((value, unit * slope[entries], np.asarray(coordinates), np.asarray(change) * unit))
@@ -128,13 +147,19 @@ def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> Stand
     rows = [terms_of(stand_in.factors, point)[None] for point in z]
     rows += [(_slopes_of_terms(stand_in.factors, point) @ change).T for point, change in zip(z, changes, strict=True)]
     coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate([values, slopes.ravel()]))[0]
-    reach = np.linalg.norm(z, axis=1).max()
-    return stand_in._replace(
+    fitted = stand_in._replace(
         centre=jnp.asarray(centre),
         unit=jnp.asarray(spread),
-        reach=jnp.asarray(reach),
+        reach=jnp.asarray(np.linalg.norm(z, axis=1).max()),
         coefficients=jnp.asarray(coefficients),
     )
+    errors = [_error(target, fitted, position_within(CHECKED_REACH)) for _ in range(CHECKS)]
+    return fitted._replace(error=jnp.asarray(np.abs(errors).max()))
+
+
+def _error(target: Target, stand_in: StandIn, position: Float[np.ndarray, "dimension"]) -> float:
+    approximate = stand_in(smooth_coordinates(target, target.data, jnp.asarray(position)))
+    return float(approximate) - normaliser_and_slope(target, position)[0]
 
 
 _slopes_of_terms = jax.jit(jax.jacfwd(terms_of, argnums=1))
@@ -153,12 +178,15 @@ def _coordinates_and_change(
 
 
 def delay_acceptance(
-    step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Any]],
+    step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Info]],
     flat_of: Callable[[Any, Any], AnyArray],
-    log_normaliser: Callable[[Any, AnyArray], Scalar],
+    log_normaliser: Callable[[Any, Any, AnyArray], Scalar],
     stand_in: Callable[[Any, Any, AnyArray], Scalar],
-) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Any]]:
-    """Turn `TOGETHER` steps for the density with the stand-in into one step for the density with the normaliser.
+    is_accurate: Callable[[Any], Bool[AnyArray, ""]],
+) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Info]]:
+    """Turn steps for the density with the stand-in into one step for the density with the normaliser.
+
+    These are `TOGETHER` steps and a test or, with an accurate stand-in, one step without a test.
 
     Parameters
     ----------
@@ -167,26 +195,32 @@ def delay_acceptance(
     flat_of : callable
         (setup, state) → flat position.
     log_normaliser : callable
-        (data, flat position) → the logarithm of the true normaliser.
+        (data, setup, flat position) → the logarithm of the normaliser, or of an accurate stand-in.
     stand_in : callable
         (data, setup, flat position) → the value of the stand-in.
+    is_accurate : callable
+        (setup) → whether the stand-in is accurate.
     """
 
-    def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Any]:
+    def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Info]:
         key_steps, key_accept = jax.random.split(key)
+        keys = jax.random.split(key_steps, TOGETHER)
 
-        def one_step(kernel: Any, key: AnyArray) -> tuple[Any, Any]:
-            return step(data, setup, key, kernel)
+        def one_step(k: AnyArray, kernel_and_info: tuple[Any, Info]) -> tuple[Any, Info]:
+            kernel, info = step(data, setup, keys[k], kernel_and_info[0])
+            return kernel, joined(kernel_and_info[1], info)
 
-        proposed, infos = jax.lax.scan(one_step, state.kernel, jax.random.split(key_steps, TOGETHER))
-        info = together(infos)
+        blank = jax.eval_shape(lambda key: step(data, setup, key, state.kernel)[1], keys[0])
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
+        count = jnp.where(is_accurate(setup), 1, TOGETHER)
+        proposed, info = jax.lax.fori_loop(0, count, one_step, (state.kernel, nothing))
         current_flat, proposed_flat = flat_of(setup, state.kernel), flat_of(setup, proposed)
-        true = log_normaliser(data, proposed_flat)
+        true = log_normaliser(data, setup, proposed_flat)
         gain = true - state.log_normaliser - stand_in(data, setup, proposed_flat) + stand_in(data, setup, current_flat)
         probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
         accepted = jax.random.uniform(key_accept) < probability
         candidate = Delayed(proposed, true)
         next_state = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
-        return next_state, info._replace(acceptance_rate=info.acceptance_rate * probability)
+        return next_state, info._replace(acceptance_rate=info.acceptance_rate / count * probability)
 
     return whole_step

@@ -56,6 +56,9 @@ class Walking(Protocol):
     def step(self, data: Any, setup: Any, key: AnyArray, state: Any) -> tuple[Any, Info]:
         """Make one transition, as in `Sampler`."""
 
+    def move_hyperparameters(self, data: Any, setup: Any, key: AnyArray, state: Any) -> Any:
+        """Move hyperparameters with the displacements fixed."""
+
     def estimands(self, data: Any, setup: Any, state: Any) -> dict[str, AnyArray]:
         """Compute the current estimands of a chain."""
 
@@ -105,7 +108,9 @@ def _run(
     def step_chain(state: Any, size: AnyArray, key: AnyArray) -> Any:
         now = _with_step_size(tuning, setup, size)
         few = jnp.minimum(now.steps, FEW_STEPS)
-        return walk.step(data, now._replace(steps=jnp.where(per_chain, few, now.steps)), key, state)
+        key_step, key_scales = jax.random.split(key)
+        state, info = walk.step(data, now._replace(steps=jnp.where(per_chain, few, now.steps)), key_step, state)
+        return walk.move_hyperparameters(data, setup, key_scales, state), info
 
     def one_transition(carry: Any, key: AnyArray) -> Any:
         states, averaging = carry

@@ -66,7 +66,7 @@ def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray) -> Setup:
 
 def whiten(gaussian: Gaussian, flat: AnyArray) -> AnyArray:
     """Map a flat position to whitened coordinates ξ."""
-    return jax.scipy.linalg.solve_triangular(gaussian.factor, flat - gaussian.centre, lower=False)
+    return gaussian.whiten(flat - gaussian.centre)
 
 
 def whitened_position(target: Target, gaussian: Gaussian, xi: AnyArray) -> dict[str, AnyArray]:

@@ -1,0 +1,78 @@
+"""Moves of hyperparameters with the displacements fixed, besides the trajectories.
+
+Data may say only that a hyperparameter, such as the scale of surface loads, is small. In its coordinate the posterior
+then has a long flat tail, which a trajectory with the step of the other coordinates crosses as a random walk. With the
+displacements fixed, the density of such a hyperparameter does not need the images, so that several wide proposals cost
+less than one gradient. They are steps of Metropolis, and leave the posterior unchanged.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from bayesreg.inference.gaussian.whitened import Setup, stand_in_at
+from bayesreg.inference.layout import marked, unravel
+from bayesreg.inference.target import Target, has_costly_normaliser, logdensity, without_normaliser
+from bayesreg.types import AnyArray
+
+# The number of proposals after each step of the sampler. Their standard deviations, in logarithms and Normal scores,
+# are spread evenly on a logarithmic axis: the posterior of a hyperparameter may be narrow or have a long tail.
+PROPOSALS, NARROWEST, WIDEST = 8, 0.05, 5.0
+
+
+def mark_separable(target: Target) -> Bool[np.ndarray, "dimension"]:
+    """Mark the entries of a flat position that are moved with the displacements fixed."""
+    return marked(target, *(() if target.mode_search is None else target.mode_search.separable))
+
+
+def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> Any:
+    """Propose other hyperparameters with the displacements fixed.
+
+    Parameters
+    ----------
+    target : Target
+    data : pytree
+    setup : Setup
+        A stand-in for a costly normaliser must be accurate if hyperparameters in the normaliser shall move.
+    key : PRNG key
+    state : blackjax HMCState
+        Its log density and gradient are updated without another evaluation of the whole density.
+    """
+    entries = np.flatnonzero(mark_separable(target))
+    if not len(entries):
+        return state
+    assert target.mode_search is not None
+    is_costly = has_costly_normaliser(target)
+    plain = target.mode_search.quadratic_part(without_normaliser(target, data) if is_costly else data)
+    names = target.normaliser.depends_on if is_costly and target.normaliser is not None else ()
+    may_move = jnp.asarray(~marked(target, *names)) | setup.stand_in.is_accurate
+    flat = setup.gaussian.place(state.position)
+
+    def density(flat: AnyArray) -> AnyArray:
+        height = logdensity(target, plain, unravel(target)(flat))
+        return height + stand_in_at(target, plain, setup, flat) if is_costly else height
+
+    def propose(carry: tuple[AnyArray, AnyArray], key: AnyArray) -> tuple[tuple[AnyArray, AnyArray], None]:
+        flat, height = carry
+        key_entry, key_width, key_step, key_accept = jax.random.split(key, 4)
+        width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
+        entry = jax.random.choice(key_entry, jnp.asarray(entries))
+        candidate = flat.at[entry].add(width * jax.random.normal(key_step))
+        candidate_height = density(candidate)
+        accepted = jnp.log(jax.random.uniform(key_accept)) < candidate_height - height
+        accepted &= may_move[entry]
+        return (jnp.where(accepted, candidate, flat), jnp.where(accepted, candidate_height, height)), None
+
+    before, gradient_before = jax.value_and_grad(density)(flat)
+    (moved, _), _ = jax.lax.scan(propose, (flat, before), jax.random.split(key, PROPOSALS))
+    after, gradient_after = jax.value_and_grad(density)(moved)
+    return state._replace(
+        position=state.position + setup.gaussian.whiten(moved - flat),
+        logdensity=state.logdensity + after - before,
+        logdensity_grad=state.logdensity_grad + setup.gaussian.factor.T @ (gradient_after - gradient_before),
+    )
