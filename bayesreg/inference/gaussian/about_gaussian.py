@@ -202,14 +202,11 @@ def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyAr
 def _with_normaliser(target: Target, sampler: Sampler, walk: Walk) -> Sampler:
     """Turn a sampler of the density with the stand-in into a sampler of the density with the normaliser."""
 
-    def log_normaliser(data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
-        # All chains share the setup, so that an accurate stand-in alone is computed.
-        true, approximate = partial(log_normaliser_at, target, data), partial(stand_in_at, target, data, setup)
-        return jax.lax.cond(setup.stand_in.is_accurate, approximate, true, flat)
+    log_normaliser = partial(log_normaliser_at, target)
 
     def init(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
         kernel = sampler.init(data, setup, estimands)
-        return Delayed(kernel, log_normaliser(data, setup, flat_of(setup, kernel)))
+        return Delayed(kernel, log_normaliser(data, flat_of(setup, kernel)))
 
     def observe(data: Any, setup: Setup, state: Delayed) -> Draw:
         estimands, evaluation = sampler.observe(without_normaliser(target, data), setup, state.kernel)
@@ -218,18 +215,8 @@ def _with_normaliser(target: Target, sampler: Sampler, walk: Walk) -> Sampler:
     def flat_of(setup: Setup, state: Any) -> AnyArray:
         return setup.gaussian.place(state.position)
 
-    def step(data: Any, setup: Setup, key: AnyArray, state: Delayed) -> tuple[Delayed, Info]:
-        key_step, key_move = jax.random.split(key)
-        state, info = tested_step(data, setup, key_step, state)
-        kernel = walk.move_hyperparameters(data, setup, key_move, state.kernel)
-        # Without an accurate stand-in the parameters of the normaliser do not move.
-        moved = stand_in_at(target, data, setup, flat_of(setup, kernel))
-        return Delayed(kernel, jnp.where(setup.stand_in.is_accurate, moved, state.log_normaliser)), info
-
-    approximate = partial(stand_in_at, target)
-    tested_step = delay_acceptance(
-        sampler.step, flat_of, log_normaliser, approximate, lambda setup: setup.stand_in.is_accurate
-    )
+    stand_in = partial(stand_in_at, target)
+    step = delay_acceptance(walk.step, walk.move_hyperparameters, flat_of, log_normaliser, stand_in)
     return sampler._replace(init=init, step=step, observe=observe)
 
 

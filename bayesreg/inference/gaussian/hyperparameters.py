@@ -38,7 +38,6 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
     target : Target
     data : pytree
     setup : Setup
-        A stand-in for a costly normaliser must be accurate if hyperparameters in the normaliser shall move.
     key : PRNG key
     state : blackjax HMCState
         Its log density and gradient are updated without another evaluation of the whole density.
@@ -49,8 +48,6 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
     assert target.mode_search is not None
     is_costly = has_costly_normaliser(target)
     plain = target.mode_search.quadratic_part(without_normaliser(target, data) if is_costly else data)
-    names = target.normaliser.depends_on if is_costly and target.normaliser is not None else ()
-    may_move = jnp.asarray(~marked(target, *names)) | setup.stand_in.is_accurate
     flat = setup.gaussian.place(state.position)
 
     def density(flat: AnyArray) -> AnyArray:
@@ -65,7 +62,6 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
         candidate = flat.at[entry].add(width * jax.random.normal(key_step))
         candidate_height = density(candidate)
         accepted = jnp.log(jax.random.uniform(key_accept)) < candidate_height - height
-        accepted &= may_move[entry]
         return (jnp.where(accepted, candidate, flat), jnp.where(accepted, candidate_height, height)), None
 
     before, gradient_before = jax.value_and_grad(density)(flat)

@@ -3,9 +3,8 @@
 The normaliser of the elastic prior depends on the parameters only, and is a smooth function of a few coordinates. A
 kernel that is reversible for the density with the stand-in makes a proposal. The proposal is accepted with the ratio of
 the normaliser to the stand-in at the proposal, divided by the same ratio at the current state. This is exact (the
-surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005). A test of several transitions at once
-is exact, too, because repeated transitions of a reversible kernel are reversible; they cost one normaliser together. A
-stand-in that is as accurate as the elastic solves needs no test.
+surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005). Reversible kernels in a palindromic
+order are reversible together, so that one normaliser tests several transitions at once.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.density import mark_normaliser, normaliser_and_slope
 from bayesreg.inference.gaussian.laplace import Gaussian
@@ -35,14 +34,9 @@ HIGHEST_DEGREE, MOST_TERMS = 4, 150
 REACH = 5.0
 # The number of values and slopes that are computed for each coefficient.
 REDUNDANCY = 2
-# The number of transitions that are tested at once: one normaliser costs as much as several transitions, and the test
+# The number of transitions that are tested at once: one normaliser costs about as much as one transition, and the test
 # seldom rejects a good stand-in.
-TOGETHER = 4
-# A stand-in with a smaller error replaces the normaliser without a test. Elastic solves cause errors of this size, too
-# (`bayesreg.model.conditioning`).
-ACCURATE = 0.02
-# The number of points at which the error is measured, and their distance from the middle, in standard deviations.
-CHECKS, CHECKED_REACH = 12, 2.5
+TOGETHER = 2
 
 
 class StandIn(NamedTuple):
@@ -57,8 +51,6 @@ class StandIn(NamedTuple):
     factors : (terms, degree) int array
         The factors of each term: 0 stands for the number 1, and i + 1 for z_i.
     coefficients : (terms,) array
-    error : scalar
-        The greatest error at points that the fit has not used; infinite before the fit.
     """
 
     centre: Float[AnyArray, "coordinates"]
@@ -66,7 +58,6 @@ class StandIn(NamedTuple):
     reach: Scalar
     factors: Int[AnyArray, "terms degree"]
     coefficients: Float[AnyArray, "terms"]
-    error: Scalar
 
     def __call__(self, coordinates: Float[AnyArray, "coordinates"]) -> Scalar:
         """Evaluate the polynomial at smooth coordinates."""
@@ -74,11 +65,6 @@ class StandIn(NamedTuple):
         near = z * jnp.minimum(1.0, self.reach / jnp.sqrt((z**2).sum() + 1e-12))
         value, change = jax.jvp(self._polynomial, (near,), (z - near,))
         return value + change
-
-    @property
-    def is_accurate(self) -> Bool[AnyArray, ""]:
-        """Whether the stand-in can replace the normaliser without a test."""
-        return self.error < ACCURATE
 
     def _polynomial(self, z: Float[AnyArray, "coordinates"]) -> Scalar:
         return terms_of(self.factors, z) @ self.coefficients
@@ -91,7 +77,7 @@ class Delayed(NamedTuple):
     ----------
     kernel : state of the kernel
     log_normaliser : scalar
-        The logarithm of the normaliser, or of an accurate stand-in, at the state of the chain.
+        The logarithm of the normaliser at the state of the chain.
     """
 
     kernel: Any
@@ -117,7 +103,7 @@ def no_stand_in(target: Target) -> StandIn:
     degree = next((degree for degree in degrees if comb(count + degree, degree) <= MOST_TERMS), 1)
     factors = np.array(list(combinations_with_replacement(range(count + 1), degree)))
     zeros, ones = jnp.zeros(count), jnp.ones(count)
-    return StandIn(zeros, ones, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)), jnp.asarray(jnp.inf))
+    return StandIn(zeros, ones, jnp.ones(()), jnp.asarray(factors), jnp.zeros(len(factors)))
 
 
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
@@ -127,17 +113,11 @@ def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> Stand
         return stand_in
     entries, middle = np.flatnonzero(mark_normaliser(target)), np.asarray(middle)
     unit, rng = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), np.random.default_rng(0)
-
-    def position_within(reach: float) -> Float[np.ndarray, "dimension"]:
-        """Choose a position in a random direction of the parameters, at most so far from the middle."""
-        direction, position = rng.normal(size=len(entries)), np.array(middle)
-        position[entries] += unit * reach * rng.uniform() * direction / np.linalg.norm(direction)
-        return position
-
     samples = []
     # The 2 makes sure that a linear polynomial is fitted at several points, too.
     for _ in range(2 + REDUNDANCY * len(stand_in.factors) // (len(entries) + 1)):
-        position = position_within(REACH)
+        direction, position = rng.normal(size=len(entries)), np.array(middle)
+        position[entries] += unit * REACH * rng.uniform() * direction / np.linalg.norm(direction)
         value, slope = normaliser_and_slope(target, position)
         coordinates, change = _coordinates_and_change(target, target.data, jnp.asarray(position), jnp.asarray(entries))
         samples.append((value, unit * slope[entries], np.asarray(coordinates), np.asarray(change) * unit))
@@ -147,19 +127,12 @@ def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> Stand
     rows = [terms_of(stand_in.factors, point)[None] for point in z]
     rows += [(_slopes_of_terms(stand_in.factors, point) @ change).T for point, change in zip(z, changes, strict=True)]
     coefficients = np.linalg.lstsq(np.concatenate(rows), np.concatenate([values, slopes.ravel()]))[0]
-    fitted = stand_in._replace(
+    return stand_in._replace(
         centre=jnp.asarray(centre),
         unit=jnp.asarray(spread),
         reach=jnp.asarray(np.linalg.norm(z, axis=1).max()),
         coefficients=jnp.asarray(coefficients),
     )
-    errors = [_error(target, fitted, position_within(CHECKED_REACH)) for _ in range(CHECKS)]
-    return fitted._replace(error=jnp.asarray(np.abs(errors).max()))
-
-
-def _error(target: Target, stand_in: StandIn, position: Float[np.ndarray, "dimension"]) -> float:
-    approximate = stand_in(smooth_coordinates(target, target.data, jnp.asarray(position)))
-    return float(approximate) - normaliser_and_slope(target, position)[0]
 
 
 _slopes_of_terms = jax.jit(jax.jacfwd(terms_of, argnums=1))
@@ -179,48 +152,48 @@ def _coordinates_and_change(
 
 def delay_acceptance(
     step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Info]],
+    move: Callable[[Any, Any, AnyArray, Any], Any],
     flat_of: Callable[[Any, Any], AnyArray],
-    log_normaliser: Callable[[Any, Any, AnyArray], Scalar],
+    log_normaliser: Callable[[Any, AnyArray], Scalar],
     stand_in: Callable[[Any, Any, AnyArray], Scalar],
-    is_accurate: Callable[[Any], Bool[AnyArray, ""]],
 ) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Info]]:
-    """Turn steps for the density with the stand-in into one step for the density with the normaliser.
+    """Turn kernels for the density with the stand-in into one step for the density with the normaliser.
 
-    These are `TOGETHER` steps and a test or, with an accurate stand-in, one step without a test.
+    The proposal is the result of `TOGETHER` steps with a move between each two of them.
 
     Parameters
     ----------
     step : callable
         (data, setup, key, state) → (state, info); reversible.
+    move : callable
+        (data, setup, key, state) → state; reversible.
     flat_of : callable
         (setup, state) → flat position.
     log_normaliser : callable
-        (data, setup, flat position) → the logarithm of the normaliser, or of an accurate stand-in.
+        (data, flat position) → the logarithm of the normaliser.
     stand_in : callable
         (data, setup, flat position) → the value of the stand-in.
-    is_accurate : callable
-        (setup) → whether the stand-in is accurate.
     """
 
     def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Info]:
-        key_steps, key_accept = jax.random.split(key)
-        keys = jax.random.split(key_steps, TOGETHER)
+        key_steps, key_moves, key_accept = jax.random.split(key, 3)
 
         def one_step(k: AnyArray, kernel_and_info: tuple[Any, Info]) -> tuple[Any, Info]:
-            kernel, info = step(data, setup, keys[k], kernel_and_info[0])
+            kernel, info = step(data, setup, jax.random.fold_in(key_steps, k), kernel_and_info[0])
+            moved = partial(move, data, setup, jax.random.fold_in(key_moves, k))
+            kernel = jax.lax.cond(k < TOGETHER - 1, moved, lambda kernel: kernel, kernel)
             return kernel, joined(kernel_and_info[1], info)
 
-        blank = jax.eval_shape(lambda key: step(data, setup, key, state.kernel)[1], keys[0])
+        blank = jax.eval_shape(lambda key: step(data, setup, key, state.kernel)[1], key)
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
-        count = jnp.where(is_accurate(setup), 1, TOGETHER)
-        proposed, info = jax.lax.fori_loop(0, count, one_step, (state.kernel, nothing))
+        proposed, info = jax.lax.fori_loop(0, TOGETHER, one_step, (state.kernel, nothing))
         current_flat, proposed_flat = flat_of(setup, state.kernel), flat_of(setup, proposed)
-        true = log_normaliser(data, setup, proposed_flat)
+        true = log_normaliser(data, proposed_flat)
         gain = true - state.log_normaliser - stand_in(data, setup, proposed_flat) + stand_in(data, setup, current_flat)
         probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
         accepted = jax.random.uniform(key_accept) < probability
         candidate = Delayed(proposed, true)
         next_state = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
-        return next_state, info._replace(acceptance_rate=info.acceptance_rate / count * probability)
+        return next_state, info._replace(acceptance_rate=info.acceptance_rate / TOGETHER * probability)
 
     return whole_step
