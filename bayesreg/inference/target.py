@@ -154,6 +154,12 @@ class ModeSearch(Protocol):
         The nodes that follow "u_boundary" do so as they do at the estimands `near`.
         """
 
+    def quadratic_trace(self, data: Any, near: Estimands, covariance: AnyArray) -> Callable[[Estimands], float]:
+        """Make the function from estimands to tr(C R), up to a constant.
+
+        C is a covariance in the order of `curvature`, and R is the `quadratic_curvature`.
+        """
+
 
 @runtime_checkable
 class Target(Hashable, Protocol):

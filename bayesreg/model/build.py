@@ -62,6 +62,8 @@ def build_posterior(
     """
     if not isinstance(mesh, TetMesh):
         raise InputError(f"build_posterior needs a mesh: a TetMesh; got {type(mesh).__name__}")
+    if not isinstance(model, ModelConfig | None):
+        raise InputError(f"model must be a ModelConfig, got {type(model).__name__}: give bayesreg.ModelConfig(...)")
     model = model or ModelConfig()
     problem, sampled, prepared = problem_of(mesh, require_observations(observations), model, skull, reference)
     tempered = not any(

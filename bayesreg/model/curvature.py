@@ -16,10 +16,11 @@ from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
 from bayesreg.fem.preconditioners import DENSE_LIMIT, solve
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import LAME, Values
+from bayesreg.model.curvature_trace import StiffnessParts, covariance_at_points
 from bayesreg.model.external_curvature import external_curvature
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
-from bayesreg.model.term import HasCurvature, PointCurvature
+from bayesreg.model.term import ExternalTerm, HasCurvature, PointCurvature
 from bayesreg.types import AnyArray, Matrix
 
 # With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
@@ -117,33 +118,94 @@ def is_nearly_quadratic(term: object) -> bool:
     return getattr(term, "is_nearly_quadratic", True)
 
 
+def quadratic_trace(
+    problem: Problem,
+    near: Values,
+    u: Float[AnyArray, "nodes 3"],
+    covariance: Float[np.ndarray, "rows rows"],
+) -> Callable[[Values], float]:
+    """Make the function that maps values of the hyperparameters to tr(C R), up to a constant.
+
+    Parameters
+    ----------
+    problem : Problem
+    near : mapping
+        Values of all blocks; see `quadratic_curvature`, which computes R.
+    u : (n, 3) array
+        The equilibrium at `near`, mm.
+    covariance : (r, r) array
+        C, in the order of `displacement_curvature`.
+    """
+    response, parts = _Response.at(problem, near, u), _stiffness_parts(problem.body, near)
+    in_nodes, displaced = response.expand(covariance, 3 * len(u)), covariance
+    if response.modes:
+        # The priors have no curvature in the field.
+        displaced = np.array(covariance)
+        displaced[: response.modes] = displaced[:, : response.modes] = 0.0
+    elastic = problem.terms.get("elastic")
+    elastic_trace = elastic and elastic.trace(parts, response.expand(displaced, 3 * len(u)))
+    scaled = {
+        name: covariance_at_points(term.gauss_newton(u, near), in_nodes)
+        for name, term in problem.terms.items()
+        if isinstance(term, HasCurvature) and is_nearly_quadratic(term) and getattr(term, "hyperparameters", ()) != ()
+    }
+    has_external = any(isinstance(term, ExternalTerm) and term.hyperparameters for term in problem.terms.values())
+
+    def trace(values: Values) -> float:
+        total = elastic_trace(_coefficients(problem.body, values), values) if elastic_trace else 0.0
+        for name, at_points in scaled.items():
+            matrices = np.asarray(problem.terms[name].gauss_newton(u, values).matrices)
+            total += float(np.vdot(matrices, at_points))
+        if has_external:
+            total += float(external_curvature(problem, values, u).multiply(in_nodes).sum())
+        return total
+
+    return trace
+
+
+def _has_few_entries(body: Body) -> bool:
+    return int(np.asarray(body.cell_entry).max()) < FEW_ENTRIES
+
+
+def _coefficients(body: Body, values: Values) -> Float[np.ndarray, "parts"]:
+    """Return the factors φ of the matrices K_s whose sum is K."""
+    return np.concatenate([np.asarray(values[name]) for name in LAME]) if _has_few_entries(body) else np.ones(1)
+
+
 def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
     """Return K, assembled from fixed matrices if λ and μ have few entries."""
-    entries = tuple(np.asarray(body.cell_entry).tolist())
-    if body.field is not None or max(entries) >= FEW_ENTRIES:
+    if body.field is not None or not _has_few_entries(body):
         return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
-    pattern, derivatives = _stiffness_parts(body.mesh, entries)
-    K = pattern.copy()
-    K.data = derivatives @ np.concatenate([np.asarray(values[name]) for name in LAME])
+    parts = _stiffness_parts(body, values)
+    K = parts.pattern.copy()
+    K.data = parts.entries @ _coefficients(body, values)
     return K
 
 
+def _stiffness_parts(body: Body, values: Values) -> StiffnessParts:
+    """Return the fixed matrices whose sum is K: one for each λ and each μ, or K itself if these have many entries."""
+    if not _has_few_entries(body):
+        K = _stiffness(body, values)
+        return StiffnessParts(K, K.data[:, None])
+    factors = None if body.field is None else tuple(np.asarray(body.stiffness_factor(values)).tolist())
+    return _kept_stiffness_parts(body.mesh, tuple(np.asarray(body.cell_entry).tolist()), factors)
+
+
 @lru_cache(maxsize=2)
-def _stiffness_parts(
-    mesh: StaticMesh, entries: tuple[int, ...]
-) -> tuple[scipy.sparse.csr_matrix, Float[np.ndarray, "entries parameters"]]:
-    """Return a matrix with the pattern of K, and the derivatives of the entries of K in each λ and μ."""
-    owned = [np.equal(entries, entry).astype(float) for entry in range(max(entries) + 1)]
+def _kept_stiffness_parts(
+    mesh: StaticMesh, entries: tuple[int, ...], factors: tuple[float, ...] | None
+) -> StiffnessParts:
+    """Compute the derivatives of K in each λ and each μ; `factors` multiply the λ and μ of each cell."""
+    factor = np.ones(len(entries)) if factors is None else np.array(factors)
+    owned = [np.equal(entries, entry) * factor for entry in range(max(entries) + 1)]
     nothing = np.zeros(len(entries))
-    pattern = stiffness(mesh.mesh, np.ones(len(entries)), np.ones(len(entries)))
-    pattern.sort_indices()
+    # Zeros are stored, so that all derivatives have the same pattern.
     derivatives = [stiffness(mesh.mesh, indicator, nothing) for indicator in owned] + [
         stiffness(mesh.mesh, nothing, indicator) for indicator in owned
     ]
-    # All derivatives must have the same pattern, so zeros are stored.
     for derivative in derivatives:
         derivative.sort_indices()
-    return pattern, np.stack([derivative.data for derivative in derivatives], axis=1)
+    return StiffnessParts(derivatives[0], np.stack([derivative.data for derivative in derivatives], axis=1))
 
 
 class _Response(NamedTuple):
@@ -196,6 +258,19 @@ class _Response(NamedTuple):
         reduced[:, modes:] += cross.T
         reduced[modes:, modes:] += nodal[self.sampled][:, self.sampled].toarray()
         return (reduced + reduced.T) / 2
+
+    def expand(
+        self, covariance: Float[np.ndarray, "columns columns"], unknowns: int
+    ) -> Float[np.ndarray, "unknowns unknowns"]:
+        """Expand a covariance of (z, u_B) to all unknowns; those of held nodes have none."""
+        if np.array_equal(self.sampled, np.arange(unknowns)) and not self.modes:
+            return covariance
+        of_sampled = covariance[self.modes :, self.modes :]
+        cross = self.W @ covariance
+        rows, nodal = np.concatenate([self.sampled, self.free]), np.zeros((unknowns, unknowns))
+        blocks = [[of_sampled, cross[:, self.modes :].T], [cross[:, self.modes :], cross @ self.W.T]]
+        nodal[np.ix_(rows, rows)] = np.block(blocks) if len(self.free) else of_sampled
+        return nodal
 
     def place(self, curvature: Matrix) -> Float[np.ndarray, "rows rows"]:
         """Expand a curvature in u_B to (z, u_B)."""

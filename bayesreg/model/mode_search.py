@@ -8,6 +8,7 @@ from functools import reduce
 from typing import Any
 
 import jax
+import numpy as np
 from jaxtyping import Float
 
 from bayesreg.model.blocks import LAME, Values
@@ -19,6 +20,7 @@ from bayesreg.model.curvature import (
     displacement_curvature,
     is_nearly_quadratic,
     quadratic_curvature,
+    quadratic_trace,
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
@@ -97,6 +99,17 @@ class ModeSearch:
         """
         values, others = (complete(data.blocks, point) for point in (estimands, near))
         return quadratic_curvature(data, values, others, _equilibrium(data, others))
+
+    def quadratic_trace(
+        self, data: Problem, near: Values, covariance: Float[np.ndarray, "rows rows"]
+    ) -> Callable[[Values], float]:
+        """Make the function from estimands to tr(C R), up to a constant.
+
+        C is a covariance, and R is the `quadratic_curvature` with the equilibrium as at the estimands `near`.
+        """
+        near_values = complete(data.blocks, near)
+        trace = quadratic_trace(data, near_values, _equilibrium(data, near_values), covariance)
+        return lambda estimands: trace(complete(data.blocks, estimands))
 
 
 @jax.jit

@@ -9,13 +9,13 @@ import xarray as xr
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from bayesreg.report.estimands import DISPLACEMENT, MOST_VALUES
+from bayesreg.inference.draws.inference_data import DERIVED
+from bayesreg.report.estimands import MOST_VALUES
 from bayesreg.types import AnyArray
 
 # Chains belong to different groups if this many of their standard deviations separate them in several estimands.
 SEPARATION_SD = 3.0
 MIN_SEPARATED_ESTIMANDS = 3
-GROUPED_VARIABLES = (DISPLACEMENT, "lam", "mu", "t_similarity", "t_elastic", "field_sd", "field")
 
 
 class Grouping(NamedTuple):
@@ -61,14 +61,14 @@ def _renumber(label: np.ndarray) -> np.ndarray:
 def _values(posterior: xr.Dataset) -> Float[np.ndarray, "chains draws estimands"]:
     """Return all estimands as columns of one array."""
     posterior = thin(posterior)
-    draws = [posterior[name].transpose("chain", "draw", ...) for name in GROUPED_VARIABLES if name in posterior]
+    draws = [values.transpose("chain", "draw", ...) for name, values in posterior.items() if name not in DERIVED]
     flat = [values.to_numpy().reshape(*values.shape[:2], -1) for values in draws]
     return np.concatenate(flat, axis=-1).astype(float)
 
 
 def thin(posterior: xr.Dataset) -> xr.Dataset:
     """Thin the draws evenly if they would need much memory."""
-    numbers = sum(posterior[name].size for name in GROUPED_VARIABLES if name in posterior)
+    numbers = sum(values.size for name, values in posterior.items() if name not in DERIVED)
     return posterior.isel(draw=slice(None, None, max(1, numbers // MOST_VALUES)))
 
 

@@ -80,6 +80,9 @@ class ModeSearch:
     def quadratic_curvature(self, data, estimands, near):
         return np.asarray(data.precision)
 
+    def quadratic_trace(self, data, near, covariance):
+        return lambda estimands: 0.0
+
 
 class GaussianTarget:
     """N(0, covariance) of "u_boundary" before a wall that bends with y, which the x of a node should not exceed.

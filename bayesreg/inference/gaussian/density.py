@@ -80,14 +80,17 @@ def hessian_rows(
     """Compute rows of the Hessian of the log density, by finite differences of its gradient.
 
     The coordinates are Normal scores and logarithms, so that one step suits all. Exact rows would take longer to
-    compile than the search takes. The normaliser, which may be costly, is evaluated only for the rows of the entries
-    on which it depends.
+    compile than the search takes. The normaliser, which may be costly, and the images are evaluated only for the rows
+    of the entries on which they depend.
     """
-    rows, plain, normalised = [], without_normaliser(target, data), mark_normaliser(target)
+    assert target.mode_search is not None
+    plain, quadratic = without_normaliser(target, data), target.mode_search.quadratic_part(data)
+    normalised, separable = mark_normaliser(target), marked(target, *target.mode_search.separable)
+    rows = []
     for entry in entries:
         step = np.zeros(len(flat))
         step[entry] = STEP
-        row_data = data if normalised[entry] else plain
+        row_data = quadratic if separable[entry] else data if normalised[entry] else plain
         ahead, behind = (height_and_slope(target, row_data, flat + way * step)[1] for way in (1, -1))
         rows.append((ahead - behind) / (2 * STEP))
     return np.array(rows)

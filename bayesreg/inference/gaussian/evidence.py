@@ -12,8 +12,9 @@ of the evidence is that of log rest at u_0 + d, less ½ tr((A + R)⁻¹ ∂R).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +42,8 @@ FARTHEST = 3.0
 # The greatest number of iterations of a search, whose coordinates are standard deviations; the slope at which it ends;
 # and the least curvature of a hyperparameter's evidence, which is that of a prior of ±3.
 MOST_ITERATIONS, PRECISE, LEAST_CURVATURE = 10, 0.02, 0.1
+# A search ends, too, if an iteration gains less than this share of the whole gain: the next expansion changes more.
+LEAST_SHARE = 0.01
 
 
 class Expansion(NamedTuple):
@@ -106,6 +109,8 @@ def maximise_evidence(
         values, vectors = np.linalg.eigh(evidence_curvature(target, about, curvature))
         units = vectors / np.sqrt(np.maximum(np.abs(values), LEAST_CURVATURE))
     best: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
+    # Those of the start and of every iteration.
+    heights: list[float] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
         height, slope, position = evidence(target, about, flat[entries] + units @ xi)
@@ -114,14 +119,21 @@ def maximise_evidence(
             # A value that makes the line search turn back: it rises with the distance from the best point so far.
             top, _, best_xi, best_slope = best[-1]
             return -top + 2 * abs(best_slope @ (xi - best_xi)), best_slope
+        if not heights:
+            heights.append(height)
         if not best or height > best[-1][0]:
             best[:] = [(height, position, xi.copy(), slope)]
         return -height, -slope
 
+    def stop_if_settled(intermediate_result: Any) -> None:
+        heights.append(-intermediate_result.fun)
+        if heights[-1] - heights[-2] < LEAST_SHARE * (heights[-1] - heights[0]):
+            raise StopIteration
+
     reach = FARTHEST / np.abs(units).max(axis=0)
     options = {"maxiter": MOST_ITERATIONS, "ftol": 1e-12, "gtol": PRECISE}
     minimize(objective, np.zeros(len(entries)), jac=True, method="L-BFGS-B", bounds=[(-r, r) for r in reach],
-             options=options)  # fmt: skip
+             options=options, callback=stop_if_settled)  # fmt: skip
     return Found(best[-1][1], float(np.abs(best[-1][2]).max()), units)
 
 
@@ -155,7 +167,7 @@ def evidence(
     log_normaliser, push_of_normaliser = normaliser_and_slope(target, start)
     slope = height_and_slope(target, plain, start)[1]
     precision = regular(about.images + dense(_curvature(target, start, start)))
-    factor = scipy.linalg.cho_factor(precision, lower=True, check_finite=False)
+    factor = scipy.linalg.cholesky(precision, lower=True, overwrite_a=True, check_finite=False), True
     moving = is_displacement[rows]
     push = np.where(moving, (about.slope + slope)[rows], 0.0)
     # The field does not move, because the rest is not quadratic in it.
@@ -167,8 +179,8 @@ def evidence(
     height, slope = height_and_slope(target, plain, position)
     height, slope = height + log_normaliser, slope + push_of_normaliser
     gain = about.slope @ (position - about.flat) - step @ (about.images @ step) / 2
-    covariance, _ = scipy.linalg.lapack.dpotri(factor[0], lower=1)
-    traces = [trace(covariance, first) for first in slopes_of_curvature(target, start, about.entries)]
+    trace_at = _trace_function(target, start, _inverse(factor[0]))
+    traces = [(trace_at({k: STEP}) - trace_at({k: -STEP})) / (2 * STEP) for k in about.entries.tolist()]
     log_det = 2 * np.log(np.diag(factor[0])).sum()
     return (
         float(gain + height - log_det / 2),
@@ -207,11 +219,9 @@ def volume_at(
 ) -> Volume:
     """Expand −½ log det H in the hyperparameters, where H is the curvature in "field" and "u_boundary"."""
     entries = np.flatnonzero(mark_hyperparameters(target)).tolist()
-    covariance = _inverse(scipy.linalg.cho_factor(curvature, lower=True)[0])
-
-    def trace_at(steps: dict[int, float]) -> float:
-        return trace(covariance, _curvature(target, _moved(flat, steps), flat))
-
+    lower = scipy.linalg.cholesky(curvature, lower=True)
+    covariance = _inverse(lower)
+    trace_at = _trace_function(target, flat, covariance)
     centre_trace = trace_at({})
     alone = {(k, way): trace_at({k: way * STEP}) for k in entries for way in (1, -1)}
     traces = np.zeros((len(entries), len(entries)))
@@ -221,23 +231,25 @@ def volume_at(
             both = trace_at({k: STEP, other_entry: STEP}) + trace_at({k: -STEP, other_entry: -STEP})
             alone_sum = sum(alone[entry, way] for entry in (k, other_entry) for way in (1, -1))
             traces[row, column] = traces[column, row] = (both - alone_sum + 2 * centre_trace) / 2
-    return Volume(covariance, traces / STEP**2, partial(slopes_of_curvature, target, flat, np.array(entries)))
+    return Volume(lower, covariance, traces / STEP**2, partial(slopes_of_curvature, target, flat, np.array(entries)))
 
 
 def _inverse(lower: Float[np.ndarray, "rows rows"]) -> Float[np.ndarray, "rows rows"]:
-    """Compute the inverse of a matrix from its lower Cholesky factor."""
+    """Compute the inverse of a matrix from its lower Cholesky factor, which is zero above the diagonal."""
     inverse, _ = scipy.linalg.lapack.dpotri(lower, lower=1)
-    return np.tril(inverse) + np.tril(inverse, -1).T
+    whole = inverse + inverse.T
+    whole[np.diag_indices(len(whole))] /= 2
+    return whole
 
 
-def trace(covariance: Float[np.ndarray, "rows rows"], matrix: Matrix) -> float:
-    """Compute tr(C M) of two symmetric matrices; only the lower triangle of C is used."""
-    if scipy.sparse.issparse(matrix):
-        entries = scipy.sparse.tril(matrix, format="coo")
-        below = float(covariance[entries.row, entries.col] @ entries.data)
-    else:
-        below = float(np.vdot(np.tril(covariance), matrix))
-    return 2 * below - float(covariance.diagonal() @ matrix.diagonal())
+def _trace_function(
+    target: Target, flat: Float[np.ndarray, "dimension"], covariance: Float[np.ndarray, "rows rows"]
+) -> Callable[[dict[int, float]], float]:
+    """Make the function that maps steps of some entries of a flat position to tr(C R), up to a constant."""
+    assert target.mode_search is not None
+    data = target.mode_search.quadratic_part(target.data)
+    trace = target.mode_search.quadratic_trace(data, estimands_at(target, data, jnp.asarray(flat)), covariance)
+    return lambda steps: trace(estimands_at(target, data, jnp.asarray(_moved(flat, steps))))
 
 
 def dense(matrix: Matrix) -> Float[np.ndarray, "rows rows"]:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
+import scipy.linalg
 from jaxtyping import Bool, Float
 
 from bayesreg.inference.layout import Placed, marked
@@ -33,6 +33,8 @@ from bayesreg.types import Matrix
 
 SCALE, COMPONENTS = "field_sd", "field"
 _MOST = 1.0
+# The number of random directions for the traces of products of matrices; they only define coordinates.
+DIRECTIONS = 64
 
 
 def mark_scales(target: Target) -> Bool[np.ndarray, "dimension"]:
@@ -83,6 +85,8 @@ class Volume:
 
     Attributes
     ----------
+    lower : (r, r) array
+        The Cholesky factor L of H = L Lᵀ; its upper triangle is not used.
     covariance : (r, r) array
         C = H⁻¹.
     second_traces : (k, k) array
@@ -91,6 +95,7 @@ class Volume:
         () → H_k of every hyperparameter, dense or sparse; a function because only `curvature` needs them.
     """
 
+    lower: Float[np.ndarray, "rows rows"]
     covariance: Float[np.ndarray, "rows rows"]
     second_traces: Float[np.ndarray, "hyperparameters hyperparameters"]
     slopes: Callable[[], Sequence[Matrix]]
@@ -102,14 +107,15 @@ class Volume:
 
     @cached_property
     def curvature(self) -> Float[np.ndarray, "hyperparameters hyperparameters"]:
-        """Minus the second derivatives of −½ log det H in θ."""
-        # Dense products are faster: the sparse matrices have too many entries.
-        shares = [
-            (slope.toarray() if scipy.sparse.issparse(slope) else slope) @ self.covariance for slope in self.slopes()
-        ]
-        squares = np.zeros(self.second_traces.shape)
-        for row, share in enumerate(shares):
-            turned = np.ascontiguousarray(share.T)
-            for column, other_share in enumerate(shares[: row + 1]):
-                squares[row, column] = squares[column, row] = np.vdot(turned, other_share)
+        """Minus the second derivatives of −½ log det H in θ.
+
+        tr(C H_k C H_l) = tr(V_kᵀ V_l) with V_k = L⁻¹ H_k L⁻ᵀ. It is estimated by the images V_k Z of some random
+        orthogonal directions Z (Hutchinson 1989); a matrix of few rows has them all, and the result is exact.
+        """
+        rows = len(self.lower)
+        normal = np.random.default_rng(0).normal(size=(rows, min(rows, DIRECTIONS)))
+        directions = np.linalg.qr(normal)[0] * np.sqrt(rows / normal.shape[1])
+        pulled = scipy.linalg.solve_triangular(self.lower, directions, lower=True, trans="T")
+        images = [scipy.linalg.solve_triangular(self.lower, slope @ pulled, lower=True) for slope in self.slopes()]
+        squares = np.array([[np.vdot(image, other_image) for other_image in images] for image in images])
         return (self.second_traces - squares) / 2

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 from pydantic import Field, StrictBool, model_validator
 
@@ -12,6 +14,7 @@ from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
 from bayesreg.fem.elements import Elements
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
+from bayesreg.model.curvature_trace import StiffnessParts
 from bayesreg.model.state import State
 from bayesreg.settings import KnownOrInferred, Section, Vector, is_inferred, wrong
 from bayesreg.types import AnyArray, Matrix, Scalar
@@ -109,3 +112,10 @@ class BoltzmannTerm(NamedTuple):
     def curvature(self, stiffness: Matrix, values: Values) -> Matrix:
         """Return S / T_r, 1/mm², where S is the Schur complement of the stiffness in the sampled nodes."""
         return stiffness / float(values["t_elastic"])
+
+    def trace(
+        self, parts: StiffnessParts, covariance: Float[np.ndarray, "unknowns unknowns"]
+    ) -> Callable[[Float[np.ndarray, "parts"], Values], float]:
+        """Make the function (φ, values) → tr(C K / T_r), where φ multiplies the parts of K."""
+        form = parts.linear_form(covariance)
+        return lambda coefficients, values: float(coefficients @ form / values["t_elastic"])

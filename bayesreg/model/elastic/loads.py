@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from bayesreg.fem.elasticity import internal_force, rigid_modes
 from bayesreg.fem.elements import Elements, boundary_areas
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
+from bayesreg.model.curvature_trace import StiffnessParts
 from bayesreg.model.state import State
 from bayesreg.settings import KnownOrInferred, ScalePrior, Section, Vector
 from bayesreg.types import AnyArray, Matrix, Scalar
@@ -125,3 +127,15 @@ class LoadsTerm(NamedTuple):
         """Return K D⁻¹ K, 1/mm²."""
         weights = np.repeat(1 / np.asarray(self.variances(values)), 3)
         return stiffness @ (scipy.sparse.diags(weights) @ stiffness)
+
+    def trace(
+        self, parts: StiffnessParts, covariance: Float[np.ndarray, "unknowns unknowns"]
+    ) -> Callable[[Float[np.ndarray, "parts"], Values], float]:
+        """Make the function (φ, values) → tr(C K D⁻¹ K), where φ multiplies the parts of K."""
+        forms = parts.quadratic_forms(covariance)
+
+        def trace(coefficients: Float[np.ndarray, "parts"], values: Values) -> float:
+            weighted = np.tensordot(1 / np.asarray(self.variances(values)), forms, axes=1)
+            return float(coefficients @ weighted @ coefficients)
+
+        return trace

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -85,9 +86,9 @@ class ObservationSection(Section):
         """Read the files that the section names, before any long computation; the run folder stores the arrays."""
         return {}
 
+    @abstractmethod
     def observe(self, inputs: Inputs) -> Sequence[Any]:
         """Make the observations from the arrays `inputs.observed[self.name]` and from all other inputs of the run."""
-        raise NotImplementedError
 
     # For the report: `summary` holds the arrays of the observation's method `summarise`, and those of `check_draw`
     # (chain, draw, …); `described` is the observation's entry in run.json.

@@ -85,13 +85,9 @@ def independent_scores(
     inside = np.zeros(high - low, bool)
     places = tuple((voxels - low).T)
     inside[places] = True
-    covariances = []
-    for score in scores.T:
-        field = np.zeros(inside.shape)
-        field[places] = score
-        products, pairs = _products(field, inside)
-        covariances.append(products)
-    covariance = np.sum(covariances, axis=0)
+    fields = np.zeros((scores.shape[1], *inside.shape))
+    fields[:, *places] = scores.T
+    covariance, pairs = _products(fields, inside)
     if not covariance[0, 0, 0] > 0:
         raise InputError("the residual is zero at every point: nothing tells how it is correlated")
     correlation = covariance / np.maximum(pairs, 1) / (covariance[0, 0, 0] / pairs[0, 0, 0])
@@ -105,27 +101,29 @@ def _autocorrelation(
     centred: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
 ) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
     """Compute ρ(h) and the number of pairs at every lag; zero lag comes first, negative lags last."""
-    products, pairs = _products(centred, inside)
+    products, pairs = _products(centred[None], inside)
     covariance = products / np.maximum(pairs, 1)
     return covariance / covariance[0, 0, 0], pairs
 
 
 def _products(
-    field: Float[np.ndarray, "X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
+    fields: Float[np.ndarray, "fields X Y Z"], inside: Bool[np.ndarray, "X Y Z"]
 ) -> tuple[Float[np.ndarray, "U V W"], Float[np.ndarray, "U V W"]]:
-    """Sum the products of all pairs at every lag, and count these pairs; see `_autocorrelation`."""
-    shape = [scipy.fft.next_fast_len(2 * n) for n in inside.shape]
+    """Sum the products of all pairs at every lag over some fields, and count these pairs; see `_autocorrelation`."""
+    shape = [scipy.fft.next_fast_len(2 * n, real=True) for n in inside.shape]
 
-    def products(field: np.ndarray) -> np.ndarray:
-        return scipy.fft.irfftn(np.abs(scipy.fft.rfftn(field, shape)) ** 2, shape)
+    def products(fields: np.ndarray) -> np.ndarray:
+        power = sum(np.abs(scipy.fft.rfftn(field, shape, workers=-1)) ** 2 for field in fields)
+        return scipy.fft.irfftn(power, shape, workers=-1)
 
-    return products(field), np.rint(products(inside.astype(float)))
+    return products(fields), np.rint(products(inside[None].astype(float)))
 
 
 def _lag_lengths(shape: tuple[int, ...], grid: Image) -> Float[np.ndarray, "U V W"]:
     """Compute |h| of every lag, mm."""
-    steps = np.stack(np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in shape), indexing="ij"), axis=-1)
-    return np.linalg.norm(steps @ np.asarray(grid.affine)[:3, :3].T, axis=-1)
+    steps = np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in shape), indexing="ij", sparse=True)
+    lags = np.asarray(grid.affine)[:3, :3] @ np.array(steps, dtype=object)
+    return np.sqrt(sum(lag**2 for lag in lags))
 
 
 def _first_gap(correlation: np.ndarray, pairs: np.ndarray, lags: np.ndarray, width: float) -> float:

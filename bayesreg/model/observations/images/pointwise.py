@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
@@ -64,7 +65,7 @@ class ValueCurvature(NamedTuple):
     shared: SharedCurvature | None = None
 
 
-class Pointwise:
+class Pointwise(ABC):
     """The base of these similarities; see `bayesreg.model.observations.images.similarity.Similarity`.
 
     A subclass is a pytree: it names its arrays in `arrays`, in the order of its arguments. It adds `energy`,
@@ -73,9 +74,9 @@ class Pointwise:
 
     arrays: ClassVar[tuple[str, ...]] = ()
 
+    @abstractmethod
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return E_s, a sum over the points, mm³ times squared intensity."""
-        raise NotImplementedError
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """Return the residuals f − m."""
@@ -90,13 +91,13 @@ class Pointwise:
         slope = jax.grad(lambda values: self.energy(pair._replace(moving=values), temperature))
         return ValueCurvature(jax.jvp(slope, (pair.moving,), (jnp.ones_like(pair.moving),))[1])
 
+    @abstractmethod
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return −log Z_s, a sum over the points."""
-        raise NotImplementedError
 
+    @abstractmethod
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Draw residuals from the model, in units of their scales."""
-        raise NotImplementedError
 
     def of_one_point(self: Same) -> Same:
         """Return the similarity itself: its points are independent."""
