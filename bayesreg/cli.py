@@ -32,6 +32,7 @@ from bayesreg.command_options import (
     OutFolder,
     Overrides,
     PointsFile,
+    QuickLook,
     Resume,
     Space,
     SurfaceFile,
@@ -139,6 +140,7 @@ def register(
     fixed_ignore: FixedIgnore = None,
     moving_ignore: MovingIgnore = None,
     channel: Channel = None,
+    quick: QuickLook = False,
     overrides: Overrides = None,
     resume: Resume = False,
     quiet: Quiet = False,
@@ -156,6 +158,7 @@ def register(
         moving_ignore,
         channel or (),
         overrides or (),
+        quick,
     )
     typer.echo("\n".join(understood.lines))
     _sample(understood.config, out, resume, quiet)

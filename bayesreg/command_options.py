@@ -45,6 +45,9 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override an entry, e.g. sampler.chains=4; may be repeated."),
 ]
+QuickLook = Annotated[
+    bool, typer.Option("--quick", help="Stop at Laplace's approximation, about the mode; the report says approximate.")
+]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with the run that DIR holds; a finished one needs a larger budget.")
 ]

@@ -1,5 +1,6 @@
 """Observations in a configuration: landmarks with images, on labels and on a mesh alone, to the report."""
 
+import logging
 import re
 from contextlib import nullcontext
 
@@ -103,6 +104,20 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
         assert "Distances of the landmarks" in page
         assert "Posterior predictive checks" not in page
         assert "Before and after" not in page
+
+
+def test_a_budget_that_is_spent_at_once_leaves_a_valid_folder(folder, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    stop = {"max_minutes": 1e-5, "rhat": 1.01, "ess": 400}
+    file = configuration(folder, [PAIRS], stop=stop, sampler={"name": "hmc", "chains": 2})
+    result = br.run(file, tmp_path / "out", progress=False)
+    said = {"mode: the time is spent before the search settled", "warm-up: left out, because the time is spent"}
+    assert said <= set(caplog.messages)
+    stopped = result.run.manifest["stopped"]
+    assert stopped["converged"] is False
+    assert "s of sampling" in stopped["reason"]
+    assert "Not converged" in result.report.read_text(encoding="utf-8")
+    assert br.load_result(tmp_path / "out").u_mean.shape == result.mesh.points.shape
 
 
 @pytest.mark.long

@@ -78,6 +78,13 @@ def test_options_are_set_as_in_run(register):
     assert (config.stop.max_minutes, config.image_options.similarity.kind) == (3, "lncc")
 
 
+def test_a_quick_look_ends_at_the_approximation(register):
+    result = register.call("--quick", "--set", "stop.max_steps=7")
+    config = register.calls[0][0]
+    assert (config.sampler.name, config.stop.rhat, config.stop.max_steps) == ("laplace", None, 7)
+    assert "sampler     laplace, approximate" in result.output
+
+
 def test_what_is_said_is_what_was_set(register):
     result = register.call("--labels", register.path("labels"), "--set", f"data.intracranial={register.path('mask')}",
                            "--set", "data.label_table={csf: 1, gm: [2, 3]}")  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
 
@@ -52,8 +53,9 @@ class Sampler(NamedTuple):
     Attributes
     ----------
     prepare : callable
-        (points, key) → (setup, points). It takes start points (chains as the leading axis). It returns the setup, a
-        pytree that the kernel needs besides the data and that is computed once, and the points at which chains start.
+        (points, key, deadline) → (setup, points). It takes start points (chains as the leading axis). It returns the
+        setup, a pytree that the kernel needs besides the data and that is computed once, and the points at which chains
+        start. At the `Deadline` it ends with what it has.
     data : callable
         (setup) → the data of the target that the functions below take.
     blank : callable
@@ -74,7 +76,7 @@ class Sampler(NamedTuple):
         Whether a step has many elastic solves and does not report them. The solve of the draw is counted instead.
     """
 
-    prepare: Callable[[Any, AnyArray], tuple[Any, Any]]
+    prepare: Callable[[Any, AnyArray, Deadline], tuple[Any, Any]]
     data: Callable[[Any], Any]
     blank: Callable[[], Any]
     init: Callable[[Any, Any, Estimands], Any]

@@ -17,6 +17,9 @@ from bayesreg.label_tables import TABLES, recognise_tables
 from bayesreg.tissues import ORGAN
 from bayesreg.types import InputError
 
+# These draws are independent, so that few are enough.
+QUICK = {"sampler": {"name": "laplace"}, "stop": {"rhat": None, "ess": None, "max_steps": 100}}
+
 
 class Understood(NamedTuple):
     """A configuration that was made from paths, with its description.
@@ -42,6 +45,7 @@ def understand(
     moving_ignore: Path | None = None,
     channels: Sequence[str] = (),
     overrides: Sequence[str] = (),
+    quick: bool = False,
 ) -> Understood:
     """Make the configuration of a pair in files.
 
@@ -63,6 +67,8 @@ def understand(
         Further images of the same two visits: the paths of a fixed and a moving image, with a comma between them.
     overrides : sequence of str
         As in `bayesreg.load_config`.
+    quick : bool
+        Whether the run ends at draws from Laplace's approximation.
 
     Raises
     ------
@@ -79,6 +85,8 @@ def understand(
     files = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
     sections: dict[str, Any] = {"data": {"source": "files", "label_table": chosen, **files}}
     sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
+    if quick:
+        sections |= QUICK
     config = make_config(sections, overrides)
     if any(override.startswith("data.label_table") for override in overrides):
         how = "as set"
@@ -108,6 +116,8 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
     yield f"{'contrast':<12}{contrast}; compared by {config.image_options.similarity.kind}"
     yield f"{'model':<12}preset {config.model.preset}"
+    if config.sampler.name == "laplace":
+        yield f"{'sampler':<12}laplace, approximate: independent draws of the Gaussian about the mode"
 
 
 def _channel(number: int, pair: str) -> dict[str, str]:

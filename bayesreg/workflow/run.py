@@ -25,6 +25,7 @@ from bayesreg.inference.chains.run import (
     temper_target,
 )
 from bayesreg.inference.chains.stopping import StopRule
+from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_blocks
 from bayesreg.io import checkpoints, store
@@ -127,9 +128,10 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     provenance["observations"] = _fingerprint(posterior, observations)
     provenance["sources"] = sources
     searching = time.perf_counter()
-    posterior = temper(config, inputs, posterior)
+    deadline = Deadline.after(_max_seconds(config))
+    posterior = temper(config, inputs, posterior, deadline)
     provenance["independent_points"] = posterior.independent_points
-    reached = _first(config, inputs, posterior, folder, time.perf_counter() - searching)
+    reached = _first(config, inputs, posterior, folder, deadline, time.perf_counter() - searching)
     inputs = with_initial(inputs, config)
     with folder.locked():
         if folder.stage is not None:
@@ -153,7 +155,8 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(folder.path, provenance, posterior, observations)
     # A pair that `simulate` stored is not tempered yet.
-    posterior = temper(config, inputs, posterior)
+    deadline = Deadline.after(_max_seconds(config))
+    posterior = temper(config, inputs, posterior, deadline)
     provenance["independent_points"] = posterior.independent_points
     if finished:
         checkpoints.reopen(folder, to_blocks(posterior.target, load_result(folder.path).idata, BLOCK))
@@ -161,7 +164,7 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     if stored_config.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
-    reached = _load_reached(config, inputs, posterior, folder)
+    reached = _load_reached(config, inputs, posterior, folder, deadline)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
     with folder.writing() as temporary_path:
@@ -251,12 +254,13 @@ def _describe_mesh(inputs: Inputs) -> str:
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
 
-def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
+def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadline = NEVER) -> Posterior:
     """Temper the posterior by its numbers of independent points, unless it is tempered already."""
     if posterior.tempered:
         return posterior
     _log.info("how many points are independent: where the images first lead to")
-    target = temper_target(posterior.target, config.sampler.chains, config.seed, start_of(config, inputs, posterior))
+    start = start_of(config, inputs, posterior)
+    target = temper_target(posterior.target, config.sampler.chains, config.seed, start, deadline)
     assert isinstance(target, PosteriorTarget)
     tempered = target.posterior
     for name, count in tempered.independent_points.items():
@@ -264,24 +268,33 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior) -> Posterior:
     return tempered
 
 
-def _first(config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder, seconds: float = 0.0) -> Reached:
+def _first(
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    folder: RunFolder,
+    deadline: Deadline,
+    seconds: float = 0.0,
+) -> Reached:
     """Make the state of the chains before their first step; InputError if a chain cannot start.
 
     The `seconds` that were spent before count as sampling.
     """
     options, start = config.sampler, start_of(config, inputs, posterior)
     checkpoint = first_checkpoint(
-        posterior.target, options.name, options.chains, config.seed, start, **options.settings
+        posterior.target, options.name, options.chains, config.seed, start, deadline, **options.settings
     )
     checkpoint = checkpoint._replace(seconds=checkpoint.seconds + seconds)
     return checkpoint, checkpoints.StoredBlocks(folder, 0)
 
 
-def _load_reached(config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder) -> Reached:
+def _load_reached(
+    config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder, deadline: Deadline
+) -> Reached:
     """Load the state of the chains that the interrupted run stored last."""
     state = checkpoints.load_state(folder)
     if state is None:
-        return _first(config, inputs, posterior, folder)
+        return _first(config, inputs, posterior, folder, deadline)
     blocks = checkpoints.StoredBlocks(folder, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior.target, options.name, options.chains, **options.settings), blocks
@@ -312,12 +325,16 @@ def _sample(
         config.seed,
         thin=options.thin,
         block=options.block or _block(posterior),
-        stop=StopRule(config.stop.rhat, config.stop.ess, config.stop.max_minutes and 60 * config.stop.max_minutes),
+        stop=StopRule(config.stop.rhat, config.stop.ess, _max_seconds(config)),
         progress=progress,
         resume=reached,
         on_block=keep,
         **options.settings,
     )
+
+
+def _max_seconds(config: Config) -> float | None:
+    return config.stop.max_minutes and 60 * config.stop.max_minutes
 
 
 def _require_memory(config: Config, posterior: Posterior) -> None:

@@ -34,7 +34,7 @@ def found(sampler):
     def draws(devices, order=(0, 1, 2, 3)):
         order = np.array(order)
         state, moments, tally = jax.tree.map(lambda x: x[order], (begun.state, begun.moments, begun.tally))
-        block = run_block(chosen, DRAWS, 2, devices, data, 1, order, 0, begun.setup, state, moments, tally)
+        block = run_block(chosen, DRAWS, 2, devices, data, 1, order, 0, DRAWS, begun.setup, state, moments, tally)
         jax.block_until_ready(block)
         displacements = block[-1]["u_boundary"]
         return len(displacements.sharding.device_set), np.asarray(displacements)[np.argsort(order)]

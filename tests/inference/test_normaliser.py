@@ -13,6 +13,7 @@ import pytest
 
 import bayesreg as br
 from bayesreg.inference.chains.initialise import starting_points
+from bayesreg.inference.deadline import NEVER
 from bayesreg.inference.gaussian.density import log_normaliser_at, mark_normaliser
 from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.normaliser import (
@@ -198,7 +199,7 @@ def test_a_chain_knows_the_whole_density_where_it_stands():
 def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     post = posterior()
     points = starting_points(post.target, br.Start(), 2, jax.random.key(0))
-    setup, _ = hmc(post.target, Hmc(warm_up=2)).prepare(points, jax.random.key(1))
+    setup, _ = hmc(post.target, Hmc(warm_up=2)).prepare(points, jax.random.key(1), NEVER)
     sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post.target)
     places = np.asarray(setup.middle) + sd * np.random.default_rng(0).normal(size=(10, len(sd)))
     true, approximate = (

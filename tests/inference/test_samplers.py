@@ -12,6 +12,7 @@ from scipy import stats
 
 import bayesreg as br
 from bayesreg.config.samplers import sampler_section
+from bayesreg.inference.chains import run
 from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.chains.run import checkpoint_from_arrays
 from bayesreg.inference.gaussian.laplace import Gaussian
@@ -118,6 +119,19 @@ def test_a_wrong_sign_in_the_acceptance_is_found(name, monkeypatch):
 
     monkeypatch.setattr(blackjax.mcmc.proposal, "jnp", Wrong())
     assert least_p(after_steps(name), name) < 1e-6
+
+
+def test_slow_blocks_are_drawn_in_parts(monkeypatch):
+    runs = []
+    for longest in (np.inf, 0.0):
+        monkeypatch.setattr(run, "LONGEST_CALL", longest)
+        runs.append(br.sample(target(), "hmc", draws=8, block=4, warm_up=4, progress=False))
+    whole, parts = runs
+    assert [len(block["lp"][0]) for block in whole.blocks] == [1, 3, 4]
+    assert [len(block["lp"][0]) for block in parts.blocks] == 8 * [1]
+    for name in ("u_boundary", "lp"):
+        joined = [np.concatenate([block[name] for block in samples.blocks], axis=1) for samples in (whole, parts)]
+        np.testing.assert_array_equal(*joined)
 
 
 THIN = {"rwmh": 60}

@@ -44,7 +44,7 @@ def asked(monkeypatch):
 
 def test_the_rule_holds_of_all_estimands(asked):
     checkpoint, blocks = drawn()
-    verdict = judge(RULE, checkpoint, blocks)
+    verdict = judge(RULE, checkpoint, blocks, len(blocks))
     assert verdict.holds
     assert asked == [5, 63]
     assert verdict.figures.worst == worst(blocks)
@@ -54,7 +54,7 @@ def test_the_rule_holds_of_all_estimands(asked):
 @pytest.mark.parametrize("node", [0, 17])
 def test_the_suspect_is_judged_alone(asked, node):
     checkpoint, blocks = drawn(shift=0.35, node=node)
-    verdict = judge(RULE, checkpoint, blocks)
+    verdict = judge(RULE, checkpoint, blocks, len(blocks))
     assert asked == [5]
     assert (verdict.holds, verdict.figures) == (False, None)
     # Sorted by name: the three of lam stand before it.
@@ -70,7 +70,7 @@ def test_what_no_suspect_shows_is_seen_with_all(asked):
     for block in blocks:
         block["u_boundary"][1, :, 17, 1] *= 1.5
     assert worst(blocks, np.array([3 + 3 * 17 + 1])).rhat == worst(blocks).rhat > RULE.rhat
-    verdict = judge(RULE, checkpoint, blocks)
+    verdict = judge(RULE, checkpoint, blocks, len(blocks))
     assert asked == [5, 63]
     assert not verdict.holds
     assert verdict.figures.worst == worst(blocks)
@@ -85,9 +85,9 @@ def test_nothing_is_said_of_one_chain_or_of_no_estimand():
 
 def test_what_is_far_off_is_not_judged(asked):
     checkpoint, blocks = drawn(shift=3.0)
-    assert not judge(RULE, checkpoint, blocks).holds
-    assert not judge(RULE, checkpoint._replace(draws=np.array(50)), blocks).holds
-    assert not judge(StopRule(), checkpoint, blocks).holds
+    assert not judge(RULE, checkpoint, blocks, len(blocks)).holds
+    assert not judge(RULE, checkpoint._replace(draws=np.array(50)), blocks, len(blocks)).holds
+    assert not judge(StopRule(), checkpoint, blocks, len(blocks)).holds
     assert asked == []
 
 
@@ -104,6 +104,6 @@ def test_long_runs_are_judged_when_they_have_grown(asked):
         {name: np.concatenate([b[name] for b in blocks], axis=1)[:, indices] for name in blocks[0]}
         for indices in index_groups
     ]
-    assert judge(RULE, checkpoint, many_blocks) == (False, None)
+    assert judge(RULE, checkpoint, many_blocks, len(many_blocks)) == (False, None)
     assert asked == []
     assert judge_all(RULE, checkpoint, many_blocks).holds

@@ -12,6 +12,7 @@ from bayesreg.inference.gaussian import about_gaussian
 from bayesreg.inference.gaussian.laplace import laplace
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _with_step_size, tune
 from bayesreg.inference.gaussian.whitened import Moved
+from bayesreg.types import InputError
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
 
 
@@ -52,6 +53,19 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
     # With one step for all it stands where it began, and the others pay for it.
     assert outcomes[False][1] == 9.0
     assert outcomes[False][0] < outcomes[True][0]
+
+
+class Stuck(Walk):
+    """Chains that accept nothing."""
+
+    def step(self, data, setup, key, state):
+        return state, Moved(jnp.zeros(()))
+
+
+def test_a_warm_up_that_accepts_nothing_names_the_cause():
+    starts = {"u_boundary": jnp.zeros((4, 3))}
+    with pytest.raises(InputError, match=r"accepts 0.0% of its transitions.*the pose and the mask"):
+        tune(None, Stuck(), Steps(), starts, jax.random.key(0), Tuning(20, 0.75, quarter_turns=True))
 
 
 @pytest.mark.parametrize("size", [0.011, 0.3, 0.46, 0.53, 0.79, 1.2, 1.5, 1.6, 4.0])

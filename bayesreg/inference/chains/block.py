@@ -54,23 +54,26 @@ def run_block(
     seed: AnyArray | int,
     numbers: AnyArray,
     first: AnyArray | int,
+    count: AnyArray | int,
     setup: Any,
     state: Any,
     moments: Moments,
     tally: Tally,
 ) -> tuple[Any, Moments, Tally, dict[str, AnyArray]]:
-    """Draw a block from every chain: `length` draws of `thin` steps each.
+    """Draw a block from every chain: `count` draws of `thin` steps each.
 
     Parameters
     ----------
     chosen : Chosen
     length, thin : int
+        `length` is the greatest number of draws; the code is compiled once for all counts up to it.
     devices : Mesh or None
         The devices that share the chains.
     data : pytree
         The data that the sampler takes.
     seed, numbers, first : int, (c,) int array, int
         The seed, the number of each chain, and the number of draws before this block. They determine the random keys.
+    count : int
     setup, state, moments, tally : pytrees
         As in a `Checkpoint`, before the block.
 
@@ -79,7 +82,8 @@ def run_block(
     state, moments, tally
         As in a `Checkpoint`, after the block.
     draws : dict of (c, length, ...) arrays
-        The draws. Rates and counts cover the steps between each draw and the draw before it.
+        The draws; those after the first `count` have no meaning. Rates and counts cover the steps between each draw and
+        the draw before it.
     """
     kernel = chosen.sampler
     _, key_chains = jax.random.split(jax.random.key(seed))
@@ -101,9 +105,9 @@ def run_block(
 
         observe = partial(kernel.observe, data, setup)
         if kernel.outside is None:
-            drawn = _in_step(step, observe, kernel.many_solves, length, thin, state, moments)
+            drawn = _in_step(step, observe, kernel.many_solves, length, count, thin, state, moments)
         else:
-            drawn = _at_own_pace(step, outside, observe, length, thin, state, moments)
+            drawn = _at_own_pace(step, outside, observe, length, count, thin, state, moments)
         tally = jax.tree.map(lambda before, window: before + window.sum(), tally, drawn.windows)
         return drawn.state, drawn.moments, tally, drawn.places | _statistics(drawn.windows)
 
@@ -120,26 +124,31 @@ def _in_step(
     observe: Callable[[Any], Draw],
     many_solves: bool,
     length: int,
+    count: AnyArray | int,
     thin: int,
     state: Any,
     moments: Moments,
 ) -> _Drawn:
     """Run a block in which all chains take each step at the same time."""
 
-    def one_draw(carry: tuple[Any, Moments], draw: AnyArray) -> tuple[tuple[Any, Moments], tuple[Any, Tally]]:
+    def one_draw(draw: AnyArray, drawn: _Drawn) -> _Drawn:
         def one_step(i: AnyArray | int, state_and_tally: tuple[Any, Tally]) -> tuple[Any, Tally]:
             state, info = step(draw * thin + i, state_and_tally[0])
             return state, count_step(state_and_tally[1], info)
 
-        state, moments = carry
-        state, window = jax.lax.fori_loop(0, thin, one_step, (state, no_steps()))
-        drawn = observe(state)
+        state, window = jax.lax.fori_loop(0, thin, one_step, (drawn.state, no_steps()))
+        observed = observe(state)
         if many_solves:
-            window = with_solve(window, drawn.evaluation, thin)
-        return (state, update(moments, watched_values(drawn))), (_place(drawn), window)
+            window = with_solve(window, observed.evaluation, thin)
+        places, windows = (
+            jax.tree.map(lambda rows, x: rows.at[draw].set(x), rows, row)
+            for rows, row in ((drawn.places, _place(observed)), (drawn.windows, window))
+        )
+        return _Drawn(state, update(drawn.moments, watched_values(observed)), places, windows)
 
-    (state, moments), (places, windows) = jax.lax.scan(one_draw, (state, moments), jnp.arange(length))
-    return _Drawn(state, moments, places, windows)
+    shapes = jax.eval_shape(lambda state: _place(observe(state)), state)
+    places = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
+    return jax.lax.fori_loop(0, count, one_draw, _Drawn(state, moments, places, no_steps((length,))))
 
 
 def _at_own_pace(
@@ -147,6 +156,7 @@ def _at_own_pace(
     outside: Outside,
     observe: Callable[[Any], Draw],
     length: int,
+    count: AnyArray | int,
     thin: int,
     state: Any,
     moments: Moments,
@@ -159,7 +169,7 @@ def _at_own_pace(
     """
 
     def next_taken(i: AnyArray, state: Any) -> AnyArray:
-        return jax.lax.while_loop(lambda i: (i < length * thin) & outside(i, state), lambda i: i + 1, i)
+        return jax.lax.while_loop(lambda i: (i < count * thin) & outside(i, state), lambda i: i + 1, i)
 
     def one_step(carry: tuple[AnyArray, _Drawn]) -> tuple[AnyArray, _Drawn]:
         i, (state, moments, places, windows) = carry
@@ -177,10 +187,11 @@ def _at_own_pace(
     first = next_taken(jnp.zeros((), int), state)
     moments = update(moments, watched_values(begun), first // thin)
     carry = first, _Drawn(state, moments, places, no_steps((length,)))
-    _, (state, moments, places, windows) = jax.lax.while_loop(lambda carry: carry[0] < length * thin, one_step, carry)
+    _, (state, moments, places, windows) = jax.lax.while_loop(lambda carry: carry[0] < count * thin, one_step, carry)
     latest = jax.lax.cummax(jnp.where(windows.steps > 0, jnp.arange(1, length + 1), 0))
     places = jax.tree.map(lambda rows: rows[latest], places)
-    return _Drawn(state, moments, places, with_passed_over(windows, thin - windows.steps))
+    passed_over = jnp.where(jnp.arange(length) < count, thin - windows.steps, 0)
+    return _Drawn(state, moments, places, with_passed_over(windows, passed_over))
 
 
 def _place(drawn: Draw) -> dict[str, AnyArray]:

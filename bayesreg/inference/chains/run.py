@@ -18,6 +18,7 @@ from bayesreg.inference.chains.devices import devices_for, share
 from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.chains.progress import NoProgress, Progress, SamplingProgress, Showing
 from bayesreg.inference.chains.stopping import StopRule, Verdict, judge, judge_all, out_of_time, reason
+from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.diagnostics import Convergence, Figures, figures, labelled
 from bayesreg.inference.draws.inference_data import to_inference_data
@@ -27,6 +28,9 @@ from bayesreg.inference.kernel import Draw
 from bayesreg.inference.samplers.registry import Chosen, choose_sampler
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
+
+# The time of a call that draws a part of a block, s: signals and the budget act between two calls.
+LONGEST_CALL = 10.0
 
 
 @runtime_checkable
@@ -120,7 +124,8 @@ def sample(
     thin : int
         Steps per kept draw.
     block : int
-        Kept draws between two checks of the stop rule; the device holds the draws of one block only.
+        Kept draws between two checks of the stop rule; the device holds the draws of one block only. If a block would
+        take more than `LONGEST_CALL` seconds, it is drawn and stored in parts, so that signals and the budget act soon.
     start : Start, optional
         The default starts all chains at rest, the parameters spread by 10 %.
     stop : StopRule, optional
@@ -130,7 +135,8 @@ def sample(
     resume : (Checkpoint, Blocks), optional
         The run to continue, instead of a new one from `start`; every new block is appended to its blocks.
     on_block : callable, optional
-        A function that is called after each block with its number, its draws and the checkpoint after it.
+        A function that is called after each block, or part of a block, with its number, its draws and the checkpoint
+        after it.
     **settings
         Settings of the sampler, see `bayesreg.inference.samplers.settings`.
 
@@ -150,13 +156,14 @@ def sample(
     stop = stop or StopRule()
     began = time.perf_counter()
     target = posterior.target
+    deadline = Deadline.after(stop.max_seconds)
     if resume is None:
-        target = temper_target(target, chains, seed, start)
+        target = temper_target(target, chains, seed, start, deadline)
     elif target.mode_search is not None and target.mode_search.tempering is not None:
         raise InputError("these draws are of a tempered posterior: resume them with the posterior of their samples")
     chosen = choose_sampler(sampler, target, **settings)
     if resume is None:
-        checkpoint = first_checkpoint(target, sampler, chains, seed, start, **settings)
+        checkpoint = first_checkpoint(target, sampler, chains, seed, start, deadline, **settings)
         checkpoint = checkpoint._replace(seconds=np.array(time.perf_counter() - began))
         blocks: Blocks = []
         began = time.perf_counter()
@@ -166,13 +173,13 @@ def sample(
     shown = progress if callable(progress) else SamplingProgress if progress else NoProgress
     with shown(draws, stop.max_seconds, stop.rhat) as bar:
         advance = _advance(chosen, chains, seed, thin, block, draws, checkpoint, began)
-        verdict, ended = _judge(stop, checkpoint, blocks, bar)
+        verdict, ended = _judge(stop, checkpoint, blocks, block, draws, bar)
         while not ended and (block_and_checkpoint := next(advance, None)) is not None:
             drawn, checkpoint = block_and_checkpoint
             blocks.append(drawn)
             if on_block is not None:
                 on_block(len(blocks) - 1, drawn, checkpoint)
-            verdict, ended = _judge(stop, checkpoint, blocks, bar)
+            verdict, ended = _judge(stop, checkpoint, blocks, block, draws, bar)
     return _gather_samples(target, chosen.sampler.exact, blocks, checkpoint, stop, verdict, draws)
 
 
@@ -181,11 +188,12 @@ def temper_target(
     chains: int,
     seed: int,
     start: Start | None = None,
+    deadline: Deadline = NEVER,
 ) -> Target:
     """Temper a target by its residuals if its options ask for it; `sample` draws from the result."""
     points = starting_points(target, start or Start(), chains, _start_key(seed))
     require_numbers(points)
-    return temper(target, points)
+    return temper(target, points, deadline)
 
 
 def _start_key(seed: int) -> AnyArray:
@@ -198,9 +206,12 @@ def first_checkpoint(
     chains: int,
     seed: int,
     start: Start | None = None,
+    deadline: Deadline = NEVER,
     **settings: Any,
 ) -> Checkpoint:
     """Make the checkpoint before the first draw; `sample` starts its chains there unless it resumes a run.
+
+    At the deadline the search and the warm-up end with what they have.
 
     Raises
     ------
@@ -212,7 +223,7 @@ def first_checkpoint(
     points = starting_points(target, start or Start(), chains, key_start)
     require_numbers(points)
     chosen = choose_sampler(sampler, target, **settings)
-    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1))
+    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), deadline)
     data = chosen.sampler.data(setup)
     checkpoint = _first(chosen, data, setup, points)
     require_density(_observe(chosen, data, setup, checkpoint.state).evaluation)
@@ -280,35 +291,49 @@ def _advance(
     checkpoint: Checkpoint,
     began: float,
 ) -> Iterator[tuple[Block, Checkpoint]]:
-    """Yield blocks of draws until each chain has `draws` draws."""
+    """Yield blocks of draws, or parts of blocks, until each chain has `draws` draws."""
     spent = float(checkpoint.seconds)
+    # A step of many solves may take seconds. All others are so short that whole blocks are.
+    longest = 1 if chosen.sampler.many_solves else block
     devices = devices_for(chains)
     data = chosen.sampler.data(checkpoint.setup)
     while int(checkpoint.draws) < draws:
-        length = min(block, draws - int(checkpoint.draws))
+        called = time.perf_counter()
+        count = min(longest, block - int(checkpoint.draws) % block, draws - int(checkpoint.draws))
         state, moments, tally, block_draws = run_block(
             chosen,
-            length,
+            block,
             thin,
             devices,
             data,
             seed,
             np.arange(chains),
             int(checkpoint.draws),
+            count,
             checkpoint.setup,
             *share(checkpoint[2:5], devices),
         )
-        block_draws = {name: np.asarray(value) for name, value in block_draws.items()}
+        block_draws = {name: np.asarray(value)[:, :count] for name, value in block_draws.items()}
+        # The first call includes the compilation, so that the second one may be short, too.
+        if chosen.sampler.many_solves:
+            longest = int(np.clip(count * LONGEST_CALL / (time.perf_counter() - called), 1, block))
         seconds = np.array(spent + time.perf_counter() - began)
-        drawn = np.array(int(checkpoint.draws) + length)
+        drawn = np.array(int(checkpoint.draws) + count)
         checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
         yield block_draws, checkpoint
 
 
-def _judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, bar: Progress) -> tuple[Verdict, bool]:
-    """Show the progress and judge the draws so far; return the verdict and whether the run ends."""
+def _judge(
+    stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, block: int, draws: int, bar: Progress
+) -> tuple[Verdict, bool]:
+    """Show the progress and judge the draws so far; return the verdict and whether the run ends.
+
+    Only whole blocks are judged, so that the number of draws does not depend on the speed of the machine.
+    """
     bar.show(checkpoint, scale_reduction(checkpoint.moments))
-    verdict = judge(stop, checkpoint, blocks)
+    drawn = int(checkpoint.draws)
+    is_whole = drawn % block == 0 or drawn == draws
+    verdict = judge(stop, checkpoint, blocks, -(-drawn // block)) if is_whole else Verdict(holds=False)
     return verdict, verdict.holds or out_of_time(stop, checkpoint)
 
 

@@ -49,8 +49,8 @@ class Verdict(NamedTuple):
     figures: Figures | None = None
 
 
-def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
-    """Judge all draws so far by a stop rule."""
+def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks, number: int) -> Verdict:
+    """Judge all draws so far by a stop rule; `number` checks were possible so far, this one included."""
     if stop.rhat is None or int(checkpoint.draws) < stop.min_draws:
         return Verdict(holds=False)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
@@ -59,7 +59,7 @@ def judge(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict:
         return Verdict(running < stop.rhat)
     # The running R̂ is cheap and close to the strict one. If it is far from the threshold, or if one of the suspects
     # fails, the strict R̂ of all estimands need not be computed.
-    if not running < 1 + 1.5 * (stop.rhat - 1) or not _is_due(len(blocks)):
+    if not running < 1 + 1.5 * (stop.rhat - 1) or not _is_due(number):
         return Verdict(holds=False)
     if not _meets(figures(blocks, _suspects(rhat)).worst, stop):
         return Verdict(holds=False)
@@ -73,9 +73,9 @@ def judge_all(stop: StopRule, checkpoint: Checkpoint, blocks: Blocks) -> Verdict
 
 
 def _is_due(count: int) -> bool:
-    """Check whether draws are judged after this number of blocks.
+    """Check whether draws are judged at the check of this number.
 
-    They are judged after each of the first 20 blocks, and then whenever the run is 5 % longer, because each check reads
+    They are judged at each of the first 20 checks, and then whenever the run is 5 % longer, because each check reads
     all draws. All checks of a run together read about twenty times its draws, whatever its length.
     """
     return count <= 20 or math.floor(math.log(count, LONGER)) > math.floor(math.log(count - 1, LONGER))

@@ -6,6 +6,7 @@ and the map back to the estimands are common to all of them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.gaussian.density import height_and_slope, log_normaliser_at
 from bayesreg.inference.gaussian.hyperparameters import move_hyperparameters
 from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, slope_at
@@ -43,6 +45,8 @@ from bayesreg.inference.target import (
     without_normaliser,
 )
 from bayesreg.types import AnyArray, InputError
+
+_log = logging.getLogger(__name__)
 
 # Start points have standard deviations larger than those of Laplace's approximation by this factor.
 OVERDISPERSION = 1.5
@@ -154,14 +158,14 @@ def about_gaussian(
     # The first call must be outside of a trace: inside, the target's own arrays would become constants of the program.
     unravel(target)
 
-    def prepare(points: Any, key: AnyArray) -> tuple[Setup, Any]:
-        modes = search_modes(target, points, mode_search == "per_chain")
+    def prepare(points: Any, key: AnyArray, deadline: Deadline) -> tuple[Setup, Any]:
+        modes = search_modes(target, points, mode_search == "per_chain", deadline)
         key_start, key_tune = jax.random.split(key)
         starts = _scatter_all(target, modes, jax.random.split(key_start, len(modes.chains)))
         gaussian = modes.gaussians[0]
         if tuning is None:
             return setup_about(target, gaussian, gaussian.centre), starts
-        return _warm_up(walk, tuning, np.asarray(gaussian.centre), starts, key_tune)
+        return _warm_up(walk, tuning, gaussian, starts, key_tune, deadline)
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
@@ -182,21 +186,32 @@ def _condition(target: Target, setup: Setup) -> Any:
     return target.condition(estimands_of(target, target.data, unravel(target)(setup.middle)))
 
 
-def _warm_up(walk: Walk, tuning: Tuning, mode: AnyArray, points: Any, key: AnyArray) -> tuple[Setup, Any]:
+def _warm_up(
+    walk: Walk, tuning: Tuning, gaussian: Gaussian, points: Any, key: AnyArray, deadline: Deadline
+) -> tuple[Setup, Any]:
     """Warm the chains up; return their setup and their estimands at the end.
 
     Two stages have the same length, so that they are compiled once. The second stage is whitened at the points that the
     chains reach in the first one. The first stage is whitened by the curvature at the start points, too: the curvature
-    at the mode can be so much smaller that no step is short enough for a chain to leave its start.
+    at the mode can be so much smaller that no step is short enough for a chain to leave its start. At the deadline, the
+    stages that have not begun are left out.
     """
+    if deadline.has_passed:
+        _log.warning("warm-up: left out, because the time is spent")
+        stand_in = make_stand_in(walk.target, gaussian, gaussian.centre)
+        return setup_about(walk.target, gaussian, gaussian.centre)._replace(stand_in=stand_in), points
+    mode = np.asarray(gaussian.centre)
     target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
     key_settle, key_tune = jax.random.split(key)
     first = _setup_on_average(target, mode, points)
     first = first._replace(stand_in=make_stand_in(target, first.gaussian, first.middle))
-    _, points = tune(_condition(target, first), walk, first, points, key_settle, stage, per_chain=True)
+    settled = tune(_condition(target, first), walk, first, points, key_settle, stage, per_chain=True, deadline=deadline)
+    if deadline.has_passed:
+        return settled
+    points = settled[1]
     # The stand-in is accurate far about both middles.
     second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
-    return tune(_condition(target, second), walk, second, points, key_tune, stage)
+    return tune(_condition(target, second), walk, second, points, key_tune, stage, deadline=deadline)
 
 
 def _with_normaliser(target: Target, sampler: Sampler, walk: Walk) -> Sampler:

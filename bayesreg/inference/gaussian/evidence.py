@@ -23,6 +23,7 @@ import scipy.sparse
 from jaxtyping import Float, Int
 from scipy.optimize import minimize
 
+from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.gaussian.density import (
     estimands_at,
     height_and_slope,
@@ -89,6 +90,7 @@ def maximise_evidence(
     flat: Float[np.ndarray, "dimension"],
     curvature: Float[np.ndarray, "rows rows"],
     units: Float[np.ndarray, "hyperparameters hyperparameters"] | None = None,
+    deadline: Deadline = NEVER,
 ) -> Found:
     """Look for the maximum of the evidence of the hyperparameters about a flat position.
 
@@ -102,6 +104,8 @@ def maximise_evidence(
     units : (k, k) array, optional
         The units of an earlier search near `flat`. Without them they are computed from the curvature of the evidence,
         which costs several evaluations.
+    deadline : Deadline
+        The search ends then.
     """
     entries = np.flatnonzero(mark_hyperparameters(target))
     about = _expand(target, flat, entries, curvature)
@@ -126,6 +130,7 @@ def maximise_evidence(
         return -height, -slope
 
     def stop_if_settled(intermediate_result: Any) -> None:
+        deadline.require_time()
         heights.append(-intermediate_result.fun)
         if heights[-1] - heights[-2] < LEAST_SHARE * (heights[-1] - heights[0]):
             raise StopIteration

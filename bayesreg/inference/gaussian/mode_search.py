@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
+from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.gaussian.density import (
     estimands_at,
     height_and_slope,
@@ -39,6 +40,7 @@ def find_mode(
     target: Target,
     start: Float[np.ndarray, "dimension"],
     iterations: int = 40,
+    deadline: Deadline = NEVER,
 ) -> Float[np.ndarray, "dimension"]:
     """Find a mode of the log density of the position, by L-BFGS along the target's continuation.
 
@@ -49,6 +51,8 @@ def find_mode(
         Flat position to start from.
     iterations : int
         The greatest number of iterations of a stage. The last stage is whitened and run again until it converges.
+    deadline : Deadline
+        The search ends then, and returns the best point so far.
 
     Returns
     -------
@@ -60,13 +64,14 @@ def find_mode(
     InputError
         If the density is not finite at the start.
     """
-    return settle(target, approach(target, start, iterations), iterations)
+    return settle(target, approach(target, start, iterations, deadline), iterations, deadline=deadline)
 
 
 def approach(
     target: Target,
     start: Float[np.ndarray, "dimension"],
     iterations: int = 40,
+    deadline: Deadline = NEVER,
 ) -> Float[np.ndarray, "dimension"]:
     """Move the displacements along the target's continuation.
 
@@ -77,7 +82,9 @@ def approach(
     if target.mode_search.search_start is not None:
         flat = np.asarray(flat_position(target, target.data, target.mode_search.search_start))
     for data in target.mode_search.continuation():
-        flat = _improve(target, data, flat, False, iterations, gain=ROUGH)
+        if deadline.has_passed:
+            break
+        flat = _improve(target, data, flat, False, iterations, deadline, gain=ROUGH)
     return flat
 
 
@@ -86,6 +93,7 @@ def settle(
     flat: Float[np.ndarray, "dimension"],
     iterations: int = 40,
     repeats: int = REPEATS,
+    deadline: Deadline = NEVER,
 ) -> Float[np.ndarray, "dimension"]:
     """Find the mode next to a flat position by L-BFGS on the target's own problem.
 
@@ -94,7 +102,9 @@ def settle(
     resting, before = mark_hyperparameters(target), flat
     better = Found(flat, np.inf)
     for _ in range(repeats):
-        improved = _improve(target, target.data, better.flat, True, iterations)
+        if deadline.has_passed:
+            break
+        improved = _improve(target, target.data, better.flat, True, iterations, deadline)
         balanced = balance_field(target, improved, partial(_factor, target, improved))
         shift = np.abs(balanced - before)[~resting].max()
         # Once the hyperparameters have settled, the other coordinates move too little to change them.
@@ -103,12 +113,14 @@ def settle(
         else:
             # The units are reused if the last search did not end at its bounds.
             better = _improve_hyperparameters(
-                target, balanced, better.units if better.greatest_change < FARTHEST else None
+                target, balanced, better.units if better.greatest_change < FARTHEST else None, deadline
             )
         before = balanced
         if shift < SETTLED and better.greatest_change < SETTLED_SD:
             return better.flat
-    if repeats == REPEATS:
+    if deadline.has_passed:
+        _log.warning("mode: the time is spent before the search settled")
+    elif repeats == REPEATS:
         _log.warning("mode: not settled")
     return better.flat
 
@@ -117,6 +129,7 @@ def _improve_hyperparameters(
     target: Target,
     flat: Float[np.ndarray, "dimension"],
     units: Float[np.ndarray, "hyperparameters hyperparameters"] | None,
+    deadline: Deadline,
 ) -> Found:
     """Move the hyperparameters, if there are any, to the maximum of their evidence about a flat position."""
     assert target.mode_search is not None
@@ -124,7 +137,7 @@ def _improve_hyperparameters(
         return Found(flat, 0.0)
     estimands = estimands_at(target, target.data, jnp.asarray(flat))
     curvature = target.mode_search.curvature(target.data, estimands).gauss_newton
-    maximum = maximise_evidence(target, flat, curvature, units)
+    maximum = maximise_evidence(target, flat, curvature, units, deadline)
     # The expansion is of second order, so the displacements may go too far. If that lowers the density, they stay.
     data, resting = without_normaliser(target, target.data), np.where(mark_hyperparameters(target), maximum.flat, flat)
     higher = height_and_slope(target, data, maximum.flat)[0] >= height_and_slope(target, data, resting)[0]
@@ -141,6 +154,7 @@ def _improve(
     flat: Float[np.ndarray, "dimension"],
     moves: bool,
     iterations: int,
+    deadline: Deadline,
     gain: float = FINE,
 ) -> Float[np.ndarray, "dimension"]:
     """Run L-BFGS in coordinates whitened at its start."""
@@ -171,7 +185,8 @@ def _improve(
         return value, gradient
 
     options = {"maxiter": iterations, "maxcor": 20, "ftol": gain, "gtol": 1e-2}
-    minimize(objective, np.zeros(len(flat)), jac=True, method="L-BFGS-B", options=options)
+    start = np.zeros(len(flat))
+    minimize(objective, start, jac=True, method="L-BFGS-B", options=options, callback=deadline.require_time)
     optimum, least, _ = best[-1]
     _log.info("mode: log density %.1f", log_normaliser - least)
     return np.asarray(_place(gaussian, moving * optimum))

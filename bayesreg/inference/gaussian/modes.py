@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.gaussian.laplace import Gaussian, laplace
 from bayesreg.inference.gaussian.mode_search import approach, find_mode, settle
 from bayesreg.inference.layout import flat_position, unravel
@@ -38,26 +39,29 @@ class Modes(NamedTuple):
     chains: list[int]
 
 
-def search_modes(target: Target, points: Any, each: bool) -> Modes:
+def search_modes(target: Target, points: Any, each: bool, deadline: Deadline = NEVER) -> Modes:
     """Search for modes from the start points (chains as the leading axis): one from their mean, or one from each.
 
-    One search costs as much as a short run, and searches from other starts seldom end at another mode.
+    One search costs as much as a short run, and searches from other starts seldom end at another mode. At the deadline
+    a search ends at the best point that it has.
     """
     chains = len(next(iter(points.values())))
     if not each:
-        return Modes([laplace(target, find_mode(target, _middle(target, points)))], [0] * chains)
+        return Modes([laplace(target, find_mode(target, _middle(target, points), deadline=deadline))], [0] * chains)
     modes = []
     for chain in range(chains):
         _log.info("chain %d:", chain)
-        modes.append(find_mode(target, _flat(target, jax.tree.map(lambda x, index=chain: x[index], points))))
+        start = _flat(target, jax.tree.map(lambda x, index=chain: x[index], points))
+        modes.append(find_mode(target, start, deadline=deadline))
     return report_modes(target, tell_apart(target, np.stack(modes)))
 
 
-def temper(target: Target, points: Any) -> Target:
+def temper(target: Target, points: Any, deadline: Deadline = NEVER) -> Target:
     """Temper the target near the mode found from the mean of the start points, if it is not tempered yet."""
     if target.mode_search is None or target.mode_search.tempering is None:
         return target
-    near_mode = settle(target, approach(target, _middle(target, points)), repeats=FEW)
+    near = approach(target, _middle(target, points), deadline=deadline)
+    near_mode = settle(target, near, repeats=FEW, deadline=deadline)
     return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(near_mode))))
 
 

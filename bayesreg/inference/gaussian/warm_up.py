@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from blackjax.adaptation.step_size import dual_averaging_adaptation
 
+from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.kernel import Info
 from bayesreg.inference.target import Estimands
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 
 _log = logging.getLogger(__name__)
 
@@ -21,6 +24,8 @@ FIRST_STEP = 0.05
 # The greatest number of steps of a trajectory while each chain has a step size of its own: all chains wait for the
 # slowest one.
 FEW_STEPS = 8
+# The tuning fails if the acceptance is lower than this share after this number of transitions.
+LEAST_ACCEPTANCE, ENOUGH = 0.01, 20
 
 
 class Tuning(NamedTuple):
@@ -64,8 +69,15 @@ class Walking(Protocol):
 
 
 def tune(
-    data: Any, walk: Walking, setup: Any, starts: Any, key: AnyArray, tuning: Tuning, per_chain: bool = False
-) -> tuple[Any, Any]:  # fmt: skip
+    data: Any,
+    walk: Walking,
+    setup: Any,
+    starts: Any,
+    key: AnyArray,
+    tuning: Tuning,
+    per_chain: bool = False,
+    deadline: Deadline = NEVER,
+) -> tuple[Any, Any]:
     """Tune the step size; return the setup with it, and the estimands of the chains at the end.
 
     Parameters
@@ -81,29 +93,59 @@ def tune(
         Whether each chain has a step size of its own, and trajectories have at most `FEW_STEPS` steps. A chain that
         starts where the density is steep then takes short steps until it has left that region. With one step size for
         all chains, it would not move, or would shorten the steps of the others.
+    deadline : Deadline
+        The tuning ends then, with the step size so far.
+
+    Raises
+    ------
+    InputError
+        If the chains accept (nearly) no transition.
     """
-    keys = jax.random.split(key, tuning.warm_up)
-    first = jax.vmap(partial(walk.init, data, setup))(starts)
-    points, sizes, rates = _run(walk, tuning, data, setup, first, keys, jnp.asarray(per_chain))
-    setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(rates[len(rates) // 2 :].mean())
+    states = jax.vmap(partial(walk.init, data, setup))(starts)
+    averaging = jax.vmap(_averaging(tuning)[0])(jnp.full(len(jax.tree.leaves(states)[0]), setup.step_size))
+    rates: list[float] = []
+    for key_transition in jax.random.split(key, tuning.warm_up):
+        if deadline.has_passed:
+            _log.warning("warm-up: the time is spent after %d of %d transitions", len(rates), tuning.warm_up)
+            break
+        arguments = data, setup, states, averaging, key_transition, jnp.asarray(per_chain)
+        states, averaging, rate = _transition(walk, tuning, *arguments)
+        rates.append(float(rate))
+    if not rates:
+        return setup, starts
+    points, sizes = _end(walk, tuning, data, setup, states, averaging)
+    setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(np.mean(rates[len(rates) // 2 :]))
+    if len(rates) >= ENOUGH and late < LEAST_ACCEPTANCE and not per_chain:
+        raise InputError(
+            f"the warm-up accepts {late:.1%} of its transitions, even with steps of {float(setup.step_size):.2g} "
+            "standard deviations: the search has not ended at a mode, or the density is rough about it. Most often the "
+            "images do not fit: check the pose and the mask (bayesreg check), or start from a displacement field "
+            "(start.field)"
+        )
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     _log.info("warm-up: step %.2g%s, acceptance %.0f%%", float(setup.step_size), trajectory, 100 * late)
     return setup, points
 
 
+def _averaging(tuning: Tuning) -> tuple[Callable, Callable, Callable]:
+    """Return the functions of dual averaging: begin, update and final."""
+    return dual_averaging_adaptation(tuning.acceptance)
+
+
+# One transition is one call, so that a signal and the deadline are noticed between two of them.
 @partial(jax.jit, static_argnums=(0, 1))
-def _run(
+def _transition(
     walk: Walking,
     tuning: Tuning,
     data: Any,
     setup: Any,
-    first: Any,
-    keys: AnyArray,
+    states: Any,
+    averaging: Any,
+    key: AnyArray,
     per_chain: AnyArray,
-) -> tuple[Any, AnyArray, AnyArray]:
-    """Run the transitions; return estimands and step size of each chain, and the acceptance of each transition."""
-    begin, update, final = dual_averaging_adaptation(tuning.acceptance)
-    chains = len(jax.tree.leaves(first)[0])
+) -> tuple[Any, Any, AnyArray]:
+    """Make one transition of every chain; return states, averages and the mean acceptance."""
+    update = _averaging(tuning)[1]
 
     def step_chain(state: Any, size: AnyArray, key: AnyArray) -> Any:
         now = _with_step_size(tuning, setup, size)
@@ -112,16 +154,17 @@ def _run(
         state, info = walk.step(data, now._replace(steps=jnp.where(per_chain, few, now.steps)), key_step, state)
         return walk.move_hyperparameters(data, setup, key_scales, state), info
 
-    def one_transition(carry: Any, key: AnyArray) -> Any:
-        states, averaging = carry
-        states, info = jax.vmap(step_chain)(states, jnp.exp(averaging.log_step_size), jax.random.split(key, chains))
-        rates = jnp.nan_to_num(info.acceptance_rate)
-        averaging = jax.vmap(update)(averaging, jnp.where(per_chain, rates, rates.mean()))
-        return (states, averaging), rates.mean()
+    sizes = jnp.exp(averaging.log_step_size)
+    states, info = jax.vmap(step_chain)(states, sizes, jax.random.split(key, len(sizes)))
+    rates = jnp.nan_to_num(info.acceptance_rate)
+    averaging = jax.vmap(update)(averaging, jnp.where(per_chain, rates, rates.mean()))
+    return states, averaging, rates.mean()
 
-    averaging = jax.vmap(begin)(jnp.full(chains, setup.step_size))
-    (states, averaging), rates = jax.lax.scan(one_transition, (first, averaging), keys)
-    return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(final)(averaging), rates
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _end(walk: Walking, tuning: Tuning, data: Any, setup: Any, states: Any, averaging: Any) -> tuple[Any, AnyArray]:
+    """Return the estimands and the step size of each chain after its last transition."""
+    return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(_averaging(tuning)[2])(averaging)
 
 
 def _with_step_size(tuning: Tuning, setup: Any, size: AnyArray) -> Any:

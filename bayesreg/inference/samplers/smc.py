@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
 
+from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.gaussian.rotation import rotation
 from bayesreg.inference.gaussian.whitened import Setup, whitened_density, whitened_position
 from bayesreg.inference.kernel import Sampler
@@ -38,15 +39,17 @@ def smc(target: Target, settings: Smc) -> Sampler:
     particles, spread, target_acceptance = settings.particles, settings.spread, settings.target_acceptance
     chains_of = hmc(target, Hmc(**settings.model_dump(include=set(Hmc.model_fields))))
 
-    def prepare(points: Any, key: AnyArray) -> tuple[Setup, Any]:
+    def prepare(points: Any, key: AnyArray, deadline: Deadline) -> tuple[Setup, Any]:
         chains = len(next(iter(points.values())))
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
-        setup, _ = chains_of.prepare(points, key)
+        setup, _ = chains_of.prepare(points, key, deadline)
         data = chains_of.data(setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         first = spread * jax.random.normal(key_first, (particles, len(setup.middle)))
-        tempered_particles, weights = _temper(target, data, setup, spread, first, target_acceptance, key_temper)
+        tempered_particles, weights = _temper(
+            target, data, setup, spread, first, target_acceptance, key_temper, deadline
+        )
         chosen = resampling.systematic(key_choose, weights, chains)
         positions = jax.vmap(lambda xi: whitened_position(target, setup.gaussian, xi))(tempered_particles[chosen])
         return setup, jax.vmap(partial(estimands_of, target, target.data))(positions)
@@ -62,14 +65,21 @@ def _temper(
     particles: AnyArray,
     acceptance: float,
     key: AnyArray,
+    deadline: Deadline,
 ) -> tuple[AnyArray, AnyArray]:
-    """Compute particles and weights at β = 1; the step size is adapted to the acceptance at each temperature."""
+    """Compute particles and weights at β = 1; the step size is adapted to the acceptance at each temperature.
+
+    At the deadline, β is what it is then.
+    """
     state, size = adaptive_tempered.init(particles), setup.step_size
     for number in range(_MOST):
         state, rate = _rise(target, data, setup, spread, state, size, jax.random.fold_in(key, number))
         power = float(state.tempering_param)
         if not np.isfinite(power):
             break
+        if power < 1 and deadline.has_passed:
+            _log.warning("tempering: the time is spent at a power of %.2g of the density", power)
+            return state.particles, state.weights
         if power >= 1:
             effective = 1 / float((state.weights**2).sum())
             _log.info(
