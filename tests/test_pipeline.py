@@ -24,8 +24,8 @@ from bayesreg.io.datasets import Anatomy
 from bayesreg.io.run_folder import RunFolder
 from bayesreg.model import problem
 from bayesreg.workflow import meshing, preparation
-from bayesreg.workflow import run as run_module
 from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.budget import block_length
 from bayesreg.workflow.check import check
 from bayesreg.workflow.reports import compare, report
 from bayesreg.workflow.reproduce import reproduce
@@ -286,8 +286,8 @@ def test_the_posterior_is_built_once_at_the_start_parameters(finished, folder, m
 def test_looks_at_the_stop_rule_keep_up_with_the_size_of_a_problem(finished, folder, points, draws):
     posterior = posterior_of(br.load_config(folder / "run.yaml"), store.read_inputs(RunFolder(folder / "out")))
     larger = posterior.images._replace(positions=np.ones((points, 3)))
-    assert run_module._block(replace(posterior, data=posterior.data.with_term("images", larger))) == draws
-    assert run_module._block(replace(posterior, data=posterior.data.without_term("images"))) == 100
+    assert block_length(replace(posterior, data=posterior.data.with_term("images", larger))) == draws
+    assert block_length(replace(posterior, data=posterior.data.without_term("images"))) == 100
 
 
 def test_check_estimates_without_writing(folder):

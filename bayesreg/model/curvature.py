@@ -15,16 +15,13 @@ from jaxtyping import Float, Int
 from bayesreg.fem.elasticity import element_stiffness, stiffness, unknowns_of
 from bayesreg.fem.preconditioners import DENSE_LIMIT, solve
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import LAME, Values
-from bayesreg.model.curvature_trace import StiffnessParts, covariance_at_points
+from bayesreg.model.blocks import Values
 from bayesreg.model.external_curvature import external_curvature
 from bayesreg.model.program import Problem
-from bayesreg.model.state import Body, StaticMesh
+from bayesreg.model.state import Body
+from bayesreg.model.stiffness_parts import coefficients, stiffness_of, stiffness_parts
 from bayesreg.model.term import ExternalTerm, HasCurvature, PointCurvature
 from bayesreg.types import AnyArray, Matrix
-
-# With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
-FEW_ENTRIES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +97,7 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
         The equilibrium at `near`, mm.
     """
     response = _Response.at(problem, near, u)
-    K = _stiffness(problem.body, values)
+    K = stiffness_of(problem.body, values)
     curved = (term for term in problem.terms.values() if isinstance(term, HasCurvature) and is_nearly_quadratic(term))
     observed = _sum(len(u), (term.gauss_newton(u, values) for term in curved))
     curvature = response.reduce(observed + external_curvature(problem, values, u))
@@ -111,6 +108,16 @@ def quadratic_curvature(problem: Problem, values: Values, near: Values, u: Float
     total = _dense(curvature) + response.place(_dense(prior))
     total[: response.modes, : response.modes] += np.eye(response.modes)
     return total
+
+
+def _covariance_at_points(
+    points: PointCurvature, covariance: Float[np.ndarray, "unknowns unknowns"]
+) -> Float[np.ndarray, "points 3 3"]:
+    """Compute the covariance of the displacement of each point from the covariance of all nodes."""
+    corners = 3 * np.asarray(points.nodes)[..., None] + np.arange(3)
+    between_corners = covariance[corners[:, :, :, None, None], corners[:, None, None]]
+    weights = np.asarray(points.weights)
+    return np.einsum("qa,qaibj,qb->qij", weights, between_corners, weights, optimize=True)
 
 
 def is_nearly_quadratic(term: object) -> bool:
@@ -136,7 +143,7 @@ def quadratic_trace(
     covariance : (r, r) array
         C, in the order of `displacement_curvature`.
     """
-    response, parts = _Response.at(problem, near, u), _stiffness_parts(problem.body, near)
+    response, parts = _Response.at(problem, near, u), stiffness_parts(problem.body, near)
     in_nodes, displaced = response.expand(covariance, 3 * len(u)), covariance
     if response.modes:
         # The priors have no curvature in the field.
@@ -145,14 +152,14 @@ def quadratic_trace(
     elastic = problem.terms.get("elastic")
     elastic_trace = elastic and elastic.trace(parts, response.expand(displaced, 3 * len(u)))
     scaled = {
-        name: covariance_at_points(term.gauss_newton(u, near), in_nodes)
+        name: _covariance_at_points(term.gauss_newton(u, near), in_nodes)
         for name, term in problem.terms.items()
         if isinstance(term, HasCurvature) and is_nearly_quadratic(term) and getattr(term, "hyperparameters", ()) != ()
     }
     has_external = any(isinstance(term, ExternalTerm) and term.hyperparameters for term in problem.terms.values())
 
     def trace(values: Values) -> float:
-        total = elastic_trace(_coefficients(problem.body, values), values) if elastic_trace else 0.0
+        total = elastic_trace(coefficients(problem.body, values), values) if elastic_trace else 0.0
         for name, at_points in scaled.items():
             matrices = np.asarray(problem.terms[name].gauss_newton(u, values).matrices)
             total += float(np.vdot(matrices, at_points))
@@ -161,51 +168,6 @@ def quadratic_trace(
         return total
 
     return trace
-
-
-def _has_few_entries(body: Body) -> bool:
-    return int(np.asarray(body.cell_entry).max()) < FEW_ENTRIES
-
-
-def _coefficients(body: Body, values: Values) -> Float[np.ndarray, "parts"]:
-    """Return the factors φ of the matrices K_s whose sum is K."""
-    return np.concatenate([np.asarray(values[name]) for name in LAME]) if _has_few_entries(body) else np.ones(1)
-
-
-def _stiffness(body: Body, values: Values) -> scipy.sparse.csr_matrix:
-    """Return K, assembled from fixed matrices if λ and μ have few entries."""
-    if body.field is not None or not _has_few_entries(body):
-        return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
-    parts = _stiffness_parts(body, values)
-    K = parts.pattern.copy()
-    K.data = parts.entries @ _coefficients(body, values)
-    return K
-
-
-def _stiffness_parts(body: Body, values: Values) -> StiffnessParts:
-    """Return the fixed matrices whose sum is K: one for each λ and each μ, or K itself if these have many entries."""
-    if not _has_few_entries(body):
-        K = _stiffness(body, values)
-        return StiffnessParts(K, K.data[:, None])
-    factors = None if body.field is None else tuple(np.asarray(body.stiffness_factor(values)).tolist())
-    return _kept_stiffness_parts(body.mesh, tuple(np.asarray(body.cell_entry).tolist()), factors)
-
-
-@lru_cache(maxsize=2)
-def _kept_stiffness_parts(
-    mesh: StaticMesh, entries: tuple[int, ...], factors: tuple[float, ...] | None
-) -> StiffnessParts:
-    """Compute the derivatives of K in each λ and each μ; `factors` multiply the λ and μ of each cell."""
-    factor = np.ones(len(entries)) if factors is None else np.array(factors)
-    owned = [np.equal(entries, entry) * factor for entry in range(max(entries) + 1)]
-    nothing = np.zeros(len(entries))
-    # Zeros are stored, so that all derivatives have the same pattern.
-    derivatives = [stiffness(mesh.mesh, indicator, nothing) for indicator in owned] + [
-        stiffness(mesh.mesh, nothing, indicator) for indicator in owned
-    ]
-    for derivative in derivatives:
-        derivative.sort_indices()
-    return StiffnessParts(derivatives[0], np.stack([derivative.data for derivative in derivatives], axis=1))
 
 
 class _Response(NamedTuple):

@@ -15,7 +15,6 @@ from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.continuation import continuation
 from bayesreg.model.coordinates import complete
 from bayesreg.model.curvature import (
-    FEW_ENTRIES,
     Curvature,
     displacement_curvature,
     is_nearly_quadratic,
@@ -24,6 +23,7 @@ from bayesreg.model.curvature import (
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
+from bayesreg.model.stiffness_parts import FEW_ENTRIES
 from bayesreg.types import AnyArray
 
 

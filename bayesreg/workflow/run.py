@@ -15,15 +15,10 @@ from typing import Any
 import numpy as np
 
 from bayesreg.config import Config, load_config, load_stored_config, resolved_yaml
+from bayesreg.inference.chains.beginning import checkpoint_from_arrays, first_checkpoint, temper_target
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.progress import Showing
-from bayesreg.inference.chains.run import (
-    Samples,
-    checkpoint_from_arrays,
-    first_checkpoint,
-    sample,
-    temper_target,
-)
+from bayesreg.inference.chains.run import Samples, sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.draws.blocks import Block, Blocks
@@ -32,7 +27,6 @@ from bayesreg.io import checkpoints, store
 from bayesreg.io.atomic import write_text
 from bayesreg.io.records import Inputs
 from bayesreg.io.run_folder import RunFolder
-from bayesreg.memory import memory_of_machine
 from bayesreg.messages import show_messages
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
@@ -40,6 +34,7 @@ from bayesreg.model.target import PosteriorTarget
 from bayesreg.results.result import REPORT, Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
+from bayesreg.workflow.budget import BLOCK, block_length, max_seconds, require_memory
 from bayesreg.workflow.finish import finish
 from bayesreg.workflow.interruption import ending_between_blocks
 from bayesreg.workflow.preparation import (
@@ -55,9 +50,6 @@ from bayesreg.workflow.sources import digests_of_sources, require_same_sources
 
 _log = logging.getLogger(__name__)
 
-# BLOCK is the number of draws between two checks of the stop rule, for up to POINTS quadrature points. More points give
-# smaller blocks, of at least FEWEST draws, because each block writes the whole state.
-BLOCK, POINTS, FEWEST = 100, 20_000, 10
 # Sections of the configuration that do not change what is drawn.
 MAY_CHANGE = ("stop", "results", "report", "evaluation")
 
@@ -124,11 +116,11 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
         _log.warning("%s", sentence)
     # The folder is written after all inputs are checked, and before the first step.
     posterior = posterior_of(config, inputs, observations)
-    _require_memory(config, posterior)
+    require_memory(config, posterior)
     provenance["observations"] = _fingerprint(posterior, observations)
     provenance["sources"] = sources
     searching = time.perf_counter()
-    deadline = Deadline.after(_max_seconds(config))
+    deadline = Deadline.after(max_seconds(config))
     posterior = temper(config, inputs, posterior, deadline)
     provenance["independent_points"] = posterior.independent_points
     reached = _first(config, inputs, posterior, folder, deadline, time.perf_counter() - searching)
@@ -155,7 +147,7 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(folder.path, provenance, posterior, observations)
     # A pair that `simulate` stored is not tempered yet.
-    deadline = Deadline.after(_max_seconds(config))
+    deadline = Deadline.after(max_seconds(config))
     posterior = temper(config, inputs, posterior, deadline)
     provenance["independent_points"] = posterior.independent_points
     if finished:
@@ -324,38 +316,10 @@ def _sample(
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or _block(posterior),
-        stop=StopRule(config.stop.rhat, config.stop.ess, _max_seconds(config)),
+        block=options.block or block_length(posterior),
+        stop=StopRule(config.stop.rhat, config.stop.ess, max_seconds(config)),
         progress=progress,
         resume=reached,
         on_block=keep,
         **options.settings,
     )
-
-
-def _max_seconds(config: Config) -> float | None:
-    return config.stop.max_minutes and 60 * config.stop.max_minutes
-
-
-def _require_memory(config: Config, posterior: Posterior) -> None:
-    """Raise InputError if one block of draws and the moments of the chains exceed the memory of the machine."""
-    options = config.sampler
-    estimands = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values())
-    block = min(options.block or _block(posterior), config.stop.max_steps // options.thin)
-    # Two moments per number; the new moments are made while the old ones still exist.
-    needed = 8 * options.chains * (block * estimands + 4 * (estimands + posterior.mesh.points.size))
-    if needed > (held := memory_of_machine()):
-        raise InputError(
-            f"sampler.chains = {options.chains:,} with blocks of {block:,} draws of {estimands:,} estimands need "
-            f"{needed / 1e9:,.0f} GB, and this machine has {held / 1e9:,.0f} GB; give fewer chains, or fewer draws to "
-            "a block (sampler.block)"
-        )
-
-
-def _block(posterior: Posterior) -> int:
-    """Choose the number of draws per block: costly steps get small blocks, so that time limits are checked in time.
-
-    The number depends on the size of the problem and not on measured time, so that a seed always gives the same draws.
-    """
-    points = sum(len(getattr(term, "positions", ())) for term in posterior.data.terms.values())
-    return max(BLOCK * POINTS // max(points, POINTS), FEWEST)

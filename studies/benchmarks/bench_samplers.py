@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from bayesreg.inference.chains.beginning import _first, checkpoint_from_arrays
 from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.checkpoint import Checkpoint
-from bayesreg.inference.chains.run import _first, checkpoint_from_arrays
 from bayesreg.inference.samplers.registry import SAMPLERS, Chosen, choose_sampler
 from bayesreg.io import checkpoints, store
 from bayesreg.io.run_folder import RunFolder

@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import bayesreg as br
-from bayesreg.inference.chains.run import first_checkpoint, sample
+from bayesreg.inference.chains.beginning import first_checkpoint
+from bayesreg.inference.chains.run import sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.target import logdensity

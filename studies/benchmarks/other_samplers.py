@@ -47,9 +47,10 @@ import numpy as np
 
 import bayesreg as br
 from bayesreg.inference import target as targets
+from bayesreg.inference.chains.beginning import first_checkpoint
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.inference.chains.run import first_checkpoint, sample
+from bayesreg.inference.chains.run import sample
 from bayesreg.inference.draws.blocks import Block
 from bayesreg.inference.draws.diagnostics import worst
 from bayesreg.inference.gaussian.laplace import Gaussian

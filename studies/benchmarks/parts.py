@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import bayesreg as br
 from bayesreg.fem.elasticity import total_strain_energy
 from bayesreg.fem.equilibrium import equilibrium
-from bayesreg.inference.chains.run import checkpoint_from_arrays
+from bayesreg.inference.chains.beginning import checkpoint_from_arrays
 from bayesreg.inference.gaussian.whitened import whitened_density, whitened_position
 from bayesreg.inference.samplers.hamiltonian import _quarter_turn
 from bayesreg.inference.samplers.registry import choose_sampler

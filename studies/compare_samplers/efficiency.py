@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesreg.inference.chains.beginning import first_checkpoint
 from bayesreg.inference.chains.checkpoint import Checkpoint
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.inference.chains.run import HasTarget, Samples, first_checkpoint, sample
+from bayesreg.inference.chains.run import HasTarget, Samples, sample
 from bayesreg.inference.chains.stopping import StopRule
 from bayesreg.inference.draws.blocks import Block
 from bayesreg.types import InputError

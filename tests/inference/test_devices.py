@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bayesreg.inference.chains.beginning import first_checkpoint
 from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.devices import devices_for, side_by_side
-from bayesreg.inference.chains.run import first_checkpoint, sample
+from bayesreg.inference.chains.run import sample
 from bayesreg.inference.samplers.registry import choose_sampler
 from tests.inference.gaussians import GaussianTarget
 from tests.model.test_equality import posterior

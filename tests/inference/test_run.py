@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from bayesreg.inference.chains.beginning import checkpoint_from_arrays
 from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
 from bayesreg.inference.chains.initialise import starting_points
-from bayesreg.inference.chains.run import checkpoint_from_arrays
 from bayesreg.inference.draws.diagnostics import convergence
 from bayesreg.inference.draws.inference_data import open_posterior, save_posterior
 from bayesreg.inference.samplers.random_walk import rwmh

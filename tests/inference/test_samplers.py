@@ -13,8 +13,8 @@ from scipy import stats
 import bayesreg as br
 from bayesreg.config.samplers import sampler_section
 from bayesreg.inference.chains import run
+from bayesreg.inference.chains.beginning import checkpoint_from_arrays
 from bayesreg.inference.chains.checkpoint import checkpoint_to_arrays
-from bayesreg.inference.chains.run import checkpoint_from_arrays
 from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.modes import distance, search_modes
 from bayesreg.inference.gaussian.whitened import setup_about

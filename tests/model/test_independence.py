@@ -10,7 +10,7 @@ from scipy import ndimage
 
 import bayesreg as br
 from bayesreg.image import Image
-from bayesreg.inference.chains.run import first_checkpoint, temper_target
+from bayesreg.inference.chains.beginning import first_checkpoint, temper_target
 from bayesreg.inference.gaussian.mode_search import approach
 from bayesreg.inference.layout import flat_position
 from bayesreg.model.coordinates import complete

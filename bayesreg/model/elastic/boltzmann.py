@@ -14,8 +14,8 @@ from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
 from bayesreg.fem.elements import Elements
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
-from bayesreg.model.curvature_trace import StiffnessParts
 from bayesreg.model.state import State
+from bayesreg.model.stiffness_parts import StiffnessParts
 from bayesreg.settings import KnownOrInferred, Section, Vector, is_inferred, wrong
 from bayesreg.types import AnyArray, Matrix, Scalar
 

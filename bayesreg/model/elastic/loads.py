@@ -15,8 +15,8 @@ from bayesreg.fem.elasticity import internal_force, rigid_modes
 from bayesreg.fem.elements import Elements, boundary_areas
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
-from bayesreg.model.curvature_trace import StiffnessParts
 from bayesreg.model.state import State
+from bayesreg.model.stiffness_parts import StiffnessParts
 from bayesreg.settings import KnownOrInferred, ScalePrior, Section, Vector
 from bayesreg.types import AnyArray, Matrix, Scalar
 
