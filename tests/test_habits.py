@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
         pytest.param(["ruff", "check"], id="ruff"),
         pytest.param(["ruff", "format", "--check", "--diff"], id="format"),
         pytest.param(["lint-imports"], id="layers"),
-        pytest.param(["mypy"], id="types", marks=pytest.mark.slow),
+        pytest.param(["mypy"], id="types", marks=pytest.mark.long),
     ],
 )
 def test_source_passes(command):
