@@ -51,7 +51,7 @@ def ending_between_blocks() -> Iterator[Callable[[], None]]:
         if came:
             raise Interrupted(number)
         came.append(number)
-        _log.info("the run ends after this block of draws; another signal ends it at once")
+        _log.info("the run ends after the draws in hand; another signal ends it at once")
 
     def require_none() -> None:
         if came:

@@ -104,7 +104,7 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     # A run that was interrupted before it stored its inputs begins again in the same folder.
     if not (resume and folder.status() is not None):
         folder.require_fresh()
-    _log.info("reading the files, meshing")
+    _log.info("reading the files and meshing")
     if config.has_images and not config.pairs_of_images:
         _log.info("the images are shown and not compared: observations does not name them ({kind: images})")
     # The digests precede the reading, so that a resumed run detects a file that changed during the reading.
@@ -119,6 +119,7 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     require_memory(config, posterior)
     provenance["observations"] = _fingerprint(posterior, observations)
     provenance["sources"] = sources
+    _log.info("%s", _describe_mesh(inputs))
     searching = time.perf_counter()
     deadline = Deadline.after(max_seconds(config))
     posterior = temper(config, inputs, posterior, deadline)
@@ -144,6 +145,7 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
             report(folder.path)
         return load_result(folder.path)
     inputs = store.read_inputs(folder)
+    _log.info("%s", _describe_mesh(inputs))
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
     _require_same_observations(folder.path, provenance, posterior, observations)
     # A pair that `simulate` stored is not tempered yet.
@@ -178,7 +180,6 @@ def _go_on(
 ) -> Result:
     """Sample from the current state of the chains, and write the results."""
     _save_state(folder, *reached)
-    _log.info("%s", _describe_mesh(inputs))
     with ending_between_blocks() as require_no_signal:
         samples = _sample(config, posterior, reached, folder, progress, require_no_signal)
     _log.info("writing the results")
@@ -250,7 +251,7 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadl
     """Temper the posterior by its numbers of independent points, unless it is tempered already."""
     if posterior.tempered:
         return posterior
-    _log.info("how many points are independent: where the images first lead to")
+    _log.info("first search for the mode, to count the independent points of the images there")
     start = start_of(config, inputs, posterior)
     target = temper_target(posterior.target, config.sampler.chains, config.seed, start, deadline)
     assert isinstance(target, PosteriorTarget)

@@ -88,9 +88,9 @@ def distance(gaussian: Gaussian, flat: Float[np.ndarray, "dimension"]) -> float:
 def report_modes(target: Target, modes: Modes) -> Modes:
     """Report the modes in the log, and return them."""
     if len(modes.gaussians) == 1:
-        _log.info("modes: every chain's search ended at one and the same")
+        _log.info("modes: the searches of all chains ended at the same one")
         return modes
-    _log.info("modes: %d, about which the chains start; all are whitened at the first", len(modes.gaussians))
+    _log.info("modes: %d; each chain starts about its own, and all are whitened at the first", len(modes.gaussians))
     for number, gaussian in enumerate(modes.gaussians):
         centre = np.asarray(gaussian.centre)
         chains = ", ".join(str(chain) for chain, mode in enumerate(modes.chains) if mode == number)
