@@ -10,7 +10,7 @@ import pytest
 
 from bayesreg.inference.gaussian import about_gaussian
 from bayesreg.inference.gaussian.laplace import laplace
-from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _with_step_size, tune
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _transition, _with_step_size, tune
 from bayesreg.inference.gaussian.whitened import Moved
 from bayesreg.types import InputError
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
@@ -53,6 +53,12 @@ def test_a_chain_that_starts_where_it_is_steep_comes_home_if_it_has_a_step_of_it
     # With one step for all it stands where it began, and the others pay for it.
     assert outcomes[False][1] == 9.0
     assert outcomes[False][0] < outcomes[True][0]
+
+
+def test_transitions_are_compiled_once():
+    compiled = _transition._cache_size()
+    tune(None, Walk(), Steps(), {"u_boundary": jnp.zeros((5, 3))}, jax.random.key(0), Tuning(4, 0.7))
+    assert _transition._cache_size() == compiled + 1
 
 
 class Stuck(Walk):

@@ -103,6 +103,7 @@ def tune(
     """
     states = jax.vmap(partial(walk.init, data, setup))(starts)
     averaging = jax.vmap(_averaging(tuning)[0])(jnp.full(len(jax.tree.leaves(states)[0]), setup.step_size))
+    states, averaging = _with_strong_types((states, averaging))
     rates: list[float] = []
     for key_transition in jax.random.split(key, tuning.warm_up):
         if deadline.has_passed:
@@ -125,6 +126,11 @@ def tune(
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     _log.info("warm-up: step %.2g%s, acceptance %.0f%%", float(setup.step_size), trajectory, 100 * late)
     return setup, points
+
+
+def _with_strong_types(tree: Any) -> Any:
+    """Make the types of all arrays strong: one call's result then has the types of its arguments."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), tree)
 
 
 def _averaging(tuning: Tuning) -> tuple[Callable, Callable, Callable]:
@@ -158,7 +164,7 @@ def _transition(
     states, info = jax.vmap(step_chain)(states, sizes, jax.random.split(key, len(sizes)))
     rates = jnp.nan_to_num(info.acceptance_rate)
     averaging = jax.vmap(update)(averaging, jnp.where(per_chain, rates, rates.mean()))
-    return states, averaging, rates.mean()
+    return *_with_strong_types((states, averaging)), rates.mean()
 
 
 @partial(jax.jit, static_argnums=(0, 1))
