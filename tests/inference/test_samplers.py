@@ -209,7 +209,7 @@ def test_every_chain_finds_its_own_mode(caplog):
     assert sorted(centres) == pytest.approx([-4.5, 4.5], abs=0.1)
     sd = np.sqrt(two_modes().covariance[1, 1])
     assert distance(modes.gaussians[0], np.asarray(modes.gaussians[1].centre)) == pytest.approx(9 / sd, rel=0.02)
-    assert any("2, about which" in text for text in caplog.messages)
+    assert any("modes: 2; each chain starts about its own" in text for text in caplog.messages)
     assert any("chains 0, 3" in text for text in caplog.messages)
 
 
