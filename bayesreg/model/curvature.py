@@ -156,7 +156,7 @@ def quadratic_trace(
         for name, term in problem.terms.items()
         if isinstance(term, HasCurvature) and is_nearly_quadratic(term) and getattr(term, "hyperparameters", ()) != ()
     }
-    has_external = any(isinstance(term, ExternalTerm) and term.hyperparameters for term in problem.terms.values())
+    has_external = any(isinstance(term, ExternalTerm) for term in problem.terms.values())
 
     def trace(values: Values) -> float:
         total = elastic_trace(coefficients(problem.body, values), values) if elastic_trace else 0.0

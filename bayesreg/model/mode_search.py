@@ -23,8 +23,11 @@ from bayesreg.model.curvature import (
 )
 from bayesreg.model.program import Problem
 from bayesreg.model.state import state_of
-from bayesreg.model.stiffness_parts import FEW_ENTRIES
+from bayesreg.model.stiffness_parts import has_few_entries
 from bayesreg.types import AnyArray
+
+# With more unknown entries of λ or μ, the derivatives in all of them would cost too much.
+FEW_ENTRIES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class ModeSearch:
         """
         names = [name for term in self.data.terms.values() for name in getattr(term, "hyperparameters", ())]
         elastic = self.data.terms.get("elastic")
-        if elastic is not None and elastic.determinant is not None:
+        if elastic is not None and elastic.determinant is not None and has_few_entries(self.data.body):
             names += [name for name in LAME if len(self.data.blocks[name].free.index) <= FEW_ENTRIES]
         return tuple(name for name in names if name in self.data.blocks and self.data.blocks[name].is_sampled)
 

@@ -22,8 +22,9 @@ from bayesreg.fem.elasticity import stiffness
 from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.state import Body, StaticMesh
 
-# With more entries of λ or μ (as with one for each element), the derivatives in all of them would cost too much.
-FEW_ENTRIES = 20
+# With more entries of λ or μ (as with one for each element), K is not divided into parts, and λ and μ are no
+# hyperparameters.
+MOST_ENTRIES = 50
 
 
 class StiffnessParts(NamedTuple):
@@ -60,18 +61,19 @@ class StiffnessParts(NamedTuple):
         return forms
 
 
-def _has_few_entries(body: Body) -> bool:
-    return int(np.asarray(body.cell_entry).max()) < FEW_ENTRIES
+def has_few_entries(body: Body) -> bool:
+    """Check whether K has one part for each λ and each μ."""
+    return int(np.asarray(body.cell_entry).max()) < MOST_ENTRIES
 
 
 def coefficients(body: Body, values: Values) -> Float[np.ndarray, "parts"]:
     """Return the factors φ of the matrices K_s whose sum is K."""
-    return np.concatenate([np.asarray(values[name]) for name in LAME]) if _has_few_entries(body) else np.ones(1)
+    return np.concatenate([np.asarray(values[name]) for name in LAME]) if has_few_entries(body) else np.ones(1)
 
 
 def stiffness_of(body: Body, values: Values) -> scipy.sparse.csr_matrix:
     """Return K, assembled from fixed matrices if λ and μ have few entries."""
-    if body.field is not None or not _has_few_entries(body):
+    if body.field is not None or not has_few_entries(body):
         return stiffness(body.mesh.mesh, *(np.asarray(by_cell) for by_cell in body.lame_by_cell(values)))
     parts = stiffness_parts(body, values)
     K = parts.pattern.copy()
@@ -81,7 +83,7 @@ def stiffness_of(body: Body, values: Values) -> scipy.sparse.csr_matrix:
 
 def stiffness_parts(body: Body, values: Values) -> StiffnessParts:
     """Return the fixed matrices whose sum is K: one for each λ and each μ, or K itself if these have many entries."""
-    if not _has_few_entries(body):
+    if not has_few_entries(body):
         K = stiffness_of(body, values)
         return StiffnessParts(K, K.data[:, None])
     factors = None if body.field is None else tuple(np.asarray(body.stiffness_factor(values)).tolist())

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,11 @@ _log = logging.getLogger(__name__)
 
 # Sections of the configuration that do not change what is drawn.
 MAY_CHANGE = ("stop", "results", "report", "evaluation")
+
+CUT = (
+    "The budget (stop.max_minutes) ended the search for the mode or the warm-up early: the chains of this run mix "
+    "badly, and more draws help little. Begin the run anew, in another folder and with more time."
+)
 
 Reached = tuple[Checkpoint, Blocks]
 
@@ -125,6 +130,8 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     posterior = temper(config, inputs, posterior, deadline)
     provenance["independent_points"] = posterior.independent_points
     reached = _first(config, inputs, posterior, folder, deadline, time.perf_counter() - searching)
+    if deadline.has_passed:
+        provenance["appraisal"] = _with_warning(provenance.get("appraisal", {}), CUT)
     inputs = with_initial(inputs, config)
     with folder.locked():
         if folder.stage is not None:
@@ -150,15 +157,18 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     _require_same_observations(folder.path, provenance, posterior, observations)
     # A pair that `simulate` stored is not tempered yet.
     deadline = Deadline.after(max_seconds(config))
+    searching = time.perf_counter()
     posterior = temper(config, inputs, posterior, deadline)
     provenance["independent_points"] = posterior.independent_points
+    if CUT in provenance.get("appraisal", {}).get("warnings", ()):
+        _log.warning("%s", CUT)
     if finished:
         checkpoints.reopen(folder, to_blocks(posterior.target, load_result(folder.path).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
     if stored_config.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
-    reached = _load_reached(config, inputs, posterior, folder, deadline)
+    reached = _load_reached(config, inputs, posterior, folder, deadline, time.perf_counter() - searching)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
     with folder.writing() as temporary_path:
@@ -187,6 +197,10 @@ def _go_on(
     _log.info("%s", samples.reason)
     _warn(config, result)
     return result
+
+
+def _with_warning(appraisal: Mapping[str, Any], sentence: str) -> dict[str, Any]:
+    return {**appraisal, "warnings": [*appraisal.get("warnings", ()), sentence]}
 
 
 def _warn(config: Config, result: Result) -> None:
@@ -267,7 +281,7 @@ def _first(
     posterior: Posterior,
     folder: RunFolder,
     deadline: Deadline,
-    seconds: float = 0.0,
+    seconds: float,
 ) -> Reached:
     """Make the state of the chains before their first step; InputError if a chain cannot start.
 
@@ -282,12 +296,12 @@ def _first(
 
 
 def _load_reached(
-    config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder, deadline: Deadline
+    config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder, deadline: Deadline, seconds: float
 ) -> Reached:
     """Load the state of the chains that the interrupted run stored last."""
     state = checkpoints.load_state(folder)
     if state is None:
-        return _first(config, inputs, posterior, folder, deadline)
+        return _first(config, inputs, posterior, folder, deadline, seconds)
     blocks = checkpoints.StoredBlocks(folder, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior.target, options.name, options.chains, **options.settings), blocks

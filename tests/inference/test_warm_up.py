@@ -10,7 +10,7 @@ import pytest
 
 from bayesreg.inference.gaussian import about_gaussian
 from bayesreg.inference.gaussian.laplace import laplace
-from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _transition, _with_step_size, tune
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, _transition, tune, with_step_size
 from bayesreg.inference.gaussian.whitened import Moved
 from bayesreg.types import InputError
 from tests.inference.gaussians import DIMENSION, NODES, GaussianTarget
@@ -76,11 +76,11 @@ def test_a_warm_up_that_accepts_nothing_names_the_cause():
 
 @pytest.mark.parametrize("size", [0.011, 0.3, 0.46, 0.53, 0.79, 1.2, 1.5, 1.6, 4.0])
 def test_steps_make_a_quarter_turn_and_none_is_too_long(size):
-    setup = _with_step_size(Tuning(60, 0.75, quarter_turns=True), Steps(), jnp.asarray(size))
+    setup = with_step_size(Tuning(60, 0.75, quarter_turns=True), Steps(), jnp.asarray(size))
     assert float(setup.step_size * setup.steps) == pytest.approx(np.pi / 2)
     assert setup.step_size <= size
     assert (setup.steps - 1) * size < np.pi / 2
-    alone = _with_step_size(Tuning(60, 0.75), Steps(), jnp.asarray(size))
+    alone = with_step_size(Tuning(60, 0.75), Steps(), jnp.asarray(size))
     assert (float(alone.step_size), int(alone.steps)) == (min(size, np.pi / 2), int(Steps().steps))
 
 

@@ -29,6 +29,8 @@ from bayesreg.types import InputError
 
 # The time of a call that draws a part of a block, s: signals and the budget act between two calls.
 LONGEST_CALL = 10.0
+# The number of steps of the first call, if a step has one elastic solve.
+FIRST_STEPS = 300
 
 
 @runtime_checkable
@@ -193,8 +195,8 @@ def _advance(
 ) -> Iterator[tuple[Block, Checkpoint]]:
     """Yield blocks of draws, or parts of blocks, until each chain has `draws` draws."""
     spent = float(checkpoint.seconds)
-    # A step of many solves may take seconds. All others are so short that whole blocks are.
-    longest = 1 if chosen.sampler.many_solves else block
+    # A step of many solves may take seconds.
+    longest = 1 if chosen.sampler.many_solves else max(FIRST_STEPS // thin, 1)
     devices = devices_for(chains)
     data = chosen.sampler.data(checkpoint.setup)
     while int(checkpoint.draws) < draws:
@@ -215,8 +217,7 @@ def _advance(
         )
         block_draws = {name: np.asarray(value)[:, :count] for name, value in block_draws.items()}
         # The first call includes the compilation, so that the second one may be short, too.
-        if chosen.sampler.many_solves:
-            longest = int(np.clip(count * LONGEST_CALL / (time.perf_counter() - called), 1, block))
+        longest = int(np.clip(count * LONGEST_CALL / (time.perf_counter() - called), 1, block))
         seconds = np.array(spent + time.perf_counter() - began)
         drawn = np.array(int(checkpoint.draws) + count)
         checkpoint = Checkpoint(drawn, checkpoint.setup, state, moments, tally, seconds)
@@ -249,6 +250,9 @@ def _gather_samples(
     if stop.ess is not None and verdict.figures is None:
         # The last check may have been some blocks ago.
         verdict = judge_all(stop, checkpoint, blocks)
+    elif stop.ess is None and not verdict.holds:
+        # The budget may have ended a run in the middle of a block.
+        verdict = judge(stop, checkpoint, blocks, 1)
     mean, sd = pool(checkpoint.moments)
     rhat = scale_reduction(checkpoint.moments)["estimands"]
     return Samples(

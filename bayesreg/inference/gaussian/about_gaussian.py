@@ -24,7 +24,7 @@ from bayesreg.inference.gaussian.hyperparameters import move_hyperparameters
 from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, slope_at
 from bayesreg.inference.gaussian.modes import Modes, search_modes
 from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, make_stand_in
-from bayesreg.inference.gaussian.warm_up import Tuning, tune
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, tune, with_step_size
 from bayesreg.inference.gaussian.whitened import (
     Setup,
     Transition,
@@ -199,7 +199,8 @@ def _warm_up(
     if deadline.has_passed:
         _log.warning("warm-up: left out, because the time is spent")
         stand_in = make_stand_in(walk.target, gaussian, gaussian.centre)
-        return setup_about(walk.target, gaussian, gaussian.centre)._replace(stand_in=stand_in), points
+        setup = with_step_size(tuning, setup_about(walk.target, gaussian, gaussian.centre), FIRST_STEP)
+        return setup._replace(stand_in=stand_in), points
     mode = np.asarray(gaussian.centre)
     target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
     key_settle, key_tune = jax.random.split(key)

@@ -34,7 +34,7 @@ from bayesreg.inference.gaussian.density import (
 from bayesreg.inference.gaussian.hierarchy import Volume, mark_hyperparameters
 from bayesreg.inference.layout import marked
 from bayesreg.inference.target import Target, without_normaliser
-from bayesreg.types import Matrix
+from bayesreg.types import InputError, Matrix
 
 # The step of finite differences of the curvature, in the logarithm of a scale or a Normal score.
 STEP = 0.01
@@ -113,13 +113,15 @@ def maximise_evidence(
         values, vectors = np.linalg.eigh(evidence_curvature(target, about, curvature))
         units = vectors / np.sqrt(np.maximum(np.abs(values), LEAST_CURVATURE))
     best: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []
-    # Those of the start and of every iteration.
+    # The log evidence at the start and after each iteration.
     heights: list[float] = []
 
     def objective(xi: np.ndarray) -> tuple[float, np.ndarray]:
         height, slope, position = evidence(target, about, flat[entries] + units @ xi)
         slope = units.T @ slope
         if not (np.isfinite(height) and np.isfinite(slope).all()):
+            if not best:
+                raise InputError("the mode cannot be looked for: the evidence of the hyperparameters is not finite")
             # A value that makes the line search turn back: it rises with the distance from the best point so far.
             top, _, best_xi, best_slope = best[-1]
             return -top + 2 * abs(best_slope @ (xi - best_xi)), best_slope

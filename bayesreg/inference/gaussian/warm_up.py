@@ -115,7 +115,7 @@ def tune(
     if not rates:
         return setup, starts
     points, sizes = _end(walk, tuning, data, setup, states, averaging)
-    setup, late = _with_step_size(tuning, setup, jnp.median(sizes)), float(np.mean(rates[len(rates) // 2 :]))
+    setup, late = with_step_size(tuning, setup, jnp.median(sizes)), float(np.mean(rates[len(rates) // 2 :]))
     if len(rates) >= ENOUGH and late < LEAST_ACCEPTANCE and not per_chain:
         raise InputError(
             f"the warm-up accepts {late:.1%} of its transitions, even with steps of {float(setup.step_size):.2g} "
@@ -154,7 +154,7 @@ def _transition(
     update = _averaging(tuning)[1]
 
     def step_chain(state: Any, size: AnyArray, key: AnyArray) -> Any:
-        now = _with_step_size(tuning, setup, size)
+        now = with_step_size(tuning, setup, size)
         few = jnp.minimum(now.steps, FEW_STEPS)
         key_step, key_scales = jax.random.split(key)
         state, info = walk.step(data, now._replace(steps=jnp.where(per_chain, few, now.steps)), key_step, state)
@@ -173,7 +173,8 @@ def _end(walk: Walking, tuning: Tuning, data: Any, setup: Any, states: Any, aver
     return jax.vmap(partial(walk.estimands, data, setup))(states), jax.vmap(_averaging(tuning)[2])(averaging)
 
 
-def _with_step_size(tuning: Tuning, setup: Any, size: AnyArray) -> Any:
+def with_step_size(tuning: Tuning, setup: Any, size: AnyArray | float) -> Any:
+    """Return the setup with a step size within the bounds and, for quarter turns, the number of steps."""
     size = jnp.clip(size, tuning.least, tuning.greatest)
     if not tuning.quarter_turns:
         return setup._replace(step_size=size)
