@@ -116,6 +116,7 @@ def test_a_budget_that_is_spent_at_once_leaves_a_valid_folder(folder, tmp_path, 
     stopped = result.run.manifest["stopped"]
     assert stopped["converged"] is False
     assert "s of sampling" in stopped["reason"]
+    assert any("ended the search" in warning for warning in result.run.manifest["appraisal"]["warnings"])
     assert "Not converged" in result.report.read_text(encoding="utf-8")
     assert br.load_result(tmp_path / "out").u_mean.shape == result.mesh.points.shape
 
