@@ -144,13 +144,14 @@ def quadratic_trace(
         C, in the order of `displacement_curvature`.
     """
     response, parts = _Response.at(problem, near, u), stiffness_parts(problem.body, near)
-    in_nodes, displaced = response.expand(covariance, 3 * len(u)), covariance
+    in_nodes = without_field = response.expand(covariance, 3 * len(u))
     if response.modes:
         # The priors have no curvature in the field.
-        displaced = np.array(covariance)
-        displaced[: response.modes] = displaced[:, : response.modes] = 0.0
+        of_displacements = np.array(covariance)
+        of_displacements[: response.modes] = of_displacements[:, : response.modes] = 0.0
+        without_field = response.expand(of_displacements, 3 * len(u))
     elastic = problem.terms.get("elastic")
-    elastic_trace = elastic and elastic.trace(parts, response.expand(displaced, 3 * len(u)))
+    elastic_trace = elastic and elastic.trace(parts, without_field)
     scaled = {
         name: _covariance_at_points(term.gauss_newton(u, near), in_nodes)
         for name, term in problem.terms.items()

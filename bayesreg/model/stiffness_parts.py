@@ -42,7 +42,7 @@ class StiffnessParts(NamedTuple):
     entries: Float[np.ndarray, "entries parts"]
 
     def linear_form(self, covariance: Float[np.ndarray, "unknowns unknowns"]) -> Float[np.ndarray, "parts"]:
-        """Compute tr(C K_s)."""
+        """Compute the traces tr(C K_s) of all parts."""
         rows = np.repeat(np.arange(self.pattern.shape[0]), np.diff(self.pattern.indptr))
         return covariance[rows, self.pattern.indices] @ self.entries
 

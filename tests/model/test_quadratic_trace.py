@@ -21,6 +21,10 @@ from tests.phantoms import ball_mesh, smooth_image
 MESH = ball_mesh(spacing=30.0)
 WIDE = br.ScalePrior(median=0.5, log_sd=1.0)
 PRIORS = {"priors": {name: {"high": 60.0} for name in ("lam", "mu")}}
+# 25 tissues, of which the first has an unknown λ and μ.
+NAMES = tuple(f"part{k}" for k in range(25))
+MANY_TISSUES = br.TetMesh.from_arrays(MESH.points, MESH.cells, np.arange(len(MESH.cells)) % 25, NAMES)
+FIXED = {"lam": dict.fromkeys(NAMES[1:], 10.0), "mu": dict.fromkeys(NAMES[1:], 1.0)}
 BOUNDARY = {"normalised": True, "t_elastic": WIDE, "rigid_sd": 2.0, **PRIORS}
 
 
@@ -54,21 +58,22 @@ def images():
 
 
 @pytest.mark.parametrize(
-    ("options", "observations"),
+    ("mesh", "options", "observations"),
     [
-        ({"body_load": WIDE, "surface_load": WIDE, **PRIORS}, [images, landmarks]),
-        (BOUNDARY, [images, landmarks, Volume, Stiffness]),
-        ({**BOUNDARY, "sampled": "all"}, [landmarks]),
-        ({"elasticity": "field", "field": FieldConfig(modes=5, correlation=30.0), **BOUNDARY}, [images, landmarks]),
-        ({"elasticity": "element", "t_elastic": WIDE, "normalised": True, **PRIORS}, [landmarks]),
+        (MESH, {"body_load": WIDE, "surface_load": WIDE, **PRIORS}, [images, landmarks]),
+        (MANY_TISSUES, {"body_load": WIDE, "surface_load": 0.5, "fixed": FIXED, **PRIORS}, [landmarks]),
+        (MESH, BOUNDARY, [images, landmarks, Volume, Stiffness]),
+        (MESH, {**BOUNDARY, "sampled": "all"}, [landmarks]),
+        (
+            MESH,
+            {"elasticity": "field", "field": FieldConfig(modes=5, correlation=30.0), **BOUNDARY},
+            [images, landmarks],
+        ),
+        (MESH, {"elasticity": "element", "t_elastic": WIDE, "normalised": True, **PRIORS}, [landmarks]),
     ],
-    ids=["loads", "boundary", "all nodes", "field", "elements"],
+    ids=["loads", "many tissues", "boundary", "all nodes", "field", "elements"],
 )
-def test_the_trace_is_that_of_the_product(options, observations):
-    require_traces(MESH, options, observations)
-
-
-def require_traces(mesh, options, observations):
+def test_the_trace_is_that_of_the_product(mesh, options, observations):
     posterior = br.build_posterior(mesh, [make() for make in observations], model_of(**options))
     target, search = posterior.target, posterior.target.mode_search
     data = search.quadratic_part(target.data)
@@ -93,11 +98,3 @@ def require_traces(mesh, options, observations):
         flat[entries] += 0.3 * rng.normal(size=len(entries))
         expected = np.vdot(covariance, curvature(flat) - at_near)
         assert trace(estimands(flat)) - trace(estimands(near)) == pytest.approx(expected, rel=1e-8)
-
-
-def test_many_tissues_of_which_few_are_unknown_have_their_traces():
-    names = tuple(f"part{k}" for k in range(25))
-    mesh = br.TetMesh.from_arrays(MESH.points, MESH.cells, np.arange(len(MESH.cells)) % 25, names)
-    fixed = {"lam": dict.fromkeys(names[1:], 10.0), "mu": dict.fromkeys(names[1:], 1.0)}
-    options = {"body_load": WIDE, "surface_load": 0.5, "fixed": fixed, **PRIORS}
-    require_traces(mesh, options, [landmarks])

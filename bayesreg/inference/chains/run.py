@@ -215,7 +215,7 @@ def _advance(
             checkpoint.setup,
             *share(checkpoint[2:5], devices),
         )
-        block_draws = {name: np.asarray(value)[:, :count] for name, value in block_draws.items()}
+        block_draws = {name: np.array(np.asarray(value)[:, :count]) for name, value in block_draws.items()}
         # The first call includes the compilation, so that the second one may be short, too.
         longest = int(np.clip(count * LONGEST_CALL / (time.perf_counter() - called), 1, block))
         seconds = np.array(spent + time.perf_counter() - began)

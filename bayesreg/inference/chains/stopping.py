@@ -94,7 +94,7 @@ def _meets(worst: Worst, stop: StopRule) -> bool:
 
 def out_of_time(stop: StopRule, checkpoint: Checkpoint) -> bool:
     """Check whether the time of a run is spent."""
-    # The first block is drawn however long the search for the mode took, so that every run has draws.
+    # The first draw is made however long the search for the mode took, so that every run has draws.
     begun = int(checkpoint.draws) > 0
     return begun and stop.max_seconds is not None and float(checkpoint.seconds) >= stop.max_seconds
 
