@@ -14,7 +14,7 @@ again.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import breadth_first_order, reverse_cuthill_mckee
 
 from bayesreg.fem.elasticity import element_stiffness, rigid_modes, unknowns_of
 from bayesreg.fem.elements import Elements, elements_of
+from bayesreg.fem.host_band import HostBand
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -44,6 +45,8 @@ class BandLayout(NamedTuple):
 
     Attributes
     ----------
+    on_host : HostBand
+        The same band for LAPACK.
     places : (144, m) int array
         The flat index of every entry of every element's stiffness into an array (columns, 1 + below, width, width). A
         block column holds the diagonal block, then those below it. Unused entries have an index past the end.
@@ -51,6 +54,7 @@ class BandLayout(NamedTuple):
         One for the columns past the last unknown, else zero.
     """
 
+    on_host: HostBand
     places: Int[AnyArray, "entries cells"]
     padding: Float[AnyArray, "columns width"]
 
@@ -115,8 +119,8 @@ def rigid_freedom(
 
 def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLayout:
     """Order some unknowns (3 · node + axis) of K into a narrow band, cut into block columns."""
-    rank = np.full(3 * len(mesh.points), -1)
-    rank[_narrow_order(mesh, unknowns)] = np.arange(len(unknowns))
+    rank, order = np.full(3 * len(mesh.points), -1), _narrow_order(mesh, unknowns)
+    rank[order] = np.arange(len(unknowns))
     degrees = rank[unknowns_of(mesh.cells).reshape(-1, 12)].T
     row, column = np.repeat(degrees, 12, axis=0), np.tile(degrees, (12, 1))
     is_stored = (row >= 0) & (column >= 0)
@@ -127,7 +131,8 @@ def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLay
     places = ((block * (1 + BLOCKS_BELOW) + below) * width + row % width) * width + column % width
     padding = np.arange(columns * width).reshape(columns, width) >= len(unknowns)
     past_the_end = columns * (1 + BLOCKS_BELOW) * width**2
-    return BandLayout(jnp.asarray(np.where(is_stored, places, past_the_end)), jnp.asarray(padding, float))
+    places = jnp.asarray(np.where(is_stored, places, past_the_end))
+    return BandLayout(HostBand(mesh, order), places, jnp.asarray(padding, float))
 
 
 def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[np.ndarray, "unknowns"]:
@@ -183,11 +188,22 @@ def log_pseudo_determinant(
     return supported - free - determinant.log_null
 
 
+@jax.custom_jvp
 def log_determinant(
     layout: BandLayout, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
 ) -> Scalar:
-    """Compute log det of the rows and columns of K(λ, μ) that are in a layout."""
-    return band_log_determinant(_assemble(elements, lam, mu, layout))
+    """Compute log det of the rows and columns of K(λ, μ) that are in a layout; differentiable in λ and μ."""
+
+    def on_device(lam: AnyArray, mu: AnyArray) -> Scalar:
+        return band_log_determinant(_assemble(elements, lam, mu, layout))
+
+    return jax.lax.platform_dependent(lam, mu, cpu=layout.on_host.log_determinant, default=on_device)
+
+
+@log_determinant.defjvp
+def _log_determinant_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
+    layout, elements, lam, mu = primals
+    return jax.jvp(lambda lam, mu: band_log_determinant(_assemble(elements, lam, mu, layout)), (lam, mu), tangents[2:])
 
 
 def _assemble(elements: Elements, lam: AnyArray, mu: AnyArray, layout: BandLayout) -> Band:

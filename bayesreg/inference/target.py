@@ -201,6 +201,13 @@ class Target(Hashable, Protocol):
         """The normaliser of the prior of "u_boundary"; None if the density leaves it out."""
 
     @property
+    def surrogate(self) -> Callable[[Any], Any] | None:
+        """The map from the data to those of a similar problem with nearly the same density, up to the normaliser.
+
+        The costly normaliser is left out. The map is None without one.
+        """
+
+    @property
     def mode_search(self) -> ModeSearch | None:
         """The parts that the search for a mode needs; None if the target does not allow this search."""
 

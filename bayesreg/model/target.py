@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from bayesreg.model import coordinates, evaluation, program
 from bayesreg.model.blocks import Values
-from bayesreg.model.conditioning import condition
+from bayesreg.model.conditioning import condition, simplify
 from bayesreg.model.coordinates import Coordinates
 from bayesreg.model.elastic.skull import Skull, mark_behind_skull
 from bayesreg.model.evaluation import Evaluation
@@ -111,6 +111,15 @@ class PosteriorTarget:
         if not self.posterior.options.elastic_prior.normalised or "elastic" not in self.data.terms:
             return None
         return Normaliser(is_costly=len(self.posterior.mesh.points) > CHEAP_NODES)
+
+    @property
+    def surrogate(self) -> Callable[[Problem], Problem] | None:
+        """The map to the data of a similar problem: images in single precision, without the costly normaliser.
+
+        It is None without a costly normaliser.
+        """
+        normaliser = self.normaliser
+        return partial(simplify, normaliser=normaliser) if normaliser is not None and normaliser.is_costly else None
 
     @property
     def mode_search(self) -> ModeSearch:

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference.gaussian.delayed_acceptance import chain_data
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import choose_sampler
 from studies.calibration.chains import (
@@ -117,7 +118,7 @@ def _successive(
 
         def transition(estimands: Any, key: Any) -> Any:
             key_data, key_step = jax.random.split(key)
-            here = observed(key_data, estimands)
+            here = chain_data(model.target, observed(key_data, estimands))
             state, info = kernel.step(here, setup, key_step, kernel.init(here, setup, estimands))
             drawn = kernel.observe(here, setup, state)
             return drawn.estimands, (quantities(drawn.estimands, drawn.evaluation), info.acceptance_rate)

@@ -22,6 +22,7 @@ from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from scipy import stats
 
 import bayesreg as br
+from bayesreg.inference.gaussian.delayed_acceptance import chain_data
 from bayesreg.inference.gaussian.laplace import average_gaussian
 from bayesreg.inference.gaussian.mode_search import settle
 from bayesreg.inference.gaussian.whitened import Setup, whitened_position
@@ -238,11 +239,11 @@ def _scattered(posterior: br.Posterior, data: Any, setup: Setup, observed: Any, 
     return jax.lax.map(draw, (setup, observed, keys), batch_size=BATCH)
 
 
-@partial(jax.jit, static_argnums=0)
-def _begin(kernel: Sampler, data: Any, setup: Setup, observed: Any, starts: Estimands) -> Any:
+@partial(jax.jit, static_argnums=(0, 1))
+def _begin(kernel: Sampler, posterior: br.Posterior, data: Any, setup: Setup, observed: Any, starts: Estimands) -> Any:
     def initial_state(replication: Any) -> Any:
         setup, observed, start = replication
-        return kernel.init(observing(data, observed), setup, start)
+        return kernel.init(chain_data(posterior.target, observing(data, observed)), setup, start)
 
     return jax.lax.map(initial_state, (setup, observed, starts), batch_size=BATCH)
 
@@ -253,7 +254,7 @@ def _advance(  # type: ignore[no-untyped-def]
 ):
     def transition(replication: Any) -> Any:
         setup, observed, key, state = replication
-        here = observing(data, observed)
+        here = chain_data(posterior.target, observing(data, observed))
         state, info = kernel.step(here, setup, key, state)
         drawn = kernel.observe(here, setup, state)
         place = ravel_pytree(posterior.target.coordinates.unconstrain(data, drawn.estimands))[0]
@@ -283,7 +284,7 @@ def _run(
     tuned, steps = (settings.warm_up, settings.warm_up + settings.draws) if last else (settings.approach,) * 2
     begin, update, final = dual_averaging_adaptation(settings.target_acceptance)
     averaging = jax.vmap(begin)(setup.step_size)
-    states = _begin(kernel, data, setup, observed, starts)
+    states = _begin(kernel, posterior, data, setup, observed, starts)
     history = []
     for step in range(steps):
         size = jnp.exp(averaging.log_step_size) if step < tuned else final(averaging)

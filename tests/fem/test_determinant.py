@@ -20,6 +20,7 @@ from bayesreg.fem.determinant import (
 )
 from bayesreg.fem.elasticity import lame_entries
 from bayesreg.fem.elements import elements_of
+from bayesreg.fem.host_band import HostBand
 from bayesreg.mesh import TetMesh
 from tests.oracles import paper
 from tests.phantoms import LAM, MU, PAPER_LAM, PAPER_MU, ball_mesh
@@ -76,8 +77,12 @@ def test_determinant_of_the_interior_is_numpys():
     """The paper's contrast of 1e-6 to 30."""
     inner = (3 * MESH.interior[:, None] + np.arange(3)).ravel()
     K = paper.stiffness(MESH.points, MESH.cells, PAPER_LAM[MESH.tissue], PAPER_MU[MESH.tissue])[inner][:, inner]
-    value = log_determinant(band_layout(MESH, inner), ELEMENTS, by_cell(PAPER_LAM), by_cell(PAPER_MU))
-    assert float(value) == pytest.approx(np.linalg.slogdet(K.toarray())[1], rel=1e-9)
+    layout, expected = band_layout(MESH, inner), np.linalg.slogdet(K.toarray())[1]
+    arguments = layout, ELEMENTS, by_cell(PAPER_LAM), by_cell(PAPER_MU)
+    assert float(log_determinant(*arguments)) == pytest.approx(expected, rel=1e-9)
+    on_device, _ = jax.value_and_grad(log_determinant, argnums=2)(*arguments)
+    assert float(on_device) == pytest.approx(expected, rel=1e-9)
+    assert np.isnan(log_determinant(*arguments[:2], -arguments[2], arguments[3]))
 
 
 @pytest.mark.parametrize("elasticity", SIZES)
@@ -130,6 +135,15 @@ def test_side_by_side_and_twice_differentiated():
     hessian = np.asarray(jax.jit(jax.jacfwd(gradient))(jnp.asarray(LAM)))
     differences = [(gradient(LAM + h) - gradient(LAM - h)) / 2e-4 for h in 1e-4 * np.eye(3)]
     np.testing.assert_allclose(hessian, np.stack(differences), rtol=1e-6, atol=1e-9)
+
+
+def test_bands_on_the_host_are_equal_if_mesh_and_order_are():
+    order = np.arange(3 * len(MESH.points))
+    band = HostBand(MESH, order)
+    assert band == HostBand(MESH, order)
+    assert hash(band) == hash(HostBand(MESH, order))
+    assert band != HostBand(MESH, order[::-1])
+    assert band != HostBand(MESH.moved(0.1 * MESH.points), order)
 
 
 def test_a_matrix_that_is_not_definite_is_not_a_number():

@@ -84,7 +84,8 @@ def checkpoint_from_arrays(
     """
     chosen = choose_sampler(sampler, target, **settings)
     points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), target.coordinates.reference())
-    expected = jax.eval_shape(partial(_first, chosen, target.data), chosen.sampler.blank(), points)
+    setup = chosen.sampler.blank()
+    expected = jax.eval_shape(partial(_first, chosen), chosen.sampler.data(setup), setup, points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
     if [np.shape(leaf) for leaf in leaves] != [leaf.shape for leaf in wanted]:

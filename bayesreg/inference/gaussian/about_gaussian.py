@@ -19,17 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from bayesreg.inference.deadline import Deadline
-from bayesreg.inference.gaussian.density import height_and_slope, log_normaliser_at
+from bayesreg.inference.gaussian.delayed_acceptance import with_delayed_acceptance
+from bayesreg.inference.gaussian.density import height_and_slope
 from bayesreg.inference.gaussian.hyperparameters import move_hyperparameters
 from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, slope_at
 from bayesreg.inference.gaussian.modes import Modes, search_modes
-from bayesreg.inference.gaussian.normaliser import Delayed, delay_acceptance, make_stand_in
+from bayesreg.inference.gaussian.normaliser import make_stand_in
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, tune, with_step_size
 from bayesreg.inference.gaussian.whitened import (
     Setup,
     Transition,
     setup_about,
-    stand_in_at,
     whiten,
     whitened_density,
     whitened_position,
@@ -40,7 +40,6 @@ from bayesreg.inference.target import (
     Estimands,
     Target,
     estimands_of,
-    has_costly_normaliser,
     require_soft_wall,
     without_normaliser,
 )
@@ -173,17 +172,12 @@ def about_gaussian(
 
     data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
-    # An approximate sampler needs neither the exact normaliser nor other moves.
+    # An approximate sampler needs neither the exact density nor other moves.
     if not exact:
         return sampler
-    if has_costly_normaliser(target):
-        return _with_normaliser(target, sampler, walk)
-    return sampler._replace(step=walk.step_and_move)
-
-
-def _condition(target: Target, setup: Setup) -> Any:
-    """Prepare the data of the target for chains about the middle."""
-    return target.condition(estimands_of(target, target.data, unravel(target)(setup.middle)))
+    if target.surrogate is None:
+        return sampler._replace(step=walk.step_and_move)
+    return with_delayed_acceptance(target, sampler, walk)
 
 
 def _warm_up(
@@ -206,34 +200,25 @@ def _warm_up(
     key_settle, key_tune = jax.random.split(key)
     first = _setup_on_average(target, mode, points)
     first = first._replace(stand_in=make_stand_in(target, first.gaussian, first.middle))
-    settled = tune(_condition(target, first), walk, first, points, key_settle, stage, per_chain=True, deadline=deadline)
+    data = surrogate_data(target, first)
+    settled = tune(data, walk, first, points, key_settle, stage, per_chain=True, deadline=deadline)
     if deadline.has_passed:
         return settled
     points = settled[1]
     # The stand-in is accurate far about both middles.
     second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
-    return tune(_condition(target, second), walk, second, points, key_tune, stage, deadline=deadline)
+    return tune(surrogate_data(target, second), walk, second, points, key_tune, stage, deadline=deadline)
 
 
-def _with_normaliser(target: Target, sampler: Sampler, walk: Walk) -> Sampler:
-    """Turn a sampler of the density with the stand-in into a sampler of the density with the normaliser."""
+def _condition(target: Target, setup: Setup) -> Any:
+    """Prepare the data of the target for chains about the middle."""
+    return target.condition(estimands_of(target, target.data, unravel(target)(setup.middle)))
 
-    log_normaliser = partial(log_normaliser_at, target)
 
-    def init(data: Any, setup: Setup, estimands: Estimands) -> Delayed:
-        kernel = sampler.init(data, setup, estimands)
-        return Delayed(kernel, log_normaliser(data, flat_of(setup, kernel)))
-
-    def observe(data: Any, setup: Setup, state: Delayed) -> Draw:
-        estimands, evaluation = sampler.observe(without_normaliser(target, data), setup, state.kernel)
-        return Draw(estimands, evaluation._replace(logdensity=evaluation.logdensity + state.log_normaliser))
-
-    def flat_of(setup: Setup, state: Any) -> AnyArray:
-        return setup.gaussian.place(state.position)
-
-    stand_in = partial(stand_in_at, target)
-    step = delay_acceptance(walk.step, walk.move_hyperparameters, flat_of, log_normaliser, stand_in)
-    return sampler._replace(init=init, step=step, observe=observe)
+def surrogate_data(target: Target, setup: Setup) -> Any:
+    """Prepare the data of the target's surrogate, or its own if it has none, for chains about the middle."""
+    data = _condition(target, setup)
+    return data if target.surrogate is None else target.surrogate(data)
 
 
 def _setup_on_average(target: Target, mode: AnyArray, points: Any) -> Setup:

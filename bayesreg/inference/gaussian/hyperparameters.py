@@ -8,6 +8,7 @@ less than one gradient. They are steps of Metropolis, and leave the posterior un
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from bayesreg.inference.gaussian.whitened import Setup, stand_in_at
-from bayesreg.inference.layout import marked, unravel
-from bayesreg.inference.target import Target, has_costly_normaliser, logdensity, without_normaliser
+from bayesreg.inference.gaussian.laplace import solve_upper
+from bayesreg.inference.gaussian.whitened import Setup, surrogate_density
+from bayesreg.inference.layout import marked
+from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray
 
 # The number of proposals after each step of the sampler. Their standard deviations, in logarithms and Normal scores,
@@ -37,6 +39,7 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
     ----------
     target : Target
     data : pytree
+        As in `surrogate_density`.
     setup : Setup
     key : PRNG key
     state : blackjax HMCState
@@ -46,13 +49,8 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
     if not len(entries):
         return state
     assert target.mode_search is not None
-    is_costly = has_costly_normaliser(target)
-    plain = target.mode_search.quadratic_part(without_normaliser(target, data) if is_costly else data)
+    density = partial(surrogate_density, target, target.mode_search.quadratic_part(data), setup)
     flat = setup.gaussian.place(state.position)
-
-    def density(flat: AnyArray) -> AnyArray:
-        height = logdensity(target, plain, unravel(target)(flat))
-        return height + stand_in_at(target, plain, setup, flat) if is_costly else height
 
     def propose(carry: tuple[AnyArray, AnyArray], key: AnyArray) -> tuple[tuple[AnyArray, AnyArray], None]:
         flat, height = carry
@@ -67,8 +65,11 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
     before, gradient_before = jax.value_and_grad(density)(flat)
     (moved, _), _ = jax.lax.scan(propose, (flat, before), jax.random.split(key, PROPOSALS))
     after, gradient_after = jax.value_and_grad(density)(moved)
+    # The factor is upper triangular: a change of the first entries changes only as many whitened coordinates.
+    first = entries[-1] + 1
+    change = solve_upper(setup.gaussian.factor[:first, :first], (moved - flat)[:first])
     return state._replace(
-        position=state.position + setup.gaussian.whiten(moved - flat),
+        position=state.position.at[:first].add(change),
         logdensity=state.logdensity + after - before,
-        logdensity_grad=state.logdensity_grad + setup.gaussian.factor.T @ (gradient_after - gradient_before),
+        logdensity_grad=state.logdensity_grad + setup.gaussian.pull_back(gradient_after - gradient_before),
     )

@@ -195,7 +195,7 @@ def _improve(
 # These products run on the device, because the threads of NumPy's products stay active for a while and slow down the
 # next computation.
 _place = jax.jit(Gaussian.place)
-_pull_back = jax.jit(lambda gaussian, slope: gaussian.factor.T @ slope)
+_pull_back = jax.jit(Gaussian.pull_back)
 
 
 def _decouple(

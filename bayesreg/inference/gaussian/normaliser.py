@@ -1,15 +1,11 @@
 """A polynomial stand-in for a normaliser that is too costly for every step of a trajectory.
 
-The normaliser of the elastic prior depends on the parameters only, and is a smooth function of a few coordinates. A
-kernel that is reversible for the density with the stand-in makes a proposal. The proposal is accepted with the ratio of
-the normaliser to the stand-in at the proposal, divided by the same ratio at the current state. This is exact (the
-surrogate transition method, Liu 2001; delayed acceptance, Christen and Fox 2005). Reversible kernels in a palindromic
-order are reversible together, so that one normaliser tests several transitions at once.
+The normaliser of the elastic prior depends on the parameters only, and is a smooth function of a few coordinates. The
+draws do not depend on the stand-in (see `delayed_acceptance`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from itertools import combinations_with_replacement
 from math import comb
@@ -22,7 +18,6 @@ from jaxtyping import Float, Int
 
 from bayesreg.inference.gaussian.density import mark_normaliser, normaliser_and_slope
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.kernel import Info, joined
 from bayesreg.inference.layout import dimension, unravel
 from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
 from bayesreg.types import AnyArray, Scalar
@@ -34,9 +29,6 @@ HIGHEST_DEGREE, MOST_TERMS = 4, 150
 REACH = 5.0
 # The number of values and slopes that are computed for each coefficient.
 REDUNDANCY = 2
-# The number of transitions that are tested at once: one normaliser costs about as much as one transition, and the test
-# seldom rejects a good stand-in.
-TOGETHER = 2
 
 
 class StandIn(NamedTuple):
@@ -68,20 +60,6 @@ class StandIn(NamedTuple):
 
     def _polynomial(self, z: Float[AnyArray, "coordinates"]) -> Scalar:
         return terms_of(self.factors, z) @ self.coefficients
-
-
-class Delayed(NamedTuple):
-    """The state of a chain whose kernel uses the stand-in.
-
-    Attributes
-    ----------
-    kernel : state of the kernel
-    log_normaliser : scalar
-        The logarithm of the normaliser at the state of the chain.
-    """
-
-    kernel: Any
-    log_normaliser: Scalar
 
 
 def terms_of(factors: Int[AnyArray, "terms degree"], z: Float[AnyArray, "entries"]) -> Float[AnyArray, "terms"]:
@@ -148,52 +126,3 @@ def _coordinates_and_change(
         return smooth_coordinates(target, data, flat.at[entries].set(some))
 
     return coordinates_of(flat[entries]), jax.jacfwd(coordinates_of)(flat[entries])
-
-
-def delay_acceptance(
-    step: Callable[[Any, Any, AnyArray, Any], tuple[Any, Info]],
-    move: Callable[[Any, Any, AnyArray, Any], Any],
-    flat_of: Callable[[Any, Any], AnyArray],
-    log_normaliser: Callable[[Any, AnyArray], Scalar],
-    stand_in: Callable[[Any, Any, AnyArray], Scalar],
-) -> Callable[[Any, Any, AnyArray, Delayed], tuple[Delayed, Info]]:
-    """Turn kernels for the density with the stand-in into one step for the density with the normaliser.
-
-    The proposal is the result of `TOGETHER` steps with a move between each two of them.
-
-    Parameters
-    ----------
-    step : callable
-        (data, setup, key, state) → (state, info); reversible.
-    move : callable
-        (data, setup, key, state) → state; reversible.
-    flat_of : callable
-        (setup, state) → flat position.
-    log_normaliser : callable
-        (data, flat position) → the logarithm of the normaliser.
-    stand_in : callable
-        (data, setup, flat position) → the value of the stand-in.
-    """
-
-    def whole_step(data: Any, setup: Any, key: AnyArray, state: Delayed) -> tuple[Delayed, Info]:
-        key_steps, key_moves, key_accept = jax.random.split(key, 3)
-
-        def one_step(k: AnyArray, kernel_and_info: tuple[Any, Info]) -> tuple[Any, Info]:
-            kernel, info = step(data, setup, jax.random.fold_in(key_steps, k), kernel_and_info[0])
-            moved = partial(move, data, setup, jax.random.fold_in(key_moves, k))
-            kernel = jax.lax.cond(k < TOGETHER - 1, moved, lambda kernel: kernel, kernel)
-            return kernel, joined(kernel_and_info[1], info)
-
-        blank = jax.eval_shape(lambda key: step(data, setup, key, state.kernel)[1], key)
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank)
-        proposed, info = jax.lax.fori_loop(0, TOGETHER, one_step, (state.kernel, nothing))
-        current_flat, proposed_flat = flat_of(setup, state.kernel), flat_of(setup, proposed)
-        true = log_normaliser(data, proposed_flat)
-        gain = true - state.log_normaliser - stand_in(data, setup, proposed_flat) + stand_in(data, setup, current_flat)
-        probability = jnp.exp(jnp.minimum(jnp.nan_to_num(gain, nan=-jnp.inf), 0.0))
-        accepted = jax.random.uniform(key_accept) < probability
-        candidate = Delayed(proposed, true)
-        next_state = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
-        return next_state, info._replace(acceptance_rate=info.acceptance_rate / TOGETHER * probability)
-
-    return whole_step

@@ -13,12 +13,7 @@ from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.gaussian.normaliser import StandIn, no_stand_in, smooth_coordinates
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP
 from bayesreg.inference.layout import unravel
-from bayesreg.inference.target import (
-    Target,
-    has_costly_normaliser,
-    logdensity,
-    without_normaliser,
-)
+from bayesreg.inference.target import Target, logdensity
 from bayesreg.types import AnyArray, Scalar
 
 
@@ -60,7 +55,11 @@ Transition = Callable[[Target, Any, Setup, AnyArray, Any], tuple[Any, Moved]]
 
 @partial(jax.jit, static_argnums=0)
 def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray) -> Setup:
-    """Make a setup before its tuning."""
+    """Make a setup before its tuning.
+
+    The factor only defines the coordinates of the chains. Rounding it leaves the density of a position as it is.
+    """
+    gaussian = gaussian.in_single_precision()
     return Setup(gaussian, jnp.asarray(middle), jnp.asarray(FIRST_STEP), jnp.asarray(1, int), no_stand_in(target))
 
 
@@ -75,19 +74,20 @@ def whitened_position(target: Target, gaussian: Gaussian, xi: AnyArray) -> dict[
 
 
 def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
-    """Make the function log π(ξ), up to a constant, with the stand-in for a costly normaliser."""
-    gaussian = setup.gaussian
-    if not has_costly_normaliser(target):
-        return lambda xi: logdensity(target, data, whitened_position(target, gaussian, xi))
-    plain = without_normaliser(target, data)
-
-    def density(xi: AnyArray) -> AnyArray:
-        flat = gaussian.place(xi)
-        return logdensity(target, plain, unravel(target)(flat)) + stand_in_at(target, plain, setup, flat)
-
-    return density
+    """Make the function `surrogate_density` of whitened coordinates ξ."""
+    return lambda xi: surrogate_density(target, data, setup, setup.gaussian.place(xi))
 
 
-def stand_in_at(target: Target, data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
-    """Evaluate the stand-in for the normaliser at a flat position."""
-    return setup.stand_in(smooth_coordinates(target, data, flat))
+def surrogate_density(target: Target, data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
+    """Compute log π̃ at a flat position: the log density of the data, with the stand-in for a costly normaliser.
+
+    Parameters
+    ----------
+    target : Target
+    data : pytree
+        The data of the target, if it has no surrogate; else those of the surrogate, or of a part of it.
+    setup : Setup
+    flat : (d,) array
+    """
+    height = logdensity(target, data, unravel(target)(flat))
+    return height + setup.stand_in(smooth_coordinates(target, data, flat))

@@ -13,6 +13,7 @@ import numpy as np
 from blackjax.smc import adaptive_tempered, resampling
 
 from bayesreg.inference.deadline import Deadline
+from bayesreg.inference.gaussian.about_gaussian import surrogate_data
 from bayesreg.inference.gaussian.rotation import rotation
 from bayesreg.inference.gaussian.whitened import Setup, whitened_density, whitened_position
 from bayesreg.inference.kernel import Sampler
@@ -44,7 +45,7 @@ def smc(target: Target, settings: Smc) -> Sampler:
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
         setup, _ = chains_of.prepare(points, key, deadline)
-        data = chains_of.data(setup)
+        data = surrogate_data(target, setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         first = spread * jax.random.normal(key_first, (particles, len(setup.middle)))
         tempered_particles, weights = _temper(

@@ -115,9 +115,10 @@ class ComparedImages(NamedTuple):
 
     def likelihood(self, state: State) -> ImageLikelihood:
         """Return the distribution of f(x_q), given m(x_q + u(x_q))."""
+        u, values = _cast((state.u, dict(state.values)), self.positions.dtype)
         # Without the barrier, XLA interpolates twice: for the density and for the record.
-        compared = jax.lax.optimization_barrier(self.compared(self.places(state.u), state.values))
-        return ImageLikelihood(self, compared, self.temperature(state.values))
+        compared = jax.lax.optimization_barrier(self.compared(self.places(u), values))
+        return ImageLikelihood(self, compared, self.temperature(values))
 
     def places(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "points 3"]:
         """Return the displaced points x_q + u(x_q), mm."""
@@ -169,6 +170,10 @@ class ComparedImages(NamedTuple):
     def with_independent_points(self, count: float) -> ComparedImages:
         """Return the term with the likelihood tempered to this number of independent points."""
         return self._replace(independent_share=jnp.asarray(count / len(self.positions)))
+
+    def in_single_precision(self) -> ComparedImages:
+        """Return the term with its arrays in single precision; it sums the log density in double precision."""
+        return _cast(self, jnp.float32)
 
     def gauss_newton(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Return the tempered Gauss–Newton curvature of E_s / T_s; for eq. (1) it is 2 w ∇m ∇mᵀ / T_s, 1/mm²."""
@@ -303,6 +308,11 @@ def _subtract(minuend: ValueCurvature, subtrahend: ValueCurvature) -> ValueCurva
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:
     """Compute the gradient ∇m."""
     return jax.grad(lambda x: term.moving(x).sum())(places)
+
+
+def _cast(tree: Any, dtype: Any) -> Any:
+    """Convert all floating-point arrays of a pytree to a type."""
+    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
 def images_of(problem: Any) -> ComparedImages | None:

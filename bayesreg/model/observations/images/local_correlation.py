@@ -33,6 +33,7 @@ from bayesreg.model.observations.images.pointwise import (
     SimilaritySettings,
     SumOfSquaredDifferences,
     ValueCurvature,
+    total,
 )
 from bayesreg.model.term import SharedCurvature
 from bayesreg.settings import Positive
@@ -127,7 +128,7 @@ class WindowCorrelation(NamedTuple):
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return the log normaliser of Gaussian noise in N − 2K dimensions, up to a constant."""
         lost = self.windows.number * jnp.log(jnp.pi * temperature)
-        return 0.5 * pair.shares @ jnp.log(pair.weights / (jnp.pi * temperature)) + lost
+        return total(pair.shares, 0.5 * jnp.log(pair.weights / (jnp.pi * temperature))) + lost
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """Return the residuals f − a m − b."""
@@ -172,7 +173,7 @@ class WindowCorrelation(NamedTuple):
 @jax.custom_jvp
 def _energy(similarity: WindowCorrelation, pair: Intensities) -> Scalar:
     fit = similarity.fit(pair)
-    return pair.weights @ (fit.fixed * fit.residuals)
+    return total(pair.weights, fit.fixed * fit.residuals)
 
 
 @_energy.defjvp
@@ -180,9 +181,9 @@ def _energy_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Sc
     """Compute the derivative with a and b fixed, since E_s is minimal in them; the second derivative varies them."""
     (similarity, pair), (_, change) = primals, tangents
     fit = similarity.fit(pair)
-    slope = 2 * (pair.weights * fit.residuals) @ (change.fixed - fit.gain * change.moving)
-    slope += (fit.residuals**2 + similarity.ridge * fit.gain**2) @ change.weights
-    return pair.weights @ (fit.fixed * fit.residuals), slope
+    slope = total(2 * pair.weights * fit.residuals, change.fixed - fit.gain * change.moving)
+    slope += total(fit.residuals**2 + similarity.ridge * fit.gain**2, change.weights)
+    return total(pair.weights, fit.fixed * fit.residuals), slope
 
 
 def windows_of(positions: Float[np.ndarray, "points 3"], width: float) -> Windows:

@@ -27,6 +27,7 @@ from bayesreg.model.observations.images.pointwise import (
     SimilaritySettings,
     SumOfSquaredDifferences,
     ValueCurvature,
+    total,
 )
 from bayesreg.settings import Positive
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -94,7 +95,7 @@ class JointInformation(NamedTuple):
         """Return Σ_q log p(f_q), with which the likelihood is a density of f."""
         histogram = self.histogram(pair)
         width = (self.fixed_range[1] - self.fixed_range[0]) / (BINS - 3)
-        return pair.shares @ (histogram.fixed @ jnp.log(histogram.joint.sum(axis=1) / width))
+        return total(pair.shares, histogram.fixed @ jnp.log(histogram.joint.sum(axis=1) / width))
 
     def residuals(self, pair: Intensities) -> Float[AnyArray, "points"]:
         """Return f minus its mean given m."""

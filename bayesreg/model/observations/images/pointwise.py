@@ -65,6 +65,15 @@ class ValueCurvature(NamedTuple):
     shared: SharedCurvature | None = None
 
 
+def total(weights: Float[AnyArray, "points"], values: Float[AnyArray, "points"]) -> Scalar:
+    """Sum weighted values in double precision, whatever their own precision is.
+
+    This is a product of vectors instead of a sum of products: XLA would fuse the sum with the interpolation that made
+    the values, and repeat the index arithmetic for each of its taps.
+    """
+    return weights.astype(float) @ values.astype(float)
+
+
 class Pointwise(ABC):
     """The base of these similarities; see `bayesreg.model.observations.images.similarity.Similarity`.
 
@@ -119,13 +128,11 @@ class SumOfSquaredDifferences(Pointwise):
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return Σ_q w_q (f − m)², which does not depend on the temperature."""
-        # A product of vectors instead of a sum of products: XLA would fuse the sum with the interpolation that made
-        # `moving`, and repeat the index arithmetic for each of its taps.
-        return (pair.weights * pair.shares) @ pair.differences**2
+        return total(pair.weights * pair.shares, pair.differences**2)
 
     def log_normaliser(self, pair: Intensities, temperature: Scalar) -> Scalar:
         """Return Σ_q −½ log(2π σ_q²)."""
-        return 0.5 * pair.shares @ jnp.log(pair.weights / (jnp.pi * temperature))
+        return total(pair.shares, 0.5 * jnp.log(pair.weights / (jnp.pi * temperature)))
 
     def variance(self) -> Scalar:
         """Return one, the variance of the noise in units of its squared scale."""
@@ -159,8 +166,7 @@ class StudentTNoise(Pointwise):
         """
         nu = self.degrees_of_freedom
         log_terms = jnp.log1p(2 * pair.weights * pair.differences**2 / (nu * temperature))
-        # A product of vectors, as in eq. (1).
-        return temperature * (nu + 1) / 2 * (pair.shares @ log_terms)
+        return temperature * (nu + 1) / 2 * total(pair.shares, log_terms)
 
     def convexity(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Return 2 w (ν + 1)/(ν + 3) times the weights (ν + 1)/(ν + z²) of iteratively reweighted least squares.
@@ -176,7 +182,7 @@ class StudentTNoise(Pointwise):
         """Return Σ_q log Γ((ν+1)/2) − log Γ(ν/2) − ½ log(νπ s_q²)."""
         nu = self.degrees_of_freedom
         shape = gammaln((nu + 1) / 2) - gammaln(nu / 2)
-        return pair.shares @ (shape + 0.5 * jnp.log(2 * pair.weights / (jnp.pi * nu * temperature)))
+        return total(pair.shares, shape + 0.5 * jnp.log(2 * pair.weights / (jnp.pi * nu * temperature)))
 
     def variance(self) -> Scalar:
         """Return the variance ν / (ν − 2)."""
