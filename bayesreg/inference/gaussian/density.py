@@ -84,13 +84,13 @@ def hessian_rows(
     of the entries on which they depend.
     """
     assert target.mode_search is not None
-    plain, quadratic = without_normaliser(target, data), target.mode_search.quadratic_part(data)
     normalised, separable = mark_normaliser(target), marked(target, *target.mode_search.separable)
     rows = []
     for entry in entries:
         step = np.zeros(len(flat))
         step[entry] = STEP
-        row_data = quadratic if separable[entry] else data if normalised[entry] else plain
+        row_data = data if normalised[entry] else without_normaliser(target, data)
+        row_data = target.mode_search.quadratic_part(row_data) if separable[entry] else row_data
         ahead, behind = (height_and_slope(target, row_data, flat + way * step)[1] for way in (1, -1))
         rows.append((ahead - behind) / (2 * STEP))
     return np.array(rows)

@@ -12,11 +12,17 @@ import scipy.linalg
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
-from bayesreg.inference.gaussian.density import estimands_at, height_and_slope, hessian_rows, regular
+from bayesreg.inference.gaussian.density import (
+    estimands_at,
+    height_and_slope,
+    hessian_rows,
+    mark_normaliser,
+    regular,
+)
 from bayesreg.inference.gaussian.evidence import volume_at
 from bayesreg.inference.gaussian.hierarchy import mark_hyperparameters, mark_scales
 from bayesreg.inference.layout import marked, unravel
-from bayesreg.inference.target import Curvature, Target
+from bayesreg.inference.target import Curvature, Target, without_normaliser
 from bayesreg.types import AnyArray, InputError
 
 # The search has no end if a parameter exceeds the greatest reference value of its kind by this factor.
@@ -104,8 +110,9 @@ def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarra
 
 
 def slope_at(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """Compute ∇log π at a flat position."""
-    return height_and_slope(target, target.data, flat)[1]
+    """Compute ∇log π at a flat position, up to the slope in scales if the normaliser depends on nothing else."""
+    is_scale = mark_scales(target)[mark_normaliser(target)].all()
+    return height_and_slope(target, without_normaliser(target, target.data) if is_scale else target.data, flat)[1]
 
 
 def _add_convexly(
@@ -114,14 +121,25 @@ def _add_convexly(
     """Add a curvature to a positive definite one, and make the sum positive definite.
 
     In coordinates that whiten the first, eigenvalues of the sum are replaced by their absolute values, and by
-    `LEAST_RATIO` if these are smaller. Only eigenvalues below `LEAST_RATIO` are computed; there are few or none.
+    `LEAST_RATIO` if these are smaller. Most often none is, which a Cholesky factorisation finds out soon.
     """
+    try:
+        scipy.linalg.cholesky((1 - LEAST_RATIO) * approximate + remainder, overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return approximate + remainder + _lift_eigenvalues(approximate, remainder)
+    return approximate + remainder
+
+
+def _lift_eigenvalues(
+    approximate: Float[np.ndarray, "rows rows"], remainder: Float[np.ndarray, "rows rows"]
+) -> Float[np.ndarray, "rows rows"]:
+    """Compute what `_add_convexly` adds to the sum. Few eigenvalues are so small, and only these are computed."""
     lower = np.linalg.cholesky(approximate)
     half = scipy.linalg.solve_triangular(lower, remainder, lower=True)
     whitened = scipy.linalg.solve_triangular(lower, half.T, lower=True)
     values, vectors = scipy.linalg.eigh(whitened, subset_by_value=(-np.inf, LEAST_RATIO - 1))
     vectors = lower @ vectors
-    return approximate + remainder + (vectors * (np.maximum(np.abs(1 + values), LEAST_RATIO) - 1 - values)) @ vectors.T
+    return (vectors * (np.maximum(np.abs(1 + values), LEAST_RATIO) - 1 - values)) @ vectors.T
 
 
 def gaussian_of(

@@ -104,7 +104,7 @@ def settle(
     for _ in range(repeats):
         if deadline.has_passed:
             break
-        improved = _improve(target, target.data, better.flat, True, iterations, deadline)
+        improved = improve(target, better.flat, iterations, deadline)
         balanced = balance_field(target, improved, partial(_factor, target, improved))
         shift = np.abs(balanced - before)[~resting].max()
         # Once the hyperparameters have settled, the other coordinates move too little to change them.
@@ -123,6 +123,13 @@ def settle(
     elif repeats == REPEATS:
         _log.warning("mode: not settled")
     return better.flat
+
+
+def improve(
+    target: Target, flat: Float[np.ndarray, "dimension"], iterations: int = 40, deadline: Deadline = NEVER
+) -> Float[np.ndarray, "dimension"]:
+    """Move all coordinates but the hyperparameters towards the mode."""
+    return _improve(target, target.data, flat, True, iterations, deadline)
 
 
 def _improve_hyperparameters(

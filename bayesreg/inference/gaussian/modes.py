@@ -12,14 +12,12 @@ from jaxtyping import Float
 
 from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.gaussian.laplace import Gaussian, laplace
-from bayesreg.inference.gaussian.mode_search import approach, find_mode, settle
+from bayesreg.inference.gaussian.mode_search import approach, find_mode, improve, settle
 from bayesreg.inference.layout import flat_position, unravel
 from bayesreg.inference.target import Target, estimands_of, logdensity
 
 _log = logging.getLogger(__name__)
 
-# After this number of repeats of the search, residuals are close to those at the mode.
-FEW = 2
 # Two modes count as one if no coordinate differs by more than this number of its standard deviations.
 SAME = 1.0
 
@@ -61,7 +59,8 @@ def temper(target: Target, points: Any, deadline: Deadline = NEVER) -> Target:
     if target.mode_search is None or target.mode_search.tempering is None:
         return target
     near = approach(target, _middle(target, points), deadline=deadline)
-    near_mode = settle(target, near, repeats=FEW, deadline=deadline)
+    # Residuals change little once the displacements have followed the first search for hyperparameters.
+    near_mode = improve(target, settle(target, near, repeats=1, deadline=deadline), deadline=deadline)
     return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(near_mode))))
 
 
