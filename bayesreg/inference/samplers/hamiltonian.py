@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from bayesreg.inference.gaussian.about_gaussian import about_gaussian
-from bayesreg.inference.gaussian.rotation import rotation
+from bayesreg.inference.gaussian.rotation import corrected_rotation, rotation
 from bayesreg.inference.gaussian.warm_up import Tuning
 from bayesreg.inference.gaussian.whitened import Moved, Setup, whitened_density
 from bayesreg.inference.kernel import Sampler
@@ -33,11 +33,12 @@ def hmc(target: Target, settings: Hmc) -> Sampler:
 
 def _quarter_turn(target: Target, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Moved]:
     key_step, key_move = jax.random.split(key)
-    kernel = blackjax.mcmc.hmc.build_kernel(rotation())
+    kernel = blackjax.mcmc.hmc.build_kernel(corrected_rotation(setup.steps))
     density = whitened_density(target, data, setup)
     size = setup.step_size * jax.random.uniform(key_step, minval=JITTER[0], maxval=JITTER[1])
-    state, info = kernel(key_move, state, density, size, jnp.ones_like(state.position), setup.steps)
-    return state, Moved(info.acceptance_rate, info.is_divergent, info.num_integration_steps)
+    # One step of the integrator is a whole trajectory.
+    state, info = kernel(key_move, state, density, size, jnp.ones_like(state.position), 1)
+    return state, Moved(info.acceptance_rate, info.is_divergent, setup.steps)
 
 
 def nuts(target: Target, settings: Nuts) -> Sampler:
