@@ -10,8 +10,10 @@ and shares no code with the density under test.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +23,7 @@ from scipy.linalg import solve_triangular
 import bayesreg as br
 from bayesreg.inference.target import without_normaliser
 from bayesreg.mesh import TetMesh
+from bayesreg.model import target
 from tests.options import posterior_of
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, smooth_image
@@ -50,11 +53,14 @@ class Variant(NamedTuple):
     loads : bool
         Random loads on all nodes in place of exp(−E_r / T_r), and Student's t noise; their sizes and T_s are inferred,
         and μ of one tissue is known.
+    surrogate : bool
+        Whether the few nodes are treated like many: trajectories then see the surrogate of the density.
     """
 
     skull: bool = False
     temperatures: bool = False
     loads: bool = False
+    surrogate: bool = False
 
     @property
     def inferred(self) -> dict[str, float]:
@@ -87,7 +93,13 @@ VARIANTS = {
     "skull": Variant(skull=True),
     "temperatures": Variant(temperatures=True),
     "loads": Variant(loads=True),
+    "loads with surrogate": Variant(loads=True, surrogate=True),
 }
+
+
+def treated_as_it_says(variant: Variant) -> AbstractContextManager[Any]:
+    """Make the context in which posteriors of a variant have a surrogate if the variant says so."""
+    return mock.patch.object(target, "CHEAP_NODES", 0) if variant.surrogate else nullcontext()
 
 
 def calibrated(variant: Variant, **planted: Any) -> br.Posterior:
