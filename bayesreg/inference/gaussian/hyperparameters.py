@@ -62,14 +62,14 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
         accepted = jnp.log(jax.random.uniform(key_accept)) < candidate_height - height
         return (jnp.where(accepted, candidate, flat), jnp.where(accepted, candidate_height, height)), None
 
-    before, gradient_before = jax.value_and_grad(density)(flat)
-    (moved, _), _ = jax.lax.scan(propose, (flat, before), jax.random.split(key, PROPOSALS))
-    after, gradient_after = jax.value_and_grad(density)(moved)
+    (moved, _), _ = jax.lax.scan(propose, (flat, density(flat)), jax.random.split(key, PROPOSALS))
+    # A loop over both places compiles the gradient once.
+    heights, gradients = jax.lax.map(jax.value_and_grad(density), jnp.stack([flat, moved]))
     # The factor is upper triangular: a change of the first entries changes only as many whitened coordinates.
     first = entries[-1] + 1
     change = solve_upper(setup.gaussian.factor[:first, :first], (moved - flat)[:first])
     return state._replace(
         position=state.position.at[:first].add(change),
-        logdensity=state.logdensity + after - before,
-        logdensity_grad=state.logdensity_grad + setup.gaussian.pull_back(gradient_after - gradient_before),
+        logdensity=state.logdensity + heights[1] - heights[0],
+        logdensity_grad=state.logdensity_grad + setup.gaussian.pull_back(gradients[1] - gradients[0]),
     )
