@@ -73,6 +73,7 @@ def compare(
     chains: int = 200,
     steps: int = 10,
     seed: int = 0,
+    step_size: float = STEP_SIZE,
 ) -> Comparison:
     """Compare the moments of a kernel's chains with those of their starts.
 
@@ -85,7 +86,7 @@ def compare(
     if sampler != "rwmh":
         reference = prior_reference(simulator, posterior)
         centre = np.asarray(reference.centre)[None]
-        shared = setups_about(posterior, [reference], centre, STEP_SIZE, STEPS)
+        shared = setups_about(posterior, [reference], centre, step_size, STEPS)
         setup = jax.tree.map(lambda x: x[0], shared)
     run = partial(_successive, kernel, simulator.posterior, steps)
     outputs = run(simulator.posterior.data, data, setup, jax.random.key(seed), first)

@@ -124,6 +124,11 @@ class Simulator:
         self.variant, self.mesh = variant, mesh
         self.posterior = calibrated(variant)
 
+    @property
+    def sampled(self) -> np.ndarray:
+        """The nodes whose displacements are drawn."""
+        return np.arange(len(self.mesh.points)) if self.variant.loads else self.mesh.boundary
+
     @cached_property
     def unit_stiffness(self) -> dict[str, np.ndarray]:
         """K of λ = 1, and of μ = 1, in one tissue: (3n, 3n) for each."""
@@ -166,7 +171,7 @@ class Simulator:
 
     def draw_displacement(self, rng: np.random.Generator, values: dict[str, Any]) -> Any:
         """Draw the displacements of the sampled nodes from the untruncated Gaussian prior, (b, 3) in mm."""
-        nodes = np.arange(len(self.mesh.points)) if self.variant.loads else self.mesh.boundary
+        nodes = self.sampled
         rigid = paper.rigid_modes(self.mesh.points[nodes]) / (RIGID_SD * np.sqrt(len(nodes)))
         precision = self.elastic_precision(values) + rigid @ rigid.T
         factor = np.linalg.cholesky(precision)
@@ -189,7 +194,7 @@ class Simulator:
         while len(draws) < count:
             values = self.draw_parameters(rng)
             u = self.draw_displacement(rng, values)
-            depth = np.maximum(self.mesh.points[self.mesh.boundary, 0] + u[:, 0] - WALL, 0.0)
+            depth = np.maximum(self.mesh.points[self.sampled, 0] + u[:, 0] - WALL, 0.0)
             if not self.variant.skull or np.log(rng.uniform()) < -0.5 * ((depth / WIDTH) ** 2).sum():
                 blocks = self.posterior.data.blocks
                 values |= {name: values[name][blocks[name].free.index] for name in LAME}
