@@ -8,8 +8,8 @@ stops these motions when it is removed. Then det S_{−J} = pdet S · det(N_J)²
 
 Both determinants are those of sparse matrices. With the nodes in the order of Cuthill and McKee, the matrices are
 narrow bands. A Cholesky factorisation by blocks of columns gives the determinant in about n w² operations for n
-unknowns of bandwidth w. The derivative, tr(K⁻¹ ∂K), needs the inverse only inside the band: twice as many operations
-again.
+unknowns of bandwidth w. On a CPU it is LAPACK's where no derivative is needed (`host_band`). The derivative,
+tr(K⁻¹ ∂K), needs the inverse only inside the band: twice as many operations again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scipy.sparse.csgraph import breadth_first_order, reverse_cuthill_mckee
 
 from bayesreg.fem.elasticity import element_stiffness, rigid_modes, unknowns_of
 from bayesreg.fem.elements import Elements, elements_of
-from bayesreg.fem.host_band import HostBand
+from bayesreg.fem.host_band import HostBand, band_entries
 from bayesreg.mesh import TetMesh
 from bayesreg.types import AnyArray, InputError, Scalar
 
@@ -119,11 +119,8 @@ def rigid_freedom(
 
 def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLayout:
     """Order some unknowns (3 · node + axis) of K into a narrow band, cut into block columns."""
-    rank, order = np.full(3 * len(mesh.points), -1), _narrow_order(mesh, unknowns)
-    rank[order] = np.arange(len(unknowns))
-    degrees = rank[unknowns_of(mesh.cells).reshape(-1, 12)].T
-    row, column = np.repeat(degrees, 12, axis=0), np.tile(degrees, (12, 1))
-    is_stored = (row >= 0) & (column >= 0)
+    order = _narrow_order(mesh, unknowns)
+    row, column, is_stored = band_entries(mesh, order)
     width = -(-int(np.abs(row - column)[is_stored].max()) // BLOCKS_BELOW)
     columns, block, below = -(-len(unknowns) // width), column // width, row // width - column // width
     # Blocks above the diagonal are transposes of those below, so they are not stored.

@@ -204,7 +204,7 @@ class Target(Hashable, Protocol):
     def surrogate(self) -> Callable[[Any], Any] | None:
         """The map from the data to those of a similar problem with nearly the same density, up to the normaliser.
 
-        The costly normaliser is left out. The map is None without one.
+        The costly normaliser is left out. The map is None without a costly normaliser.
         """
 
     @property

@@ -21,6 +21,7 @@ import bayesreg as br
 from bayesreg.inference.gaussian.delayed_acceptance import chain_data
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers.registry import choose_sampler
+from bayesreg.model.target import PosteriorTarget
 from studies.calibration.chains import (
     BATCH,
     condition,
@@ -30,7 +31,7 @@ from studies.calibration.chains import (
     quantity_names,
     setups_about,
 )
-from studies.calibration.simulator import Simulator, draw_data, observing
+from studies.calibration.simulator import Simulator, draw_data, observing, require_treatment
 
 SIGNIFICANCE = 0.01
 # The trajectories are in whitened coordinates about a reference that is independent of the data.
@@ -80,6 +81,7 @@ def compare(
     `posterior` defaults to that of the simulator; any other posterior is a planted error.
     """
     posterior = simulator.posterior if posterior is None else posterior
+    require_treatment(simulator.variant, posterior)
     first = of_posterior(posterior, simulator.draw_prior(np.random.default_rng(seed), chains))
     kernel = choose_sampler(sampler, posterior.target, **(RANDOM_WALK if sampler == "rwmh" else {})).sampler
     setup, data = None, condition(posterior)
@@ -88,7 +90,7 @@ def compare(
         centre = np.asarray(reference.centre)[None]
         shared = setups_about(posterior, [reference], centre, step_size, STEPS)
         setup = jax.tree.map(lambda x: x[0], shared)
-    run = partial(_successive, kernel, simulator.posterior, steps)
+    run = partial(_successive, kernel, posterior.target, simulator.posterior, steps)
     outputs = run(simulator.posterior.data, data, setup, jax.random.key(seed), first)
     start, successive, acceptance = (np.asarray(x) for x in outputs)
     names = quantity_names(posterior)
@@ -104,9 +106,17 @@ def _moments(values: np.ndarray) -> np.ndarray:
     return np.concatenate([values, values**2], axis=-1)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _successive(
-    kernel: Sampler, model: br.Posterior, steps: int, truth: Any, data: Any, setup: Any, key: Any, first: Any
+    kernel: Sampler,
+    target: PosteriorTarget,
+    model: br.Posterior,
+    steps: int,
+    truth: Any,
+    data: Any,
+    setup: Any,
+    key: Any,
+    first: Any,
 ) -> Any:
     """Return the quantities before the first step (chain, k) and after each step (chain, step, k), and acceptances."""
 
@@ -119,7 +129,7 @@ def _successive(
 
         def transition(estimands: Any, key: Any) -> Any:
             key_data, key_step = jax.random.split(key)
-            here = chain_data(model.target, observed(key_data, estimands))
+            here = chain_data(target, observed(key_data, estimands))
             state, info = kernel.step(here, setup, key_step, kernel.init(here, setup, estimands))
             drawn = kernel.observe(here, setup, state)
             return drawn.estimands, (quantities(drawn.estimands, drawn.evaluation), info.acceptance_rate)

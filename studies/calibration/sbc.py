@@ -41,7 +41,7 @@ from studies.calibration.chains import (
     setups_about,
     simulated,
 )
-from studies.calibration.simulator import Simulator, observing
+from studies.calibration.simulator import Simulator, observing, require_treatment
 
 BINS = 10
 LEVELS = (0.5, 0.9)
@@ -170,6 +170,7 @@ def calibrate(
 ) -> Ranks:
     """Rank truths from the simulator among draws of its posterior, or of another, wrong one."""
     posterior = simulator.posterior if posterior is None else posterior
+    require_treatment(simulator.variant, posterior)
     rng = np.random.default_rng(seed)
     truths = simulator.draw_prior(rng, settings.replications)
     key_data, key_chains = jax.random.split(jax.random.key(seed))

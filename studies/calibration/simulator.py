@@ -102,6 +102,12 @@ def treated_as_it_says(variant: Variant) -> AbstractContextManager[Any]:
     return mock.patch.object(target, "CHEAP_NODES", 0) if variant.surrogate else nullcontext()
 
 
+def require_treatment(variant: Variant, posterior: br.Posterior) -> None:
+    """Raise an error if a posterior has a surrogate and its variant says no, or the reverse."""
+    if (posterior.target.surrogate is not None) != variant.surrogate:
+        raise ValueError("a variant with a surrogate must run in the context of `treated_as_it_says`")
+
+
 def calibrated(variant: Variant, **planted: Any) -> br.Posterior:
     """The density under test; `planted` are options that are wrong on purpose."""
     moving = smooth_image(MESH.points, seed=1, blur=2.0)

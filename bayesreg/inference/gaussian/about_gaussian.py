@@ -172,7 +172,7 @@ def about_gaussian(
 
     data = partial(_condition, target)
     sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
-    # An approximate sampler needs neither the exact density nor other moves.
+    # The kernel of an approximate sampler sees no density: it needs neither a surrogate nor other moves.
     if not exact:
         return sampler
     if target.surrogate is None:

@@ -39,12 +39,12 @@ class Exact(NamedTuple):
 
     Attributes
     ----------
-    draw : Draw
+    evaluation : Evaluation
     log_ratio : scalar
         log(π / π̃), up to a constant.
     """
 
-    draw: Draw
+    evaluation: Any
     log_ratio: Scalar
 
 
@@ -71,9 +71,16 @@ def delay_acceptance(
     move : callable
         (key, state of the kernels) → state; reversible.
     evaluate : callable
-        (state of the kernels) → the exact density there.
+        (state of the kernels) → the exact density there. It is the record of a draw, and not counted in `Info`.
     key : PRNG key
     state : Delayed
+
+    Returns
+    -------
+    Delayed
+        The proposal if it is accepted, else the given state.
+    Info
+        The sum over the steps; the acceptance rate is their mean times the probability to accept the proposal.
     """
     key_steps, key_moves, key_accept = jax.random.split(key, 3)
 
@@ -106,7 +113,7 @@ def with_delayed_acceptance(target: Target, sampler: Sampler, walk: Walking) -> 
         position = whitened_position(target, setup.gaussian, kernel.position)
         estimands, log_jacobian = target.coordinates.constrain(data.exact, position)
         evaluation = target.evaluate_estimands(data.exact, estimands)
-        return Exact(Draw(estimands, evaluation), evaluation.logdensity + log_jacobian - kernel.logdensity)
+        return Exact(evaluation, evaluation.logdensity + log_jacobian - kernel.logdensity)
 
     def init(data: ChainData, setup: Setup, estimands: Estimands) -> Delayed:
         kernel = walk.init(data.surrogate, setup, estimands)
@@ -117,9 +124,10 @@ def with_delayed_acceptance(target: Target, sampler: Sampler, walk: Walking) -> 
         kernels = partial(walk.step, *shared), partial(walk.move_hyperparameters, *shared)
         return delay_acceptance(*kernels, partial(evaluate, data, setup), key, state)
 
-    return sampler._replace(
-        data=lambda setup: chain_data(target, sampler.data(setup)),
-        init=init,
-        step=step,
-        observe=lambda data, setup, state: state.exact.draw,
-    )
+    def observe(data: ChainData, setup: Setup, state: Delayed) -> Draw:
+        return Draw(walk.estimands(data.exact, setup, state.kernel), state.exact.evaluation)
+
+    def data_of(setup: Setup) -> ChainData:
+        return chain_data(target, sampler.data(setup))
+
+    return sampler._replace(data=data_of, init=init, step=step, observe=observe)

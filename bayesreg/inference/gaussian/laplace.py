@@ -49,11 +49,11 @@ class Gaussian(NamedTuple):
 
     def place(self, xi: AnyArray) -> AnyArray:
         """Map whitened coordinates ξ to a flat position."""
-        return self.centre + self.factor @ xi.astype(self.factor.dtype)
+        return self.centre + _product(self.factor, xi)
 
     def pull_back(self, slope: AnyArray) -> AnyArray:
         """Map a slope in the flat position to the slope in the whitened coordinates."""
-        return self.factor.T @ slope.astype(self.factor.dtype)
+        return _product(self.factor.T, slope)
 
     def in_single_precision(self) -> Gaussian:
         """Return the Gaussian with its factor in single precision: it takes half the time to multiply."""
@@ -62,6 +62,11 @@ class Gaussian(NamedTuple):
     def whiten(self, change: AnyArray) -> AnyArray:
         """Map a change of the flat position to the change of the whitened coordinates."""
         return solve_upper(self.factor, change)
+
+
+def _product(matrix: Float[AnyArray, "rows columns"], vector: Float[AnyArray, "columns"]) -> Float[AnyArray, "rows"]:
+    """Multiply in the precision of the matrix; on a GPU the default for single precision is half of its digits."""
+    return jnp.matmul(matrix, vector.astype(matrix.dtype), precision=jax.lax.Precision.HIGHEST)
 
 
 def solve_upper(matrix: Float[AnyArray, "rows rows"], vector: Float[AnyArray, "rows"]) -> Float[AnyArray, "rows"]:
@@ -110,7 +115,10 @@ def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarra
 
 
 def slope_at(target: Target, flat: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
-    """Compute ∇log π at a flat position, up to the slope in scales if the normaliser depends on nothing else."""
+    """Compute ∇log π at a flat position.
+
+    A normaliser that depends on scales only is left out, and the slope lacks its part in their entries.
+    """
     is_scale = mark_scales(target)[mark_normaliser(target)].all()
     return height_and_slope(target, without_normaliser(target, target.data) if is_scale else target.data, flat)[1]
 
@@ -133,7 +141,7 @@ def _add_convexly(
 def _lift_eigenvalues(
     approximate: Float[np.ndarray, "rows rows"], remainder: Float[np.ndarray, "rows rows"]
 ) -> Float[np.ndarray, "rows rows"]:
-    """Compute what `_add_convexly` adds to the sum. Few eigenvalues are so small, and only these are computed."""
+    """Compute what `_add_convexly` adds to the sum. Only the few eigenvalues below `LEAST_RATIO` are computed."""
     lower = np.linalg.cholesky(approximate)
     half = scipy.linalg.solve_triangular(lower, remainder, lower=True)
     whitened = scipy.linalg.solve_triangular(lower, half.T, lower=True)

@@ -128,7 +128,7 @@ def settle(
 def improve(
     target: Target, flat: Float[np.ndarray, "dimension"], iterations: int = 40, deadline: Deadline = NEVER
 ) -> Float[np.ndarray, "dimension"]:
-    """Move all coordinates but the hyperparameters towards the mode."""
+    """Move all coordinates but the scales (`mark_scales`) towards the mode."""
     return _improve(target, target.data, flat, True, iterations, deadline)
 
 

@@ -60,7 +60,9 @@ def temper(target: Target, points: Any, deadline: Deadline = NEVER) -> Target:
         return target
     near = approach(target, _middle(target, points), deadline=deadline)
     # Residuals change little once the displacements have followed the first search for hyperparameters.
-    near_mode = improve(target, settle(target, near, repeats=1, deadline=deadline), deadline=deadline)
+    near_mode = settle(target, near, repeats=1, deadline=deadline)
+    if not deadline.has_passed:
+        near_mode = improve(target, near_mode, deadline=deadline)
     return target.mode_search.tempering(estimands_of(target, target.data, unravel(target)(jnp.asarray(near_mode))))
 
 

@@ -21,7 +21,8 @@ from blackjax.mcmc.integrators import IntegratorState
 
 from bayesreg.types import AnyArray, Scalar
 
-# The first and the last kick of a trajectory are weaker by this share of a whole kick, and their neighbours stronger.
+# Gregory's correction takes this share of a whole kick from the first and the last kick of a trajectory, and gives it
+# to the kick next to each of them.
 GREGORY = 1 / 12
 
 

@@ -116,7 +116,7 @@ class WindowCorrelation(NamedTuple):
         volume, *sums = self.windows.sums(weights[:, None] * jnp.stack([jnp.ones_like(weights), *pair[:2]], axis=1)).T
         # A window that is not compared at all has the weight zero.
         volume = jnp.maximum(volume, jnp.finfo(volume.dtype).tiny)
-        f, m = (values - total / volume for values, total in zip(pair[:2], sums, strict=True))
+        f, m = (values - values_sum / volume for values, values_sum in zip(pair[:2], sums, strict=True))
         covariance, variance = self.windows.sums(jnp.stack([weights * f * m, weights * m**2], axis=1)).T / volume
         gain = covariance / (variance + self.ridge)
         return LocalFit(volume, f, m, variance, gain, f - gain * m)

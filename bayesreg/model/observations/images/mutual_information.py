@@ -79,8 +79,8 @@ class JointInformation(NamedTuple):
     def histogram(self, pair: Intensities) -> Histogram:
         """Compute the joint histogram of a pair."""
         fixed, moving = _bins(pair.fixed, self.fixed_range), _bins(pair.moving, self.moving_range)
-        counted = pair.weights / pair.weights.mean() * pair.shares
-        joint = (fixed * counted[:, None]).T @ moving + LEAST * len(counted)
+        counted = (pair.weights / pair.weights.mean() * pair.shares).astype(float)
+        joint = (fixed * counted[:, None]).T @ moving.astype(float) + LEAST * len(counted)
         return Histogram(joint / joint.sum(), fixed, moving, counted.sum())
 
     def energy(self, pair: Intensities, temperature: Scalar) -> Scalar:
