@@ -14,6 +14,7 @@ tr(K⁻¹ ∂K), needs the inverse only inside the band: twice as many operation
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -190,17 +191,18 @@ def log_determinant(
     layout: BandLayout, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
 ) -> Scalar:
     """Compute log det of the rows and columns of K(λ, μ) that are in a layout; differentiable in λ and μ."""
-
-    def on_device(lam: AnyArray, mu: AnyArray) -> Scalar:
-        return band_log_determinant(_assemble(elements, lam, mu, layout))
-
+    on_device = partial(_log_determinant_on_device, layout, elements)
     return jax.lax.platform_dependent(lam, mu, cpu=layout.on_host.log_determinant, default=on_device)
 
 
 @log_determinant.defjvp
 def _log_determinant_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
-    layout, elements, lam, mu = primals
-    return jax.jvp(lambda lam, mu: band_log_determinant(_assemble(elements, lam, mu, layout)), (lam, mu), tangents[2:])
+    layout, elements, *moduli = primals
+    return jax.jvp(partial(_log_determinant_on_device, layout, elements), moduli, list(tangents[2:]))
+
+
+def _log_determinant_on_device(layout: BandLayout, elements: Elements, lam: AnyArray, mu: AnyArray) -> Scalar:
+    return band_log_determinant(_assemble(elements, lam, mu, layout))
 
 
 def _assemble(elements: Elements, lam: AnyArray, mu: AnyArray, layout: BandLayout) -> Band:

@@ -236,8 +236,3 @@ def require_soft_wall(target: Target) -> None:
 def without_normaliser(target: Target, data: Any) -> Any:
     """Return the data of the same problem without the normaliser."""
     return data if target.normaliser is None else target.normaliser.without(data)
-
-
-def has_costly_normaliser(target: Target) -> bool:
-    """Check whether the density has a normaliser that is too costly for every step of a trajectory."""
-    return target.normaliser is not None and target.normaliser.is_costly

@@ -65,7 +65,7 @@ class Gaussian(NamedTuple):
 
 
 def _product(matrix: Float[AnyArray, "rows columns"], vector: Float[AnyArray, "columns"]) -> Float[AnyArray, "rows"]:
-    """Multiply in the precision of the matrix; on a GPU the default for single precision is half of its digits."""
+    """Multiply in the precision of the matrix; on a GPU the default for single precision has half of its digits."""
     return jnp.matmul(matrix, vector.astype(matrix.dtype), precision=jax.lax.Precision.HIGHEST)
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from bayesreg.inference.gaussian.density import mark_normaliser, normaliser_and_slope
 from bayesreg.inference.gaussian.laplace import Gaussian
 from bayesreg.inference.layout import dimension, unravel
-from bayesreg.inference.target import Target, estimands_of, has_costly_normaliser
+from bayesreg.inference.target import Target, estimands_of
 from bayesreg.types import AnyArray, Scalar
 
 # The degree of the polynomial is the highest one with at most MOST_TERMS terms: the cost of the fit grows with them.
@@ -87,7 +87,7 @@ def no_stand_in(target: Target) -> StandIn:
 def make_stand_in(target: Target, gaussian: Gaussian, middle: AnyArray) -> StandIn:
     """Fit a polynomial to the normaliser and its slopes about a flat position, by least squares."""
     stand_in = no_stand_in(target)
-    if not has_costly_normaliser(target) or not len(stand_in.centre):
+    if target.surrogate is None or not len(stand_in.centre):
         return stand_in
     entries, middle = np.flatnonzero(mark_normaliser(target)), np.asarray(middle)
     unit, rng = np.linalg.norm(np.asarray(gaussian.factor)[entries], axis=1), np.random.default_rng(0)
