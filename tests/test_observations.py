@@ -14,8 +14,8 @@ from bayesreg.inference.draws.inference_data import arviz
 from bayesreg.io import store
 from bayesreg.io.run_folder import RunFolder
 from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.fingerprint import fingerprint, require_same_observations
 from bayesreg.workflow.preparation import prepared_inputs
-from bayesreg.workflow.run import _fingerprint, _require_same_observations
 from tests.phantoms import ball_mesh, box_mesh
 from tests.reportless import without_reports
 from tests.test_tissues import CENTRE, anatomy
@@ -271,12 +271,12 @@ class Near:
 def test_an_observation_that_forbids_is_known_again(tmp_path):
     """Also where its log is −∞ at the displacement at which observations are compared, which JSON writes as null."""
     posterior = {d: br.build_posterior(mesh=box_mesh(2), observations=[Near(d)]) for d in (1e-6, 100.0)}
-    fingerprints = {d: _fingerprint(post, [Near(d)]) for d, post in posterior.items()}
+    fingerprints = {d: fingerprint(post, [Near(d)]) for d, post in posterior.items()}
     assert fingerprints == {1e-6: {"near": None}, 100.0: {"near": 0.0}}
     for distance, built in posterior.items():
-        _require_same_observations(tmp_path, {"observations": fingerprints[distance]}, built, [Near(distance)])
+        require_same_observations(tmp_path, {"observations": fingerprints[distance]}, built, [Near(distance)])
     with pytest.raises(br.InputError, match=r"another observation 'near' .* are None and 0\.0"):
-        _require_same_observations(tmp_path, {"observations": fingerprints[1e-6]}, posterior[100.0], [Near(100.0)])
+        require_same_observations(tmp_path, {"observations": fingerprints[1e-6]}, posterior[100.0], [Near(100.0)])
 
 
 def test_nothing_observed_is_told(folder, tmp_path):

@@ -11,6 +11,8 @@ from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.target import Estimands
 from bayesreg.types import AnyArray
 
+OnMode = Callable[[Estimands], None]
+
 
 class Info(NamedTuple):
     """The report of one transition: acceptance probability, failures and cost.
@@ -53,9 +55,11 @@ class Sampler(NamedTuple):
     Attributes
     ----------
     prepare : callable
-        (points, key, deadline) → (setup, points). It takes start points (chains as the leading axis). It returns the
-        setup, a pytree that the kernel needs besides the data and that is computed once, and the points at which chains
-        start. At the `Deadline` it ends with what it has.
+        (points, key, deadline, on_mode) → (setup, points). It takes start points (chains as the leading axis). It
+        returns the setup, a pytree that the kernel needs besides the data and that is computed once, and the points at
+        which chains start. At the `Deadline` it ends with what it has. An exact sampler that begins with a search for
+        the mode calls `on_mode` with estimands drawn from Laplace's approximation (draws as the leading axis): when the
+        search has ended or, if an earlier search led near the mode, before it.
     data : callable
         (setup) → the data of the target that the functions below take.
     blank : callable
@@ -74,9 +78,11 @@ class Sampler(NamedTuple):
         skipped; only their number outside the support is counted.
     many_solves : bool
         Whether a step has many elastic solves and does not report them. The solve of the draw is counted instead.
+    compile : callable, optional
+        (points) → None. It compiles the programs of `prepare` ahead, for start points of these shapes.
     """
 
-    prepare: Callable[[Any, AnyArray, Deadline], tuple[Any, Any]]
+    prepare: Callable[[Any, AnyArray, Deadline, OnMode], tuple[Any, Any]]
     data: Callable[[Any], Any]
     blank: Callable[[], Any]
     init: Callable[[Any, Any, Estimands], Any]
@@ -85,3 +91,4 @@ class Sampler(NamedTuple):
     exact: bool
     outside: Callable[[Any, Any, AnyArray, Any], AnyArray] | None = None
     many_solves: bool = False
+    compile: Callable[[Any], None] | None = None

@@ -104,7 +104,22 @@ def write_results(
     displacement_mean: Float[np.ndarray, "X Y Z 3"],
     displacement_sd: Float[np.ndarray, "X Y Z 3"],
 ) -> None:
-    """Write the result files of a finished run.
+    """Write the result files of a finished run; the arguments are those of `write_displacement`."""
+    write_displacement(place, run, displacement_mean, displacement_sd)
+    if run.metrics is not None:
+        write_json(place("metrics.json"), run.metrics)
+    if run.predicted is not None:
+        save_arrays(place("predicted.npz"), run.predicted.as_arrays())
+    write_json(place("run.json"), run.manifest)
+
+
+def write_displacement(
+    place: Place,
+    run: Run,
+    displacement_mean: Float[np.ndarray, "X Y Z 3"],
+    displacement_sd: Float[np.ndarray, "X Y Z 3"],
+) -> None:
+    """Write the displacement of a run on its mesh and on its grid, and the warped image.
 
     Parameters
     ----------
@@ -124,11 +139,6 @@ def write_results(
     # The writer converts vectors to LPS. A standard deviation is no vector and must stay positive.
     unsigned = np.asarray(displacement_sd) * LPS
     save_displacement(place("displacement_sd.nii.gz"), unsigned, affine)
-    if run.metrics is not None:
-        write_json(place("metrics.json"), run.metrics)
-    if run.predicted is not None:
-        save_arrays(place("predicted.npz"), run.predicted.as_arrays())
-    write_json(place("run.json"), run.manifest)
 
 
 def read_run(folder: RunFolder) -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,9 @@ from numpyro.infer.util import log_density
 
 from bayesreg.model.program import Problem, registration
 from bayesreg.types import AnyArray, Scalar
+
+# NumPyro keeps the handlers of all threads in one stack, and JAX may trace the program in two threads at a time.
+_ONE_THREAD = Lock()
 
 
 class Evaluation(NamedTuple):
@@ -45,7 +49,7 @@ def evaluate(
     problem: Problem, values: dict[str, AnyArray], guess: Float[AnyArray, "nodes 3"] | None = None
 ) -> Evaluation:
     """Evaluate the log density at some values; a `guess` of u saves iterations but removes the derivative."""
-    total, trace = log_density(registration, (problem, guess), {}, values)
+    total, trace = _trace(problem, values, guess)
     names = ("u", "strain_energy", "solver_iterations", "solver_failed", "outside_support")
     quantities = {name: trace[name]["value"] for name in names}
     # Any NaN counts as a failure and becomes −∞, so that no sampler can move there.
@@ -59,7 +63,7 @@ def evaluate(
 @jax.jit
 def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
     """Return every factor of the density by name, and the energies."""
-    _, trace = log_density(registration, (problem,), {}, values)
+    _, trace = _trace(problem, values)
     factors = {"similarity_energy": _similarity_energy(trace), "strain_energy": trace["strain_energy"]["value"]}
     for name in (*problem.terms, "support", "solved"):
         factors[name] = trace[name]["fn"].log_prob(trace[name]["value"]).sum()
@@ -67,6 +71,14 @@ def terms(problem: Problem, values: dict[str, AnyArray]) -> dict[str, Scalar]:
         if block.is_sampled and name != "u_boundary":
             factors[f"prior_{name}"] = trace[name]["fn"].log_prob(values[name])
     return factors
+
+
+def _trace(
+    problem: Problem, values: dict[str, AnyArray], guess: Float[AnyArray, "nodes 3"] | None = None
+) -> tuple[Scalar, dict[str, Any]]:
+    """Run the program at some values; return its log density and its sites."""
+    with _ONE_THREAD:
+        return log_density(registration, (problem, guess), {}, values)
 
 
 def _similarity_energy(trace: dict[str, Any]) -> Scalar:

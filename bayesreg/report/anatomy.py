@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from bayesreg.image import Image
@@ -12,33 +13,32 @@ from bayesreg.io.records import Run
 from bayesreg.report import panels, style
 from bayesreg.report.panels import Row, View
 from bayesreg.report.slices import Plane, sample
-from bayesreg.report.study import Study
+from bayesreg.report.study import image_differences
 from bayesreg.report.style import Drawing
 from bayesreg.report.verdict import number
 
 CONVENTION = "Neurological convention: the left of the patient is on the left."
 
 
-def before_and_after(study: Study) -> Drawing | None:
+def before_and_after(run: Run, view: View) -> Drawing | None:
     """Draw the fixed, moving and warped images, and their differences, on three planes; None without images.
 
     If the images have unlike contrast, or a pose was needed, the figure shows the borders of the tissues on all images.
     """
-    run, view = study.run, study.view
     if run.fixed is None or run.moving is None or run.warped is None:
         return None
     images, differences = _columns(run), _differences(run)
     with style.look():
         figure, axes = _grid(view, len(images) + len(differences))
         for row, plane in zip(axes, view.planes[::-1], strict=True):
-            _draw_images(row, study, plane, images)
+            _draw_images(row, view, plane, images)
             row[0].set_ylabel(plane.title, color=style.MUTED)
         if differences:
             _draw_differences(figure, axes[:, len(images) :], view, list(differences.values()))
         for panel, title in zip(axes[0], [*images, *differences], strict=True):
             panel.set_title(title)
         uri = style.data_uri(figure)
-    caption = " ".join(_explain(study))
+    caption = " ".join(_explain(run))
     return Drawing("registration", "Before and after", caption, "Fixed, moving and warped images on three planes.", uri)
 
 
@@ -65,11 +65,11 @@ def _differences(run: Run) -> dict[str, Image]:
     return {"before: m − f": run.moving, "after: m(x + ū) − f": run.warped}
 
 
-def _draw_images(row: np.ndarray, study: Study, plane: Plane, images: Mapping[str, Image]) -> None:
-    run = study.run
+def _draw_images(row: np.ndarray, view: View, plane: Plane, images: Mapping[str, Image]) -> None:
+    run = view.run
     shared = panels.grey_limits(run) if run.matching.one_contrast else None
     plain = run.matching.one_contrast and run.matching.pose.is_identity
-    fixed, moving, warped = panels.ignored(study.view, plane)
+    fixed, moving, warped = panels.ignored(view, plane)
     masks = (fixed, moving, warped) if len(images) == 3 else (fixed, None, moving, warped)
     for panel, image, mask in zip(row, images.values(), masks, strict=False):
         panels.image_panel(panel, image, plane, shared or panels.range_of(image))
@@ -98,11 +98,11 @@ def _difference(view: View, image: Image, plane: Plane) -> np.ndarray:
     return np.where(view.slice(plane).inside, sample(image, points) - sample(view.run.fixed, points), np.nan)
 
 
-def _explain(study: Study) -> list[str]:
-    run = study.run
+def _explain(run: Run) -> list[str]:
     sentences = ["Planes through the node of greatest displacement."]
-    if study.image_differences is not None:
-        before, after = study.image_differences
+    differences = image_differences(run)
+    if differences is not None:
+        before, after = differences
         sentences.append(
             f"The root mean square of the difference falls from {before:.3f} to {after:.3f} (scaled intensity)."
         )
@@ -115,9 +115,8 @@ def _explain(study: Study) -> list[str]:
     return [*sentences, CONVENTION]
 
 
-def displacement(study: Study) -> Drawing:
+def displacement(run: Run, view: View, reach: Float[np.ndarray, "nodes"]) -> Drawing:
     """Draw the posterior mean with arrows, the radius that holds 95 %, and the known error, on three planes."""
-    run, view, reach = study.run, study.view, study.predicted.reach
     rows = [
         Row("|ū|, mm", lambda plane: view.norm(plane, run.u_mean), style.MAGNITUDE),
         Row("95 % radius, mm", lambda plane: view.scalar(plane, reach), style.ERROR),

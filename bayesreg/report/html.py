@@ -5,14 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
+from jaxtyping import Float
 
 from bayesreg.io.records import Run
-from bayesreg.report.page import Opening, write_page
+from bayesreg.report import anatomy
+from bayesreg.report.page import Opening, PageSection, write_page
+from bayesreg.report.panels import View
 from bayesreg.report.sections import SECTIONS
 from bayesreg.report.study import Study
 from bayesreg.report.summary import answers
 from bayesreg.report.verdict import approximation, nested_entry, warnings_of
+
+KICKER = "Bayesian elastic registration"
+FIRST = (
+    "Sampling goes on. What follows is Laplace’s approximation: the Gaussian with the curvature of the posterior at "
+    "its mode. The report of the draws will replace this page when they have converged, or when their budget is spent."
+)
 
 
 def write_report(
@@ -31,9 +41,34 @@ def write_report(
     write_page(path, _opening(study), [section.page_section(study) for section in SECTIONS if section.applies(study)])
 
 
+def write_first_report(run: Run, reach: Float[np.ndarray, "nodes"], path: str | Path) -> None:
+    """Write the report of the first answer, which the report of the draws replaces later.
+
+    Parameters
+    ----------
+    run : Run
+        Of its manifest, the entries `name` and `appraisal` are read.
+    reach : (n,) array
+        Radius of the ball around the mean that holds each displaced node with 95 % probability, mm.
+    path : path
+        The HTML file; replaced in one step.
+    """
+    view = View.of(run)
+    figures = [figure for figure in (anatomy.before_and_after(run, view),) if figure is not None]
+    opening = Opening(
+        kicker=KICKER,
+        title=str(run.manifest["name"] or "Registration"),
+        lead="First answer, before the first draw",
+        approximation=FIRST,
+        warnings=nested_entry(run.manifest, "appraisal", "warnings") or [],
+    )
+    displacement = anatomy.displacement(run, view, reach)
+    write_page(path, opening, [PageSection("Registration", figures), PageSection("Displacement", [displacement])])
+
+
 def _opening(study: Study) -> Opening:
     return Opening(
-        kicker="Bayesian elastic registration",
+        kicker=KICKER,
         title=study.name,
         lead=_describe(study),
         verdicts=[("", study.verdict)],

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 from markupsafe import Markup
 
 from bayesreg.report import (
@@ -60,6 +61,14 @@ class Section(NamedTuple):
         return PageSection(self.title, items)
 
 
+def _before_and_after(study: Study) -> Item | None:
+    return anatomy.before_and_after(study.run, study.view)
+
+
+def _displacement(study: Study) -> Item:
+    return anatomy.displacement(study.run, study.view, np.asarray(study.predicted.reach))
+
+
 def _fit(study: Study) -> list[Item]:
     table = observations.observation_table(study.manifest)
     shown = observations.shown_by_kinds(study.manifest, study.mesh, study.predicted)
@@ -95,8 +104,8 @@ def _settings(study: Study) -> list[Item]:
 
 
 SECTIONS = (
-    Section("Registration", [pose.notes, anatomy.before_and_after, three_d]),
-    Section("Displacement", [anatomy.displacement, uncertainty.place_table, uncertainty.places, trust.explain]),
+    Section("Registration", [pose.notes, _before_and_after, three_d]),
+    Section("Displacement", [_displacement, uncertainty.place_table, uncertainty.places, trust.explain]),
     Section("Pose", [pose.pose_table]),
     Section("Landmarks held out", [evaluation.evaluation_table, evaluation.evaluation]),
     Section("Error", [_errors]),

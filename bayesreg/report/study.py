@@ -114,14 +114,6 @@ class Study:
             return self.run.metrics
         return compute_metrics(self.mesh, self.run.u_mean, self.run.truth, self.posterior)
 
-    @cached_property
-    def image_differences(self) -> tuple[float, float] | None:
-        """The root mean square of moving and warped minus fixed image; None unless the images have one contrast."""
-        run = self.run
-        if run.fixed is None or run.moving is None or run.warped is None or not run.matching.one_contrast:
-            return None
-        return rms_difference(run, run.moving), rms_difference(run, run.warped)
-
     @property
     def is_of_the_paper(self) -> bool:
         """Whether the model is that of the paper."""
@@ -141,6 +133,13 @@ class Study:
     def name(self) -> str:
         """The name of the run; without a name, a description of its sampled variables."""
         return str(self.manifest.get("name") or self.elasticity or "Registration")
+
+
+def image_differences(run: Run) -> tuple[float, float] | None:
+    """Compute the root mean square of moving and warped minus fixed image; None unless they have one contrast."""
+    if run.fixed is None or run.moving is None or run.warped is None or not run.matching.one_contrast:
+        return None
+    return rms_difference(run, run.moving), rms_difference(run, run.warped)
 
 
 def rms_difference(run: Run, image: Image) -> float:

@@ -69,7 +69,7 @@ def finish(
         | {"displacement_sd": moments.rms_sd},
         u_mean=samples.u_mean,
         u_sd=samples.u_sd,
-        warped=_warp(inputs, moments.mean),
+        warped=warp_moving(inputs, moments.mean),
         metrics=metrics,
         predicted=predicted,
         **inputs._asdict(),
@@ -100,7 +100,7 @@ def _store_draws(posterior: Posterior, samples: Samples, folder: RunFolder, seed
     return open_posterior(folder.path / POSTERIOR)
 
 
-def _warp(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
+def warp_moving(inputs: Inputs, mean_field: np.ndarray) -> Image | None:
     """Resample the moving image on the fixed grid by the mean displacement and the pose."""
     if inputs.moving is None or inputs.fixed is None:
         return None

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from bayesreg.ahead import ahead
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.data import BrainWebData, FilesData
 from bayesreg.distance import forbidden
@@ -91,11 +92,12 @@ def prepare(config: Config) -> Prepared:
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, size * BRAIN_CLOSING, anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
     fixed_ignore = None if anatomy.image is None else _ignored(config, "fixed", anatomy.image)
-    matched = _match(config, anatomy, domain, fixed_ignore)
-    appraisal = _appraise(config, anatomy, domain, matched)
-    clock.lap("images")
     settings = complete_lengths(config.mesh, size)
-    mesh = mesh_of(anatomy, domain, settings)
+    with ahead(mesh_of, anatomy, domain, settings) as meshing:
+        matched = _match(config, anatomy, domain, fixed_ignore)
+        appraisal = _appraise(config, anatomy, domain, matched)
+        clock.lap("images")
+    mesh = meshing.result()
     if settings.file is not None:
         require_agreement(mesh, tissue, settings.file)
     clock.lap("mesh")
@@ -236,10 +238,11 @@ def with_unsampled(provenance: dict[str, Any], began: float) -> dict[str, Any]:
 
 
 def store_inputs(folder: RunFolder, inputs: Inputs, provenance: dict[str, Any]) -> None:
-    """Write the inputs of a run and their provenance into its folder."""
-    with folder.writing("prepared") as temporary_path:
+    """Write the inputs of a run and their provenance into its folder; the provenance alone if it holds the inputs."""
+    with folder.writing(folder.stage or "prepared") as temporary_path:
         store.write_json(temporary_path(PROVENANCE), provenance)
-        store.write_inputs(temporary_path, inputs)
+        if folder.stage is None:
+            store.write_inputs(temporary_path, inputs)
 
 
 def _require_start(config: Config, mesh: TetMesh | None = None) -> None:

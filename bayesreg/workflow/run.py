@@ -14,8 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from bayesreg.ahead import ahead
 from bayesreg.config import Config, load_config, load_stored_config, resolved_yaml
-from bayesreg.inference.chains.beginning import checkpoint_from_arrays, first_checkpoint, temper_target
+from bayesreg.inference.chains.beginning import (
+    checkpoint_from_arrays,
+    compile_programs,
+    first_checkpoint,
+    temper_target,
+)
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.progress import Showing
 from bayesreg.inference.chains.run import Samples, sample
@@ -32,10 +38,12 @@ from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.target import PosteriorTarget
 from bayesreg.results.result import REPORT, Result, load_result
-from bayesreg.types import InputError
+from bayesreg.types import AnyArray, InputError
 from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
 from bayesreg.workflow.budget import BLOCK, block_length, max_seconds, require_memory
+from bayesreg.workflow.fingerprint import fingerprint, require_same_observations
 from bayesreg.workflow.finish import finish
+from bayesreg.workflow.first_answer import write_first_answer
 from bayesreg.workflow.interruption import ending_between_blocks
 from bayesreg.workflow.preparation import (
     PROVENANCE,
@@ -122,21 +130,23 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     # The folder is written after all inputs are checked, and before the first step.
     posterior = posterior_of(config, inputs, observations)
     require_memory(config, posterior)
-    provenance["observations"] = _fingerprint(posterior, observations)
+    provenance["observations"] = fingerprint(posterior, observations)
     provenance["sources"] = sources
     _log.info("%s", _describe_mesh(inputs))
-    searching = time.perf_counter()
-    deadline = Deadline.after(max_seconds(config))
-    posterior = temper(config, inputs, posterior, deadline)
-    provenance["independent_points"] = posterior.independent_points
-    reached = _first(config, inputs, posterior, folder, deadline, time.perf_counter() - searching)
-    if deadline.has_passed:
-        provenance["appraisal"] = _with_warning(provenance.get("appraisal", {}), CUT)
-    inputs = with_initial(inputs, config)
     with folder.locked():
         if folder.stage is not None:
             raise InputError(f"another process has begun a run in {folder.path} meanwhile; name another folder")
-        provenance = with_unsampled(provenance, began + float(reached[0].seconds))
+        searching = time.perf_counter()
+        deadline = Deadline.after(max_seconds(config))
+        with ahead(_compile, config, posterior):
+            posterior = temper(config, inputs, posterior, deadline)
+            provenance["independent_points"] = posterior.independent_points
+            inputs = with_initial(inputs, config)
+            spent = time.perf_counter() - searching
+            provenance = with_unsampled(provenance, began + spent)
+            reached = _first(config, inputs, posterior, provenance, folder, deadline, spent)
+        if deadline.has_passed:
+            provenance["appraisal"] = _with_warning(provenance.get("appraisal", {}), CUT)
         store_inputs(folder, inputs, provenance)
         return _go_on(config, inputs, posterior, reached, provenance, folder, began, progress)
 
@@ -154,7 +164,7 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     inputs = store.read_inputs(folder)
     _log.info("%s", _describe_mesh(inputs))
     posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
-    _require_same_observations(folder.path, provenance, posterior, observations)
+    require_same_observations(folder.path, provenance, posterior, observations)
     # A pair that `simulate` stored is not tempered yet.
     deadline = Deadline.after(max_seconds(config))
     searching = time.perf_counter()
@@ -168,7 +178,7 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     if stored_config.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
-    reached = _load_reached(config, inputs, posterior, folder, deadline, time.perf_counter() - searching)
+    reached = _load_reached(config, inputs, posterior, provenance, folder, deadline, time.perf_counter() - searching)
     sampled = float(reached[0].seconds)
     began -= provenance["unsampled"] + sampled
     with folder.writing() as temporary_path:
@@ -225,37 +235,6 @@ def _resumed_config(folder: RunFolder, config: Config) -> Config:
     return stored_config
 
 
-def _fingerprint(posterior: Posterior, observations: list[Any]) -> dict[str, float | None]:
-    """Compute the log likelihood of each observation at one displacement of up to 1 mm; None if it is not finite."""
-    if not observations:
-        return {}
-    rest = posterior.reference()
-    displacement = np.sin(np.arange(rest["u_boundary"].size)).reshape(rest["u_boundary"].shape)
-    logs = posterior.energies(rest | {"u_boundary": displacement})
-    log_likelihoods = {observation.name: float(logs[observation.name]) for observation in observations}
-    return {name: log if np.isfinite(log) else None for name, log in log_likelihoods.items()}
-
-
-def _require_same_observations(
-    out: Path, provenance: dict[str, Any], posterior: Posterior, observations: list[Any]
-) -> None:
-    """Raise InputError if a run is resumed with other observations than it began with."""
-    begun, now = provenance.get("observations", {}), _fingerprint(posterior, observations)
-    advice = "give the same to bayesreg.run(..., observations=[...])"
-    if list(begun) != list(now):
-        raise InputError(
-            f"the run in {out} began with the observations {list(begun) or 'none'} besides those of its configuration, "
-            f"and is resumed with {list(now) or 'none'}: {advice}"
-        )
-    for name, log in now.items():
-        then = begun[name]
-        if (log is None) != (then is None) or (log is not None and not np.isclose(log, then, rtol=1e-6)):
-            raise InputError(
-                f"the run in {out} began with another observation {name!r} than it is resumed with: their logs at one "
-                f"displacement are {then} and {log}; {advice}"
-            )
-
-
 def _describe_mesh(inputs: Inputs) -> str:
     mesh = inputs.mesh
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
@@ -275,33 +254,56 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadl
     return tempered
 
 
+def _compile(config: Config, posterior: Posterior) -> None:
+    options, length = config.sampler, _block(config, posterior)
+    compile_programs(posterior.target, options.name, options.chains, length, options.thin, **options.settings)
+
+
+def _block(config: Config, posterior: Posterior) -> int:
+    return config.sampler.block or block_length(posterior)
+
+
 def _first(
     config: Config,
     inputs: Inputs,
     posterior: Posterior,
+    provenance: dict[str, Any],
     folder: RunFolder,
     deadline: Deadline,
     seconds: float,
 ) -> Reached:
     """Make the state of the chains before their first step; InputError if a chain cannot start.
 
-    The `seconds` that were spent before count as sampling.
+    When a search has led to the mode, the first answer is written. The `seconds` that were spent before count as
+    sampling.
     """
     options, start = config.sampler, start_of(config, inputs, posterior)
+
+    def answer(estimands: Mapping[str, AnyArray]) -> None:
+        store_inputs(folder, inputs, provenance)
+        write_first_answer(config, inputs, posterior, estimands, provenance.get("appraisal", {}), folder)
+        _log.info("a first answer, about the mode, is in %s; sampling goes on", folder.path)
+
     checkpoint = first_checkpoint(
-        posterior.target, options.name, options.chains, config.seed, start, deadline, **options.settings
+        posterior.target, options.name, options.chains, config.seed, start, deadline, answer, **options.settings
     )
     checkpoint = checkpoint._replace(seconds=checkpoint.seconds + seconds)
     return checkpoint, checkpoints.StoredBlocks(folder, 0)
 
 
 def _load_reached(
-    config: Config, inputs: Inputs, posterior: Posterior, folder: RunFolder, deadline: Deadline, seconds: float
+    config: Config,
+    inputs: Inputs,
+    posterior: Posterior,
+    provenance: dict[str, Any],
+    folder: RunFolder,
+    deadline: Deadline,
+    seconds: float,
 ) -> Reached:
     """Load the state of the chains that the interrupted run stored last."""
     state = checkpoints.load_state(folder)
     if state is None:
-        return _first(config, inputs, posterior, folder, deadline, seconds)
+        return _first(config, inputs, posterior, provenance, folder, deadline, seconds)
     blocks = checkpoints.StoredBlocks(folder, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior.target, options.name, options.chains, **options.settings), blocks
@@ -331,7 +333,7 @@ def _sample(
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=options.block or block_length(posterior),
+        block=_block(config, posterior),
         stop=StopRule(config.stop.rhat, config.stop.ess, max_seconds(config)),
         progress=progress,
         resume=reached,

@@ -111,7 +111,7 @@ def test_many_parameters_have_a_stand_in_of_lower_degree(monkeypatch):
 def test_the_stand_in_is_close_to_the_normaliser_where_the_warm_up_ends():
     post = posterior()
     points = starting_points(post.target, br.Start(), 2, jax.random.key(0))
-    setup, _ = hmc(post.target, Hmc(warm_up=2)).prepare(points, jax.random.key(1), NEVER)
+    setup, _ = hmc(post.target, Hmc(warm_up=2)).prepare(points, jax.random.key(1), NEVER, lambda _: None)
     sd = np.linalg.norm(np.asarray(setup.gaussian.factor), axis=1) * mark_normaliser(post.target)
     places = np.asarray(setup.middle) + sd * np.random.default_rng(0).normal(size=(10, len(sd)))
     true, approximate = (

@@ -10,14 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bayesreg.inference.chains.block import watched_values
+from bayesreg.inference.chains.block import run_block, watched_values
 from bayesreg.inference.chains.checkpoint import Checkpoint, no_steps
+from bayesreg.inference.chains.devices import devices_for, share
 from bayesreg.inference.chains.initialise import Start, require_density, require_numbers, starting_points
 from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.draws.blocks import Blocks
 from bayesreg.inference.draws.moments import zero_moments
 from bayesreg.inference.gaussian.modes import temper
-from bayesreg.inference.kernel import Draw
+from bayesreg.inference.kernel import Draw, OnMode
 from bayesreg.inference.samplers.registry import Chosen, choose_sampler
 from bayesreg.inference.target import Target
 from bayesreg.types import AnyArray, InputError
@@ -47,11 +48,13 @@ def first_checkpoint(
     seed: int,
     start: Start | None = None,
     deadline: Deadline = NEVER,
+    on_mode: OnMode = lambda _estimands: None,
     **settings: Any,
 ) -> Checkpoint:
     """Make the checkpoint before the first draw; `sample` starts its chains there unless it resumes a run.
 
-    At the deadline the search and the warm-up end with what they have.
+    At the deadline the search and the warm-up end with what they have. `on_mode` is called between the two, see
+    `Sampler.prepare`.
 
     Raises
     ------
@@ -63,7 +66,7 @@ def first_checkpoint(
     points = starting_points(target, start or Start(), chains, key_start)
     require_numbers(points)
     chosen = choose_sampler(sampler, target, **settings)
-    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), deadline)
+    setup, points = chosen.sampler.prepare(points, jax.random.fold_in(key_start, 1), deadline, on_mode)
     data = chosen.sampler.data(setup)
     checkpoint = _first(chosen, data, setup, points)
     require_density(_observe(chosen, data, setup, checkpoint.state).evaluation)
@@ -83,8 +86,7 @@ def checkpoint_from_arrays(
         If the arrays belong to another problem.
     """
     chosen = choose_sampler(sampler, target, **settings)
-    points = jax.tree.map(lambda x: jnp.zeros((chains, *x.shape)), target.coordinates.reference())
-    setup = chosen.sampler.blank()
+    setup, points = _blank(chosen, chains)
     expected = jax.eval_shape(partial(_first, chosen), chosen.sampler.data(setup), setup, points)
     leaves = [arrays[name] for name in sorted(arrays)]
     wanted, structure = jax.tree.flatten(expected)
@@ -94,6 +96,27 @@ def checkpoint_from_arrays(
             "another version of bayesreg began"
         )
     return jax.tree.unflatten(structure, leaves)
+
+
+def compile_programs(target: Target, sampler: str, chains: int, length: int, thin: int, **settings: Any) -> None:
+    """Compile the programs of the warm-up and of a block of draws, so that they are there when the search has ended.
+
+    They are called at the reference, for a block without draws.
+    """
+    chosen = choose_sampler(sampler, target, **settings)
+    setup, points = _blank(chosen, chains)
+    if chosen.sampler.compile is not None:
+        chosen.sampler.compile(points)
+    data = chosen.sampler.data(setup)
+    checkpoint, devices = _first(chosen, data, setup, points), devices_for(chains)
+    numbers, shared = np.arange(chains), share(checkpoint[2:5], devices)
+    run_block(chosen, length, thin, devices, data, 0, numbers, 0, 0, setup, *shared)
+
+
+def _blank(chosen: Chosen, chains: int) -> tuple[Any, Any]:
+    """Return a setup of a sampler and points of chains, of the right shapes."""
+    reference = chosen.target.coordinates.reference()
+    return chosen.sampler.blank(), jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * chains), reference)
 
 
 def require_continuation(chosen: Chosen, checkpoint: Checkpoint, blocks: Blocks) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
-from bayesreg.inference.chains.beginning import first_checkpoint, require_continuation, temper_target
+from bayesreg.ahead import ahead
+from bayesreg.inference.chains.beginning import compile_programs, first_checkpoint, require_continuation, temper_target
 from bayesreg.inference.chains.block import run_block
 from bayesreg.inference.chains.checkpoint import Checkpoint, Tally
 from bayesreg.inference.chains.devices import devices_for, share
@@ -158,16 +159,16 @@ def sample(
     target = posterior.target
     deadline = Deadline.after(stop.max_seconds)
     if resume is None:
-        target = temper_target(target, chains, seed, start, deadline)
-    elif target.mode_search is not None and target.mode_search.tempering is not None:
-        raise InputError("these draws are of a tempered posterior: resume them with the posterior of their samples")
-    chosen = choose_sampler(sampler, target, **settings)
-    if resume is None:
-        checkpoint = first_checkpoint(target, sampler, chains, seed, start, deadline, **settings)
+        with ahead(partial(compile_programs, target, sampler, chains, block, thin, **settings)):
+            target = temper_target(target, chains, seed, start, deadline)
+            checkpoint = first_checkpoint(target, sampler, chains, seed, start, deadline, **settings)
         checkpoint = checkpoint._replace(seconds=np.array(time.perf_counter() - began))
         blocks: Blocks = []
         began = time.perf_counter()
-    else:
+    elif target.mode_search is not None and target.mode_search.tempering is not None:
+        raise InputError("these draws are of a tempered posterior: resume them with the posterior of their samples")
+    chosen = choose_sampler(sampler, target, **settings)
+    if resume is not None:
         checkpoint, blocks = resume
         require_continuation(chosen, checkpoint, blocks)
     shown = progress if callable(progress) else SamplingProgress if progress else NoProgress

@@ -22,10 +22,10 @@ from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.gaussian.delayed_acceptance import with_delayed_acceptance
 from bayesreg.inference.gaussian.density import height_and_slope
 from bayesreg.inference.gaussian.hyperparameters import move_hyperparameters
-from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, slope_at
+from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, laplace, slope_at
 from bayesreg.inference.gaussian.modes import Modes, search_modes
 from bayesreg.inference.gaussian.normaliser import make_stand_in
-from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, tune, with_step_size
+from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, compile_transition, tune, with_step_size
 from bayesreg.inference.gaussian.whitened import (
     Setup,
     Transition,
@@ -34,7 +34,7 @@ from bayesreg.inference.gaussian.whitened import (
     whitened_density,
     whitened_position,
 )
-from bayesreg.inference.kernel import Draw, Info, Sampler
+from bayesreg.inference.kernel import Draw, Info, OnMode, Sampler
 from bayesreg.inference.layout import dimension, flat_position, unravel
 from bayesreg.inference.target import (
     Estimands,
@@ -55,6 +55,9 @@ OVERDISPERSION = 1.5
 DEEPEST = 10.0
 # The greatest number of attempts for a start point; each attempt is half as far from the mode as the one before.
 ATTEMPTS = 10
+
+# The number of independent draws from Laplace's approximation for a first answer.
+FIRST_DRAWS = 400
 
 # A Gaussian is averaged over the mode and the points of at most this number of chains, because each costs a curvature.
 AVERAGED = 16
@@ -157,21 +160,34 @@ def about_gaussian(
     # The first call must be outside of a trace: inside, the target's own arrays would become constants of the program.
     unravel(target)
 
-    def prepare(points: Any, key: AnyArray, deadline: Deadline) -> tuple[Setup, Any]:
+    def prepare(points: Any, key: AnyArray, deadline: Deadline, on_mode: OnMode) -> tuple[Setup, Any]:
+        key_answer, key_start, key_tune = jax.random.fold_in(key, 2), *jax.random.split(key)
+        near_mode = None if target.mode_search is None else target.mode_search.search_start
+        if exact and near_mode is not None and not deadline.has_passed:
+            flat = np.asarray(flat_position(target, target.data, near_mode))
+            on_mode(_draw_independently(target, target.data, laplace(target, flat), key_answer))
         modes = search_modes(target, points, mode_search == "per_chain", deadline)
-        key_start, key_tune = jax.random.split(key)
-        starts = _scatter_all(target, modes, jax.random.split(key_start, len(modes.chains)))
         gaussian = modes.gaussians[0]
+        if exact and near_mode is None and not deadline.has_passed:
+            on_mode(_draw_independently(target, target.data, gaussian, key_answer))
+        starts = _scatter_all(target, modes, jax.random.split(key_start, len(modes.chains)))
         if tuning is None:
             return setup_about(target, gaussian, gaussian.centre), starts
         return _warm_up(walk, tuning, gaussian, starts, key_tune, deadline)
+
+    def compile_warm_up(points: Any) -> None:
+        if tuning is not None:
+            setup = blank()
+            compile_transition(surrogate_data(target, setup), walk, setup, points, _half(tuning))
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
         return setup_about(target, Gaussian(nothing, jnp.eye(unknowns)), nothing)
 
     data = partial(_condition, target)
-    sampler = Sampler(prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True)
+    sampler = Sampler(
+        prepare, data, blank, walk.init, walk.step, walk.observe, exact, many_solves=True, compile=compile_warm_up
+    )
     # The kernel of an approximate sampler sees no density: it needs neither a surrogate nor other moves.
     if not exact:
         return sampler
@@ -192,11 +208,9 @@ def _warm_up(
     """
     if deadline.has_passed:
         _log.warning("warm-up: left out, because the time is spent")
-        stand_in = make_stand_in(walk.target, gaussian, gaussian.centre)
-        setup = with_step_size(tuning, setup_about(walk.target, gaussian, gaussian.centre), FIRST_STEP)
-        return setup._replace(stand_in=stand_in), points
+        return with_step_size(tuning, setup_about(walk.target, gaussian, gaussian.centre), FIRST_STEP), points
     mode = np.asarray(gaussian.centre)
-    target, stage = walk.target, tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
+    target, stage = walk.target, _half(tuning)
     key_settle, key_tune = jax.random.split(key)
     first = _setup_on_average(target, mode, points)
     first = first._replace(stand_in=make_stand_in(target, first.gaussian, first.middle))
@@ -208,6 +222,11 @@ def _warm_up(
     # The stand-in is accurate far about both middles.
     second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
     return tune(surrogate_data(target, second), walk, second, points, key_tune, stage, deadline=deadline)
+
+
+def _half(tuning: Tuning) -> Tuning:
+    """Return the options of one of two equal stages of a warm-up."""
+    return tuning._replace(warm_up=(tuning.warm_up + 1) // 2)
 
 
 def _condition(target: Target, setup: Setup) -> Any:
@@ -230,6 +249,13 @@ def _setup_on_average(target: Target, mode: AnyArray, points: Any) -> Setup:
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
     return setup_about(target, average_gaussian(target, places), np.mean(places, axis=0))
+
+
+@partial(jax.jit, static_argnums=0)
+def _draw_independently(target: Target, data: Any, gaussian: Gaussian, key: AnyArray) -> dict[str, AnyArray]:
+    """Draw estimands from a Gaussian, with draws as the leading axis."""
+    positions = gaussian.centre + jax.random.normal(key, (FIRST_DRAWS, len(gaussian.centre))) @ gaussian.factor.T
+    return jax.vmap(lambda flat: estimands_of(target, data, unravel(target)(flat)))(positions)
 
 
 def _scatter_all(target: Target, modes: Modes, keys: AnyArray) -> Any:

@@ -105,6 +105,9 @@ def settle(
         if deadline.has_passed:
             break
         improved = improve(target, better.flat, iterations, deadline)
+        if deadline.has_passed:
+            better = better._replace(flat=improved)
+            break
         balanced = balance_field(target, improved, partial(_factor, target, improved))
         shift = np.abs(balanced - before)[~resting].max()
         # Once the hyperparameters have settled, the other coordinates move too little to change them.

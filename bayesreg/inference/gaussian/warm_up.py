@@ -101,9 +101,7 @@ def tune(
     InputError
         If the chains accept (nearly) no transition.
     """
-    states = jax.vmap(partial(walk.init, data, setup))(starts)
-    averaging = jax.vmap(_averaging(tuning)[0])(jnp.full(len(jax.tree.leaves(states)[0]), setup.step_size))
-    states, averaging = _with_strong_types((states, averaging))
+    states, averaging = _begin(walk, tuning, data, setup, starts)
     rates: list[float] = []
     for key_transition in jax.random.split(key, tuning.warm_up):
         if deadline.has_passed:
@@ -126,6 +124,19 @@ def tune(
     trajectory = f", {int(setup.steps)} to a quarter turn" if tuning.quarter_turns else ""
     _log.info("warm-up: step %.2g%s, acceptance %.0f%%", float(setup.step_size), trajectory, 100 * late)
     return setup, points
+
+
+def compile_transition(data: Any, walk: Walking, setup: Any, starts: Any, tuning: Tuning) -> None:
+    """Compile the program of `tune` for arguments of these shapes, by a call of it."""
+    states, averaging = _begin(walk, tuning, data, setup, starts)
+    _transition(walk, tuning, data, setup, states, averaging, jax.random.key(0), jnp.asarray(True))
+
+
+def _begin(walk: Walking, tuning: Tuning, data: Any, setup: Any, starts: Any) -> tuple[Any, Any]:
+    """Make the states of the chains and of their dual averaging."""
+    states = jax.vmap(partial(walk.init, data, setup))(starts)
+    averaging = jax.vmap(_averaging(tuning)[0])(jnp.full(len(jax.tree.leaves(states)[0]), setup.step_size))
+    return _with_strong_types((states, averaging))
 
 
 def _with_strong_types(tree: Any) -> Any:

@@ -82,7 +82,7 @@ def rwmh(target: Target, settings: RandomWalk) -> Sampler:
 
     return Sampler(
         # The setup is the mean of the start points: the data are prepared for their neighbourhood.
-        prepare=lambda points, _key, _deadline: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
+        prepare=lambda points, _key, _deadline, _on_mode: (jax.tree.map(lambda x: x.mean(axis=0), points), points),
         data=lambda start: target.condition(start),
         blank=lambda: target.coordinates.reference(),
         init=init,

@@ -16,7 +16,7 @@ from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.gaussian.about_gaussian import surrogate_data
 from bayesreg.inference.gaussian.rotation import rotation
 from bayesreg.inference.gaussian.whitened import Setup, whitened_density, whitened_position
-from bayesreg.inference.kernel import Sampler
+from bayesreg.inference.kernel import OnMode, Sampler
 from bayesreg.inference.samplers.hamiltonian import hmc
 from bayesreg.inference.samplers.settings import Hmc, Smc
 from bayesreg.inference.target import Target, estimands_of
@@ -40,11 +40,11 @@ def smc(target: Target, settings: Smc) -> Sampler:
     particles, spread, target_acceptance = settings.particles, settings.spread, settings.target_acceptance
     chains_of = hmc(target, Hmc(**settings.model_dump(include=set(Hmc.model_fields))))
 
-    def prepare(points: Any, key: AnyArray, deadline: Deadline) -> tuple[Setup, Any]:
+    def prepare(points: Any, key: AnyArray, deadline: Deadline, on_mode: OnMode) -> tuple[Setup, Any]:
         chains = len(next(iter(points.values())))
         if particles < chains:
             raise InputError(f"particles must be at least as many as the {chains} chains, got {particles}")
-        setup, _ = chains_of.prepare(points, key, deadline)
+        setup, _ = chains_of.prepare(points, key, deadline, on_mode)
         data = surrogate_data(target, setup)
         key_first, key_temper, key_choose = jax.random.split(jax.random.fold_in(key, 1), 3)
         first = spread * jax.random.normal(key_first, (particles, len(setup.middle)))
