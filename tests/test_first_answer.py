@@ -6,7 +6,8 @@ import pyvista
 
 import bayesreg as br
 from bayesreg.io.run_folder import RunFolder
-from bayesreg.workflow import run as workflow
+from bayesreg.workflow import beginning
+from tests.reportless import without_reports
 from tests.test_observations import IMAGES, PAIRS, configuration, folder  # noqa: F401
 
 FILES = ("displacement_mean.nii.gz", "displacement_sd.nii.gz", "transform_mean.h5", "transform_mean_inverse.h5")
@@ -14,14 +15,14 @@ FILES = ("displacement_mean.nii.gz", "displacement_sd.nii.gz", "transform_mean.h
 
 def run_until_the_answer(config, out):
     """Run as if Ctrl-C had come just after the first answer."""
-    write = workflow.write_first_answer
+    write = beginning.write_first_answer
 
     def write_and_stop(*arguments):
         write(*arguments)
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "write_first_answer", write_and_stop)
+        patch.setattr(beginning, "write_first_answer", write_and_stop)
         with pytest.raises(KeyboardInterrupt):
             br.run(config, out, progress=False)
     assert RunFolder(out).stage == "prepared"
@@ -47,13 +48,21 @@ def test_the_draws_replace_it(folder, tmp_path):  # noqa: F811
     np.testing.assert_allclose(np.median(first_sd / result.u_sd), 1.0, atol=0.1)
 
 
-def test_the_default_model_of_images_has_one(folder, tmp_path):  # noqa: F811
-    """Its variables have axes without a name."""
+def test_a_run_that_goes_on_after_it_draws_as_if_nothing_had_happened(folder, tmp_path):  # noqa: F811
+    """The search begins again: from the untempered posterior, if the default model asks for it."""
     images = {"kind": "images", "most_points": 2000}
-    run_until_the_answer(configuration(folder, [images], IMAGES, model=None, sampler=None), tmp_path / "out")
-    assert RunFolder(tmp_path / "out").is_sound("warped_mean.nii.gz")
+    stop = {"rhat": None, "ess": None, "max_steps": 2}
+    config = configuration(folder, [images], IMAGES, model=None, sampler={"warm_up": 4}, stop=stop)
+    with without_reports():
+        whole = br.run(config, tmp_path / "whole", progress=False)
+        run_until_the_answer(config, tmp_path / "out")
+        assert RunFolder(tmp_path / "out").is_sound("warped_mean.nii.gz")
+        result = br.run(config, tmp_path / "out", resume=True, progress=False)
+    np.testing.assert_array_equal(result.idata.posterior["u_boundary"], whole.idata.posterior["u_boundary"])
+    total = result.run.manifest["timings"]
+    assert total["total"] > total["sampling"] > 0
 
 
 def test_an_approximate_sampler_has_none(folder, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(workflow, "write_first_answer", lambda *_: pytest.fail("a first answer was written"))
+    monkeypatch.setattr(beginning, "write_first_answer", lambda *_: pytest.fail("a first answer was written"))
     br.run(configuration(folder, [PAIRS], stop={"rhat": None, "max_steps": 4}), tmp_path / "out", progress=False)

@@ -66,9 +66,9 @@ def save_state(folder: RunFolder, arrays: Mapping[str, AnyArray], stage: Stage |
         save_arrays(place(STATE), arrays)
 
 
-def load_state(folder: RunFolder) -> dict[str, np.ndarray] | None:
-    """Read state.npz; return None if no chain has started yet."""
-    return load_arrays(folder.file(STATE), ANEW) if folder.is_listed(STATE) else None
+def load_state(folder: RunFolder) -> dict[str, np.ndarray]:
+    """Read state.npz; raise InputError if it is damaged, or if no chain has started yet."""
+    return load_arrays(folder.file(STATE), ANEW)
 
 
 def close(folder: RunFolder) -> None:
@@ -76,7 +76,7 @@ def close(folder: RunFolder) -> None:
 
     Half of a triangular factor is zero. Compression takes too long for the state of a run that goes on.
     """
-    state = load_arrays(folder.file(STATE), ANEW)
+    state = load_state(folder)
     with folder.writing() as place:
         save_arrays(place(STATE), state, compressed=True)
     folder.drop(DRAWS)
@@ -88,7 +88,7 @@ def reopen(folder: RunFolder, blocks: Iterable[Mapping[str, AnyArray]]) -> None:
 
     If the process is killed between two steps, the folder holds either the finished run or the interrupted one.
     """
-    state = load_arrays(folder.file(STATE), ANEW)
+    state = load_state(folder)
     stored = StoredBlocks(folder, 0)
     for block in blocks:
         stored.append(block)

@@ -23,7 +23,7 @@ def require_memory(config: Config, posterior: Posterior) -> None:
     """Raise InputError if one block of draws and the moments of the chains exceed the memory of the machine."""
     options = config.sampler
     estimands = sum(np.size(value) for value in posterior.estimands(posterior.reference()).values())
-    block = min(options.block or block_length(posterior), config.stop.max_steps // options.thin)
+    block = min(draws_per_block(config, posterior), config.stop.max_steps // options.thin)
     # Two moments per number; the new moments are made while the old ones still exist.
     needed = 8 * options.chains * (block * estimands + 4 * (estimands + posterior.mesh.points.size))
     if needed > (held := memory_of_machine()):
@@ -32,6 +32,11 @@ def require_memory(config: Config, posterior: Posterior) -> None:
             f"{needed / 1e9:,.0f} GB, and this machine has {held / 1e9:,.0f} GB; give fewer chains, or fewer draws to "
             "a block (sampler.block)"
         )
+
+
+def draws_per_block(config: Config, posterior: Posterior) -> int:
+    """Return the number of draws per block of a configuration; without one, that of `block_length`."""
+    return config.sampler.block or block_length(posterior)
 
 
 def block_length(posterior: Posterior) -> int:

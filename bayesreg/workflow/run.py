@@ -7,26 +7,19 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bayesreg.ahead import ahead
 from bayesreg.config import Config, load_config, load_stored_config, resolved_yaml
-from bayesreg.inference.chains.beginning import (
-    checkpoint_from_arrays,
-    compile_programs,
-    first_checkpoint,
-    temper_target,
-)
+from bayesreg.inference.chains.beginning import checkpoint_from_arrays
 from bayesreg.inference.chains.checkpoint import Checkpoint, checkpoint_to_arrays
 from bayesreg.inference.chains.progress import Showing
 from bayesreg.inference.chains.run import Samples, sample
 from bayesreg.inference.chains.stopping import StopRule
-from bayesreg.inference.deadline import NEVER, Deadline
 from bayesreg.inference.draws.blocks import Block, Blocks
 from bayesreg.inference.draws.inference_data import to_blocks
 from bayesreg.io import checkpoints, store
@@ -36,20 +29,18 @@ from bayesreg.io.run_folder import RunFolder
 from bayesreg.messages import show_messages
 from bayesreg.model.build import require_observations
 from bayesreg.model.posterior import Posterior
-from bayesreg.model.target import PosteriorTarget
 from bayesreg.results.result import REPORT, Result, load_result
-from bayesreg.types import AnyArray, InputError
-from bayesreg.workflow.assembly import posterior_of, start_of, with_initial
-from bayesreg.workflow.budget import BLOCK, block_length, max_seconds, require_memory
+from bayesreg.types import InputError
+from bayesreg.workflow.assembly import posterior_of, with_initial
+from bayesreg.workflow.beginning import CUT, begin
+from bayesreg.workflow.budget import BLOCK, draws_per_block, max_seconds, require_memory
 from bayesreg.workflow.fingerprint import fingerprint, require_same_observations
 from bayesreg.workflow.finish import finish
-from bayesreg.workflow.first_answer import write_first_answer
 from bayesreg.workflow.interruption import ending_between_blocks
 from bayesreg.workflow.preparation import (
     PROVENANCE,
     prepared_inputs,
     require_all_unseen,
-    store_inputs,
     with_held_out,
     with_unsampled,
 )
@@ -60,11 +51,6 @@ _log = logging.getLogger(__name__)
 
 # Sections of the configuration that do not change what is drawn.
 MAY_CHANGE = ("stop", "results", "report", "evaluation")
-
-CUT = (
-    "The budget (stop.max_minutes) ended the search for the mode or the warm-up early: the chains of this run mix "
-    "badly, and more draws help little. Begin the run anew, in another folder and with more time."
-)
 
 Reached = tuple[Checkpoint, Blocks]
 
@@ -136,18 +122,9 @@ def _run(config: Config, folder: RunFolder, resume: bool, progress: Showing, obs
     with folder.locked():
         if folder.stage is not None:
             raise InputError(f"another process has begun a run in {folder.path} meanwhile; name another folder")
-        searching = time.perf_counter()
-        deadline = Deadline.after(max_seconds(config))
-        with ahead(_compile, config, posterior):
-            posterior = temper(config, inputs, posterior, deadline)
-            provenance["independent_points"] = posterior.independent_points
-            inputs = with_initial(inputs, config)
-            spent = time.perf_counter() - searching
-            provenance = with_unsampled(provenance, began + spent)
-            reached = _first(config, inputs, posterior, provenance, folder, deadline, spent)
-        if deadline.has_passed:
-            provenance["appraisal"] = _with_warning(provenance.get("appraisal", {}), CUT)
-        store_inputs(folder, inputs, provenance)
+        inputs = with_initial(inputs, config)
+        posterior, checkpoint, provenance = begin(config, inputs, posterior, provenance, folder, began)
+        reached = checkpoint, checkpoints.StoredBlocks(folder, 0)
         return _go_on(config, inputs, posterior, reached, provenance, folder, began, progress)
 
 
@@ -163,28 +140,31 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
         return load_result(folder.path)
     inputs = store.read_inputs(folder)
     _log.info("%s", _describe_mesh(inputs))
-    posterior = posterior_of(config, inputs, observations, provenance.get("independent_points"))
+    # A run without a state has not come to its chains. It begins again, so that its draws are those of a run that was
+    # not interrupted.
+    has_state = folder.is_listed(checkpoints.STATE)
+    independent_points = provenance.get("independent_points") if has_state else None
+    posterior = posterior_of(config, inputs, observations, independent_points)
     require_same_observations(folder.path, provenance, posterior, observations)
-    # A pair that `simulate` stored is not tempered yet.
-    deadline = Deadline.after(max_seconds(config))
-    searching = time.perf_counter()
-    posterior = temper(config, inputs, posterior, deadline)
-    provenance["independent_points"] = posterior.independent_points
-    if CUT in provenance.get("appraisal", {}).get("warnings", ()):
-        _log.warning("%s", CUT)
     if finished:
         checkpoints.reopen(folder, to_blocks(posterior.target, load_result(folder.path).idata, BLOCK))
     inputs = with_initial(inputs._replace(config=resolved_yaml(config)), config)
     if stored_config.evaluation != config.evaluation:
         inputs = inputs._replace(observed=with_held_out(inputs.observed, config))
         require_all_unseen(inputs, observations)
-    reached = _load_reached(config, inputs, posterior, provenance, folder, deadline, time.perf_counter() - searching)
-    sampled = float(reached[0].seconds)
-    began -= provenance["unsampled"] + sampled
+    began -= provenance["unsampled"]
+    if has_state:
+        if CUT in provenance.get("appraisal", {}).get("warnings", ()):
+            _log.warning("%s", CUT)
+        reached = _load_reached(config, posterior, folder)
+        began -= float(reached[0].seconds)
+    else:
+        posterior, checkpoint, provenance = begin(config, inputs, posterior, provenance, folder, began)
+        reached = checkpoint, checkpoints.StoredBlocks(folder, 0)
     with folder.writing() as temporary_path:
         write_text(temporary_path("config.yaml"), inputs.config)
         store.write_observed(temporary_path, inputs.observed)
-        store.write_json(temporary_path(PROVENANCE), with_unsampled(provenance, began + sampled))
+        store.write_json(temporary_path(PROVENANCE), with_unsampled(provenance, began + float(reached[0].seconds)))
     return _go_on(config, inputs, posterior, reached, provenance, folder, began, progress)
 
 
@@ -207,10 +187,6 @@ def _go_on(
     _log.info("%s", samples.reason)
     _warn(config, result)
     return result
-
-
-def _with_warning(appraisal: Mapping[str, Any], sentence: str) -> dict[str, Any]:
-    return {**appraisal, "warnings": [*appraisal.get("warnings", ()), sentence]}
 
 
 def _warn(config: Config, result: Result) -> None:
@@ -240,70 +216,9 @@ def _describe_mesh(inputs: Inputs) -> str:
     return f"mesh of {len(mesh.points)} nodes ({len(mesh.boundary)} on the boundary) and {len(mesh.cells)} elements"
 
 
-def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadline = NEVER) -> Posterior:
-    """Temper the posterior by its numbers of independent points, unless it is tempered already."""
-    if posterior.tempered:
-        return posterior
-    _log.info("first search for the mode, to count the independent points of the images there")
-    start = start_of(config, inputs, posterior)
-    target = temper_target(posterior.target, config.sampler.chains, config.seed, start, deadline)
-    assert isinstance(target, PosteriorTarget)
-    tempered = target.posterior
-    for name, count in tempered.independent_points.items():
-        _log.info(f"{name}: {count:,.0f} of {len(tempered.data.terms[name].positions):,} points are independent")
-    return tempered
-
-
-def _compile(config: Config, posterior: Posterior) -> None:
-    options, length = config.sampler, _block(config, posterior)
-    compile_programs(posterior.target, options.name, options.chains, length, options.thin, **options.settings)
-
-
-def _block(config: Config, posterior: Posterior) -> int:
-    return config.sampler.block or block_length(posterior)
-
-
-def _first(
-    config: Config,
-    inputs: Inputs,
-    posterior: Posterior,
-    provenance: dict[str, Any],
-    folder: RunFolder,
-    deadline: Deadline,
-    seconds: float,
-) -> Reached:
-    """Make the state of the chains before their first step; InputError if a chain cannot start.
-
-    When a search has led to the mode, the first answer is written. The `seconds` that were spent before count as
-    sampling.
-    """
-    options, start = config.sampler, start_of(config, inputs, posterior)
-
-    def answer(estimands: Mapping[str, AnyArray]) -> None:
-        store_inputs(folder, inputs, provenance)
-        write_first_answer(config, inputs, posterior, estimands, provenance.get("appraisal", {}), folder)
-        _log.info("a first answer, about the mode, is in %s; sampling goes on", folder.path)
-
-    checkpoint = first_checkpoint(
-        posterior.target, options.name, options.chains, config.seed, start, deadline, answer, **options.settings
-    )
-    checkpoint = checkpoint._replace(seconds=checkpoint.seconds + seconds)
-    return checkpoint, checkpoints.StoredBlocks(folder, 0)
-
-
-def _load_reached(
-    config: Config,
-    inputs: Inputs,
-    posterior: Posterior,
-    provenance: dict[str, Any],
-    folder: RunFolder,
-    deadline: Deadline,
-    seconds: float,
-) -> Reached:
+def _load_reached(config: Config, posterior: Posterior, folder: RunFolder) -> Reached:
     """Load the state of the chains that the interrupted run stored last."""
     state = checkpoints.load_state(folder)
-    if state is None:
-        return _first(config, inputs, posterior, provenance, folder, deadline, seconds)
     blocks = checkpoints.StoredBlocks(folder, int(state.pop("blocks")))
     options = config.sampler
     return checkpoint_from_arrays(state, posterior.target, options.name, options.chains, **options.settings), blocks
@@ -333,7 +248,7 @@ def _sample(
         config.stop.max_steps // options.thin,
         config.seed,
         thin=options.thin,
-        block=_block(config, posterior),
+        block=draws_per_block(config, posterior),
         stop=StopRule(config.stop.rhat, config.stop.ess, max_seconds(config)),
         progress=progress,
         resume=reached,

@@ -26,8 +26,8 @@ from bayesreg.model.posterior import Posterior
 from bayesreg.model.problem import Problem
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of
+from bayesreg.workflow.beginning import temper
 from bayesreg.workflow.preparation import PROVENANCE, prepared_inputs
-from bayesreg.workflow.run import temper
 
 _log = logging.getLogger(__name__)
 

@@ -49,7 +49,6 @@ def finished() -> Finished:
     config = br.load_config(run_folder.path / "config.yaml")
     posterior, options = posterior_of(config, store.read_inputs(run_folder)), config.sampler
     arrays = checkpoints.load_state(run_folder)
-    assert arrays is not None
     assert options.name == "hmc"
     arrays.pop("blocks")
     end = checkpoint_from_arrays(arrays, posterior.target, options.name, options.chains, **options.settings)

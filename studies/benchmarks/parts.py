@@ -42,8 +42,8 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     folder = RunFolder(parser.parse_args().run)
     config, arrays = load_stored_config(folder.file("config.yaml")), checkpoints.load_state(folder)
-    if config.sampler.name != "hmc" or arrays is None:
-        parser.error("RUN must be a run of hmc that has begun")
+    if config.sampler.name != "hmc":
+        parser.error("RUN must be a run of hmc")
     counts = store.read_json(folder.file(PROVENANCE)).get("independent_points")
     posterior, options = posterior_of(config, store.read_inputs(folder), [], counts), config.sampler
     arrays.pop("blocks")

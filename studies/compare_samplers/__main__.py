@@ -24,8 +24,8 @@ from bayesreg.io.run_folder import RunFolder
 from bayesreg.messages import show_messages
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, start_of
+from bayesreg.workflow.beginning import temper
 from bayesreg.workflow.preparation import prepared_inputs
-from bayesreg.workflow.run import temper
 from studies.compare_samplers.efficiency import Budget, Efficiency, measure_efficiency
 from studies.compare_samplers.table import Setting, efficiency_table
 from studies.terminal import in_terminal

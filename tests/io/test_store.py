@@ -202,4 +202,5 @@ def test_a_damaged_checkpoint_names_the_way_on(run, tmp_path, name):
 
 
 def test_without_a_checkpoint_there_is_no_state(tmp_path):
-    assert checkpoints.load_state(RunFolder(tmp_path)) is None
+    with pytest.raises(ValueError, match=r"status\.json is missing"):
+        checkpoints.load_state(RunFolder(tmp_path))
