@@ -6,27 +6,59 @@ that another thread has compiled for arguments of the same shapes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+import logging
+import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from typing import Any
 
+_log = logging.getLogger(__name__)
+
 
 @contextmanager
-def ahead(work: Callable[..., Any], *arguments: Any) -> Iterator[Future]:
-    """Do some work in another thread while a block runs, and wait for its end after the block.
+def ahead(steps: Iterable[Any]) -> Iterator[Future]:
+    """Take steps in another thread while a block runs, and wait for their end after the block.
 
-    An exception in the block does not wait for the work.
+    An exception in the block does not wait: the steps that have not begun are left out. The step in hand goes on, and
+    Python waits for it at its own end.
+
+    Parameters
+    ----------
+    steps : iterable
+        Its iteration is the work: a step for each element.
 
     Yields
     ------
     Future
-        Its `result()` is the result of the work.
+        Its `result()` is the last element, or raises the error of a step; nothing else does. Work that the block's
+        thread would do itself, such as compilation, needs no result.
     """
-    pool = ThreadPoolExecutor(max_workers=1)
-    done = pool.submit(work, *arguments)
+    done, abandoned = Future[Any](), threading.Event()
+
+    def work() -> None:
+        result = None
+        try:
+            for element in steps:
+                result = element
+                if abandoned.is_set():
+                    break
+        except BaseException as error:
+            _log.debug("work ahead: %s", error)
+            done.set_exception(error)
+        else:
+            done.set_result(result)
+
+    # At the end of a process, a daemon within a call of XLA aborts it.
+    threading.Thread(target=work, name=__name__).start()
     try:
         yield done
-        done.result()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    except BaseException:
+        abandoned.set()
+        raise
+    wait([done])
+
+
+def works_still() -> bool:
+    """Report whether a step in another thread goes on."""
+    return any(thread.name == __name__ for thread in threading.enumerate())

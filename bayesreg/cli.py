@@ -2,6 +2,8 @@
 
 import errno
 import logging
+import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -316,7 +318,17 @@ def schema() -> None:
 
 def main() -> None:
     """Run the `bayesreg` command; this is its entry point."""
-    app()
+    from bayesreg.ahead import works_still
+
+    try:
+        app()
+    except SystemExit as ended:
+        if works_still():
+            # Python would wait for it, though the command needs it no more.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(int(ended.code or 0))
+        raise
 
 
 def _sample(config: Any, out: Path, resume: bool, quiet: bool) -> None:

@@ -1,5 +1,7 @@
 """Work ahead in another thread, and programs that are compiled so."""
 
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -18,22 +20,49 @@ from tests.options import posterior_of
 from tests.phantoms import box_mesh, smooth_image
 
 
-def test_the_block_waits_for_the_work_and_its_error():
+def test_the_block_waits_for_the_work_and_its_result():
     begun = threading.Event()
-    with ahead(begun.wait, 10) as done:
+    with ahead(map(begun.wait, [10, 10])) as done:
         assert not done.done()
         begun.set()
     assert done.result() is True
-    with pytest.raises(ZeroDivisionError), ahead(lambda: 1 / 0):
+
+
+def test_the_result_raises_the_error_of_the_work():
+    with ahead(1 / divisor for divisor in (1, 0)) as done:
         pass
+    with pytest.raises(ZeroDivisionError):
+        done.result()
 
 
-def test_an_error_in_the_block_does_not_wait_for_the_work():
-    ended = threading.Event()
-    with pytest.raises(KeyError), ahead(ended.wait, 60) as done:
+def test_an_error_in_the_block_does_not_wait_and_leaves_out_what_has_not_begun():
+    steps, gate, taken = range(3), threading.Event(), []
+
+    def take(step):
+        taken.append(step)
+        gate.wait(60)
+
+    with pytest.raises(KeyError), ahead(map(take, steps)) as done:
         raise KeyError
     assert not done.done()
-    ended.set()
+    gate.set()
+    done.result(60)
+    assert taken == [0]
+
+
+def test_the_command_line_does_not_wait_for_what_is_no_longer_needed():
+    """A command that fails while another thread works has its status at once."""
+    code = (
+        "import time\n"
+        "from bayesreg import cli\n"
+        "from bayesreg.ahead import ahead\n"
+        "def fail():\n"
+        "    with ahead(map(time.sleep, [600])):\n"
+        "        raise SystemExit(2)\n"
+        "cli.app = fail\n"
+        "cli.main()\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 2
 
 
 def test_programs_that_were_compiled_ahead_are_not_compiled_again(caplog):

@@ -5,6 +5,7 @@ import pytest
 import pyvista
 
 import bayesreg as br
+from bayesreg.inference.gaussian import about_gaussian
 from bayesreg.io.run_folder import RunFolder
 from bayesreg.workflow import beginning
 from tests.reportless import without_reports
@@ -27,7 +28,7 @@ def run_until_the_answer(config, out):
             br.run(config, out, progress=False)
     assert RunFolder(out).stage == "prepared"
     assert not (out / "draws").exists()
-    assert "Sampling goes on." in (out / "report.html").read_text(encoding="utf-8")
+    assert "The run goes on." in (out / "report.html").read_text(encoding="utf-8")
     assert all(RunFolder(out).is_sound(name) for name in (*FILES, "report.html", "mesh.vtu"))
 
 
@@ -42,7 +43,7 @@ def test_the_draws_replace_it(folder, tmp_path):  # noqa: F811
     first_mean, first_sd = np.array(nodes["u_mean"]), np.array(nodes["u_sd"])
     result = br.run(config, out, resume=True, progress=False)
     assert RunFolder(out).stage == "finished"
-    assert "Sampling goes on." not in result.report.read_text(encoding="utf-8")
+    assert "The run goes on." not in result.report.read_text(encoding="utf-8")
     # Points of known sd make a Gaussian posterior: 800 draws against 400 independent ones of the same Gaussian.
     assert np.median(np.abs(result.u_mean - first_mean) / result.u_sd) < 0.15
     np.testing.assert_allclose(np.median(first_sd / result.u_sd), 1.0, atol=0.1)
@@ -66,3 +67,20 @@ def test_a_run_that_goes_on_after_it_draws_as_if_nothing_had_happened(folder, tm
 def test_an_approximate_sampler_has_none(folder, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setattr(beginning, "write_first_answer", lambda *_: pytest.fail("a first answer was written"))
     br.run(configuration(folder, [PAIRS], stop={"rhat": None, "max_steps": 4}), tmp_path / "out", progress=False)
+
+
+def test_a_warm_up_that_fails_leaves_no_run(folder, tmp_path, monkeypatch):  # noqa: F811
+    """A mended configuration then runs in the same folder."""
+    out = tmp_path / "out"
+    config = configuration(folder, [PAIRS], stop={"rhat": None, "max_steps": 4}, sampler={"name": "hmc", "chains": 2})
+    written = []
+    monkeypatch.setattr(beginning, "write_first_answer", lambda *_: written.append(RunFolder(out).stage))
+
+    def fail(*_):
+        raise br.InputError("no step is short enough")
+
+    monkeypatch.setattr(about_gaussian, "_warm_up", fail)
+    with pytest.raises(br.InputError, match="short enough"):
+        br.run(config, out, progress=False)
+    assert written == ["prepared"]
+    RunFolder(out).require_fresh()

@@ -24,9 +24,14 @@ class Deadline(NamedTuple):
         return cls() if seconds is None else cls(time.monotonic() + seconds)
 
     @property
+    def remaining(self) -> float:
+        """The seconds that are left; negative after the deadline."""
+        return self.end - time.monotonic()
+
+    @property
     def has_passed(self) -> bool:
         """Whether the time is spent."""
-        return time.monotonic() >= self.end
+        return self.remaining <= 0
 
     def require_time(self, *_: object) -> None:
         """Raise StopIteration if the time is spent; an optimiser of SciPy takes this as its callback."""

@@ -79,7 +79,7 @@ class Sampler(NamedTuple):
     many_solves : bool
         Whether a step has many elastic solves and does not report them. The solve of the draw is counted instead.
     compile : callable, optional
-        (points) → None. It compiles the programs of `prepare` ahead, for start points of these shapes.
+        (setup, points) → None. It compiles the programs of `prepare` ahead, for arguments of these shapes.
     """
 
     prepare: Callable[[Any, AnyArray, Deadline, OnMode], tuple[Any, Any]]
@@ -91,4 +91,4 @@ class Sampler(NamedTuple):
     exact: bool
     outside: Callable[[Any, Any, AnyArray, Any], AnyArray] | None = None
     many_solves: bool = False
-    compile: Callable[[Any], None] | None = None
+    compile: Callable[[Any, Any], None] | None = None

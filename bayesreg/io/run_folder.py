@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePath
@@ -206,6 +206,18 @@ class RunFolder:
             self._write(Status(status.stage, remaining))
             for name in dropped:
                 self._path_of(name).unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Remove the run: all of its files, and then its status."""
+        status = self.status()
+        if status is not None:
+            paths = [self._path_of(name) for name in status.files]
+            for path in paths:
+                path.unlink(missing_ok=True)
+            (self.path / STATUS).unlink()
+            for folder in {path.parent for path in paths} - {self.path}:
+                with suppress(OSError):  # The folder holds other files, too.
+                    folder.rmdir()
 
     @contextmanager
     def locked(self) -> Iterator[None]:

@@ -213,7 +213,8 @@ class _Response(NamedTuple):
         """Reduce a curvature in all nodes to (z, u_B), or to u_B only; it is sparse if no node is free."""
         W = self.W if with_field else self.W[:, self.modes :]
         if not len(self.free):
-            return nodal[self.sampled][:, self.sampled]
+            alone = nodal[self.sampled][:, self.sampled]
+            return self.place(alone) if with_field and self.modes else alone
         modes = W.shape[1] - len(self.sampled)
         cross = nodal[self.sampled][:, self.free] @ W
         reduced = W.T @ (nodal[self.free][:, self.free] @ W)

@@ -20,8 +20,9 @@ from bayesreg.report.verdict import approximation, nested_entry, warnings_of
 
 KICKER = "Bayesian elastic registration"
 FIRST = (
-    "Sampling goes on. What follows is Laplace’s approximation: the Gaussian with the curvature of the posterior at "
-    "its mode. The report of the draws will replace this page when they have converged, or when their budget is spent."
+    "The run goes on. What follows is Laplace’s approximation: the Gaussian with the curvature of the posterior near "
+    "its mode. The report of the draws will replace this page when they have converged, or when their budget is spent; "
+    "bayesreg run --resume goes on with a run that was interrupted."
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from bayesreg.io.records import Inputs
 from bayesreg.io.run_folder import RunFolder
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.target import PosteriorTarget
-from bayesreg.types import AnyArray
+from bayesreg.types import AnyArray, InputError
 from bayesreg.workflow.assembly import start_of
 from bayesreg.workflow.budget import draws_per_block, max_seconds
 from bayesreg.workflow.first_answer import write_first_answer
@@ -27,8 +27,8 @@ from bayesreg.workflow.preparation import store_inputs, with_unsampled
 _log = logging.getLogger(__name__)
 
 CUT = (
-    "The budget (stop.max_minutes) ended the search for the mode or the warm-up early: the chains of this run mix "
-    "badly, and more draws help little. Begin the run anew, in another folder and with more time."
+    "The budget (stop.max_minutes) ended the search for the mode or the warm-up early: the draws of this run are not "
+    "to be relied on, and more of them help little. Begin the run anew, in another folder and with more time."
 )
 
 
@@ -53,8 +53,8 @@ def begin(
 ) -> Begun:
     """Search for the mode and warm the chains up; store the inputs.
 
-    When a search has led near the mode, the inputs and the first answer are stored. A search that fails leaves no run
-    in the folder.
+    When a search has led near the mode, the inputs and the first answer are stored. A search or a warm-up that fails
+    leaves no run in the folder.
 
     Parameters
     ----------
@@ -73,23 +73,31 @@ def begin(
     """
     searching = time.perf_counter()
     deadline = Deadline.after(max_seconds(config))
-    with ahead(_compile, config, posterior):
+    with ahead(_programs(config, posterior)):
         posterior = temper(config, inputs, posterior, deadline)
         provenance = provenance | {"independent_points": posterior.independent_points}
         provenance = with_unsampled(provenance, began + time.perf_counter() - searching)
 
         def answer(estimands: Mapping[str, AnyArray]) -> None:
+            # It costs less than the searches. The warm-up needs the rest of a budget of which they took more than half.
+            if deadline.remaining < time.perf_counter() - searching:
+                return
             store_inputs(folder, inputs, provenance)
-            write_first_answer(config, inputs, posterior, estimands, provenance.get("appraisal", {}), folder)
-            _log.info("a first answer, about the mode, is in %s; sampling goes on", folder.path)
+            write_first_answer(config, inputs, posterior, estimands, provenance["appraisal"], folder)
+            _log.info("a first answer, about the mode, is in %s; the run goes on", folder.path)
 
         options, start = config.sampler, start_of(config, inputs, posterior)
-        checkpoint = first_checkpoint(
-            posterior.target, options.name, options.chains, config.seed, start, deadline, answer, **options.settings
-        )
-    if deadline.has_passed:
-        appraisal = provenance.get("appraisal", {})
-        provenance["appraisal"] = {**appraisal, "warnings": [*appraisal.get("warnings", ()), CUT]}
+        try:
+            checkpoint = first_checkpoint(
+                posterior.target, options.name, options.chains, config.seed, start, deadline, answer, **options.settings
+            )
+        except InputError:
+            folder.clear()
+            raise
+        # A run that begins again may have been cut before.
+        warnings = [warning for warning in provenance["appraisal"].get("warnings", ()) if warning != CUT]
+        warnings += [CUT] if deadline.has_passed else []
+        provenance["appraisal"] = provenance["appraisal"] | {"warnings": warnings}
     store_inputs(folder, inputs, provenance)
     return Begun(posterior, checkpoint._replace(seconds=np.array(time.perf_counter() - searching)), provenance)
 
@@ -108,6 +116,6 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadl
     return tempered
 
 
-def _compile(config: Config, posterior: Posterior) -> None:
+def _programs(config: Config, posterior: Posterior) -> Iterator[None]:
     options, length = config.sampler, draws_per_block(config, posterior)
-    compile_programs(posterior.target, options.name, options.chains, length, options.thin, **options.settings)
+    return compile_programs(posterior.target, options.name, options.chains, length, options.thin, **options.settings)

@@ -69,9 +69,20 @@ def images():
             {"elasticity": "field", "field": FieldConfig(modes=5, correlation=30.0), **BOUNDARY},
             [images, landmarks],
         ),
+        (
+            MESH,
+            {
+                "elasticity": "field",
+                "field": FieldConfig(modes=5, correlation=30.0),
+                "body_load": WIDE,
+                "surface_load": WIDE,
+                **PRIORS,
+            },
+            [landmarks],
+        ),
         (MESH, {"elasticity": "element", "t_elastic": WIDE, "normalised": True, **PRIORS}, [landmarks]),
     ],
-    ids=["loads", "many tissues", "boundary", "all nodes", "field", "elements"],
+    ids=["loads", "many tissues", "boundary", "all nodes", "field", "field with loads", "elements"],
 )
 def test_the_trace_is_that_of_the_product(mesh, options, observations):
     posterior = br.build_posterior(mesh, [make() for make in observations], model_of(**options))

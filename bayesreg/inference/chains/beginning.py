@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -98,19 +99,28 @@ def checkpoint_from_arrays(
     return jax.tree.unflatten(structure, leaves)
 
 
-def compile_programs(target: Target, sampler: str, chains: int, length: int, thin: int, **settings: Any) -> None:
+def compile_programs(
+    target: Target, sampler: str, chains: int, length: int, thin: int, **settings: Any
+) -> Iterator[None]:
     """Compile the programs of the warm-up and of a block of draws, so that they are there when the search has ended.
 
-    They are called at the reference, for a block without draws.
+    They are called at the reference: the warm-up for one transition, the block without draws.
+
+    Yields
+    ------
+    None
+        After each program.
     """
     chosen = choose_sampler(sampler, target, **settings)
     setup, points = _blank(chosen, chains)
     if chosen.sampler.compile is not None:
-        chosen.sampler.compile(points)
+        chosen.sampler.compile(setup, points)
+        yield
     data = chosen.sampler.data(setup)
     checkpoint, devices = _first(chosen, data, setup, points), devices_for(chains)
     numbers, shared = np.arange(chains), share(checkpoint[2:5], devices)
     run_block(chosen, length, thin, devices, data, 0, numbers, 0, 0, setup, *shared)
+    yield
 
 
 def _blank(chosen: Chosen, chains: int) -> tuple[Any, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -159,7 +159,7 @@ def sample(
     target = posterior.target
     deadline = Deadline.after(stop.max_seconds)
     if resume is None:
-        with ahead(partial(compile_programs, target, sampler, chains, block, thin, **settings)):
+        with ahead(compile_programs(target, sampler, chains, block, thin, **settings)):
             target = temper_target(target, chains, seed, start, deadline)
             checkpoint = first_checkpoint(target, sampler, chains, seed, start, deadline, **settings)
         checkpoint = checkpoint._replace(seconds=np.array(time.perf_counter() - began))

@@ -175,9 +175,8 @@ def about_gaussian(
             return setup_about(target, gaussian, gaussian.centre), starts
         return _warm_up(walk, tuning, gaussian, starts, key_tune, deadline)
 
-    def compile_warm_up(points: Any) -> None:
+    def compile_warm_up(setup: Setup, points: Any) -> None:
         if tuning is not None:
-            setup = blank()
             compile_transition(surrogate_data(target, setup), walk, setup, points, _half(tuning))
 
     def blank() -> Setup:
