@@ -24,7 +24,7 @@ from bayesreg.types import AnyArray
 
 # The number of proposals after each step of the sampler. Their standard deviations, in logarithms and Normal scores,
 # are spread evenly on a logarithmic axis: the posterior of a hyperparameter may be narrow or have a long tail.
-PROPOSALS, NARROWEST, WIDEST = 8, 0.05, 5.0
+PROPOSALS, NARROWEST, WIDEST = 32, 0.05, 5.0
 
 
 def mark_separable(target: Target) -> Bool[np.ndarray, "dimension"]:
