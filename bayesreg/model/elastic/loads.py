@@ -21,7 +21,10 @@ from bayesreg.settings import KnownOrInferred, ScalePrior, Section, Vector
 from bayesreg.types import AnyArray, Matrix, Scalar
 
 # This prior allows a load within a factor of 400 of this value.
-WIDE = ScalePrior(median=0.1, log_sd=3.0)
+BODY = ScalePrior(median=0.1, log_sd=3.0)
+# Body forces alone may explain the motion. The data then say only that surface forces are small, and a wider prior would
+# have a long tail of sizes that are as good as zero, which chains seldom enter and leave.
+SURFACE = ScalePrior(median=0.1, log_sd=1.5)
 
 
 class RandomLoads(Section):
@@ -33,9 +36,9 @@ class RandomLoads(Section):
     samples_no_node: ClassVar[bool] = False
 
     kind: Literal["loads"] = "loads"
-    body: KnownOrInferred = WIDE
+    body: KnownOrInferred = BODY
     """Standard deviation of the white noise of body forces (unit of μ times mm^½), or its prior."""
-    surface: KnownOrInferred = WIDE
+    surface: KnownOrInferred = SURFACE
     """Standard deviation of the white noise of surface forces (unit of μ times mm), or its prior."""
 
     @property
