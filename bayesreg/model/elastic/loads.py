@@ -20,9 +20,9 @@ from bayesreg.model.stiffness_parts import StiffnessParts
 from bayesreg.settings import KnownOrInferred, ScalePrior, Section, Vector
 from bayesreg.types import AnyArray, Matrix, Scalar
 
-# This prior allows a load within a factor of 400 of this value.
+# 95 % of this prior is within a factor of 360 of its median.
 BODY = ScalePrior(median=0.1, log_sd=3.0)
-# Body forces alone may explain the motion. The data then say only that surface forces are small, and a wider prior would
+# Body forces alone may explain the motion. The data then say only that surface forces are small. A wider prior would
 # have a long tail of sizes that are as good as zero, which chains seldom enter and leave.
 SURFACE = ScalePrior(median=0.1, log_sd=1.5)
 
