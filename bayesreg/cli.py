@@ -25,10 +25,12 @@ from bayesreg.command_options import (
     Inverse,
     LabelFile,
     LabelsFile,
+    LandmarksFile,
     Like,
     MapsLike,
     Margin,
     Mask,
+    MeasuredSurface,
     MovingIgnore,
     MovingImage,
     OutFolder,
@@ -133,21 +135,23 @@ def run(
 
 @app.command()
 def register(
-    fixed: FixedImage,
-    moving: MovingImage,
     out: OutFolder,
+    fixed: FixedImage = None,
+    moving: MovingImage = None,
     labels: LabelFile = None,
     table: Table = None,
     intracranial: Mask = None,
     fixed_ignore: FixedIgnore = None,
     moving_ignore: MovingIgnore = None,
     channel: Channel = None,
+    landmarks: LandmarksFile = None,
+    surface: MeasuredSurface = None,
     quick: QuickLook = False,
     overrides: Overrides = None,
     resume: Resume = False,
     quiet: Quiet = False,
 ) -> None:
-    """Sample the posterior of a pair in files, without a configuration; DIR/config.yaml holds the one that was used."""
+    """Sample the posterior of images, points or a surface in files; DIR/config.yaml holds the configuration."""
     from bayesreg.workflow.register import understand
 
     understood = understand(
@@ -161,6 +165,8 @@ def register(
         channel or (),
         overrides or (),
         quick,
+        landmarks,
+        surface,
     )
     typer.echo("\n".join(understood.lines))
     _sample(understood.config, out, resume, quiet)

@@ -8,8 +8,25 @@ import typer
 from bayesreg.label_tables import TABLES
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration, a YAML file.")]
-FixedImage = Annotated[Path, typer.Argument(metavar="FIXED", help="Pre-operative image, a file or a DICOM folder.")]
-MovingImage = Annotated[Path, typer.Argument(metavar="MOVING", help="Intra-operative image.")]
+FixedImage = Annotated[
+    Path | None,
+    typer.Argument(metavar="[FIXED", help="Pre-operative image, a file or a DICOM folder.", show_default=False),
+]
+MovingImage = Annotated[
+    Path | None, typer.Argument(metavar="MOVING]", help="Intra-operative image.", show_default=False)
+]
+LandmarksFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--landmarks", metavar="FILE", help="Pairs of points: CSV with fixed_x … moving_z (RAS, mm), or .tag."
+    ),
+]
+MeasuredSurface = Annotated[
+    Path | None,
+    typer.Option(
+        "--surface", metavar="FILE", help="Points or a mesh of the moved surface of the organ, also of a part."
+    ),
+]
 LabelFile = Annotated[
     Path | None,
     typer.Option("--labels", metavar="FILE", help="Tissue labels of FIXED; without them the organ is of one tissue."),

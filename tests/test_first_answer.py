@@ -49,6 +49,7 @@ def test_the_draws_replace_it(folder, tmp_path):  # noqa: F811
     np.testing.assert_allclose(np.median(first_sd / result.u_sd), 1.0, atol=0.1)
 
 
+@pytest.mark.long
 def test_a_run_that_goes_on_after_it_draws_as_if_nothing_had_happened(folder, tmp_path):  # noqa: F811
     """The search begins again: from the untempered posterior, if the default model asks for it."""
     images = {"kind": "images", "most_points": 2000}

@@ -64,7 +64,7 @@ def configuration(folder, observations, data=(), name="run.yaml", **sections):
 
 LABELS = {"labels": "labels.nii.gz", "label_table": {"liver": 3, "vessels": 5}}
 IMAGES = {"fixed": "fixed.nii.gz", "moving": "moving.nii.gz", **LABELS}
-PAIRS = {"kind": "landmarks", "file": "pairs.csv"}
+PAIRS = {"kind": "landmarks", "file": "pairs.csv", "noise": "normal"}
 
 
 def test_a_mesh_alone_may_have_a_skull(folder):
@@ -161,7 +161,7 @@ def test_landmarks_are_held_out(folder, tmp_path):
 
 
 def test_arviz_finds_what_it_knows_by_name(folder, tmp_path):
-    pairs = [{"kind": "landmarks", "file": "pairs.csv", "name": "points"}]
+    pairs = [PAIRS | {"name": "points"}]
     with without_reports():
         idata = br.run(configuration(folder, pairs), tmp_path / "out", progress=False).idata
     assert idata.posterior["u_boundary"].attrs["units"] == "mm"
@@ -239,11 +239,12 @@ def test_what_does_not_fit_is_told(folder, observations, data, sections, message
         br.load_config(configuration(folder, observations, data, "wrong.yaml", **sections))
 
 
-def test_landmarks_without_an_sd_are_refused_before_anything_is_written(folder, tmp_path):
-    path = configuration(folder, [PAIRS | {"file": "plain.csv"}], LABELS)
-    with pytest.raises(br.InputError, match="'landmarks' has no sd"):
-        br.run(path, tmp_path / "out", progress=False)
-    assert not (tmp_path / "out").exists()
+def test_landmarks_without_an_sd_have_it_inferred(folder, tmp_path):
+    """The error of the points is 0.2 mm."""
+    path = configuration(folder, [{"kind": "landmarks", "file": "plain.csv"}], LABELS)
+    with without_reports():
+        result = br.run(path, tmp_path / "out", progress=False)
+    assert 0.05 < float(result.idata.posterior["landmarks_sd"].median()) < 0.8
 
 
 def test_an_entry_of_observations_is_overridden_by_its_number(folder):

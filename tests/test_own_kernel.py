@@ -18,7 +18,7 @@ def posterior() -> br.Posterior:
     prior = br.Boltzmann(temperature=20.0)
     stiffness = {"lam": 1.0, "mu": 1.0}
     model = br.ModelConfig(elasticity="uniform", fixed=stiffness, elastic_prior=prior, rigid_sd=2.0)
-    return br.build_posterior(box_mesh(2), [br.Landmarks(points, points + 0.5, sd=0.5)], model)
+    return br.build_posterior(box_mesh(2), [br.Landmarks(points, points + 0.5, sd=0.5, noise=br.NormalNoise())], model)
 
 
 @pytest.mark.slow

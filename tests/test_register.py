@@ -199,3 +199,32 @@ def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):
     assert counts == {"labels": 1}
     preparation.prepare(understood.config)
     assert counts == {"fixed": 1, "moving": 1, "labels": 2, "mask": 1, "cavity": 2, "a,b": 2}
+
+
+def test_points_and_a_surface_need_no_images(register):
+    pairs, surface = register.folder / "pairs.csv", register.folder / "surface.csv"
+    pairs.write_text("fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z\n1,2,3,4,5,6\n")
+    surface.write_text("x,y,z\n1,2,3\n")
+    arguments = ["--labels", register.path("labels"), "--landmarks", str(pairs), "--surface", str(surface)]
+    result = CliRunner().invoke(app, ["register", *arguments, "-o", str(register.folder / "out")])
+    assert result.exit_code == 0, result.output
+    config = register.calls[0][0]
+    assert [section.kind for section in config.observations] == ["landmarks", "surface"]
+    assert (config.data.fixed, config.model.preset) == (None, "registration")
+    assert f"landmarks   {pairs}" in result.output
+    assert "pose" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fixed"], "is one image; give FIXED and MOVING"),
+        ([], "nothing is observed; give two images, --landmarks or --surface"),
+        (["--landmarks", "mask"], "without images, --labels says where the organ is"),
+    ],
+)
+def test_what_is_missing_is_told(register, arguments, message):
+    paths = [argument if argument.startswith("--") else register.path(argument) for argument in arguments]
+    result = CliRunner().invoke(app, ["register", *paths, "-o", str(register.folder / "out")])
+    assert result.exit_code == 2
+    assert message in result.stderr

@@ -36,8 +36,8 @@ class Understood(NamedTuple):
 
 
 def understand(
-    fixed: Path,
-    moving: Path,
+    fixed: Path | None = None,
+    moving: Path | None = None,
     labels: Path | None = None,
     table: str | None = None,
     intracranial: Path | None = None,
@@ -46,13 +46,15 @@ def understand(
     channels: Sequence[str] = (),
     overrides: Sequence[str] = (),
     quick: bool = False,
+    landmarks: Path | None = None,
+    surface: Path | None = None,
 ) -> Understood:
     """Make the configuration of a pair in files.
 
     Parameters
     ----------
-    fixed, moving : path
-        Two images.
+    fixed, moving : path, optional
+        Two images; none where points or a surface are all that is observed.
     labels : path, optional
         Tissue labels of the fixed image, or a mask of the organ. Without them, the organ is `intracranial`, or the
         bright part of the fixed image.
@@ -69,12 +71,23 @@ def understand(
         As in `bayesreg.load_config`.
     quick : bool
         Whether the run ends at draws from Laplace's approximation.
+    landmarks : path, optional
+        Pairs of points that show the same places.
+    surface : path, optional
+        Points or a mesh of the moved surface of the organ.
 
     Raises
     ------
     InputError
-        If a file is missing or unreadable, no table fits the labels, or an override is wrong.
+        If a file is missing or unreadable, nothing is observed, one image is given alone, no table fits the labels, or
+        an override is wrong.
     """
+    if (fixed is None) != (moving is None):
+        raise InputError(f"{fixed or moving} is one image; give FIXED and MOVING, or no image")
+    if fixed is None and landmarks is None and surface is None:
+        raise InputError("nothing is observed; give two images, --landmarks or --surface")
+    if fixed is None and labels is None:
+        raise InputError("without images, --labels says where the organ is: a mask, or labels of its tissues")
     if labels is None and table is not None:
         raise InputError(f"--table {table} says what labels mean; give --labels, too")
     chosen, how = (None, "none") if labels is None else _choose_table(labels, table)
@@ -84,7 +97,16 @@ def understand(
     }  # fmt: skip
     files = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
     sections: dict[str, Any] = {"data": {"source": "files", "label_table": chosen, **files}}
-    sections["observations"] = [{"kind": "images"}, *(_channel(k, pair) for k, pair in enumerate(channels, 2))]
+    pair = [] if fixed is None else [{"kind": "images"}]
+    sections["observations"] = [
+        *pair,
+        *(_channel(k, paths) for k, paths in enumerate(channels, 2)),
+        *(
+            {"kind": kind, "file": str(path.absolute())}
+            for kind, path in (("landmarks", landmarks), ("surface", surface))
+            if path is not None
+        ),
+    ]
     if quick:
         sections |= QUICK
     config = make_config(sections, overrides)
@@ -106,15 +128,20 @@ def _describe(config: Config, how: str) -> Iterator[str]:
         tissues = "; ".join(f"{name} {shorten(values, 12)}" for name, values in (data.label_table or {}).items())
         yield f"{'table':<12}{how}: {tissues}"
     yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
+    for section in config.observations:
+        if section.kind in ("landmarks", "surface"):
+            yield f"{section.name:<12}{getattr(section, 'file', '')}"
     for section in config.pairs_of_images:
         if section.fixed is not None:
             yield f"{section.name:<12}{section.fixed} and {section.moving}, compared as well"
     for image in ("fixed", "moving"):
         if (path := getattr(data, f"{image}_ignore")) is not None:
             yield f"{'ignored':<12}what is not zero in {path} says nothing, in the {image} image"
-    yield f"{'pose':<12}{'as the headers say' if data.pose == 'fixed' else 'looked for where the headers do not fit'}"
-    contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
-    yield f"{'contrast':<12}{contrast}; compared by {config.image_options.similarity.kind}"
+    if data.fixed is not None:
+        pose = "as the headers say" if data.pose == "fixed" else "looked for where the headers do not fit"
+        yield f"{'pose':<12}{pose}"
+        contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
+        yield f"{'contrast':<12}{contrast}; compared by {config.image_options.similarity.kind}"
     yield f"{'model':<12}preset {config.model.preset}"
     if config.sampler.name == "laplace":
         yield f"{'sampler':<12}laplace, approximate: independent draws of the Gaussian about the mode"

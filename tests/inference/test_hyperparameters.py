@@ -82,9 +82,9 @@ def test_draws_have_the_density_of_a_grid(options):
             state = move_hyperparameters(target, post.data, setup, key, state)
             return state, setup.gaussian.place(state.position)[entries]
 
-        return jax.lax.scan(step, state, jax.random.split(key, 4000))[1]
+        return jax.lax.scan(step, state, jax.random.split(key, 1000))[1]
 
-    draws = np.asarray(chain(jax.random.key(0)))[500:]
+    draws = np.asarray(chain(jax.random.key(0)))[125:]
     flat = setup.gaussian.place(state.position)
     axes = [np.linspace(column.min() - 0.3, column.max() + 0.3, 61) for column in draws.T]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -18,6 +18,7 @@ from bayesreg.model.build import require_observations
 from bayesreg.model.curvature import _assemble, displacement_curvature
 from bayesreg.model.external_curvature import FixedState, _curvature_of_term
 from bayesreg.model.observations.left_out import leave_out
+from bayesreg.model.observations.point_noise import NormalNoise
 from bayesreg.model.state import State
 from bayesreg.model.term import ExternalTerm, PointCurvature, SharedCurvature
 from bayesreg.types import Equilibrium
@@ -73,7 +74,7 @@ REGION = np.array([[5.0, 6.0, 7.0], [6.0, 6.0, 8.0], [5.5, 7.0, 7.5]]), np.array
 
 def landmarks():
     points, moved, sd = places()
-    return br.Landmarks(points, moved, sd)
+    return br.Landmarks(points, moved, sd, noise=NormalNoise())
 
 
 @cache
@@ -186,7 +187,7 @@ def test_a_landmark_that_nothing_else_determines_is_told():
     model = MODEL.model_copy(update={"rigid_sd": None})
     rest = {"u_boundary": jnp.zeros((len(MESH.boundary), 3))}
     points, moved, sd = (array[:3] for array in places())
-    post = br.build_posterior(MESH, [br.Landmarks(points, moved, sd)], model)
+    post = br.build_posterior(MESH, [br.Landmarks(points, moved, sd, noise=NormalNoise())], model)
     left_out = leave_out(post, post.data.terms["landmarks"], rest)
     assert np.isnan(left_out.residual).all()
     assert np.isinf(left_out.covariance).all()
@@ -197,7 +198,7 @@ def test_a_landmark_that_nothing_else_determines_is_told():
 def test_an_inferred_sd_has_the_posterior_of_its_evidence(median, log_sd):
     """The displacements are integrated out in closed form: the shifts are N(0, A Σ Aᵀ + sd² I) given sd."""
     points, moved, _ = places()
-    observed = [br.Landmarks(points, moved, br.ScalePrior(median=median, log_sd=log_sd))]
+    observed = [br.Landmarks(points, moved, br.ScalePrior(median=median, log_sd=log_sd), noise=NormalNoise())]
     post = br.build_posterior(MESH, observed, MODEL)
     precision, extension = prior()
     A = np.kron(barycentric(points), np.eye(3)) @ extension
@@ -351,7 +352,7 @@ LOOSE = MODEL.model_copy(update={"rigid_sd": None})
         ([br.Landmarks([[1.0, 1, 1]], [[1.0, 1, 1]], 1.0, name="elastic")], "'elastic' of an observation is taken"),
         (
             [br.Landmarks([[1.0, 1, 99]], [[1.0, 1, 1]], 1.0, labels=["tip"])],
-            "landmarks: point tip at .* outside the mesh",
+            "landmarks: 1 of 1 points lie .* outside the mesh, .*: tip; fewer than 4 points are left",
         ),
         ([MeanDisplacement(np.array([[0.0, 0.0, 99.0]]), np.zeros(3), 1.0)], "outside the mesh"),
     ],

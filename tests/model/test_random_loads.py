@@ -13,6 +13,7 @@ import bayesreg as br
 from bayesreg.fem.elements import boundary_areas
 from bayesreg.inference.gaussian.mode_search import find_mode
 from bayesreg.inference.layout import flat_position, unravel
+from bayesreg.model.observations.point_noise import NormalNoise
 from bayesreg.model.options import PriorConfig
 from tests.model.test_gradients import assert_gradient
 from tests.options import model_of, posterior_of
@@ -107,7 +108,7 @@ def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
     inferred = {name: {"median": 0.3, "log_sd": 2.0} for name in LOADS}
     fixed = {"lam": dict(zip(MESH.names, LAM.tolist(), strict=True)), "mu": {"csf": 0.5, "gm": 1.0}}
     model = model_of(**OPTIONS | inferred, fixed=fixed)
-    points = br.Landmarks(MESH.points, MESH.points + moved, sd=sd)
+    points = br.Landmarks(MESH.points, MESH.points + moved, sd=sd, noise=NormalNoise())
     post = br.build_posterior(MESH, [points], model)
     apart = scipy.linalg.null_space(rigid.T)
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from bayesreg.model.observations.point_noise import WRONG
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
 from bayesreg.types import AnyArray
 
@@ -32,12 +33,16 @@ def landmark_table(name: str, summary: Arrays) -> ReportTable:
     """Make the table of the residual of every landmark, at the posterior mean and with the landmark left out."""
     distance = np.linalg.norm(summary["residual"], axis=1)
     rows = [
-        [str(label), float(summary["sd"][k]), float(distance[k]), *_left_out_cells(summary, k)]
-        for k, label in enumerate(summary["names"])
+        [str(label), float(sd), float(distance[k]), *_wrong_cell(summary, k), *_left_out_cells(summary, k)]
+        for k, (label, sd) in enumerate(zip(summary["names"], summary["sd"], strict=True))
     ]
-    header = ["", "Sd, mm", "Residual, mm", "Left out, mm", "Its region"]
+    header = ["", "Sd, mm", "Residual, mm", *["Wrong"] * ("wrong" in summary), "Left out, mm", "Its region"]
     title = "Each landmark" if name == "landmarks" else f"Each landmark of {name}"
     return ReportTable(title, _caption(summary), header, rows, summary["points"])
+
+
+def _wrong_cell(summary: Arrays, k: int) -> list[str]:
+    return [f"{100 * summary['wrong'][k]:.0f} %"] if "wrong" in summary else []
 
 
 def _left_out_cells(summary: Arrays, k: int) -> list[Any]:
@@ -55,6 +60,8 @@ def _caption(summary: Arrays) -> str:
         "Residual: distance of the landmark in the moving image from where the posterior mean takes it; sd: of the "
         "error of each coordinate that the model gives it."
     )
+    if "wrong" in summary:
+        text += f" {_describe_wrong(summary)}"
     if "left_out_residual" not in summary:
         return f"{text} They were not left out in turn, as up to 60 are where nodes are sampled."
     residual = summary["left_out_residual"]
@@ -69,6 +76,17 @@ def _caption(summary: Arrays) -> str:
         f"its mean is {mean:.3g} mm. Its region: the share of the prediction that lies nearer. "
         f"{', '.join(shares)}.".replace("%", " %")
     )
+
+
+def _describe_wrong(summary: Arrays) -> str:
+    """Say what a wrong pair is, and name those that probably are."""
+    probable = [
+        f"{summary['names'][k]} ({100 * summary['wrong'][k]:.0f} %)"
+        for k in np.argsort(-summary["wrong"])
+        if summary["wrong"][k] > 0.5
+    ]
+    named = f"Probably wrong: {', '.join(probable)}." if probable else "None probably is."
+    return f"Wrong: the probability that the error of this pair has more than {WRONG:g} times that sd. {named}"
 
 
 def distance_figure(name: str, summary: Arrays) -> ReportFigure:

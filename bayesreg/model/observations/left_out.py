@@ -41,9 +41,10 @@ def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -
     """Leave each landmark out in turn, at given stiffness and scales.
 
     For given stiffness and scales, u_B is Gaussian if the other observations are linear in it. Let H be its
-    Gauss–Newton precision at `estimands`, u(p) = A u_B + const, and C = A H⁻¹ Aᵀ. Without a landmark of error s² I the
-    residual is (I − C / s²)⁻¹ r with the covariance s² (I − C / s²)⁻¹, where r is the residual with the landmark (the
-    known result of linear regression, for three rows at a time).
+    Gauss–Newton precision at `estimands`, u(p) = A u_B + const, and C = A H⁻¹ Aᵀ. A landmark whose error has the
+    precision P adds Aᵀ P A to H. Without it, the residual is (I − C P)⁻¹ r, and the covariance of u(p) is
+    (I − C P)⁻¹ C, where r is the residual with the landmark (the known result of linear regression, for three rows at a
+    time). With errors of Student's t, P has the weight of the landmark; weights of the others stay.
 
     Parameters
     ----------
@@ -61,31 +62,37 @@ def leave_out(posterior: Posterior, term: Any, estimands: dict[str, AnyArray]) -
     H = curvature[components:, components:]
     predicted, response = (np.asarray(array) for array in _predicted_with_response(data, term, values))
     A = response.reshape(3 * len(predicted), -1)
-    residual, sd = np.asarray(term.shift) - predicted, np.asarray(term.sd(values))
-    shares = [_shares(H + trace * np.trace(H) * np.eye(len(H)), A, sd) for trace in (TRACE, MORE * TRACE)]
-    left_out = [_without(*landmark) for landmark in zip(residual, *shares, sd, strict=True)]
+    residual = np.asarray(term.shift) - predicted
+    u = state_of(data.body, data.blocks, values).u
+    precision = np.asarray(term.gauss_newton(u, values).matrices)
+    error = term.noise.variance * np.asarray(term.sd(values)) ** 2
+    spreads = [_spreads(H + trace * np.trace(H) * np.eye(len(H)), A) for trace in (TRACE, MORE * TRACE)]
+    left_out = [_without(*landmark) for landmark in zip(residual, *spreads, precision, error, strict=True)]
     return LeftOut(*(np.stack(fields) for fields in zip(*left_out, strict=True)))
 
 
-def _shares(
-    precision: Float[np.ndarray, "rows rows"],
-    response: Float[np.ndarray, "coordinates rows"],
-    sd: Float[np.ndarray, "k"],
+def _spreads(
+    precision: Float[np.ndarray, "rows rows"], response: Float[np.ndarray, "coordinates rows"]
 ) -> Float[np.ndarray, "k 3 3"]:
-    """Compute C / s² of every landmark: its own share of the information about its place."""
-    spread = response @ cho_solve(cho_factor(precision), response.T)
-    return np.einsum("kikj->kij", spread.reshape(len(sd), 3, len(sd), 3)) / sd[:, None, None] ** 2
+    """Compute C of every landmark."""
+    spread, count = response @ cho_solve(cho_factor(precision), response.T), len(response) // 3
+    return np.einsum("kikj->kij", spread.reshape(count, 3, count, 3))
 
 
 def _without(
-    residual: Float[np.ndarray, "3"], share: Float[np.ndarray, "3 3"], less: Float[np.ndarray, "3 3"], sd: float
+    residual: Float[np.ndarray, "3"],
+    spread: Float[np.ndarray, "3 3"],
+    less: Float[np.ndarray, "3 3"],
+    precision: Float[np.ndarray, "3 3"],
+    error: Float[np.ndarray, "3"],
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Compute the residual without the landmark, and its covariance; `less` is its share with more regularisation."""
-    least, least_regularised = (np.linalg.eigvalsh(np.eye(3) - own_share).min() for own_share in (share, less))
+    """Compute the residual without the landmark, and its covariance; `less` is C with more regularisation."""
+    root = np.sqrt(precision)
+    least, least_regularised = (np.linalg.eigvalsh(np.eye(3) - root @ C @ root).min() for C in (spread, less))
     if least_regularised > 2 * least:
         return np.full(3, np.nan), np.full((3, 3), np.inf)
-    left = np.linalg.inv(np.eye(3) - share)
-    return left @ residual, sd**2 * left
+    left = np.linalg.inv(np.eye(3) - spread @ precision)
+    return left @ residual, left @ spread + np.diag(error)
 
 
 @jax.jit

@@ -1,0 +1,111 @@
+"""The error of a point, as a function of z² = Σ_i (q − p − u(p))_i² / sd_i², its squared distance in units of sd."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jaxtyping import Float
+from pydantic import BeforeValidator, Field
+from scipy import stats
+
+from bayesreg.settings import Section, by_kind
+from bayesreg.types import AnyArray
+
+# A point is wrong if the standard deviation of its own error is more than this multiple of sd.
+WRONG = 3.0
+
+
+@jax.tree_util.register_static
+class NormalNoise(Section):
+    """Normal errors, the same for all points."""
+
+    kind: Literal["normal"] = "normal"
+
+    @property
+    def variance(self) -> float:
+        """The variance of each coordinate, in units of sd²."""
+        return 1.0
+
+    def weight(self, squares: AnyArray) -> AnyArray:
+        """Return −2 times the derivative of the log density by z²: one."""
+        return jnp.ones_like(squares)
+
+    def bend(self, squares: AnyArray) -> AnyArray:
+        """Return −4 times the second derivative of the log density by z²: zero."""
+        return jnp.zeros_like(squares)
+
+    def distribution(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
+        """Return the distribution of points about their means (k, 3), with standard deviations (k, 3)."""
+        return dist.Normal(mean, sd).to_event(1)
+
+    def probability_of_wrong(self, squares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"] | None:
+        """Return None: no point has an error of its own."""
+        return None
+
+
+@jax.tree_util.register_static
+class StudentTNoise(Section):
+    """Student's t in three dimensions: a Normal error whose precision τ_k / sd² differs from point to point.
+
+    With τ_k ~ Gamma(ν/2, ν/2), integrated out. A point far off has a small weight (Lange, Little and Taylor 1989).
+    """
+
+    kind: Literal["student_t"] = "student_t"
+    nu: Annotated[float, Field(strict=True, gt=2, allow_inf_nan=False)] = 4.0
+    """ν, the degrees of freedom, above 2: the fewer, the heavier the tails."""
+
+    @property
+    def variance(self) -> float:
+        """The variance of each coordinate, in units of sd²."""
+        return self.nu / (self.nu - 2)
+
+    def weight(self, squares: AnyArray) -> AnyArray:
+        """Return −2 times the derivative of the log density by z², the mean of τ given z²: (ν + 3) / (ν + z²)."""
+        return (self.nu + 3) / (self.nu + squares)
+
+    def bend(self, squares: AnyArray) -> AnyArray:
+        """Return −4 times the second derivative of the log density by z²."""
+        return -2 * (self.nu + 3) / (self.nu + squares) ** 2
+
+    def distribution(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
+        """Return the distribution of points about their means (k, 3), with scales (k, 3)."""
+        return dist.MultivariateStudentT(self.nu, mean, jnp.eye(3) * sd[..., None])
+
+    def probability_of_wrong(self, squares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
+        """Return the probability that τ < 1 / WRONG², given z²: τ has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""
+        return stats.gamma((self.nu + 3) / 2, scale=2 / (self.nu + np.asarray(squares))).cdf(1 / WRONG**2)
+
+
+Noise = Annotated[NormalNoise | StudentTNoise, Field(discriminator="kind"), BeforeValidator(by_kind)]
+
+
+class PartlyNormalised(dist.Distribution):
+    """A distribution whose log density lacks a constant, such as the known part of its normaliser.
+
+    Parameters
+    ----------
+    whole : Distribution
+    constant : array
+        The part of its log density that is left out.
+    """
+
+    def __init__(self, whole: dist.Distribution, constant: AnyArray) -> None:
+        self.whole, self.constant = whole, constant
+        super().__init__(whole.batch_shape, whole.event_shape)
+
+    @property
+    def support(self):  # type: ignore[no-untyped-def]
+        """The support of the whole distribution."""
+        return self.whole.support
+
+    def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> AnyArray:
+        """Draw from the whole distribution."""
+        return self.whole.sample(key, sample_shape)
+
+    def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
+        """Return the log density less the constant."""
+        return self.whole.log_prob(value) - self.constant
