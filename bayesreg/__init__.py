@@ -35,7 +35,6 @@ _HOME = {
     "Landmarks": "model.observations.landmarks",
     "NormalNoise": "model.observations.point_noise",
     "StudentTNoise": "model.observations.point_noise",
-    "Surface": "model.observations.surface",
     "independent_points": "model.observations.images.independence",
     "make_pair": "synthetic.pair",
     "Start": "inference.chains.initialise",

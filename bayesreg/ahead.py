@@ -43,6 +43,7 @@ def ahead(steps: Iterable[Any]) -> Iterator[Future]:
                 result = element
                 if abandoned.is_set():
                     break
+        # Any error ends the work, and nobody may wait for its result.
         except BaseException as error:
             _log.debug("work ahead: %s", error)
             done.set_exception(error)
@@ -53,10 +54,9 @@ def ahead(steps: Iterable[Any]) -> Iterator[Future]:
     threading.Thread(target=work, name=__name__).start()
     try:
         yield done
-    except BaseException:
+        wait([done])
+    finally:
         abandoned.set()
-        raise
-    wait([done])
 
 
 def works_still() -> bool:

@@ -30,7 +30,6 @@ from bayesreg.command_options import (
     MapsLike,
     Margin,
     Mask,
-    MeasuredSurface,
     MovingIgnore,
     MovingImage,
     OutFolder,
@@ -145,13 +144,12 @@ def register(
     moving_ignore: MovingIgnore = None,
     channel: Channel = None,
     landmarks: LandmarksFile = None,
-    surface: MeasuredSurface = None,
     quick: QuickLook = False,
     overrides: Overrides = None,
     resume: Resume = False,
     quiet: Quiet = False,
 ) -> None:
-    """Sample the posterior of images, points or a surface in files; DIR/config.yaml holds the configuration."""
+    """Sample the posterior of images or points in files; DIR/config.yaml holds the configuration."""
     from bayesreg.workflow.register import understand
 
     understood = understand(
@@ -166,7 +164,6 @@ def register(
         overrides or (),
         quick,
         landmarks,
-        surface,
     )
     typer.echo("\n".join(understood.lines))
     _sample(understood.config, out, resume, quiet)

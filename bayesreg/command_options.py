@@ -21,12 +21,6 @@ LandmarksFile = Annotated[
         "--landmarks", metavar="FILE", help="Pairs of points: CSV with fixed_x … moving_z (RAS, mm), or .tag."
     ),
 ]
-MeasuredSurface = Annotated[
-    Path | None,
-    typer.Option(
-        "--surface", metavar="FILE", help="Points or a mesh of the moved surface of the organ, also of a part."
-    ),
-]
 LabelFile = Annotated[
     Path | None,
     typer.Option("--labels", metavar="FILE", help="Tissue labels of FIXED; without them the organ is of one tissue."),

@@ -201,15 +201,14 @@ def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):
     assert counts == {"fixed": 1, "moving": 1, "labels": 2, "mask": 1, "cavity": 2, "a,b": 2}
 
 
-def test_points_and_a_surface_need_no_images(register):
-    pairs, surface = register.folder / "pairs.csv", register.folder / "surface.csv"
+def test_points_need_no_images(register):
+    pairs = register.folder / "pairs.csv"
     pairs.write_text("fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z\n1,2,3,4,5,6\n")
-    surface.write_text("x,y,z\n1,2,3\n")
-    arguments = ["--labels", register.path("labels"), "--landmarks", str(pairs), "--surface", str(surface)]
+    arguments = ["--labels", register.path("labels"), "--landmarks", str(pairs)]
     result = CliRunner().invoke(app, ["register", *arguments, "-o", str(register.folder / "out")])
     assert result.exit_code == 0, result.output
     config = register.calls[0][0]
-    assert [section.kind for section in config.observations] == ["landmarks", "surface"]
+    assert [section.kind for section in config.observations] == ["landmarks"]
     assert (config.data.fixed, config.model.preset) == (None, "registration")
     assert f"landmarks   {pairs}" in result.output
     assert "pose" not in result.output
@@ -219,7 +218,7 @@ def test_points_and_a_surface_need_no_images(register):
     ("arguments", "message"),
     [
         (["fixed"], "is one image; give FIXED and MOVING"),
-        ([], "nothing is observed; give two images, --landmarks or --surface"),
+        ([], "nothing is observed; give two images or --landmarks"),
         (["--landmarks", "mask"], "without images, --labels says where the organ is"),
     ],
 )

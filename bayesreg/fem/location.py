@@ -119,6 +119,31 @@ def interpolation_at(
     return mesh.cells[cell], barycentric
 
 
+def nearest_places(
+    mesh: TetMesh, points: Float[np.ndarray, "k 3"]
+) -> tuple[Int[np.ndarray, "k 4"], Float[np.ndarray, "k 4"], Float[np.ndarray, "k"]]:
+    """Find the place of the mesh that is nearest to each point.
+
+    Returns
+    -------
+    nodes : (k, 4) int array
+        Nodes of the cell that holds the place; of a place on the surface, of a triangle and one of them again.
+    weights : (k, 4) array
+        Barycentric coordinates there.
+    distance : (k,) array
+        The distance from the point, mm; zero inside.
+    """
+    cell, weights = locate(mesh.points, mesh.cells, points, tolerance=1e-6)
+    nodes, distance, outside = mesh.cells[cell], np.zeros(len(points)), cell < 0
+    if outside.any():
+        face, on_face = nearest_on_surface(mesh.points, mesh.boundary_faces, points[outside])
+        corners = mesh.boundary_faces[face]
+        nodes[outside], weights[outside] = np.c_[corners, corners[:, 0]], np.c_[on_face, np.zeros(len(face))]
+        places = np.einsum("ka,kai->ki", on_face, mesh.points[corners])
+        distance[outside] = np.linalg.norm(points[outside] - places, axis=1)
+    return nodes, weights, distance
+
+
 def barycentric_maps(corners: np.ndarray) -> np.ndarray:
     """Compute the (m, 4, 3) maps to barycentric coordinates of tetrahedra.
 

@@ -13,32 +13,32 @@ from bayesreg.io.records import Run
 from bayesreg.report import panels, style
 from bayesreg.report.panels import Row, View
 from bayesreg.report.slices import Plane, sample
-from bayesreg.report.study import image_differences
 from bayesreg.report.style import Drawing
 from bayesreg.report.verdict import number
 
 CONVENTION = "Neurological convention: the left of the patient is on the left."
 
 
-def before_and_after(run: Run, view: View) -> Drawing | None:
+def before_and_after(run: Run, view: View, differences: tuple[float, float] | None) -> Drawing | None:
     """Draw the fixed, moving and warped images, and their differences, on three planes; None without images.
 
     If the images have unlike contrast, or a pose was needed, the figure shows the borders of the tissues on all images.
+    `differences` is the result of `bayesreg.report.study.image_differences`.
     """
     if run.fixed is None or run.moving is None or run.warped is None:
         return None
-    images, differences = _columns(run), _differences(run)
+    images, difference_images = _columns(run), _differences(run)
     with style.look():
-        figure, axes = _grid(view, len(images) + len(differences))
+        figure, axes = _grid(view, len(images) + len(difference_images))
         for row, plane in zip(axes, view.planes[::-1], strict=True):
             _draw_images(row, view, plane, images)
             row[0].set_ylabel(plane.title, color=style.MUTED)
-        if differences:
-            _draw_differences(figure, axes[:, len(images) :], view, list(differences.values()))
-        for panel, title in zip(axes[0], [*images, *differences], strict=True):
+        if difference_images:
+            _draw_differences(figure, axes[:, len(images) :], view, list(difference_images.values()))
+        for panel, title in zip(axes[0], [*images, *difference_images], strict=True):
             panel.set_title(title)
         uri = style.data_uri(figure)
-    caption = " ".join(_explain(run))
+    caption = " ".join(_explain(run, differences))
     return Drawing("registration", "Before and after", caption, "Fixed, moving and warped images on three planes.", uri)
 
 
@@ -98,9 +98,8 @@ def _difference(view: View, image: Image, plane: Plane) -> np.ndarray:
     return np.where(view.slice(plane).inside, sample(image, points) - sample(view.run.fixed, points), np.nan)
 
 
-def _explain(run: Run) -> list[str]:
+def _explain(run: Run, differences: tuple[float, float] | None) -> list[str]:
     sentences = ["Planes through the node of greatest displacement."]
-    differences = image_differences(run)
     if differences is not None:
         before, after = differences
         sentences.append(

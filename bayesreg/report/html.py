@@ -14,7 +14,7 @@ from bayesreg.report import anatomy
 from bayesreg.report.page import Opening, PageSection, write_page
 from bayesreg.report.panels import View
 from bayesreg.report.sections import SECTIONS
-from bayesreg.report.study import Study
+from bayesreg.report.study import Study, image_differences
 from bayesreg.report.summary import answers
 from bayesreg.report.verdict import approximation, nested_entry, warnings_of
 
@@ -55,7 +55,7 @@ def write_first_report(run: Run, reach: Float[np.ndarray, "nodes"], path: str | 
         The HTML file; replaced in one step.
     """
     view = View.of(run)
-    figures = [figure for figure in (anatomy.before_and_after(run, view),) if figure is not None]
+    before_and_after = anatomy.before_and_after(run, view, image_differences(run))
     opening = Opening(
         kicker=KICKER,
         title=str(run.manifest["name"] or "Registration"),
@@ -64,7 +64,11 @@ def write_first_report(run: Run, reach: Float[np.ndarray, "nodes"], path: str | 
         warnings=nested_entry(run.manifest, "appraisal", "warnings") or [],
     )
     displacement = anatomy.displacement(run, view, reach)
-    write_page(path, opening, [PageSection("Registration", figures), PageSection("Displacement", [displacement])])
+    sections = [
+        PageSection("Registration", [before_and_after] if before_and_after else []),
+        PageSection("Displacement", [displacement]),
+    ]
+    write_page(path, opening, sections)
 
 
 def _opening(study: Study) -> Opening:

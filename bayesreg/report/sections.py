@@ -62,7 +62,7 @@ class Section(NamedTuple):
 
 
 def _before_and_after(study: Study) -> Item | None:
-    return anatomy.before_and_after(study.run, study.view)
+    return anatomy.before_and_after(study.run, study.view, study.image_differences)
 
 
 def _displacement(study: Study) -> Item:

@@ -114,6 +114,11 @@ class Study:
             return self.run.metrics
         return compute_metrics(self.mesh, self.run.u_mean, self.run.truth, self.posterior)
 
+    @cached_property
+    def image_differences(self) -> tuple[float, float] | None:
+        """The result of the function `image_differences`."""
+        return image_differences(self.run)
+
     @property
     def is_of_the_paper(self) -> bool:
         """Whether the model is that of the paper."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesreg.report.places import regions
-from bayesreg.report.study import Study, image_differences
+from bayesreg.report.study import Study
 from bayesreg.report.verdict import decimal_text, nested_entry, number, percent, place_text
 from bayesreg.types import AnyArray
 
@@ -32,10 +32,9 @@ def _success(study: Study) -> str:
 
 def _images(study: Study) -> list[str]:
     """Describe the difference between the images before and after."""
-    differences = image_differences(study.run)
-    if differences is None:
+    if study.image_differences is None:
         return []
-    before, after = (number(value, 2) for value in differences)
+    before, after = (number(value, 2) for value in study.image_differences)
     return [f"The images differ by {after} (root mean square, scaled intensity); before, {before}."]
 
 

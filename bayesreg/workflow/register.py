@@ -14,6 +14,7 @@ from bayesreg.io.grids import Grid
 from bayesreg.io.readers import read_grid
 from bayesreg.io.volumes import load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_tables
+from bayesreg.model.observations.landmarks import LandmarksSection
 from bayesreg.tissues import ORGAN
 from bayesreg.types import InputError
 
@@ -47,14 +48,13 @@ def understand(
     overrides: Sequence[str] = (),
     quick: bool = False,
     landmarks: Path | None = None,
-    surface: Path | None = None,
 ) -> Understood:
     """Make the configuration of a pair in files.
 
     Parameters
     ----------
     fixed, moving : path, optional
-        Two images; none where points or a surface are all that is observed.
+        Two images; none where points are all that is observed.
     labels : path, optional
         Tissue labels of the fixed image, or a mask of the organ. Without them, the organ is `intracranial`, or the
         bright part of the fixed image.
@@ -73,8 +73,6 @@ def understand(
         Whether the run ends at draws from Laplace's approximation.
     landmarks : path, optional
         Pairs of points that show the same places.
-    surface : path, optional
-        Points or a mesh of the moved surface of the organ.
 
     Raises
     ------
@@ -84,8 +82,8 @@ def understand(
     """
     if (fixed is None) != (moving is None):
         raise InputError(f"{fixed or moving} is one image; give FIXED and MOVING, or no image")
-    if fixed is None and landmarks is None and surface is None:
-        raise InputError("nothing is observed; give two images, --landmarks or --surface")
+    if fixed is None and landmarks is None:
+        raise InputError("nothing is observed; give two images or --landmarks")
     if fixed is None and labels is None:
         raise InputError("without images, --labels says where the organ is: a mask, or labels of its tissues")
     if labels is None and table is not None:
@@ -101,11 +99,7 @@ def understand(
     sections["observations"] = [
         *pair,
         *(_channel(k, paths) for k, paths in enumerate(channels, 2)),
-        *(
-            {"kind": kind, "file": str(path.absolute())}
-            for kind, path in (("landmarks", landmarks), ("surface", surface))
-            if path is not None
-        ),
+        *([] if landmarks is None else [{"kind": "landmarks", "file": str(landmarks.absolute())}]),
     ]
     if quick:
         sections |= QUICK
@@ -129,8 +123,8 @@ def _describe(config: Config, how: str) -> Iterator[str]:
         yield f"{'table':<12}{how}: {tissues}"
     yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
     for section in config.observations:
-        if section.kind in ("landmarks", "surface"):
-            yield f"{section.name:<12}{getattr(section, 'file', '')}"
+        if isinstance(section, LandmarksSection):
+            yield f"{section.name:<12}{section.file}"
     for section in config.pairs_of_images:
         if section.fixed is not None:
             yield f"{section.name:<12}{section.fixed} and {section.moving}, compared as well"

@@ -68,7 +68,7 @@ def test_the_difference_is_that_of_the_labelled_voxels(seen):
     inside = np.asarray(run.tissue.voxels) > 0
     expected = np.sqrt(np.mean((np.asarray(run.moving.voxels) - np.asarray(run.fixed.voxels))[inside] ** 2))
     assert rms_difference(run, run.moving) == pytest.approx(expected, rel=1e-9)
-    assert f"{expected:.3f}" in anatomy.before_and_after(seen.run, seen.view).caption
+    assert f"{expected:.3f}" in anatomy.before_and_after(seen.run, seen.view, seen.image_differences).caption
 
 
 def test_the_mesh_is_cut_into_the_tissues_of_its_cells(view):
