@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from bayesreg.config.data import BrainWebData, CalibratedPair, FilesData, Mni152Data, PaperPair
-from bayesreg.config.samplers import Hmc, SamplerConfig, name_hmc_where_unnamed
+from bayesreg.config.samplers import Auto, SamplerConfig, name_where_unnamed
 from bayesreg.config.sections import EvaluationConfig, MeshConfig, ReportConfig, ResultsConfig, StartConfig, StopConfig
 from bayesreg.config.values import find_boundary
 from bayesreg.model.observations.images.options import ImageOptions, with_preset
@@ -107,8 +107,8 @@ class Config(Section):
     sampler: Annotated[
         SamplerConfig,
         Field(discriminator="name", validate_default=True),
-        BeforeValidator(name_hmc_where_unnamed),
-    ] = Hmc()
+        BeforeValidator(name_where_unnamed),
+    ] = Auto()
     start: StartConfig = StartConfig()
     stop: Annotated[StopConfig, Field(validate_default=True)] = StopConfig()
     report: ReportConfig = ReportConfig()

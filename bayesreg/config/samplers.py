@@ -37,16 +37,28 @@ class RandomWalk(settings.RandomWalk, _Chains):
     """The number of transitions per kept draw."""
 
 
-class Hmc(settings.Hmc, _Chains):
-    """Hamiltonian Monte Carlo, the default sampler."""
+class Auto(settings.Settings, _Chains):
+    """The default: gibbs if the displacements can be integrated out, as with pairs of points alone, else hmc."""
 
-    name: Literal["hmc"] = "hmc"
+    name: Literal["auto"] = "auto"
+
+
+class Hmc(settings.Hmc, _Chains):
+    """Hamiltonian Monte Carlo."""
+
+    name: Literal["hmc"]
 
 
 class Nuts(settings.Nuts, _Chains):
     """The No-U-Turn sampler (NUTS)."""
 
     name: Literal["nuts"]
+
+
+class Gibbs(settings.Gibbs, _Chains):
+    """The Gibbs sampler of pairs of points."""
+
+    name: Literal["gibbs"]
 
 
 class Smc(settings.Smc, _Chains):
@@ -61,7 +73,7 @@ class Laplace(settings.Laplace, _Chains):
     name: Literal["laplace"]
 
 
-SamplerConfig = Hmc | Nuts | Smc | Laplace | RandomWalk
+SamplerConfig = Auto | Hmc | Gibbs | Nuts | Smc | Laplace | RandomWalk
 
 
 def sampler_section(name: str) -> SamplerConfig:
@@ -69,8 +81,10 @@ def sampler_section(name: str) -> SamplerConfig:
     return TypeAdapter(Annotated[SamplerConfig, Field(discriminator="name")]).validate_python({"name": name})
 
 
-def name_hmc_where_unnamed(value: object) -> object:
-    """Add the name hmc to a section without a name; a text is the name alone."""
+def name_where_unnamed(value: object) -> object:
+    """Add a name to a section without one: auto, or hmc if it has settings of that; a text is the name alone."""
     if isinstance(value, str):
         return {"name": value}
-    return {"name": "hmc", **value} if isinstance(value, dict) and "name" not in value else value
+    if not isinstance(value, dict) or "name" in value:
+        return value
+    return {"name": "auto" if set(value) <= set(_Chains.model_fields) else "hmc", **value}

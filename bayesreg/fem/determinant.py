@@ -80,6 +80,14 @@ class SchurDeterminant(NamedTuple):
     log_null: Scalar
     rank: Scalar
 
+    def log_pseudo_determinant(
+        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
+    ) -> Scalar:
+        """Compute log pdet S for λ and μ by cell; differentiable, and NaN if K is not positive definite."""
+        supported = log_determinant(self.supported, elements, lam, mu)
+        free = 0.0 if self.free is None else log_determinant(self.free, elements, lam, mu)
+        return supported - free - self.log_null
+
 
 def schur_determinant(
     mesh: TetMesh, sampled: Int[np.ndarray, "sampled"], held: Int[np.ndarray, "held"]
@@ -175,15 +183,6 @@ def _require_definite(mesh: TetMesh, determinant: SchurDeterminant) -> None:
             "the elastic prior has no normaliser on this mesh: parts of it hang together by a node or an edge, "
             "or not at all; mend the mesh, or use normalised: false"
         )
-
-
-def log_pseudo_determinant(
-    determinant: SchurDeterminant, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
-) -> Scalar:
-    """Compute log pdet S for λ and μ by cell; differentiable, and NaN if K is not positive definite."""
-    supported = log_determinant(determinant.supported, elements, lam, mu)
-    free = 0.0 if determinant.free is None else log_determinant(determinant.free, elements, lam, mu)
-    return supported - free - determinant.log_null
 
 
 @jax.custom_jvp

@@ -162,6 +162,35 @@ class ModeSearch(Protocol):
 
 
 @runtime_checkable
+class Marginal(Protocol):
+    """A posterior with the displacements integrated out, given the weights of the observations (a pytree)."""
+
+    @property
+    def problem(self) -> Any:
+        """The data of the posterior."""
+
+    def draw_weights(self, key: AnyArray, estimands: Estimands) -> tuple[AnyArray, dict[str, AnyArray]]:
+        """Draw the weights given all estimands, and estimands other than "u_boundary" given it; return both."""
+
+    def log(self, estimands: Estimands, weights: AnyArray) -> Scalar:
+        """Compute the log density of all estimands but "u_boundary", which may have any value, given the weights."""
+
+    def draw_displacements(self, key: AnyArray, estimands: Estimands, weights: AnyArray) -> AnyArray:
+        """Draw "u_boundary" given the other estimands and the weights."""
+
+    def log_others(self, estimands: Estimands) -> Scalar:
+        """Compute the log of the terms of the posterior that the other functions leave out."""
+
+
+@runtime_checkable
+class Marginalisation(Protocol):
+    """A posterior whose displacements can be integrated out."""
+
+    def marginal(self) -> Marginal:
+        """Return the marginal, which is prepared at the first call."""
+
+
+@runtime_checkable
 class Target(Hashable, Protocol):
     """The posterior as the samplers use it; `bayesreg.Posterior` is an implementation."""
 
@@ -206,6 +235,10 @@ class Target(Hashable, Protocol):
 
         The costly normaliser is left out. The map is None without a costly normaliser.
         """
+
+    @property
+    def marginalisation(self) -> Marginalisation | None:
+        """The posterior with the displacements integrated out; None if that cannot be done in closed form."""
 
     @property
     def mode_search(self) -> ModeSearch | None:

@@ -176,7 +176,11 @@ class Scale(_Positive):
         """Draw the scale in a NumPyro program; see `Block`."""
         if not self.is_sampled:
             return self.median
-        return numpyro.sample(name, dist.LogNormal(jnp.log(self.median), self.log_sd))
+        return numpyro.sample(name, self.prior())
+
+    def prior(self) -> dist.Distribution:
+        """Return the prior of an unknown scale."""
+        return dist.LogNormal(jnp.log(self.median), self.log_sd)
 
     def reference(self) -> AnyArray:
         """Return the median of the prior, or the known value."""

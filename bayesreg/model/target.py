@@ -18,6 +18,7 @@ from bayesreg.model.conditioning import condition, simplify
 from bayesreg.model.coordinates import Coordinates
 from bayesreg.model.elastic.skull import Skull, mark_behind_skull
 from bayesreg.model.evaluation import Evaluation
+from bayesreg.model.marginal import Marginalisation
 from bayesreg.model.mode_search import ModeSearch
 from bayesreg.model.normaliser import Normaliser
 from bayesreg.model.program import Problem
@@ -120,6 +121,11 @@ class PosteriorTarget:
         """
         normaliser = self.normaliser
         return partial(simplify, normaliser=normaliser) if normaliser is not None and normaliser.is_costly else None
+
+    @cached_property
+    def marginalisation(self) -> Marginalisation | None:
+        """The posterior with the displacements integrated out; None if that cannot be done in closed form."""
+        return Marginalisation.of(self.data, self.posterior.mesh)
 
     @property
     def mode_search(self) -> ModeSearch:

@@ -21,6 +21,7 @@ from bayesreg.config.sections import StopConfig
 from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.diagnostics import Convergence
 from bayesreg.inference.draws.moments import greatest_rhat
+from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh, signed_volumes
 from bayesreg.model.adequacy import describe_observations
@@ -87,7 +88,7 @@ def manifest(
         },
         "pair": provenance["pair"],
         "appraisal": provenance.get("appraisal", {}),
-        "sampler": {"name": config.sampler.name, "settings": config.sampler.model_dump(exclude={"name"})},
+        "sampler": _describe_sampler(config, posterior),
         "model": config.model.model_dump(mode="json"),
         "observations": observations,
         "scales": {
@@ -124,6 +125,13 @@ def manifest(
         "implied_noise_sd": of_images.get("noise_sd"),
         "residual_to_noise": of_images.get("residual_to_noise"),
     }
+
+
+def _describe_sampler(config: Config, posterior: Posterior) -> dict[str, Any]:
+    """Return the name and the settings of the sampler that was chosen."""
+    chosen = choose_sampler(config.sampler.name, posterior.target, **config.sampler.settings)
+    common = config.sampler.model_dump(exclude={"name", *config.sampler.settings})
+    return {"name": chosen.name, "settings": common | chosen.settings.model_dump()}
 
 
 def _has_converged(samples: Samples, stop: StopConfig, judged: Convergence) -> bool | None:

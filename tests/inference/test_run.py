@@ -180,7 +180,7 @@ def test_stop_rules():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; there are rwmh, hmc, nuts, smc, laplace"),
+        ({"sampler": "mala"}, "unknown sampler 'mala'; there are auto, rwmh, hmc, nuts, gibbs, smc, laplace"),
         ({"chains": 0}, "chains must be at least 1, got 0"),
         ({"thin": 0}, "thin must be at least 1"),
         ({"sigma_u": -1.0}, "sigma_u = -1.0: expected greater than 0"),

@@ -95,7 +95,7 @@ class Samples:
 
 def sample(
     posterior: HasTarget,
-    sampler: str = "hmc",
+    sampler: str = "auto",
     chains: int = 4,
     draws: int = 1000,
     seed: int = 0,
@@ -115,7 +115,8 @@ def sample(
     ----------
     posterior : Posterior
     sampler : str
-        A name in `bayesreg.inference.samplers.registry.SAMPLERS`.
+        A name in `bayesreg.inference.samplers.registry.SAMPLERS`; "auto" is gibbs if the displacements can be
+        integrated out, as with pairs of points alone, else hmc.
     chains : int
         The number of chains. They run in parallel under `vmap`, in equal shares on the most devices that divide it.
     draws : int

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from bayesreg.inference.kernel import Sampler
 from bayesreg.inference.samplers import settings
+from bayesreg.inference.samplers.gibbs import gibbs
 from bayesreg.inference.samplers.hamiltonian import hmc, nuts
 from bayesreg.inference.samplers.laplace import laplace
 from bayesreg.inference.samplers.random_walk import rwmh
@@ -35,6 +36,7 @@ SAMPLERS: dict[str, Entry] = {
     "rwmh": Entry(settings.RandomWalk, rwmh),
     "hmc": Entry(settings.Hmc, hmc),
     "nuts": Entry(settings.Nuts, nuts),
+    "gibbs": Entry(settings.Gibbs, gibbs),
     "smc": Entry(settings.Smc, smc),
     "laplace": Entry(settings.Laplace, laplace),
 }
@@ -62,16 +64,22 @@ class Chosen:
         object.__setattr__(self, "sampler", SAMPLERS[self.name].make(self.target, self.settings))
 
 
+# The name of the sampler that suits the target: gibbs if the displacements can be integrated out, else hmc.
+AUTO = "auto"
+
+
 def choose_sampler(name: str, target: Target, **settings: Any) -> Chosen:
-    """Make the named sampler for a target with these settings.
+    """Make the named sampler for a target with these settings; the name may be `AUTO`.
 
     Raises
     ------
     InputError
         If there is no such sampler or setting, a setting is out of range, or the sampler does not accept the target.
     """
+    if name == AUTO:
+        name = "hmc" if target.marginalisation is None else "gibbs"
     if name not in SAMPLERS:
-        raise InputError(f"unknown sampler {name!r}; there are {', '.join(SAMPLERS)}")
+        raise InputError(f"unknown sampler {name!r}; there are {', '.join([AUTO, *SAMPLERS])}")
     record = SAMPLERS[name].settings
     plain = {key: value.item() if getattr(value, "size", 0) == 1 else value for key, value in settings.items()}
     try:

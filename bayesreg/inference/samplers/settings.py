@@ -65,3 +65,10 @@ class Smc(Tuned):
     """Number of particles, at least that of the chains. Many particles find several modes and weigh them."""
     spread: Annotated[float, Field(strict=True, ge=1)] = 2.0
     """The factor by which the first distribution is wider than Laplace's approximation."""
+
+
+class Gibbs(Settings):
+    """Gibbs sampling of pairs of points on one tissue with random loads: displacements are integrated out."""
+
+    warm_up: Count = 80
+    """Transitions that are not kept, from which the steps of stiffness and scales are tuned."""

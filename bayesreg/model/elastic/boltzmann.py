@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, StrictBool, model_validator
 
-from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
+from bayesreg.fem.determinant import SchurDeterminant
 from bayesreg.fem.elements import Elements
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values
@@ -106,7 +106,7 @@ class BoltzmannTerm(NamedTuple):
         """Return ½ log pdet S(λ, μ) − r/2 log(2π T_r), where r is the rank of S; zero without normaliser."""
         if self.determinant is None:
             return jnp.zeros(())
-        log_pdet = log_pseudo_determinant(self.determinant, elements, lam, mu)
+        log_pdet = self.determinant.log_pseudo_determinant(elements, lam, mu)
         return 0.5 * (log_pdet - self.determinant.rank * jnp.log(2 * jnp.pi * values["t_elastic"]))
 
     def curvature(self, stiffness: Matrix, values: Values) -> Matrix:

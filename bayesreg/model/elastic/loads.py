@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Float
 
-from bayesreg.fem.determinant import SchurDeterminant, log_pseudo_determinant
+from bayesreg.fem.determinant import SchurDeterminant
 from bayesreg.fem.elasticity import internal_force, rigid_modes
 from bayesreg.fem.elements import Elements, boundary_areas
 from bayesreg.mesh import TetMesh
@@ -117,7 +117,7 @@ class LoadsTerm(NamedTuple):
         """
         if self.determinant is None:
             return jnp.zeros(())
-        return log_pseudo_determinant(self.determinant, elements, lam, mu)
+        return self.determinant.log_pseudo_determinant(elements, lam, mu)
 
     def _log_normaliser_of_loads(self, values: Values) -> Scalar:
         """Return ½ (log det Rᵀ D R − log det D − r log 2π)."""

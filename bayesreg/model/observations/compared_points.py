@@ -10,11 +10,14 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Float, Int
 
-from bayesreg.model.blocks import Values
-from bayesreg.model.observations.point_noise import PartlyNormalised
+from bayesreg.model.blocks import Blocks, Values
+from bayesreg.model.observations.point_noise import NormalNoise, PartlyNormalised
 from bayesreg.model.state import State
 from bayesreg.model.term import Label, PointCurvature
 from bayesreg.types import AnyArray, Scalar
+
+# The number of steps of an sd with the weights of its points, and their least and greatest widths in logarithms.
+STEPS, NARROWEST, WIDEST = 16, 0.02, 2.0
 
 
 class ComparedPoints(NamedTuple):
@@ -81,7 +84,7 @@ class ComparedPoints(NamedTuple):
 
     def predicted(self, state: State) -> Float[AnyArray, "k 3"]:
         """Return the predicted displacement u(p), mm."""
-        return self._at_points(state.u)
+        return self.interpolate(state.u)
 
     def pointwise_log_likelihood(self, state: State) -> Float[AnyArray, "k"]:
         """Return the log likelihood of every landmark with its normaliser, for leave-one-out."""
@@ -105,16 +108,60 @@ class ComparedPoints(NamedTuple):
     def remainder(self, u: Float[AnyArray, "nodes 3"], values: Values) -> PointCurvature:
         """Return what the change of the weights adds; zero with Normal errors."""
         sd = self.sd(values)
-        push = (self.shift - self._at_points(u)) / sd**2
+        push = (self.shift - self.interpolate(u)) / sd**2
         bend = self.noise.bend(self.squares(u, sd))
         return PointCurvature(self.nodes, self.weights, bend[:, None, None] * push[:, :, None] * push[:, None, :])
 
     def squares(self, u: Float[AnyArray, "nodes 3"], sd: Float[AnyArray, "k 3"]) -> Float[AnyArray, "k"]:
         """Return z², the squared distance of every landmark from its predicted place, in units of sd."""
-        return (((self.shift - self._at_points(u)) / sd) ** 2).sum(axis=1)
+        return (((self.shift - self.interpolate(u)) / sd) ** 2).sum(axis=1)
 
-    def _at_points(self, u: Float[AnyArray, "nodes 3"]) -> Float[AnyArray, "k 3"]:
-        return jnp.einsum("ka,kai->ki", self.weights, jnp.asarray(u)[self.nodes])
+    def draw_weights(
+        self, key: AnyArray, values: Values, blocks: Blocks
+    ) -> tuple[Float[AnyArray, "k"], dict[str, AnyArray]]:
+        """Draw the weight τ of every point given all values, where every node is sampled, and sds with the weights.
+
+        The weights determine an sd that is inferred so narrowly that both would move each other in small steps only.
+        Random-walk Metropolis therefore multiplies every such sd by one factor c and the weights by c², which leaves
+        the errors' variances as they are (Yu and Meng 2011).
+
+        Returns
+        -------
+        weights : (k,) array
+            One for Normal errors.
+        scales : dict
+            The sds that are inferred.
+        """
+        key_weights, key_walk = jax.random.split(key)
+        residual, scales = self.shift - self.interpolate(values["u_boundary"]), self.hyperparameters
+        weights = self.noise.draw_weights(key_weights, ((residual / self.sd(values)) ** 2).sum(axis=1))
+        if not scales or isinstance(self.noise, NormalNoise):
+            return weights, {}
+
+        def density(log_factor: AnyArray) -> Scalar:
+            scaled = {name: jnp.exp(log_factor) * values[name] for name in scales}
+            scaled_weights = jnp.exp(2 * log_factor) * weights
+            sd = self.sd({**values, **scaled}) / jnp.sqrt(scaled_weights)[:, None]
+            prior = sum(blocks[name].prior().log_prob(scale) for name, scale in scaled.items())
+            jacobian = (2 * len(weights) + len(scales)) * log_factor
+            log_weights = self.noise.weights.log_prob(scaled_weights).sum()
+            return prior + log_weights + dist.Normal(0.0, sd).log_prob(residual).sum() + jacobian
+
+        def step(now: tuple[Scalar, Scalar], key: AnyArray) -> tuple[tuple[Scalar, Scalar], None]:
+            key_width, key_step, key_accept = jax.random.split(key, 3)
+            width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
+            log_factor = now[0] + width * jax.random.normal(key_step)
+            height = density(log_factor)
+            is_accepted = jnp.log(jax.random.uniform(key_accept)) < height - now[1]
+            return (jnp.where(is_accepted, log_factor, now[0]), jnp.where(is_accepted, height, now[1])), None
+
+        nothing = jnp.zeros(())
+        (log_factor, _), _ = jax.lax.scan(step, (nothing, density(nothing)), jax.random.split(key_walk, STEPS))
+        return jnp.exp(2 * log_factor) * weights, {name: jnp.exp(log_factor) * values[name] for name in scales}
+
+    def interpolate(self, u: Float[AnyArray, "nodes *shape"]) -> Float[AnyArray, "k *shape"]:
+        """Interpolate nodal values, such as displacements, at the points."""
+        return jnp.einsum("ka,ka...->k...", self.weights, jnp.asarray(u)[self.nodes])
 
     def _with_distance(self, sd: Float[AnyArray, "k 3"]) -> Float[AnyArray, "k 3"]:
         return jnp.sqrt(sd**2 + self.beyond[:, None] ** 2)

@@ -42,6 +42,10 @@ class NormalNoise(Section):
         """Return the distribution of points about their means (k, 3), with standard deviations (k, 3)."""
         return dist.Normal(mean, sd).to_event(1)
 
+    def draw_weights(self, key: AnyArray, squares: AnyArray) -> AnyArray:
+        """Return one for every point, the weight τ that errors of Student's t have to be drawn."""
+        return jnp.ones_like(squares)
+
     def probability_of_wrong(self, squares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"] | None:
         """Return None: no point has an error of its own."""
         return None
@@ -74,6 +78,15 @@ class StudentTNoise(Section):
     def distribution(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
         """Return the distribution of points about their means (k, 3), with scales (k, 3)."""
         return dist.MultivariateStudentT(self.nu, mean, jnp.eye(3) * sd[..., None])
+
+    @property
+    def weights(self) -> dist.Distribution:
+        """The distribution of τ before anything is seen."""
+        return dist.Gamma(self.nu / 2, self.nu / 2)
+
+    def draw_weights(self, key: AnyArray, squares: AnyArray) -> AnyArray:
+        """Draw τ given z²: it has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""
+        return 2 * jax.random.gamma(key, (self.nu + 3) / 2, squares.shape) / (self.nu + squares)
 
     def probability_of_wrong(self, squares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
         """Return the probability that τ < 1 / WRONG², given z²: τ has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""

@@ -1,0 +1,205 @@
+"""A Gibbs sampler for posteriors whose displacements can be integrated out, such as those of pairs of points.
+
+The displacements u, the weights τ of the points and all other unknowns θ are drawn in turn: τ given u and θ, then θ
+given τ, with u integrated out, and u given both. Random-walk Metropolis moves θ. Without the integration, u and the
+scales of its prior would move each other in small steps only. This is a partially collapsed Gibbs sampler (van Dyk and
+Park 2008).
+
+Terms that are not Gaussian in u, the barrier, are left out of these conditionals. The moves of θ are reversible, and u
+is independent of its last value. The proposal of both is therefore reversible with respect to the posterior without
+the barrier, and Metropolis' rule for the barrier alone makes it exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Float
+
+from bayesreg.inference.deadline import Deadline
+from bayesreg.inference.kernel import Draw, Info, OnMode, Sampler
+from bayesreg.inference.samplers.settings import Gibbs
+from bayesreg.inference.target import Estimands, Target
+from bayesreg.types import AnyArray, InputError
+
+# The number of steps of the random walk of θ in one transition. A step is a random multiple of the unit of θ, spread
+# evenly on a logarithmic axis, so that also tails and narrow parts of its posterior are visited.
+STEPS, NARROWEST, WIDEST = 6, 0.5, 4.0
+# The share of steps that propose θ independently of where it is, and the degrees of freedom of both proposals, which
+# are products of Student's t.
+INDEPENDENT, FREEDOM = 0.6, 5.0
+# The number of times that weights and displacements are drawn in one transition; θ costs more.
+SWEEPS = 2
+# The shares of the warm-up after each of which the steps are tuned anew.
+STAGES = 0.2, 0.3, 0.5
+# The unit in which each parameter begins, in logarithms and Normal scores.
+FIRST_UNIT = 0.3
+# The least variance of θ, in logarithms and Normal scores, for the unit of its steps.
+LEAST_VARIANCE = 1e-4
+
+
+class Setup(NamedTuple):
+    """The mean of θ in the warm-up, and a Cholesky factor of its covariance, the unit of a step."""
+
+    centre: Float[AnyArray, "parameters"]
+    unit: Float[AnyArray, "parameters parameters"]
+
+
+class State(NamedTuple):
+    """The estimands of a chain, and the log of the terms that its conditionals leave out."""
+
+    estimands: dict[str, AnyArray]
+    log_others: AnyArray
+
+
+def gibbs(target: Target, settings: Gibbs) -> Sampler:
+    """Make a Gibbs sampler.
+
+    Raises
+    ------
+    InputError
+        If the displacements of the target cannot be integrated out.
+    """
+    if target.marginalisation is None:
+        raise InputError(
+            "gibbs samples pairs of points alone, on a mesh of one tissue with random loads and at most some hundred "
+            "points; use the sampler hmc"
+        )
+    marginalisation = target.marginalisation
+
+    def prepare(points: Any, key: AnyArray, deadline: Deadline, _on_mode: OnMode) -> tuple[Setup, Any]:
+        return _warm_up(target, settings.warm_up, points, key, deadline)
+
+    return Sampler(
+        prepare=prepare,
+        data=lambda _setup: marginalisation.marginal(),
+        blank=partial(_first_setup, target),
+        init=lambda marginal, _setup, estimands: State(dict(estimands), marginal.log_others(estimands)),
+        step=partial(_step, target),
+        observe=lambda marginal, _setup, state: Draw(
+            state.estimands, target.evaluate_estimands(marginal.problem, state.estimands)
+        ),
+        exact=True,
+    )
+
+
+def _step(target: Target, marginal: Any, setup: Setup, key: AnyArray, state: State) -> tuple[State, Info]:
+    """Draw weights and displacements several times, and the last time θ between them."""
+    *keys, key_last = jax.random.split(key, SWEEPS)
+    fixed = partial(_sweep, marginal, lambda _key, estimands, _weights: estimands)
+    state, rates = jax.lax.scan(lambda state, key: fixed(key, state), state, jnp.stack(keys))
+    state, rate = _sweep(marginal, partial(_walk, target, marginal, setup), key_last, state)
+    nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
+    rate = (rates.sum() + rate) / SWEEPS
+    return state, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
+
+
+def _sweep(
+    marginal: Any, move: Callable[[AnyArray, Estimands, AnyArray], Estimands], key: AnyArray, state: State
+) -> tuple[State, AnyArray]:
+    """Draw the weights, move θ, and draw the displacements; return the probability that the barrier accepts both."""
+    key_weights, key_move, key_u, key_accept = jax.random.split(key, 4)
+    weights, estimands = marginal.draw_weights(key_weights, state.estimands)
+    parameters = move(key_move, estimands, weights)
+    proposal = {**parameters, "u_boundary": marginal.draw_displacements(key_u, parameters, weights)}
+    log_others = jnp.nan_to_num(marginal.log_others(proposal), nan=-jnp.inf)
+    acceptance = jnp.minimum(1.0, jnp.exp(log_others - state.log_others))
+    is_accepted = jax.random.uniform(key_accept) < acceptance
+    stayed = State(estimands, state.log_others)
+    return jax.tree.map(partial(jnp.where, is_accepted), State(proposal, log_others), stayed), acceptance
+
+
+def _walk(
+    target: Target, marginal: Any, setup: Setup, key: AnyArray, estimands: Estimands, weights: AnyArray
+) -> dict[str, AnyArray]:
+    """Move θ by random-walk Metropolis with the displacements integrated out."""
+    position = target.coordinates.unconstrain(marginal.problem, estimands)
+    u_boundary = position.pop("u_boundary")
+    start, unravel = ravel_pytree(position)
+    if not start.size:
+        return dict(estimands)
+
+    def estimands_of(flat: AnyArray) -> tuple[dict[str, AnyArray], AnyArray]:
+        return target.coordinates.constrain(marginal.problem, {**unravel(flat), "u_boundary": u_boundary})
+
+    def density(flat: AnyArray) -> AnyArray:
+        estimands, log_jacobian = estimands_of(flat)
+        return marginal.log(estimands, weights) + log_jacobian
+
+    def step(now: tuple[AnyArray, AnyArray], key_and_number: tuple[AnyArray, AnyArray]) -> tuple[Any, None]:
+        (flat, height), (key, number) = now, key_and_number
+        key_kind, key_width, key_move, key_accept = jax.random.split(key, 4)
+        is_independent = jax.random.bernoulli(key_kind, INDEPENDENT)
+        width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
+        move = jax.random.t(key_move, FREEDOM, start.shape)
+        alone = jax.nn.one_hot(jax.random.randint(jax.random.fold_in(key_kind, 1), (), 0, len(start)), len(start))
+        along = setup.unit @ (alone * move)
+        candidate = jnp.where(is_independent, setup.centre + setup.unit @ move, flat + width * along)
+        # The first step only evaluates the density at the start, so that the density is compiled once.
+        is_first = number == 0
+        candidate = jnp.where(is_first, flat, candidate)
+        candidate_height = density(candidate)
+        balance = jnp.where(is_independent, _log_tail(setup, flat) - _log_tail(setup, candidate), 0.0)
+        gain = candidate_height - height + balance
+        is_accepted = is_first | (jnp.log(jax.random.uniform(key_accept)) < gain)
+        return jax.tree.map(partial(jnp.where, is_accepted), (candidate, candidate_height), now), None
+
+    keys = jax.random.split(key, 1 + STEPS)
+    (end, _), _ = jax.lax.scan(step, (start, jnp.zeros(())), (keys, jnp.arange(1 + STEPS)))
+    return estimands_of(end)[0]
+
+
+def _log_tail(setup: Setup, flat: AnyArray) -> AnyArray:
+    """Compute the log density of the independent proposal, up to a constant."""
+    squares = solve_triangular(setup.unit, flat - setup.centre, lower=True) ** 2
+    return -(FREEDOM + 1) / 2 * jnp.log1p(squares / FREEDOM).sum()
+
+
+def _warm_up(target: Target, length: int, points: Any, key: AnyArray, deadline: Deadline) -> tuple[Setup, Any]:
+    """Move the chains away from their start, and tune the steps of θ by the places that they visit."""
+    assert target.marginalisation is not None
+    marginal = target.marginalisation.marginal()
+    states = jax.vmap(lambda estimands: State(dict(estimands), marginal.log_others(estimands)))(points)
+    setup = _first_setup(target)
+    for number, share in enumerate(STAGES):
+        places = []
+        for key_draw in jax.random.split(jax.random.fold_in(key, number), math.ceil(share * length)):
+            if deadline.has_passed:
+                return setup, states.estimands
+            states, flats = _transition(target, marginal, setup, key_draw, states)
+            places.append(np.asarray(flats))
+        late = np.concatenate(places[len(places) // 4 :])
+        covariance = np.cov(late, rowvar=False).reshape(late.shape[1:] * 2) + LEAST_VARIANCE * np.eye(late.shape[1])
+        setup = Setup(jnp.asarray(late.mean(axis=0)), jnp.asarray(np.linalg.cholesky(covariance)))
+    return setup, states.estimands
+
+
+# One transition is one call, so that a signal and the deadline are noticed between two of them.
+@partial(jax.jit, static_argnums=0)
+def _transition(
+    target: Target, marginal: Any, setup: Setup, key: AnyArray, states: State
+) -> tuple[State, Float[AnyArray, "chains parameters"]]:
+    """Move every chain, whether the barrier likes it or not; return its state and θ."""
+    states = states._replace(log_others=jnp.full_like(states.log_others, -jnp.inf))
+    keys = jax.random.split(key, len(states.log_others))
+    states, _ = jax.vmap(partial(_step, target, marginal, setup))(keys, states)
+    return states, jax.vmap(partial(_flat_parameters, target, marginal.problem))(states.estimands)
+
+
+def _first_setup(target: Target) -> Setup:
+    centre = _flat_parameters(target, target.data, target.coordinates.reference())
+    return Setup(centre, FIRST_UNIT * jnp.eye(len(centre)))
+
+
+def _flat_parameters(target: Target, problem: Any, estimands: Estimands) -> AnyArray:
+    """Return the position of θ."""
+    position = target.coordinates.unconstrain(problem, estimands)
+    return ravel_pytree({name: value for name, value in position.items() if name != "u_boundary"})[0]

@@ -1,0 +1,298 @@
+"""Pairs of points with the displacements integrated out, for one tissue and random loads: its algebra on the host.
+
+Given λ, the sizes s and t of the loads, and the variances Σ of the errors, the displacements u and the observed shifts
+y of the points are jointly Gaussian. With the loads' variances D = s² M + t² A, the rigid motions R, and the
+interpolation B at the points,
+
+u = K⁺ q + R c,  q ~ N(0, D) given Rᵀ q = 0,  c flat,  y = B u + e,  e ~ N(0, Σ).
+
+With G = K⁺ Bᵀ and H = B R, the covariance of y at a given rigid motion c, and the density of y, are
+
+S = Gᵀ (D − D R (Rᵀ D R)⁻¹ Rᵀ D) G + Σ,
+log p(y) = −½ (log det S + log det Hᵀ S⁻¹ H + yᵀ S⁻¹ (y − H b)) + const,  b = (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ y.
+
+S has three rows for each point and none for the nodes, and only λ changes Gᵀ M G and Gᵀ A G. At a known μ,
+K = μ K_μ + λ K_λ. The generalised eigenvectors of (K_λ, μ K_μ), with values 0 ≤ ω ≤ 3 / (2 μ), since
+(tr ε)² ≤ 3 ε : ε, diagonalise K for all λ at once; its inverse has the factors 1 / (1 + λ ω). They are analytic
+functions of x = log(1 + 3 λ / (2 μ)) up to the distance π from the real axis. Chebyshev's polynomials of a moderate
+degree therefore give Gᵀ M G and Gᵀ A G at every λ to about `PRECISION`.
+
+The host computes, because programs of XLA with LAPACK's functions in loops did not always end (jaxlib 0.10.2, 2 cores).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import scipy.fft
+import scipy.linalg
+from jaxtyping import Float
+from scipy.linalg.lapack import dpotrf, dpotrs
+from threadpoolctl import ThreadpoolController
+
+from bayesreg.fem.elasticity import rigid_modes, stiffness
+from bayesreg.fem.elements import Elements, boundary_areas
+from bayesreg.mesh import TetMesh
+from bayesreg.types import AnyArray, Scalar
+
+# The relative error of the interpolation in λ; the elastic solves of other posteriors have a similar one.
+PRECISION = 1e-8
+
+
+class Spectrum(NamedTuple):
+    """The eigenvalues of K by λ at a known μ (a pytree); it takes the place of a determinant in the elastic prior.
+
+    Attributes
+    ----------
+    ratios : (3n − 6,) array
+        ω of (K_λ, μ K_μ).
+    log_of_shear : scalar
+        log pdet μ K_μ.
+    """
+
+    ratios: Float[AnyArray, "modes"]
+    log_of_shear: Scalar
+
+    def log_pseudo_determinant(
+        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
+    ) -> Scalar:
+        """Compute log pdet K for a λ that is the same in all cells, at the known μ."""
+        return self.log_of_shear + jax.numpy.log1p(lam[0] * self.ratios).sum()
+
+
+@jax.tree_util.register_static
+class PointAlgebra:
+    """The Gaussian of displacements and shifts; a constant of a compiled program, equal only to itself.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    interpolation : (m, 3n) array
+        B, with m coordinates of points.
+    shift : (m,) array
+        y, mm.
+    mu : float
+    lam : (float, float)
+        The least and the greatest λ.
+    """
+
+    def __init__(
+        self,
+        mesh: TetMesh,
+        interpolation: Float[np.ndarray, "coordinates unknowns"],
+        shift: Float[np.ndarray, "coordinates"],
+        mu: float,
+        lam: tuple[float, float],
+    ) -> None:
+        self._rigid, self._shift, self._steepness = rigid_modes(mesh.points), shift, 1.5 / mu
+        self._rigid_at_points = interpolation @ self._rigid
+        volumes = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.points))
+        self._masses = np.repeat(np.stack([volumes, boundary_areas(mesh)]), 3, axis=1)
+        self._vectors, self.spectrum = _eigenvectors(mesh, mu)
+        self._pulled = self._vectors.T @ interpolation.T
+        self._bounds = low, high = np.log1p(self._steepness * np.array(lam))
+        degrees = _degrees(high - low)
+        # Chebyshev's nodes, at which a cosine transform gives the coefficients.
+        x = low + (high - low) * (1 + np.cos(np.pi * (np.arange(degrees) + 0.5) / degrees)) / 2
+        # S is symmetric: its upper triangle is enough, which is the lower one of LAPACK's order of columns.
+        self._triangle, squares, pushes = np.triu_indices(len(shift)), [], []
+        for value in np.expm1(x) / self._steepness:
+            responses = self._vectors @ (self._factors(value)[:, None] * self._pulled)
+            squares.append([(responses.T @ (mass[:, None] * responses))[self._triangle] for mass in self._masses])
+            pushes.append([(mass[:, None] * self._rigid).T @ responses for mass in self._masses])
+        self._squares, self._pushes = (_coefficients(np.array(samples)) for samples in (squares, pushes))
+        self._balances = np.stack([self._rigid.T @ (mass[:, None] * self._rigid) for mass in self._masses])
+
+    def log_density(self, lam: Scalar, sizes: Float[AnyArray, "2"], noise: Float[AnyArray, "coordinates"]) -> Scalar:
+        """Compute log p(y) as part of a JAX program, up to a constant; NaN where S is not positive definite.
+
+        Parameters
+        ----------
+        lam : scalar
+        sizes : (2,) array
+            s² and t².
+        noise : (m,) array
+            The diagonal of Σ, mm².
+        """
+        result = jax.ShapeDtypeStruct((), float)
+        return jax.pure_callback(self._log_densities, result, lam, sizes, noise, vmap_method="broadcast_all")
+
+    def draw(
+        self,
+        lam: Scalar,
+        sizes: Float[AnyArray, "2"],
+        noise: Float[AnyArray, "coordinates"],
+        normal: Float[AnyArray, "unknowns_and_coordinates"],
+    ) -> Float[AnyArray, "unknowns"]:
+        """Draw u given y as part of a JAX program, mm, from 3n + m independent Normal numbers.
+
+        A draw of the prior is corrected by its difference from y (Matheron's rule). The flat prior of the rigid motion
+        is the limit of a wide one.
+        """
+        result = jax.ShapeDtypeStruct((len(self._vectors),), float)
+        return jax.pure_callback(self._draw_all, result, lam, sizes, noise, normal, vmap_method="broadcast_all")
+
+    def _log_densities(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray) -> Float[np.ndarray, "*chains"]:
+        lam, sizes, noise = map(np.asarray, (lam, sizes, noise))
+        with _one_thread_each() as side_by_side:
+            logs = side_by_side(lambda given: given.log_density(self._shift), self._given(lam, sizes, noise))
+            return np.reshape(list(logs), np.shape(lam))
+
+    def _draw_all(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray, normal: AnyArray) -> np.ndarray:
+        lam, sizes, noise, numbers = map(np.asarray, (lam, sizes, noise, normal))
+        numbers, unknowns = numbers.reshape(-1, numbers.shape[-1]), len(self._vectors)
+        factors = np.stack([self._factors(value) for value in np.ravel(lam)])
+        variances = np.reshape(sizes, (-1, 2)) @ self._masses
+        with _one_thread_each() as side_by_side:
+            conditionals = list(side_by_side(_Given.factorised, self._given(lam, sizes, noise)))
+
+            def balanced(load: np.ndarray) -> np.ndarray:
+                """Return loads (chains as rows), less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
+                parts = [given.balance @ row for given, row in zip(conditionals, load @ self._rigid, strict=True)]
+                return load - variances * (np.stack(parts) @ self._rigid.T)
+
+            load = balanced(np.sqrt(variances) * numbers[:, :unknowns])
+            error = np.sqrt(np.reshape(noise, (len(factors), -1))) * numbers[:, unknowns:]
+            # Rows are chains, so that each product reads its matrix once for all of them.
+            modes = factors * (load @ self._vectors)
+            apart = self._shift - modes @ self._pulled - error
+            solutions = [given.solve(shift) for given, shift in zip(conditionals, apart, strict=True)]
+            weights, motions = (np.stack(part) for part in zip(*solutions, strict=True))
+            pull = balanced(variances * ((factors * (weights @ self._pulled.T)) @ self._vectors.T))
+            modes += factors * (pull @ self._vectors)
+            u = modes @ self._vectors.T + motions @ self._rigid.T
+        return u.reshape(*np.shape(lam), unknowns)
+
+    def _factors(self, lam: float) -> Float[np.ndarray, "modes"]:
+        return 1 / (1 + lam * self.spectrum.ratios)
+
+    def _given(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray) -> list[_Given]:
+        """Return the Gaussian of y of every chain, not factorised."""
+        low, high = self._bounds
+        x, sizes = np.log1p(self._steepness * np.ravel(lam)), np.reshape(sizes, (-1, 2))
+        # A known λ has one degree, whose polynomial is one everywhere.
+        angles = np.arccos(np.clip((2 * x - low - high) / (high - low if high > low else 1.0), -1, 1))
+        weights = np.cos(np.arange(len(self._squares)) * angles[:, None])[:, :, None] * sizes[:, None]
+        squares, pushes = (np.tensordot(weights, array, axes=2) for array in (self._squares, self._pushes))
+        balances = np.linalg.inv(np.tensordot(sizes, self._balances, axes=1))
+        chains = zip(squares, pushes, balances, np.reshape(noise, (len(x), -1)), strict=True)
+        return [_Given(self._rigid_at_points, self._triangle, *arrays) for arrays in chains]
+
+
+class _Given(NamedTuple):
+    """The Gaussian of y at given λ, sizes and errors.
+
+    Attributes
+    ----------
+    rigid : (m, 6) array
+        H.
+    triangle : two (t,) int arrays
+        The rows and columns of the upper triangle of an (m, m) array.
+    square : (t,) array
+        Gᵀ D G there.
+    push : (6, m) array
+        Rᵀ D G.
+    balance : (6, 6) array
+        (Rᵀ D R)⁻¹.
+    noise : (m,) array
+        The diagonal of Σ, mm².
+    """
+
+    rigid: Float[np.ndarray, "coordinates 6"]
+    triangle: tuple[np.ndarray, np.ndarray]
+    square: Float[np.ndarray, "entries"]
+    push: Float[np.ndarray, "6 coordinates"]
+    balance: Float[np.ndarray, "6 6"]
+    noise: Float[np.ndarray, "coordinates"]
+
+    def factorised(self) -> _Factorised:
+        """Factorise S."""
+        covariance = np.zeros((len(self.noise),) * 2)
+        covariance[self.triangle] = self.square
+        covariance -= self.push.T @ (self.balance @ self.push)
+        covariance[np.diag_indices(len(covariance))] += self.noise
+        lower, failure = dpotrf(covariance.T, lower=1, overwrite_a=1)
+        if failure:
+            lower = np.full_like(lower, np.nan)
+        whitened = dpotrs(lower, self.rigid, lower=1)[0]
+        return _Factorised(lower, whitened, self.rigid.T @ whitened, self.balance)
+
+    def log_density(self, shift: Float[np.ndarray, "coordinates"]) -> float:
+        """Compute log p(y) for shifts y, mm, up to a constant."""
+        factorised = self.factorised()
+        log_dets = np.log(np.diag(factorised.lower)).sum() + np.linalg.slogdet(factorised.information)[1] / 2
+        return float(-log_dets - shift @ factorised.solve(shift)[0] / 2)
+
+
+class _Factorised(NamedTuple):
+    """The factors of S and of the information about the rigid motion.
+
+    Attributes
+    ----------
+    lower : (m, m) array
+        The Cholesky factor of S; NaN if S is not positive definite.
+    whitened : (m, 6) array
+        S⁻¹ H.
+    information : (6, 6) array
+        Hᵀ S⁻¹ H.
+    balance : (6, 6) array
+        (Rᵀ D R)⁻¹.
+    """
+
+    lower: Float[np.ndarray, "coordinates coordinates"]
+    whitened: Float[np.ndarray, "coordinates 6"]
+    information: Float[np.ndarray, "6 6"]
+    balance: Float[np.ndarray, "6 6"]
+
+    def solve(self, shift: Float[np.ndarray, "coordinates"]) -> tuple[Float[np.ndarray, "coordinates"], np.ndarray]:
+        """Return S⁻¹ (y − H b) and b for shifts y, mm."""
+        rigid = np.linalg.solve(self.information, self.whitened.T @ shift)
+        return dpotrs(self.lower, shift, lower=1)[0] - self.whitened @ rigid, rigid
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[Callable[..., Iterator[Any]]]:
+    """Yield `map` for chains side by side, each in one thread; BLAS would share one small matrix among all threads."""
+    controller, pool = _threads()
+    with controller.limit(limits=1):
+        yield pool.map
+
+
+@lru_cache
+def _threads() -> tuple[ThreadpoolController, ThreadPoolExecutor]:
+    return ThreadpoolController(), ThreadPoolExecutor(os.cpu_count())
+
+
+def _eigenvectors(mesh: TetMesh, mu: float) -> tuple[Float[np.ndarray, "unknowns modes"], Spectrum]:
+    """Compute the eigenvectors V of (K_λ, μ K_μ) in the complement of the rigid motions, Vᵀ μ K_μ V = 1, and ω."""
+    ones, nothing = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells))
+    complement = scipy.linalg.qr(rigid_modes(mesh.points))[0][:, 6:]
+    volume, shear = (
+        complement.T @ (stiffness(mesh, *moduli) @ complement) for moduli in ((ones, nothing), (nothing, mu * ones))
+    )
+    ratios, vectors = scipy.linalg.eigh(volume, shear)
+    return complement @ vectors, Spectrum(ratios, np.linalg.slogdet(shear)[1])
+
+
+def _degrees(extent: float) -> int:
+    """Return the number of Chebyshev's polynomials for a function that is analytic within π of an interval."""
+    if extent == 0:
+        return 1
+    # The greatest ellipse of Bernstein in which it is analytic has the half-axis π, where half the interval is 1.
+    half_axis = 2 * math.pi / extent
+    return math.ceil(-math.log(PRECISION) / math.log(half_axis + math.hypot(half_axis, 1)))
+
+
+def _coefficients(samples: Float[np.ndarray, "degrees *shape"]) -> Float[np.ndarray, "degrees *shape"]:
+    """Compute Chebyshev's coefficients from samples at Chebyshev's nodes, from the greatest node to the least."""
+    coefficients = scipy.fft.dct(samples, axis=0) / len(samples)
+    coefficients[0] /= 2
+    return coefficients

@@ -1,0 +1,135 @@
+"""The Gibbs sampler and its marginal posterior, against dense algebra and other samplers."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+import bayesreg as br
+from bayesreg.fem.elasticity import stiffness
+from bayesreg.inference.samplers.registry import choose_sampler
+from bayesreg.model.marginal import Marginal
+from bayesreg.model.observations.point_noise import NormalNoise, StudentTNoise
+from tests.phantoms import box_mesh
+
+BOX = box_mesh(2)
+MESH = br.TetMesh.from_arrays(BOX.points, BOX.cells, np.zeros(len(BOX.cells), int), ("organ",))
+RNG = np.random.default_rng(3)
+FIXED = RNG.uniform(2, 18, (9, 3))
+# One point is wrong, and one lies outside the mesh.
+FIXED[0, 0] = -1.0
+MOVING = FIXED * np.array([0.95, 1.0, 1.05]) + RNG.normal(0.5, 0.4, FIXED.shape)
+MOVING[3] += 6.0
+SCALES = {"body_load": 0.05, "surface_load": 0.2, "landmarks_sd": 0.6}
+
+
+@cache
+def posterior(noise=None, sd=None, least_volume=0.0, known_loads=False, known_lam=None) -> br.Posterior:
+    loads = br.RandomLoads(body=0.5, surface=0.2) if known_loads else br.RandomLoads()
+    fixed = {"mu": {"organ": 1.0}} | ({} if known_lam is None else {"lam": {"organ": known_lam}})
+    model = br.ModelConfig(preset="registration", elastic_prior=loads, least_volume=least_volume, fixed=fixed)
+    points = br.Landmarks(FIXED, MOVING, sd or br.ScalePrior(median=1.0), noise=noise or StudentTNoise())
+    return br.build_posterior(MESH, [points], model)
+
+
+def marginal_of(posterior: br.Posterior) -> Marginal:
+    return posterior.target.marginalisation.marginal()
+
+
+def estimands(u=None, **changed) -> dict:
+    values = {**SCALES, "lam": np.array([3.0]), "u_boundary": np.zeros(MESH.points.shape) if u is None else u}
+    return {name: jnp.asarray(value) for name, value in (values | changed).items()}
+
+
+def dense_conditional(posterior: br.Posterior, given: dict, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the precision and the mean of u given all else, from matrices in the nodes."""
+    term, elastic = posterior.data.terms["landmarks"], posterior.data.terms["elastic"]
+    ones = np.ones(len(MESH.cells))
+    K = stiffness(MESH, float(given["lam"][0]) * ones, ones).toarray()
+    variances = np.repeat(np.asarray(elastic.variances(given)), 3)
+    B = np.zeros((3 * len(FIXED), MESH.points.size))
+    for k, (nodes, shares) in enumerate(zip(np.asarray(term.nodes), np.asarray(term.weights), strict=True)):
+        for node, share in zip(nodes, shares, strict=True):
+            B[3 * k : 3 * k + 3, 3 * node : 3 * node + 3] += share * np.eye(3)
+    precisions = (weights[:, None] / np.asarray(term.sd(given)) ** 2).ravel()
+    precision = K @ (K / variances[:, None]) + B.T @ (precisions[:, None] * B)
+    return precision, np.linalg.solve(precision, B.T @ (precisions * np.asarray(term.shift).ravel()))
+
+
+def test_the_marginal_density_is_the_joint_one_with_u_integrated_out():
+    """Laplace's integral, which is exact for Normal errors, of the density of the posterior itself."""
+    own = posterior(NormalNoise())
+    marginal, ones = marginal_of(own), np.ones(len(FIXED))
+    differences = []
+    by_lam = [{"lam": np.array([lam])} for lam in (0.0, 0.01, 0.4, 12.0, 70.0, 99.9)]
+    for changed in (*by_lam, {"body_load": 1.0}, {"landmarks_sd": 0.2, "body_load": 1.0}, {"surface_load": 2.0}):
+        given = estimands(**changed)
+        precision, mean = dense_conditional(own, given, ones)
+        joint = own.logdensity_constrained({**given, "u_boundary": mean.reshape(-1, 3), "mu": np.ones(1)})
+        integral = float(joint) - np.linalg.slogdet(precision)[1] / 2
+        differences.append(float(marginal.log(given, jnp.asarray(ones))) - integral)
+    np.testing.assert_allclose(differences, differences[0], atol=1e-5)
+
+
+def test_displacements_are_drawn_from_their_conditional():
+    own, weights = posterior(NormalNoise()), np.linspace(0.3, 2.0, len(FIXED))
+    precision, mean = dense_conditional(own, estimands(), weights)
+    draw = jax.jit(jax.vmap(lambda key: marginal_of(own).draw_displacements(key, estimands(), jnp.asarray(weights))))
+    draws = np.asarray(draw(jax.random.split(jax.random.key(1), 4000))).reshape(4000, -1)
+    whitened = (draws - mean) @ np.linalg.cholesky(precision)
+    assert np.abs(whitened.mean(axis=0)).max() < 5 / np.sqrt(4000)
+    covariance = np.cov(whitened, rowvar=False)
+    assert np.abs(np.diag(covariance) - 1).max() < 6 * np.sqrt(2 / 4000)
+    assert np.abs(covariance - np.diag(np.diag(covariance))).max() < 6 / np.sqrt(4000)
+
+
+def test_lam_has_the_posterior_of_a_quadrature():
+    own, ones = posterior(NormalNoise(), sd=0.5, known_loads=True), jnp.ones(len(FIXED))
+    marginal, u = marginal_of(own), estimands()["u_boundary"]
+    lam = np.linspace(0.0, 100.0, 2001)
+    log = jax.jit(jax.vmap(lambda lam: marginal.log({"lam": lam[None], "u_boundary": u}, ones)))
+    density = np.asarray(log(jnp.asarray(lam)))
+    cumulative = integrate.cumulative_trapezoid(np.exp(density - density.max()), lam, initial=0)
+    draws = np.asarray(br.sample(own, draws=600, seed=4, progress=False).idata.posterior["lam"]).ravel()
+    position = np.interp(draws, lam, cumulative / cumulative[-1])
+    # Draws are correlated; every fifth is as good as independent.
+    assert stats.kstest(position[::5], "uniform").pvalue > 0.001
+
+
+@pytest.mark.parametrize("least_volume", [0.0, 0.95], ids=["alone", "with a barrier"])
+def test_it_agrees_with_hamiltonian_trajectories(least_volume):
+    """With few hyperparameters; where loads are inferred, trajectories need many more draws."""
+    own, moments = posterior(least_volume=least_volume, known_loads=True, known_lam=3.0), []
+    for name in ("gibbs", "hmc"):
+        samples = br.sample(own, name, draws=300, seed=6, progress=False)
+        draws, ess = samples.idata.posterior, samples.convergence.ess_bulk
+        values = np.c_[np.log(draws["landmarks_sd"]).values.ravel(), draws["u_boundary"].values.reshape(1200, -1)]
+        sizes = np.r_[float(ess["landmarks_sd"]), np.ravel(ess["u_boundary"])]
+        moments.append((values.mean(axis=0), values.std(axis=0), sizes))
+        if name == "gibbs":
+            assert (samples.tally.acceptance < samples.tally.steps).all() == (least_volume > 0)
+    (mean, sd, ess), (other_mean, other_sd, other_ess) = moments
+    z = (mean - other_mean) / np.hypot(sd / np.sqrt(ess), other_sd / np.sqrt(other_ess))
+    assert np.abs(z).max() < 4.5
+    assert np.abs(np.log(sd / other_sd)).max() < 4 / np.sqrt(min(ess.min(), other_ess.min()))
+
+
+def test_the_default_is_gibbs_where_it_can_be():
+    assert choose_sampler("auto", posterior().target).name == "gibbs"
+    two_tissues = br.TetMesh.from_arrays(MESH.points, MESH.cells, np.arange(len(MESH.cells)) % 2, ("a", "b"))
+    points = br.Landmarks(FIXED, MOVING, 1.0)
+    other = br.build_posterior(two_tissues, [points], br.ModelConfig(preset="registration"))
+    assert choose_sampler("auto", other.target).name == "hmc"
+    with pytest.raises(br.InputError, match="pairs of points alone"):
+        choose_sampler("gibbs", other.target)
+
+
+def test_the_same_seed_gives_the_same_draws_in_any_blocks():
+    whole, parts = (br.sample(posterior(), draws=20, seed=2, block=block, progress=False) for block in (20, 7))
+    for name in ("lam", "u_boundary"):
+        np.testing.assert_array_equal(*(np.asarray(samples.idata.posterior[name]) for samples in (whole, parts)))
