@@ -44,6 +44,15 @@ class Points(NamedTuple):
     points: Float[np.ndarray, "k 3"]
     names: tuple[str, ...]
     sd: Float[np.ndarray, "k"] | None = None
+    undefined: tuple[int, ...] = ()
+    """The numbers of the points without a position, which are zero in `points`: Slicer's points that are not placed."""
+
+    @property
+    def defined(self) -> Points:
+        """The points that have a position."""
+        kept = np.setdiff1d(np.arange(len(self.names)), self.undefined).astype(int)
+        names = tuple(self.names[k] for k in kept)
+        return Points(self.points[kept], names, None if self.sd is None else self.sd[kept])
 
 
 class PointPairs(NamedTuple):
@@ -140,19 +149,22 @@ def _read_markups(text: str, path: str, space: Space | None) -> Points:
         markups = json.loads(text)["markups"]
     except (json.JSONDecodeError, KeyError, TypeError):
         raise InputError(f"{path} is no file of 3D Slicer's markups: expected JSON with the key markups") from None
-    points, names = [], []
+    points, names, undefined = [], [], []
     for markup in _require_objects(markups, "markups", path):
         if markup.get("coordinateUnits", "mm") not in ("mm", ["mm", "UCUM", "millimeter"]):
             raise InputError(f"{path}: expected coordinates in mm, got {markup['coordinateUnits']!r}")
-        defined = [
-            point
-            for point in _require_objects(markup.get("controlPoints", []), "controlPoints", path)
-            if point.get("positionStatus", "defined") == "defined"
+        controls = _require_objects(markup.get("controlPoints", []), "controlPoints", path)
+        for number, point in enumerate(controls, len(names)):
+            if point.get("positionStatus", "defined") != "defined":
+                undefined.append(number)
+        positions = [
+            [0.0] * 3 if number in undefined else _position(point, path)
+            for number, point in enumerate(controls, len(names))
         ]
-        positions = [_position(point, path) for point in defined]
         points.append(_in_ras(positions, str(markup.get("coordinateSystem", "LPS")), path))
-        names += [str(point.get("label", "")) for point in defined]
-    return Points(np.concatenate(points) if points else np.zeros((0, 3)), tuple(names))
+        names += [str(point.get("label", "")) for point in controls]
+    placed = np.concatenate(points) if points else np.zeros((0, 3))
+    return Points(placed, tuple(names), undefined=tuple(undefined))
 
 
 def _require_objects(value: Any, key: str, path: str) -> list[dict[str, Any]]:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Int
 
 from bayesreg.io.atomic import write_text
 from bayesreg.io.point_formats import READERS, PointPairs, Points
 from bayesreg.io.spaces import Space
 from bayesreg.printable import require_printable
 from bayesreg.types import InputError
+
+# The greatest number of points that a message names.
+MOST_NAMED = 8
+
+_log = logging.getLogger(__name__)
 
 
 def read_points(path: str | Path) -> Points:
@@ -28,7 +35,7 @@ def read_points(path: str | Path) -> Points:
     points = _read(Path(path))
     if isinstance(points, PointPairs):
         raise InputError(f"{path} holds pairs of points; expected points of one space")
-    return points
+    return points.defined
 
 
 def read_side(path: str | Path, side: Literal["fixed", "moving"], space: Space | None = None) -> Points:
@@ -48,7 +55,9 @@ def read_side(path: str | Path, side: Literal["fixed", "moving"], space: Space |
         points in LPS, and no space is given.
     """
     points = _read(Path(path), space)
-    return Points(getattr(points, side), points.names, points.sd) if isinstance(points, PointPairs) else points
+    if isinstance(points, PointPairs):
+        return Points(getattr(points, side), points.names, points.sd)
+    return points.defined
 
 
 def write_table(path: str | Path, columns: Mapping[str, Sequence[Any]]) -> None:
@@ -71,7 +80,8 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
     moving : path, optional
         The points in the moving image. They are paired by name if the names are unique in each file and both files have
         the same names. They are paired in order if names repeat or the files share no name. Unique names of which only
-        some agree are an error.
+        some agree are an error. Points without a position (Slicer's `positionStatus`) are left out with their partners,
+        once pairs are made.
 
     Raises
     ------
@@ -88,31 +98,55 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
             f"{path} holds points of one space; give the points of the moving image, too, or a CSV with the columns "
             "fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z"
         )
-    moving_points = read_points(moving)
+    moving_points = _read(Path(moving))
+    if isinstance(moving_points, PointPairs):
+        raise InputError(f"{moving} holds pairs of points; expected points of one space")
     if moving_points.sd is not None:
         raise InputError(f"{moving} gives an sd; expected it in the file of the fixed points, {path}, for each pair")
-    if len(moving_points.points) != len(points.points):
-        raise InputError(
-            f"{path} holds {len(points.points)} points and {moving} {len(moving_points.points)}: they are no pairs"
-        )
-    return PointPairs(
-        points.points,
-        moving_points.points[_order(points, moving_points, f"{path} and {moving}")],
-        points.names,
-        points.sd,
-    )
+    first, second = _partners(points, moving_points, path, moving)
+    are_defined = ~(np.isin(first, points.undefined) | np.isin(second, moving_points.undefined))
+    _tell_left_out(points, moving_points, path, moving)
+    first, second = first[are_defined], second[are_defined]
+    if not len(first):
+        raise InputError(f"{path} and {moving} hold no pair of which both points have a position")
+    names = tuple(points.names[k] for k in first)
+    sd = None if points.sd is None else points.sd[first]
+    return PointPairs(points.points[first], moving_points.points[second], names, sd)
 
 
-def _order(fixed_points: Points, moving_points: Points, files: str) -> list[int]:
-    """Find the index in the other file of the partner of each point."""
-    names, others = fixed_points.names, moving_points.names
-    unique = len(set(names)) == len(names) and len(set(others)) == len(others)
-    shared = set(names) & set(others) - {""}
-    if not unique or not shared:
-        return list(range(len(names)))
-    if alone := sorted(set(names) ^ set(others)):
-        raise InputError(f"{files} share some names only; {alone[0]!r} stands in one of them: give both the same names")
-    return [others.index(name) for name in names]
+def _partners(
+    fixed_points: Points, moving_points: Points, path: str | Path, moving: str | Path
+) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+    """Find the numbers of both points of each pair; a point without a position need not have a partner."""
+    sides = fixed_points, moving_points
+    names, others = (points.names for points in sides)
+    unique = all(len(set(points.names)) == len(points.names) for points in sides)
+    if unique and set(names) & set(others) - {""}:
+        without_position = {points.names[k] for points in sides for k in points.undefined}
+        if alone := sorted((set(names) ^ set(others)) - without_position):
+            raise InputError(
+                f"{path} and {moving} share some names only; {alone[0]!r} stands in one of them: give both the same "
+                "names"
+            )
+        pairs = [(k, others.index(name)) for k, name in enumerate(names) if name in others]
+        return np.array([k for k, _ in pairs], int), np.array([j for _, j in pairs], int)
+    if len(names) != len(others):
+        counts = [f"{len(points.names)} points" + _describe_undefined(points) for points in sides]
+        raise InputError(f"{path} holds {counts[0]} and {moving} {counts[1]}: they are no pairs")
+    return np.arange(len(names)), np.arange(len(names))
+
+
+def _describe_undefined(points: Points) -> str:
+    return f" ({len(points.undefined)} without a position)" if points.undefined else ""
+
+
+def _tell_left_out(fixed_points: Points, moving_points: Points, path: str | Path, moving: str | Path) -> None:
+    """Log which points have no position, so that their pairs are left out."""
+    for points, file in ((fixed_points, path), (moving_points, moving)):
+        if points.undefined:
+            named = ", ".join(points.names[k] or f"number {k + 1}" for k in points.undefined[:MOST_NAMED])
+            more = ", …" * (len(points.undefined) > MOST_NAMED)
+            _log.warning("%s: points without a position are left out with their partners: %s%s", file, named, more)
 
 
 def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
@@ -132,7 +166,7 @@ def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
 
 
 def _require_sound(points: Points | PointPairs, path: Path) -> None:
-    places = points.points if isinstance(points, Points) else np.hstack([points.fixed, points.moving])
+    places = points.defined.points if isinstance(points, Points) else np.hstack([points.fixed, points.moving])
     if not len(places):
         raise InputError(f"{path} holds no point")
     require_printable(points.names, str(path))

@@ -228,7 +228,9 @@ class _Given(NamedTuple):
     def log_density(self, shift: Float[np.ndarray, "coordinates"]) -> float:
         """Compute log p(y) for shifts y, mm, up to a constant."""
         factorised = self.factorised()
-        log_dets = np.log(np.diag(factorised.lower)).sum() + np.linalg.slogdet(factorised.information)[1] / 2
+        # NaN where S is not positive definite.
+        with np.errstate(invalid="ignore"):
+            log_dets = np.log(np.diag(factorised.lower)).sum() + np.linalg.slogdet(factorised.information)[1] / 2
         return float(-log_dets - shift @ factorised.solve(shift)[0] / 2)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,9 @@ from bayesreg.inference.chains.run import Samples
 from bayesreg.inference.draws.inference_data import append_groups, dataset, open_posterior, save_posterior
 from bayesreg.io import checkpoints, store
 from bayesreg.io.point_formats import PointPairs
-from bayesreg.io.records import Inputs, Run
+from bayesreg.io.records import Inputs, Predicted, Run
 from bayesreg.io.run_folder import RunFolder
+from bayesreg.model.observations.observation import Doubtful
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import warp_image
 from bayesreg.report.metrics import compute_metrics
@@ -28,6 +30,8 @@ from bayesreg.workflow.evaluation import NAME, evaluate_landmarks
 from bayesreg.workflow.manifest import manifest
 from bayesreg.workflow.prediction import mean_values, predict, with_unresolved
 from bayesreg.workflow.predictive_groups import predictive_groups
+
+_log = logging.getLogger(__name__)
 
 
 def finish(
@@ -50,6 +54,8 @@ def finish(
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
     predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
+
+    provenance = with_doubts(provenance, posterior, predicted)
 
     def transform(most: int) -> Transform:
         u = nodal_draws(config.model, inputs, draws, most)
@@ -86,6 +92,21 @@ def finish(
         write_report(finished, idata, *judged, place(REPORT))
     checkpoints.close(folder)
     return Result(folder.path, finished)
+
+
+def with_doubts(provenance: dict[str, Any], posterior: Posterior, predicted: Predicted) -> dict[str, Any]:
+    """Log what observations doubt, and add it to the warnings of the appraisal."""
+    doubts = [
+        sentence
+        for name, observation in posterior.observations.items()
+        if isinstance(observation, Doubtful)
+        for sentence in observation.doubts(predicted.of_observation(name))
+    ]
+    for sentence in doubts:
+        _log.warning("%s", sentence)
+    appraisal = provenance.get("appraisal", {})
+    warnings = [*appraisal.get("warnings", ()), *doubts]
+    return provenance | {"appraisal": appraisal | {"warnings": list(dict.fromkeys(warnings))}}
 
 
 def _store_draws(posterior: Posterior, samples: Samples, folder: RunFolder, seed: int) -> Any:

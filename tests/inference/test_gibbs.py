@@ -15,6 +15,7 @@ from bayesreg.fem.elasticity import stiffness
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.model.marginal import Marginal
 from bayesreg.model.observations.point_noise import NormalNoise, StudentTNoise
+from bayesreg.model.state import state_of
 from tests.phantoms import box_mesh
 
 BOX = box_mesh(2)
@@ -133,3 +134,25 @@ def test_the_same_seed_gives_the_same_draws_in_any_blocks():
     whole, parts = (br.sample(posterior(), draws=20, seed=2, block=block, progress=False) for block in (20, 7))
     for name in ("lam", "u_boundary"):
         np.testing.assert_array_equal(*(np.asarray(samples.idata.posterior[name]) for samples in (whole, parts)))
+
+
+def test_an_outlier_of_40_mm_is_named_and_moves_nothing_else():
+    fixed = np.random.default_rng(5).uniform(1, 19, (30, 3))
+    shift = 0.05 * (fixed - 10) + np.random.default_rng(6).normal(0, 0.1, fixed.shape)
+    outlier = np.zeros_like(fixed)
+    outlier[7, 0] = 40.0
+    means = []
+    for moving in (fixed + shift, fixed + shift + outlier):
+        points = br.Landmarks(fixed, moving, br.ScalePrior(median=1.0, log_sd=2.0))
+        own = br.build_posterior(MESH, [points], br.ModelConfig(preset="registration"))
+        draws = br.sample(own, draws=200, seed=1, progress=False).idata.posterior
+        mean = {name: draws[name].mean(("chain", "draw")).values for name in own.reference()}
+        observation = own.observations["landmarks"]
+        state = state_of(own.data.body, own.data.blocks, own.fill(mean))
+        means.append((state.u, observation.doubts(observation.summarise(own, state))))
+    (without, no_doubt), (with_outlier, doubts) = means
+    assert no_doubt == []
+    assert len(doubts) == 1
+    assert "1 pair of points is probably wrong" in doubts[0]
+    assert ": 8 (" in doubts[0]
+    assert np.abs(with_outlier - without).max() < 0.3

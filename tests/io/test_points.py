@@ -172,3 +172,38 @@ def test_resects_files_are_read():
         rows = [line.split() for line in path.read_text().splitlines() if line.rstrip(";").rstrip().endswith('""')]
         np.testing.assert_allclose(np.hstack([pairs.fixed, pairs.moving]), [[float(x) for x in r[:6]] for r in rows])
         assert np.linalg.norm(pairs.moving - pairs.fixed, axis=1).max() < 25
+
+
+def control_points(path: Path, places: dict[str, tuple[float, float, float] | None]) -> Path:
+    control = [
+        {"label": name, "position": list(place or (0, 0, 0)), "positionStatus": "defined" if place else "undefined"}
+        for name, place in places.items()
+    ]
+    path.write_text(json.dumps({"markups": [{"coordinateSystem": "RAS", "controlPoints": control}]}))
+    return path
+
+
+@pytest.mark.parametrize("labels", [("a", "b", "c", "d"), ("F", "F", "F", "F")], ids=["by name", "in order"])
+def test_a_point_without_a_position_is_left_out_with_its_partner(tmp_path, caplog, labels):
+    control = [{"label": name, "position": [k, 0, 0]} for k, name in enumerate(labels)]
+    for file, missing in (("fixed", 1), ("moving", 2)):
+        points = [
+            {**point, "positionStatus": "undefined"} if k == missing else point for k, point in enumerate(control)
+        ]
+        (tmp_path / f"{file}.mrk.json").write_text(
+            json.dumps({"markups": [{"coordinateSystem": "RAS", "controlPoints": points}]})
+        )
+    pairs = read_point_pairs(tmp_path / "fixed.mrk.json", tmp_path / "moving.mrk.json")
+    np.testing.assert_array_equal(pairs.fixed[:, 0], [0, 3])
+    np.testing.assert_array_equal(pairs.moving[:, 0], [0, 3])
+    assert f"left out with their partners: {labels[1]}" in caplog.text
+
+
+def test_a_planned_point_that_stands_in_one_file_needs_no_partner(tmp_path):
+    fixed = control_points(tmp_path / "f.mrk.json", {"a": (0, 0, 0), "b": (1, 0, 0), "planned": None})
+    moving = control_points(tmp_path / "m.mrk.json", {"b": (1, 1, 0), "a": (0, 1, 0)})
+    assert read_point_pairs(fixed, moving).names == ("a", "b")
+    nothing = control_points(tmp_path / "n.mrk.json", {"a": None, "b": None, "c": (0, 0, 0)})
+    other = control_points(tmp_path / "o.mrk.json", {"a": (0, 0, 0), "b": (0, 0, 0), "c": None})
+    with pytest.raises(br.InputError, match="no pair of which both points have a position"):
+        read_point_pairs(other, nothing)

@@ -19,7 +19,11 @@ from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import scale_block
 from bayesreg.model.observations.compared_points import ComparedPoints
-from bayesreg.model.observations.landmarks_report import distance_figure, landmark_table
+from bayesreg.model.observations.landmarks_report import (
+    describe_wrong_pairs,
+    distance_figure,
+    landmark_table,
+)
 from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.observations.observation import Placed, Recorded
 from bayesreg.model.observations.point_noise import Noise, NormalNoise, StudentTNoise
@@ -37,8 +41,9 @@ UNKNOWN_SD = ScalePrior(median=1.0, log_sd=2.0)
 STRAIN = 0.2
 # The least number of landmarks if others lie too far outside the mesh.
 FEWEST = 4
-# The greatest number of landmarks that are left out in turn, and of unknowns for which the memory suffices.
-MOST_LEFT_OUT, MOST_UNKNOWNS = 60, 12_000
+# The greatest number of unknowns for which the memory suffices to leave landmarks out in turn, and of these unknowns
+# times the coordinates of the landmarks.
+MOST_UNKNOWNS, MOST_ENTRIES = 12_000, 20_000_000
 
 
 _log = logging.getLogger(__name__)
@@ -152,7 +157,7 @@ class Landmarks:
         return observation
 
     def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
-        """Summarise the residuals at a state, and for few landmarks their predictions by all other observations."""
+        """Summarise the residuals at a state, and the predictions of landmarks by all other observations."""
         term = posterior.data.terms[self.name]
         summary = {
             "names": np.array(self.labels),
@@ -162,10 +167,15 @@ class Landmarks:
         }
         if (wrong := term.probability_of_wrong(state)) is not None:
             summary["wrong"] = wrong
-        if len(self.labels) > MOST_LEFT_OUT or not len(posterior.sampled) or 3 * len(posterior.sampled) > MOST_UNKNOWNS:
+        unknowns = 3 * len(posterior.sampled)
+        if not unknowns or unknowns > MOST_UNKNOWNS or 3 * len(self.labels) * unknowns > MOST_ENTRIES:
             return summary
         left_out = leave_out(posterior, term, posterior.estimands(state.values))
         return summary | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
+
+    def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
+        """Name the pairs that are probably wrong, for the terminal and the first page of the report."""
+        return describe_wrong_pairs(self.name, summary)
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""

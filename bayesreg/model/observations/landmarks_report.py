@@ -14,6 +14,8 @@ from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTabl
 from bayesreg.types import AnyArray
 
 LEVELS = (0.5, 0.95)
+# The greatest number of landmarks that the figure shows, and of pairs that a sentence names.
+MOST_SHOWN, MOST_NAMED = 60, 8
 
 
 def region_probability(
@@ -63,7 +65,7 @@ def _caption(summary: Arrays) -> str:
     if "wrong" in summary:
         text += f" {_describe_wrong(summary)}"
     if "left_out_residual" not in summary:
-        return f"{text} They were not left out in turn, as up to 60 are where nodes are sampled."
+        return f"{text} They were not left out in turn: no node is sampled, or there are too many."
     residual = summary["left_out_residual"]
     is_finite = np.isfinite(residual).all(axis=1)
     if not is_finite.any():
@@ -80,25 +82,46 @@ def _caption(summary: Arrays) -> str:
 
 def _describe_wrong(summary: Arrays) -> str:
     """Say what a wrong pair is, and name those that probably are."""
-    probable = [
-        f"{summary['names'][k]} ({100 * summary['wrong'][k]:.0f} %)"
-        for k in np.argsort(-summary["wrong"])
-        if summary["wrong"][k] > 0.5
-    ]
+    probable = [f"{summary['names'][k]} ({100 * summary['wrong'][k]:.0f} %)" for k in _probably_wrong(summary)]
     named = f"Probably wrong: {', '.join(probable)}." if probable else "None probably is."
     return f"Wrong: the probability that the error of this pair has more than {WRONG:g} times that sd. {named}"
 
 
+def describe_wrong_pairs(name: str, summary: Arrays) -> list[str]:
+    """Return a sentence that names the pairs that are probably wrong; none if there is none."""
+    wrong = _probably_wrong(summary)
+    if not len(wrong):
+        return []
+    distance = np.linalg.norm(summary["residual"], axis=1)
+    named = [f"{summary['names'][k]} ({distance[k]:.1f} mm, {100 * summary['wrong'][k]:.0f} %)" for k in wrong]
+    which = "pair of points is" if len(wrong) == 1 else "pairs of points are"
+    return [
+        f"{name}: {len(wrong)} {which} probably wrong (distance from where the others have it, probability): "
+        f"{', '.join(named[:MOST_NAMED])}{', …' * (len(named) > MOST_NAMED)}. They count little; look at them again."
+    ]
+
+
+def _probably_wrong(summary: Arrays) -> np.ndarray:
+    """Return the numbers of the pairs that are probably wrong, the most probable first."""
+    wrong = np.asarray(summary.get("wrong", ()))
+    order = np.argsort(-wrong)
+    return order[wrong[order] > 0.5]
+
+
 def distance_figure(name: str, summary: Arrays) -> ReportFigure:
     """Make the figure of the distances with and without each landmark, and of their expected distribution."""
-    count = len(summary["names"])
+    furthest = np.argsort(-np.linalg.norm(summary["residual"], axis=1))[:MOST_SHOWN]
+    chosen = np.sort(furthest)
+    count = len(chosen)
     caption = (
         "How far each landmark lies from where the posterior takes it: with the landmark among the data (dots) and "
         "predicted by all others (rings). Grey: what 95 % of landmarks with this error do not exceed."
+        + f" The {count} furthest of {len(summary['names'])} are shown."
+        * (count < len(summary["names"]))
     )
     alt = f"Distances of {count} landmarks, with and without each among the data."
     height = max(1.6, 0.17 * count + 0.9)
-    draw = partial(_draw_distances, summary)
+    draw = partial(_draw_distances, {key: np.asarray(values)[chosen] for key, values in summary.items()})
     return ReportFigure(f"landmarks-{name}", "Distances of the landmarks", caption, alt, height, draw)
 
 

@@ -7,6 +7,7 @@ of an observation, each with the code that uses it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -93,6 +94,14 @@ class Smoothable(Protocol):
 
     def smoothed_term(self, term: Any, sd: float) -> Any:
         """Return the term with smoothed data; sd in mm."""
+
+
+@runtime_checkable
+class Doubtful(Protocol):
+    """An observation that may have sentences on doubtful values, for the terminal and the report's first page."""
+
+    def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
+        """Return these sentences, from the arrays of `summarise`."""
 
 
 @runtime_checkable
