@@ -149,7 +149,9 @@ def _read_markups(text: str, path: str, space: Space | None) -> Points:
         markups = json.loads(text)["markups"]
     except (json.JSONDecodeError, KeyError, TypeError):
         raise InputError(f"{path} is no file of 3D Slicer's markups: expected JSON with the key markups") from None
-    points, names, undefined = [], [], []
+    points: list[np.ndarray] = []
+    names: list[str] = []
+    undefined: list[int] = []
     for markup in _require_objects(markups, "markups", path):
         if markup.get("coordinateUnits", "mm") not in ("mm", ["mm", "UCUM", "millimeter"]):
             raise InputError(f"{path}: expected coordinates in mm, got {markup['coordinateUnits']!r}")

@@ -93,8 +93,8 @@ def test_the_statistics_tell_a_slightly_different_distribution():
 
 
 def test_every_exact_sampler_is_looked_at():
-    """All but smc, which moves by hmc's kernel."""
-    assert {name for name in SAMPLERS if choose_sampler(name, target()).sampler.exact} == {*STEPS, "smc"}
+    """All but smc, which moves by hmc's kernel, and gibbs (`test_gibbs`)."""
+    assert {name for name in HERE if choose_sampler(name, target()).sampler.exact} == {*STEPS, "smc"}
 
 
 @pytest.mark.slow
@@ -134,13 +134,15 @@ def test_slow_blocks_are_drawn_in_parts(monkeypatch):
         np.testing.assert_array_equal(*joined)
 
 
+# The Gibbs sampler takes no other target than pairs of points: `test_gibbs` has its tests.
+HERE = [name for name in SAMPLERS if name != "gibbs"]
 THIN = {"rwmh": 60}
 SETTINGS = {"rwmh": {"sigma_u": 0.5}, "smc": {"particles": 64}}
 LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", HERE)
 def test_from_start_to_end(name):
     """Search for the mode, warm-up and chains: means, and the probabilities below exact quantiles.
 
@@ -160,7 +162,7 @@ def test_from_start_to_end(name):
     assert samples.exact == (name != "laplace")
 
 
-@pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "rwmh"])
+@pytest.mark.parametrize("name", [name for name in HERE if name != "rwmh"])
 def test_a_hard_wall_is_refused_by_what_follows_the_gradient(name):
     with pytest.raises(br.InputError, match=r"model.skull_width: 0.5, or .* sampler.name: rwmh"):
         br.sample(target("rwmh"), name, 2, 4, progress=False)
