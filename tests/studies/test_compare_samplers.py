@@ -46,7 +46,7 @@ def test_a_sampler_that_does_not_fit_is_a_note(folder, tmp_path):  # noqa: F811
 @pytest.mark.parametrize(
     ("samplers", "minutes", "message"),
     [
-        (["hmc", "mala"], 5.0, "unknown sampler 'mala'; there are auto, rwmh, hmc, nuts"),
+        (["hmc", "mala"], 5.0, "unknown sampler 'mala'; there are rwmh, hmc, nuts"),
         (["hmc", "hmc"], 5.0, "none of them twice; got hmc, hmc"),
         (["hmc"], 0.0, "minutes must be positive, got 0"),
     ],
