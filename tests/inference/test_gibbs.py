@@ -102,10 +102,9 @@ def test_lam_has_the_posterior_of_a_quadrature():
     assert stats.kstest(position[::5], "uniform").pvalue > 0.001
 
 
-@pytest.mark.parametrize("least_volume", [0.0, 0.95], ids=["alone", "with a barrier"])
-def test_it_agrees_with_hamiltonian_trajectories(least_volume):
+def test_it_agrees_with_hamiltonian_trajectories_before_a_barrier():
     """With few hyperparameters; where loads are inferred, trajectories need many more draws."""
-    own, moments = posterior(least_volume=least_volume, known_loads=True, known_lam=3.0), []
+    own, moments = posterior(least_volume=0.95, known_loads=True, known_lam=3.0), []
     for name in ("gibbs", "hmc"):
         samples = br.sample(own, name, draws=300, seed=6, progress=False)
         draws, ess = samples.idata.posterior, samples.convergence.ess_bulk
@@ -113,7 +112,7 @@ def test_it_agrees_with_hamiltonian_trajectories(least_volume):
         sizes = np.r_[float(ess["landmarks_sd"]), np.ravel(ess["u_boundary"])]
         moments.append((values.mean(axis=0), values.std(axis=0), sizes))
         if name == "gibbs":
-            assert (samples.tally.acceptance < samples.tally.steps).all() == (least_volume > 0)
+            assert (samples.tally.acceptance < samples.tally.steps).all()
     (mean, sd, ess), (other_mean, other_sd, other_ess) = moments
     z = (mean - other_mean) / np.hypot(sd / np.sqrt(ess), other_sd / np.sqrt(other_ess))
     assert np.abs(z).max() < 4.5
@@ -145,7 +144,7 @@ def test_an_outlier_of_40_mm_is_named_and_moves_nothing_else():
     for moving in (fixed + shift, fixed + shift + outlier):
         points = br.Landmarks(fixed, moving, br.ScalePrior(median=1.0, log_sd=2.0))
         own = br.build_posterior(MESH, [points], br.ModelConfig(preset="registration"))
-        draws = br.sample(own, draws=200, seed=1, progress=False).idata.posterior
+        draws = br.sample(own, chains=2, draws=100, seed=1, progress=False).idata.posterior
         mean = {name: draws[name].mean(("chain", "draw")).values for name in own.reference()}
         observation = own.observations["landmarks"]
         state = state_of(own.data.body, own.data.blocks, own.fill(mean))
