@@ -44,7 +44,7 @@ class Auto(settings.Settings, _Chains):
 
 
 class Hmc(settings.Hmc, _Chains):
-    """Hamiltonian Monte Carlo."""
+    """Hamiltonian Monte Carlo about a mode, the default with images."""
 
     name: Literal["hmc"]
 

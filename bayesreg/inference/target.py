@@ -170,7 +170,7 @@ class Marginal(Protocol):
         """The data of the posterior."""
 
     def draw_weights(self, key: AnyArray, estimands: Estimands) -> tuple[AnyArray, dict[str, AnyArray]]:
-        """Draw the weights given all estimands, and estimands other than "u_boundary" given it; return both."""
+        """Draw the weights given all estimands; return them, and all estimands, of which some move with the weights."""
 
     def log(self, estimands: Estimands, weights: AnyArray) -> Scalar:
         """Compute the log density of all estimands but "u_boundary", which may have any value, given the weights."""
@@ -180,14 +180,6 @@ class Marginal(Protocol):
 
     def log_others(self, estimands: Estimands) -> Scalar:
         """Compute the log of the terms of the posterior that the other functions leave out."""
-
-
-@runtime_checkable
-class Marginalisation(Protocol):
-    """A posterior whose displacements can be integrated out."""
-
-    def marginal(self) -> Marginal:
-        """Return the marginal, which is prepared at the first call."""
 
 
 @runtime_checkable
@@ -237,8 +229,11 @@ class Target(Hashable, Protocol):
         """
 
     @property
-    def marginalisation(self) -> Marginalisation | None:
-        """The posterior with the displacements integrated out; None if that cannot be done in closed form."""
+    def prepare_marginal(self) -> Callable[[], Marginal] | None:
+        """The function that prepares, at its first call, the posterior with the displacements integrated out.
+
+        It is None if they cannot be integrated out in closed form.
+        """
 
     @property
     def mode_search(self) -> ModeSearch | None:

@@ -156,12 +156,11 @@ def _read_markups(text: str, path: str, space: Space | None) -> Points:
         if markup.get("coordinateUnits", "mm") not in ("mm", ["mm", "UCUM", "millimeter"]):
             raise InputError(f"{path}: expected coordinates in mm, got {markup['coordinateUnits']!r}")
         controls = _require_objects(markup.get("controlPoints", []), "controlPoints", path)
-        for number, point in enumerate(controls, len(names)):
-            if point.get("positionStatus", "defined") != "defined":
-                undefined.append(number)
+        are_placed = [point.get("positionStatus", "defined") == "defined" for point in controls]
+        undefined += [len(names) + k for k, is_placed in enumerate(are_placed) if not is_placed]
         positions = [
-            [0.0] * 3 if number in undefined else _position(point, path)
-            for number, point in enumerate(controls, len(names))
+            _position(point, path) if is_placed else [0.0] * 3
+            for point, is_placed in zip(controls, are_placed, strict=True)
         ]
         points.append(_in_ras(positions, str(markup.get("coordinateSystem", "LPS")), path))
         names += [str(point.get("label", "")) for point in controls]

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayesreg.mesh import TetMesh
-from bayesreg.model import evaluation
+from bayesreg.model import evaluation, point_algebra
 from bayesreg.model.blocks import Values
 from bayesreg.model.coordinates import complete
 from bayesreg.model.elastic.barrier import Barrier
@@ -35,11 +35,12 @@ class Marginal(NamedTuple):
     ----------
     problem : Problem
         The posterior's own, with the determinant of K from its eigenvalues.
-    algebra : PointAlgebra
+    number : scalar integer
+        That of its `PointAlgebra`.
     """
 
     problem: Problem
-    algebra: PointAlgebra
+    number: Int[AnyArray, ""]
 
     def draw_weights(self, key: AnyArray, estimands: Values) -> tuple[Float[AnyArray, "points"], dict[str, AnyArray]]:
         """Draw the weight τ of every point given all estimands, and the sd of points with their weights.
@@ -63,7 +64,7 @@ class Marginal(NamedTuple):
         """Compute log p(y, θ | τ) up to a constant; the displacements of the estimands have no effect."""
         values = complete(self.problem.blocks, estimands)
         prior = evaluation.evaluate(self.problem._replace(terms={}), values).logdensity
-        log = prior + self.algebra.log_density(*self._given(values, weights))
+        log = prior + point_algebra.log_density(self.number, *self._given(values, weights))
         return jnp.where(jnp.isnan(log), -jnp.inf, log)
 
     def draw_displacements(
@@ -72,8 +73,10 @@ class Marginal(NamedTuple):
         """Draw u given θ and τ, mm."""
         values = complete(self.problem.blocks, estimands)
         lam, sizes, noise = self._given(values, weights)
-        normal = jax.random.normal(key, (values["u_boundary"].size + len(noise),))
-        return self.algebra.draw(lam, sizes, noise, normal).reshape(-1, 3)
+        key_load, key_error = jax.random.split(key)
+        white = jax.random.normal(key_load, (values["u_boundary"].size,))
+        errors = jax.random.normal(key_error, noise.shape)
+        return point_algebra.draw(self.number, lam, sizes, noise, white, errors).reshape(-1, 3)
 
     def log_others(self, estimands: Values) -> Scalar:
         """Compute the sum of the logs of all terms that are not Gaussian in u: the barrier."""
@@ -91,7 +94,7 @@ class Marginal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Marginalisation:
-    """A posterior whose displacements can be integrated out; its algebra is prepared once, when it is needed.
+    """A posterior whose displacements can be integrated out; its algebra is prepared at the first call.
 
     Attributes
     ----------
@@ -115,22 +118,25 @@ class Marginalisation:
         is_small &= 3 * sum(len(term.shift) for term in points) <= MOST_COORDINATES
         return cls(problem, mesh) if one_tissue and is_small and np.isfinite(_range_of_lam(problem)[1]) else None
 
-    def marginal(self) -> Marginal:
+    def __call__(self) -> Marginal:
         """Return the marginal; several threads may ask for it."""
         with self._lock:
-            return self._marginal
+            elastic = self.problem.terms["elastic"]._replace(determinant=self._algebra.spectrum)
+            return Marginal(self.problem.with_term("elastic", elastic), jnp.asarray(self._algebra.number))
 
     @cached_property
-    def _marginal(self) -> Marginal:
+    def _algebra(self) -> PointAlgebra:
         points, unknowns = points_of(self.problem), 3 * len(self.mesh.points)
         identity = jnp.eye(unknowns).reshape(-1, 3, unknowns)
         interpolation = np.concatenate([np.asarray(term.interpolate(identity)) for term in points])
-        shift, mu = np.concatenate([np.asarray(term.shift) for term in points]), self.problem.blocks["mu"].reference()
-        algebra = PointAlgebra(
-            self.mesh, interpolation.reshape(-1, unknowns), shift.ravel(), float(mu[0]), _range_of_lam(self.problem)
+        return PointAlgebra(
+            self.mesh,
+            self.problem.terms["elastic"],
+            interpolation.reshape(-1, unknowns),
+            np.concatenate([np.asarray(term.shift) for term in points]).ravel(),
+            float(np.asarray(self.problem.blocks["mu"].reference())[0]),
+            _range_of_lam(self.problem),
         )
-        elastic = self.problem.terms["elastic"]._replace(determinant=algebra.spectrum)
-        return Marginal(self.problem.with_term("elastic", elastic), algebra)
 
 
 def points_of(problem: Problem) -> list[ComparedPoints]:
@@ -141,5 +147,5 @@ def points_of(problem: Problem) -> list[ComparedPoints]:
 def _range_of_lam(problem: Problem) -> tuple[float, float]:
     """Return the least and the greatest λ that its prior allows; both are the known one."""
     block = problem.blocks["lam"]
-    low, high = (block.low[0], block.high[0]) if block.is_sampled else (block.reference()[0],) * 2
-    return float(low), float(high)
+    low, high = (block.low, block.high) if block.is_sampled else (block.reference(),) * 2
+    return float(np.asarray(low)[0]), float(np.asarray(high)[0])

@@ -22,6 +22,7 @@ The host computes, because programs of XLA with LAPACK's functions in loops did 
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -29,8 +30,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.fft
 import scipy.linalg
@@ -38,9 +41,10 @@ from jaxtyping import Float
 from scipy.linalg.lapack import dpotrf, dpotrs
 from threadpoolctl import ThreadpoolController
 
-from bayesreg.fem.elasticity import rigid_modes, stiffness
-from bayesreg.fem.elements import Elements, boundary_areas
+from bayesreg.fem.elasticity import stiffness
+from bayesreg.fem.elements import Elements
 from bayesreg.mesh import TetMesh
+from bayesreg.model.elastic.loads import LoadsTerm
 from bayesreg.types import AnyArray, Scalar
 
 # The relative error of the interpolation in λ; the elastic solves of other posteriors have a similar one.
@@ -65,16 +69,19 @@ class Spectrum(NamedTuple):
         self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
     ) -> Scalar:
         """Compute log pdet K for a λ that is the same in all cells, at the known μ."""
-        return self.log_of_shear + jax.numpy.log1p(lam[0] * self.ratios).sum()
+        return self.log_of_shear + jnp.log1p(lam[0] * self.ratios).sum()
 
 
-@jax.tree_util.register_static
 class PointAlgebra:
-    """The Gaussian of displacements and shifts; a constant of a compiled program, equal only to itself.
+    """The Gaussian of displacements and shifts.
+
+    A program of JAX knows it by its number, an argument: programs then serve other points, and do not keep its arrays
+    in memory.
 
     Parameters
     ----------
     mesh : TetMesh
+    elastic : LoadsTerm
     interpolation : (m, 3n) array
         B, with m coordinates of points.
     shift : (m,) array
@@ -87,16 +94,18 @@ class PointAlgebra:
     def __init__(
         self,
         mesh: TetMesh,
+        elastic: LoadsTerm,
         interpolation: Float[np.ndarray, "coordinates unknowns"],
         shift: Float[np.ndarray, "coordinates"],
         mu: float,
         lam: tuple[float, float],
     ) -> None:
-        self._rigid, self._shift, self._steepness = rigid_modes(mesh.points), shift, 1.5 / mu
+        self.number = next(_numbers)
+        _by_number[self.number] = self
+        self._rigid, self._shift, self._steepness = np.asarray(elastic.rigid), shift, 1.5 / mu
         self._rigid_at_points = interpolation @ self._rigid
-        volumes = np.bincount(mesh.cells.ravel(), np.repeat(mesh.volumes / 4, 4), len(mesh.points))
-        self._masses = np.repeat(np.stack([volumes, boundary_areas(mesh)]), 3, axis=1)
-        self._vectors, self.spectrum = _eigenvectors(mesh, mu)
+        self._masses = np.repeat(np.stack([np.asarray(elastic.volumes), np.asarray(elastic.areas)]), 3, axis=1)
+        self._vectors, self.spectrum = _eigenvectors(mesh, mu, self._rigid)
         self._pulled = self._vectors.T @ interpolation.T
         self._bounds = low, high = np.log1p(self._steepness * np.array(lam))
         degrees = _degrees(high - low)
@@ -111,46 +120,18 @@ class PointAlgebra:
         self._squares, self._pushes = (_coefficients(np.array(samples)) for samples in (squares, pushes))
         self._balances = np.stack([self._rigid.T @ (mass[:, None] * self._rigid) for mass in self._masses])
 
-    def log_density(self, lam: Scalar, sizes: Float[AnyArray, "2"], noise: Float[AnyArray, "coordinates"]) -> Scalar:
-        """Compute log p(y) as part of a JAX program, up to a constant; NaN where S is not positive definite.
-
-        Parameters
-        ----------
-        lam : scalar
-        sizes : (2,) array
-            s² and t².
-        noise : (m,) array
-            The diagonal of Σ, mm².
-        """
-        result = jax.ShapeDtypeStruct((), float)
-        return jax.pure_callback(self._log_densities, result, lam, sizes, noise, vmap_method="broadcast_all")
-
-    def draw(
-        self,
-        lam: Scalar,
-        sizes: Float[AnyArray, "2"],
-        noise: Float[AnyArray, "coordinates"],
-        normal: Float[AnyArray, "unknowns_and_coordinates"],
-    ) -> Float[AnyArray, "unknowns"]:
-        """Draw u given y as part of a JAX program, mm, from 3n + m independent Normal numbers.
-
-        A draw of the prior is corrected by its difference from y (Matheron's rule). The flat prior of the rigid motion
-        is the limit of a wide one.
-        """
-        result = jax.ShapeDtypeStruct((len(self._vectors),), float)
-        return jax.pure_callback(self._draw_all, result, lam, sizes, noise, normal, vmap_method="broadcast_all")
-
-    def _log_densities(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray) -> Float[np.ndarray, "*chains"]:
-        lam, sizes, noise = map(np.asarray, (lam, sizes, noise))
+    def log_densities(self, lam: np.ndarray, sizes: np.ndarray, noise: np.ndarray) -> Float[np.ndarray, "*chains"]:
+        """Compute `log_density` of chains, which are the leading axes of all arguments."""
         with _one_thread_each() as side_by_side:
             logs = side_by_side(lambda given: given.log_density(self._shift), self._given(lam, sizes, noise))
             return np.reshape(list(logs), np.shape(lam))
 
-    def _draw_all(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray, normal: AnyArray) -> np.ndarray:
-        lam, sizes, noise, numbers = map(np.asarray, (lam, sizes, noise, normal))
-        numbers, unknowns = numbers.reshape(-1, numbers.shape[-1]), len(self._vectors)
-        factors = np.stack([self._factors(value) for value in np.ravel(lam)])
-        variances = np.reshape(sizes, (-1, 2)) @ self._masses
+    def draw_all(
+        self, lam: np.ndarray, sizes: np.ndarray, noise: np.ndarray, white: np.ndarray, errors: np.ndarray
+    ) -> Float[np.ndarray, "*chains unknowns"]:
+        """Compute `draw` of chains, which are the leading axes of all arguments."""
+        factors = np.stack([self._factors(value) for value in lam.ravel()])
+        variances = sizes.reshape(-1, 2) @ self._masses
         with _one_thread_each() as side_by_side:
             conditionals = list(side_by_side(_Given.factorised, self._given(lam, sizes, noise)))
 
@@ -159,8 +140,8 @@ class PointAlgebra:
                 parts = [given.balance @ row for given, row in zip(conditionals, load @ self._rigid, strict=True)]
                 return load - variances * (np.stack(parts) @ self._rigid.T)
 
-            load = balanced(np.sqrt(variances) * numbers[:, :unknowns])
-            error = np.sqrt(np.reshape(noise, (len(factors), -1))) * numbers[:, unknowns:]
+            load = balanced(np.sqrt(variances) * white.reshape(variances.shape))
+            error = (np.sqrt(noise) * errors).reshape(len(factors), -1)
             # Rows are chains, so that each product reads its matrix once for all of them.
             modes = factors * (load @ self._vectors)
             apart = self._shift - modes @ self._pulled - error
@@ -169,7 +150,7 @@ class PointAlgebra:
             pull = balanced(variances * ((factors * (weights @ self._pulled.T)) @ self._vectors.T))
             modes += factors * (pull @ self._vectors)
             u = modes @ self._vectors.T + motions @ self._rigid.T
-        return u.reshape(*np.shape(lam), unknowns)
+        return u.reshape(white.shape)
 
     def _factors(self, lam: float) -> Float[np.ndarray, "modes"]:
         return 1 / (1 + lam * self.spectrum.ratios)
@@ -214,7 +195,7 @@ class _Given(NamedTuple):
     noise: Float[np.ndarray, "coordinates"]
 
     def factorised(self) -> _Factorised:
-        """Factorise S."""
+        """Compute S, factorise it, and solve with it for H."""
         covariance = np.zeros((len(self.noise),) * 2)
         covariance[self.triangle] = self.square
         covariance -= self.push.T @ (self.balance @ self.push)
@@ -260,6 +241,58 @@ class _Factorised(NamedTuple):
         return dpotrs(self.lower, shift, lower=1)[0] - self.whitened @ rigid, rigid
 
 
+# The algebras that something else holds.
+_by_number: WeakValueDictionary[int, PointAlgebra] = WeakValueDictionary()
+_numbers = itertools.count()
+
+
+def log_density(
+    number: AnyArray, lam: Scalar, sizes: Float[AnyArray, "2"], noise: Float[AnyArray, "coordinates"]
+) -> Scalar:
+    """Compute log p(y) as part of a JAX program, up to a constant; NaN where S is not positive definite.
+
+    Parameters
+    ----------
+    number : scalar integer
+        `PointAlgebra.number`.
+    lam : scalar
+    sizes : (2,) array
+        s² and t².
+    noise : (m,) array
+        The diagonal of Σ, mm².
+    """
+    result = jax.ShapeDtypeStruct((), float)
+    return jax.pure_callback(_log_densities, result, number, lam, sizes, noise, vmap_method="broadcast_all")
+
+
+def draw(
+    number: AnyArray,
+    lam: Scalar,
+    sizes: Float[AnyArray, "2"],
+    noise: Float[AnyArray, "coordinates"],
+    white: Float[AnyArray, "unknowns"],
+    errors: Float[AnyArray, "coordinates"],
+) -> Float[AnyArray, "unknowns"]:
+    """Draw u given y as part of a JAX program, mm, from independent Normal numbers for loads and errors.
+
+    A draw of the prior is corrected by its difference from y (Matheron's rule). The flat prior of the rigid motion is
+    the limit of a wide one.
+    """
+    result = jax.ShapeDtypeStruct(jnp.shape(white), float)
+    arguments = number, lam, sizes, noise, white, errors
+    return jax.pure_callback(_draw_all, result, *arguments, vmap_method="broadcast_all")
+
+
+def _log_densities(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains"]:
+    lam, sizes, noise = map(np.asarray, given)
+    return _by_number[int(np.ravel(number)[0])].log_densities(lam, sizes, noise)
+
+
+def _draw_all(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains unknowns"]:
+    lam, sizes, noise, white, errors = map(np.asarray, given)
+    return _by_number[int(np.ravel(number)[0])].draw_all(lam, sizes, noise, white, errors)
+
+
 @contextmanager
 def _one_thread_each() -> Iterator[Callable[..., Iterator[Any]]]:
     """Yield `map` for chains side by side, each in one thread; BLAS would share one small matrix among all threads."""
@@ -273,10 +306,12 @@ def _threads() -> tuple[ThreadpoolController, ThreadPoolExecutor]:
     return ThreadpoolController(), ThreadPoolExecutor(os.cpu_count())
 
 
-def _eigenvectors(mesh: TetMesh, mu: float) -> tuple[Float[np.ndarray, "unknowns modes"], Spectrum]:
+def _eigenvectors(
+    mesh: TetMesh, mu: float, rigid: Float[np.ndarray, "unknowns 6"]
+) -> tuple[Float[np.ndarray, "unknowns modes"], Spectrum]:
     """Compute the eigenvectors V of (K_λ, μ K_μ) in the complement of the rigid motions, Vᵀ μ K_μ V = 1, and ω."""
     ones, nothing = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells))
-    complement = scipy.linalg.qr(rigid_modes(mesh.points))[0][:, 6:]
+    complement = scipy.linalg.qr(rigid)[0][:, 6:]
     volume, shear = (
         complement.T @ (stiffness(mesh, *moduli) @ complement) for moduli in ((ones, nothing), (nothing, mu * ones))
     )

@@ -123,8 +123,8 @@ class PosteriorTarget:
         return partial(simplify, normaliser=normaliser) if normaliser is not None and normaliser.is_costly else None
 
     @cached_property
-    def marginalisation(self) -> Marginalisation | None:
-        """The posterior with the displacements integrated out; None if that cannot be done in closed form."""
+    def prepare_marginal(self) -> Marginalisation | None:
+        """The function that prepares the posterior with the displacements integrated out, where this is possible."""
         return Marginalisation.of(self.data, self.posterior.mesh)
 
     @property

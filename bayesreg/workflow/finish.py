@@ -54,8 +54,7 @@ def finish(
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
     predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
-
-    provenance = with_doubts(provenance, posterior, predicted)
+    provenance = _with_doubts(provenance, posterior, predicted)
 
     def transform(most: int) -> Transform:
         u = nodal_draws(config.model, inputs, draws, most)
@@ -94,7 +93,7 @@ def finish(
     return Result(folder.path, finished)
 
 
-def with_doubts(provenance: dict[str, Any], posterior: Posterior, predicted: Predicted) -> dict[str, Any]:
+def _with_doubts(provenance: dict[str, Any], posterior: Posterior, predicted: Predicted) -> dict[str, Any]:
     """Log what observations doubt, and add it to the warnings of the appraisal."""
     doubts = [
         sentence
@@ -105,8 +104,7 @@ def with_doubts(provenance: dict[str, Any], posterior: Posterior, predicted: Pre
     for sentence in doubts:
         _log.warning("%s", sentence)
     appraisal = provenance.get("appraisal", {})
-    warnings = [*appraisal.get("warnings", ()), *doubts]
-    return provenance | {"appraisal": appraisal | {"warnings": list(dict.fromkeys(warnings))}}
+    return provenance | {"appraisal": appraisal | {"warnings": [*appraisal.get("warnings", ()), *doubts]}}
 
 
 def _store_draws(posterior: Posterior, samples: Samples, folder: RunFolder, seed: int) -> Any:

@@ -91,7 +91,7 @@ class GaussianTarget:
     mixture of two such, of equal mass, their means so far apart in the y of the first node.
     """
 
-    coordinates, variables, normaliser, surrogate, marginalisation = Coordinates(), Variables(), None, None, None
+    coordinates, variables, normaliser, surrogate, prepare_marginal = Coordinates(), Variables(), None, None, None
 
     def __init__(self, wall: float = WALL, apart: float = 0.0, width: float = WIDTH):
         root = np.random.default_rng(0).normal(size=(DIMENSION, DIMENSION))

@@ -39,7 +39,7 @@ def posterior(noise=None, sd=None, least_volume=0.0, known_loads=False, known_la
 
 
 def marginal_of(posterior: br.Posterior) -> Marginal:
-    return posterior.target.marginalisation.marginal()
+    return posterior.target.prepare_marginal()
 
 
 def estimands(u=None, **changed) -> dict:

@@ -91,7 +91,7 @@ def test_without_a_field_nothing_is_asked_for():
 class Displaced:
     """A target of T_r, the noise σ and displacements u of the data y = u + σ e, without images."""
 
-    data = hard_wall = normaliser = surrogate = marginalisation = variables = None
+    data = hard_wall = normaliser = surrogate = prepare_marginal = variables = None
 
     def unused(self, *_):
         raise AssertionError("nobody asks for it")

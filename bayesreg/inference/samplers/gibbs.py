@@ -30,14 +30,12 @@ from bayesreg.inference.samplers.settings import Gibbs
 from bayesreg.inference.target import Estimands, Target
 from bayesreg.types import AnyArray, InputError
 
-# The number of steps of the random walk of θ in one transition. A step is a random multiple of the unit of θ, spread
+# The number of steps of θ in one transition. Some go along one direction of its unit by a random multiple, spread
 # evenly on a logarithmic axis, so that also tails and narrow parts of its posterior are visited.
 STEPS, NARROWEST, WIDEST = 6, 0.5, 4.0
-# The share of steps that propose θ independently of where it is, and the degrees of freedom of both proposals, which
-# are products of Student's t.
+# The share of the other steps, which propose θ independently of where it is, and the degrees of freedom of Student's t,
+# from which every component of both kinds is drawn.
 INDEPENDENT, FREEDOM = 0.6, 5.0
-# The number of times that weights and displacements are drawn in one transition; θ costs more.
-SWEEPS = 2
 # The shares of the warm-up after each of which the steps are tuned anew.
 STAGES = 0.2, 0.3, 0.5
 # The unit in which each parameter begins, in logarithms and Normal scores.
@@ -68,19 +66,19 @@ def gibbs(target: Target, settings: Gibbs) -> Sampler:
     InputError
         If the displacements of the target cannot be integrated out.
     """
-    if target.marginalisation is None:
+    prepare_marginal = target.prepare_marginal
+    if prepare_marginal is None:
         raise InputError(
             "gibbs samples pairs of points alone, on a mesh of one tissue with random loads and at most some hundred "
             "points; use the sampler hmc"
         )
-    marginalisation = target.marginalisation
 
     def prepare(points: Any, key: AnyArray, deadline: Deadline, _on_mode: OnMode) -> tuple[Setup, Any]:
         return _warm_up(target, settings.warm_up, points, key, deadline)
 
     return Sampler(
         prepare=prepare,
-        data=lambda _setup: marginalisation.marginal(),
+        data=lambda _setup: prepare_marginal(),
         blank=partial(_first_setup, target),
         init=lambda marginal, _setup, estimands: State(dict(estimands), marginal.log_others(estimands)),
         step=partial(_step, target),
@@ -92,13 +90,11 @@ def gibbs(target: Target, settings: Gibbs) -> Sampler:
 
 
 def _step(target: Target, marginal: Any, setup: Setup, key: AnyArray, state: State) -> tuple[State, Info]:
-    """Draw weights and displacements several times, and the last time θ between them."""
-    *keys, key_last = jax.random.split(key, SWEEPS)
-    fixed = partial(_sweep, marginal, lambda _key, estimands, _weights: estimands)
-    state, rates = jax.lax.scan(lambda state, key: fixed(key, state), state, jnp.stack(keys))
-    state, rate = _sweep(marginal, partial(_walk, target, marginal, setup), key_last, state)
-    nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
-    rate = (rates.sum() + rate) / SWEEPS
+    """Draw weights and displacements twice, the second time with θ between them, which costs more."""
+    key_first, key_second = jax.random.split(key)
+    state, first_rate = _sweep(marginal, lambda _key, estimands, _weights: estimands, key_first, state)
+    state, second_rate = _sweep(marginal, partial(_walk, target, marginal, setup), key_second, state)
+    rate, nothing, no = (first_rate + second_rate) / 2, jnp.zeros((), int), jnp.zeros((), bool)
     return state, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
 
 
@@ -120,7 +116,7 @@ def _sweep(
 def _walk(
     target: Target, marginal: Any, setup: Setup, key: AnyArray, estimands: Estimands, weights: AnyArray
 ) -> dict[str, AnyArray]:
-    """Move θ by random-walk Metropolis with the displacements integrated out."""
+    """Move θ by steps of Metropolis with the displacements integrated out."""
     position = target.coordinates.unconstrain(marginal.problem, estimands)
     u_boundary = position.pop("u_boundary")
     start, unravel = ravel_pytree(position)
@@ -136,12 +132,11 @@ def _walk(
 
     def step(now: tuple[AnyArray, AnyArray], key_and_number: tuple[AnyArray, AnyArray]) -> tuple[Any, None]:
         (flat, height), (key, number) = now, key_and_number
-        key_kind, key_width, key_move, key_accept = jax.random.split(key, 4)
+        key_kind, key_width, key_which, key_move, key_accept = jax.random.split(key, 5)
         is_independent = jax.random.bernoulli(key_kind, INDEPENDENT)
         width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
         move = jax.random.t(key_move, FREEDOM, start.shape)
-        alone = jax.nn.one_hot(jax.random.randint(jax.random.fold_in(key_kind, 1), (), 0, len(start)), len(start))
-        along = setup.unit @ (alone * move)
+        along = setup.unit @ (move * jax.nn.one_hot(jax.random.randint(key_which, (), 0, len(start)), len(start)))
         candidate = jnp.where(is_independent, setup.centre + setup.unit @ move, flat + width * along)
         # The first step only evaluates the density at the start, so that the density is compiled once.
         is_first = number == 0
@@ -165,8 +160,8 @@ def _log_tail(setup: Setup, flat: AnyArray) -> AnyArray:
 
 def _warm_up(target: Target, length: int, points: Any, key: AnyArray, deadline: Deadline) -> tuple[Setup, Any]:
     """Move the chains away from their start, and tune the steps of θ by the places that they visit."""
-    assert target.marginalisation is not None
-    marginal = target.marginalisation.marginal()
+    assert target.prepare_marginal is not None
+    marginal = target.prepare_marginal()
     states = jax.vmap(lambda estimands: State(dict(estimands), marginal.log_others(estimands)))(points)
     setup = _first_setup(target)
     for number, share in enumerate(STAGES):
@@ -187,7 +182,7 @@ def _warm_up(target: Target, length: int, points: Any, key: AnyArray, deadline: 
 def _transition(
     target: Target, marginal: Any, setup: Setup, key: AnyArray, states: State
 ) -> tuple[State, Float[AnyArray, "chains parameters"]]:
-    """Move every chain, whether the barrier likes it or not; return its state and θ."""
+    """Move every chain, out of places that the barrier forbids, too; return its state and θ."""
     states = states._replace(log_others=jnp.full_like(states.log_others, -jnp.inf))
     keys = jax.random.split(key, len(states.log_others))
     states, _ = jax.vmap(partial(_step, target, marginal, setup))(keys, states)

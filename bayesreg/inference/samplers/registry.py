@@ -77,7 +77,7 @@ def choose_sampler(name: str, target: Target, **settings: Any) -> Chosen:
         If there is no such sampler or setting, a setting is out of range, or the sampler does not accept the target.
     """
     if name == AUTO:
-        name = "hmc" if target.marginalisation is None else "gibbs"
+        name = "hmc" if target.prepare_marginal is None else "gibbs"
     if name not in SAMPLERS:
         raise InputError(f"unknown sampler {name!r}; there are {', '.join([AUTO, *SAMPLERS])}")
     record = SAMPLERS[name].settings

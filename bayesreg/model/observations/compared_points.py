@@ -16,9 +16,6 @@ from bayesreg.model.state import State
 from bayesreg.model.term import Label, PointCurvature
 from bayesreg.types import AnyArray, Scalar
 
-# The number of steps of an sd with the weights of its points, and their least and greatest widths in logarithms.
-STEPS, NARROWEST, WIDEST = 16, 0.02, 2.0
-
 
 class ComparedPoints(NamedTuple):
     """Landmarks on a mesh (a pytree).
@@ -122,8 +119,9 @@ class ComparedPoints(NamedTuple):
         """Draw the weight τ of every point given all values, where every node is sampled, and sds with the weights.
 
         The weights determine an sd that is inferred so narrowly that both would move each other in small steps only.
-        Random-walk Metropolis therefore multiplies every such sd by one factor c and the weights by c², which leaves
-        the errors' variances as they are (Yu and Meng 2011).
+        Every such sd is therefore multiplied by one factor c and the weights by c², which leaves the errors' variances
+        as they are (Yu and Meng 2011). The prior of the weights alone gives c² ~ Gamma(k ν/2, ν Σ τ / 2), a proposal
+        that Metropolis accepts by all other factors.
 
         Returns
         -------
@@ -132,32 +130,23 @@ class ComparedPoints(NamedTuple):
         scales : dict
             The sds that are inferred.
         """
-        key_weights, key_walk = jax.random.split(key)
+        key_weights, key_factor, key_accept = jax.random.split(key, 3)
         residual, scales = self.shift - self.interpolate(values["u_boundary"]), self.hyperparameters
         weights = self.noise.draw_weights(key_weights, ((residual / self.sd(values)) ** 2).sum(axis=1))
         if not scales or isinstance(self.noise, NormalNoise):
             return weights, {}
 
-        def density(log_factor: AnyArray) -> Scalar:
-            scaled = {name: jnp.exp(log_factor) * values[name] for name in scales}
-            scaled_weights = jnp.exp(2 * log_factor) * weights
-            sd = self.sd({**values, **scaled}) / jnp.sqrt(scaled_weights)[:, None]
-            prior = sum(blocks[name].prior().log_prob(scale) for name, scale in scaled.items())
-            jacobian = (2 * len(weights) + len(scales)) * log_factor
-            log_weights = self.noise.weights.log_prob(scaled_weights).sum()
-            return prior + log_weights + dist.Normal(0.0, sd).log_prob(residual).sum() + jacobian
+        def others(factor: Scalar) -> Scalar:
+            scaled = {name: factor * values[name] for name in scales}
+            sd = self.sd({**values, **scaled}) / (factor * jnp.sqrt(weights)[:, None])
+            priors = sum(blocks[name].prior().log_prob(scale) + jnp.log(scale) for name, scale in scaled.items())
+            return priors + dist.Normal(0.0, sd).log_prob(residual).sum()
 
-        def step(now: tuple[Scalar, Scalar], key: AnyArray) -> tuple[tuple[Scalar, Scalar], None]:
-            key_width, key_step, key_accept = jax.random.split(key, 3)
-            width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
-            log_factor = now[0] + width * jax.random.normal(key_step)
-            height = density(log_factor)
-            is_accepted = jnp.log(jax.random.uniform(key_accept)) < height - now[1]
-            return (jnp.where(is_accepted, log_factor, now[0]), jnp.where(is_accepted, height, now[1])), None
-
-        nothing = jnp.zeros(())
-        (log_factor, _), _ = jax.lax.scan(step, (nothing, density(nothing)), jax.random.split(key_walk, STEPS))
-        return jnp.exp(2 * log_factor) * weights, {name: jnp.exp(log_factor) * values[name] for name in scales}
+        nu = self.noise.nu
+        square = 2 * jax.random.gamma(key_factor, nu * len(weights) / 2) / (nu * weights.sum())
+        gain = others(jnp.sqrt(square)) - others(jnp.ones(()))
+        factor = jnp.where(jnp.log(jax.random.uniform(key_accept)) < gain, jnp.sqrt(square), 1.0)
+        return factor**2 * weights, {name: factor * values[name] for name in scales}
 
     def interpolate(self, u: Float[AnyArray, "nodes *shape"]) -> Float[AnyArray, "k *shape"]:
         """Interpolate nodal values, such as displacements, at the points."""

@@ -79,11 +79,6 @@ class StudentTNoise(Section):
         """Return the distribution of points about their means (k, 3), with scales (k, 3)."""
         return dist.MultivariateStudentT(self.nu, mean, jnp.eye(3) * sd[..., None])
 
-    @property
-    def weights(self) -> dist.Distribution:
-        """The distribution of τ before anything is seen."""
-        return dist.Gamma(self.nu / 2, self.nu / 2)
-
     def draw_weights(self, key: AnyArray, squares: AnyArray) -> AnyArray:
         """Draw τ given z²: it has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""
         return 2 * jax.random.gamma(key, (self.nu + 3) / 2, squares.shape) / (self.nu + squares)
