@@ -33,6 +33,7 @@ _HOME = {
     "MutualInformation": "model.observations.images.mutual_information",
     "SelfSimilarity": "model.observations.images.self_similarity",
     "Landmarks": "model.observations.landmarks",
+    "Surface": "model.observations.surface",
     "NormalNoise": "model.observations.point_noise",
     "StudentTNoise": "model.observations.point_noise",
     "independent_points": "model.observations.images.independence",

@@ -26,6 +26,7 @@ from bayesreg.command_options import (
     LabelFile,
     LabelsFile,
     LandmarksFile,
+    MeasuredSurfaceFile,
     Like,
     MapsLike,
     Margin,
@@ -144,6 +145,7 @@ def register(
     moving_ignore: MovingIgnore = None,
     channel: Channel = None,
     landmarks: LandmarksFile = None,
+    surface: MeasuredSurfaceFile = None,
     quick: QuickLook = False,
     overrides: Overrides = None,
     resume: Resume = False,
@@ -164,6 +166,7 @@ def register(
         overrides or (),
         quick,
         landmarks,
+        surface,
     )
     typer.echo("\n".join(understood.lines))
     _sample(understood.config, out, resume, quiet)

@@ -21,6 +21,14 @@ LandmarksFile = Annotated[
         "--landmarks", metavar="FILE", help="Pairs of points: CSV with fixed_x … moving_z (RAS, mm), or .tag."
     ),
 ]
+MeasuredSurfaceFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--surface",
+        metavar="FILE",
+        help="Points on the moved surface of the organ, without partners: .ply, .stl, .vtk, .csv with x, y, z, …",
+    ),
+]
 LabelFile = Annotated[
     Path | None,
     typer.Option("--labels", metavar="FILE", help="Tissue labels of FIXED; without them the organ is of one tissue."),

@@ -15,11 +15,16 @@ from bayesreg.io.readers import read_grid
 from bayesreg.io.volumes import load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_tables
 from bayesreg.model.observations.landmarks import LandmarksSection
+from bayesreg.model.observations.surface import SurfaceSection
 from bayesreg.tissues import ORGAN
 from bayesreg.types import InputError
 
 # These draws are independent, so that few are enough.
 QUICK = {"sampler": {"name": "laplace"}, "stop": {"rhat": None, "ess": None, "max_steps": 100}}
+
+
+# The sd of each rigid motion, mm, where points on a surface are all that is observed: how well navigation knows the pose.
+RIGID_SD = 1.0
 
 
 class Understood(NamedTuple):
@@ -48,13 +53,14 @@ def understand(
     overrides: Sequence[str] = (),
     quick: bool = False,
     landmarks: Path | None = None,
+    surface: Path | None = None,
 ) -> Understood:
     """Make the configuration of a pair in files.
 
     Parameters
     ----------
     fixed, moving : path, optional
-        Two images; none where points are all that is observed.
+        Two images; none where points or a surface are all that is observed.
     labels : path, optional
         Tissue labels of the fixed image, or a mask of the organ. Without them, the organ is `intracranial`, or the
         bright part of the fixed image.
@@ -73,6 +79,9 @@ def understand(
         Whether the run ends at draws from Laplace's approximation.
     landmarks : path, optional
         Pairs of points that show the same places.
+    surface : path, optional
+        Points on the moved surface of the organ, without partners. Where nothing else is observed, the rigid motion
+        has a prior of sd `RIGID_SD`, since a part of a surface says little about it.
 
     Raises
     ------
@@ -82,8 +91,8 @@ def understand(
     """
     if (fixed is None) != (moving is None):
         raise InputError(f"{fixed or moving} is one image; give FIXED and MOVING, or no image")
-    if fixed is None and landmarks is None:
-        raise InputError("nothing is observed; give two images or --landmarks")
+    if fixed is None and landmarks is None and surface is None:
+        raise InputError("nothing is observed; give two images, --landmarks or --surface")
     if fixed is None and labels is None:
         raise InputError("without images, --labels says where the organ is: a mask, or labels of its tissues")
     if labels is None and table is not None:
@@ -100,7 +109,10 @@ def understand(
         *pair,
         *(_channel(k, paths) for k, paths in enumerate(channels, 2)),
         *([] if landmarks is None else [{"kind": "landmarks", "file": str(landmarks.absolute())}]),
+        *([] if surface is None else [{"kind": "surface", "file": str(surface.absolute())}]),
     ]
+    if fixed is None and landmarks is None:
+        sections["model"] = {"rigid_sd": RIGID_SD}
     if quick:
         sections |= QUICK
     config = make_config(sections, overrides)
@@ -123,7 +135,7 @@ def _describe(config: Config, how: str) -> Iterator[str]:
         yield f"{'table':<12}{how}: {tissues}"
     yield f"{'mask':<12}{data.intracranial or 'none: nothing bounds the motion'}"
     for section in config.observations:
-        if isinstance(section, LandmarksSection):
+        if isinstance(section, LandmarksSection | SurfaceSection):
             yield f"{section.name:<12}{section.file}"
     for section in config.pairs_of_images:
         if section.fixed is not None:
@@ -137,6 +149,8 @@ def _describe(config: Config, how: str) -> Iterator[str]:
         contrast = {None: "found out", True: "one, on one scale of intensities", False: "unlike"}[data.same_contrast]
         yield f"{'contrast':<12}{contrast}; compared by {config.image_options.similarity.kind}"
     yield f"{'model':<12}preset {config.model.preset}"
+    if config.model.rigid_sd is not None:
+        yield f"{'pose':<12}as the headers say, each rigid motion to {config.model.rigid_sd:g} mm (model.rigid_sd)"
     if config.sampler.name == "laplace":
         yield f"{'sampler':<12}laplace, approximate: independent draws of the Gaussian about the mode"
 

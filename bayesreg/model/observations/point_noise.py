@@ -1,4 +1,7 @@
-"""The error of a point, as a function of z² = Σ_i (q − p − u(p))_i² / sd_i², its squared distance in units of sd."""
+"""The error of a point, as a function of z² = Σ_i (q − p − u(p))_i² / sd_i², its squared distance in units of sd.
+
+A point that was measured with its partner has errors along three dimensions, one on a surface along its normal alone.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +33,11 @@ class NormalNoise(Section):
         """The variance of each coordinate, in units of sd²."""
         return 1.0
 
-    def weight(self, squares: AnyArray) -> AnyArray:
+    def weight(self, squares: AnyArray, dimensions: int = 3) -> AnyArray:
         """Return −2 times the derivative of the log density by z²: one."""
         return jnp.ones_like(squares)
 
-    def bend(self, squares: AnyArray) -> AnyArray:
+    def bend(self, squares: AnyArray, dimensions: int = 3) -> AnyArray:
         """Return −4 times the second derivative of the log density by z²: zero."""
         return jnp.zeros_like(squares)
 
@@ -42,18 +45,24 @@ class NormalNoise(Section):
         """Return the distribution of points about their means (k, 3), with standard deviations (k, 3)."""
         return dist.Normal(mean, sd).to_event(1)
 
+    def distribution_along(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
+        """Return the distribution of numbers about their means, for errors along one dimension."""
+        return dist.Normal(mean, sd)
+
     def draw_weights(self, key: AnyArray, squares: AnyArray) -> AnyArray:
         """Return one for every point, the weight τ that errors of Student's t have to be drawn."""
         return jnp.ones_like(squares)
 
-    def probability_of_wrong(self, squares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"] | None:
+    def probability_of_wrong(
+        self, squares: Float[np.ndarray, "k"], dimensions: int = 3
+    ) -> Float[np.ndarray, "k"] | None:
         """Return None: no point has an error of its own."""
         return None
 
 
 @jax.tree_util.register_static
 class StudentTNoise(Section):
-    """Student's t in three dimensions: a Normal error whose precision τ_k / sd² differs from point to point.
+    """Student's t in d dimensions: a Normal error whose precision τ_k / sd² differs from point to point.
 
     With τ_k ~ Gamma(ν/2, ν/2), integrated out. A point far off has a small weight (Lange, Little and Taylor 1989).
     """
@@ -67,25 +76,29 @@ class StudentTNoise(Section):
         """The variance of each coordinate, in units of sd²."""
         return self.nu / (self.nu - 2)
 
-    def weight(self, squares: AnyArray) -> AnyArray:
-        """Return −2 times the derivative of the log density by z², the mean of τ given z²: (ν + 3) / (ν + z²)."""
-        return (self.nu + 3) / (self.nu + squares)
+    def weight(self, squares: AnyArray, dimensions: int = 3) -> AnyArray:
+        """Return −2 times the derivative of the log density by z², the mean of τ given z²: (ν + d) / (ν + z²)."""
+        return (self.nu + dimensions) / (self.nu + squares)
 
-    def bend(self, squares: AnyArray) -> AnyArray:
+    def bend(self, squares: AnyArray, dimensions: int = 3) -> AnyArray:
         """Return −4 times the second derivative of the log density by z²."""
-        return -2 * (self.nu + 3) / (self.nu + squares) ** 2
+        return -2 * (self.nu + dimensions) / (self.nu + squares) ** 2
 
     def distribution(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
         """Return the distribution of points about their means (k, 3), with scales (k, 3)."""
         return dist.MultivariateStudentT(self.nu, mean, jnp.eye(3) * sd[..., None])
 
+    def distribution_along(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
+        """Return the distribution of numbers about their means, for errors along one dimension."""
+        return dist.StudentT(self.nu, mean, sd)
+
     def draw_weights(self, key: AnyArray, squares: AnyArray) -> AnyArray:
         """Draw τ given z²: it has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""
         return 2 * jax.random.gamma(key, (self.nu + 3) / 2, squares.shape) / (self.nu + squares)
 
-    def probability_of_wrong(self, squares: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k"]:
-        """Return the probability that τ < 1 / WRONG², given z²: τ has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""
-        return stats.gamma((self.nu + 3) / 2, scale=2 / (self.nu + np.asarray(squares))).cdf(1 / WRONG**2)
+    def probability_of_wrong(self, squares: Float[np.ndarray, "k"], dimensions: int = 3) -> Float[np.ndarray, "k"]:
+        """Return the probability that τ < 1 / WRONG², given z²: τ has the distribution Gamma((ν + d)/2, (ν + z²)/2)."""
+        return stats.gamma((self.nu + dimensions) / 2, scale=2 / (self.nu + np.asarray(squares))).cdf(1 / WRONG**2)
 
 
 Noise = Annotated[NormalNoise | StudentTNoise, Field(discriminator="kind"), BeforeValidator(by_kind)]
@@ -117,3 +130,32 @@ class PartlyNormalised(dist.Distribution):
     def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
         """Return the log density less the constant."""
         return self.whole.log_prob(value) - self.constant
+
+
+class Tempered(dist.Distribution):
+    """A distribution whose log density counts by a share, as that of points that depend on one another.
+
+    Replicates are drawn from the whole distribution.
+
+    Parameters
+    ----------
+    whole : Distribution
+    share : scalar
+    """
+
+    def __init__(self, whole: dist.Distribution, share: AnyArray) -> None:
+        self.whole, self.share = whole, share
+        super().__init__(whole.batch_shape, whole.event_shape)
+
+    @property
+    def support(self):  # type: ignore[no-untyped-def]
+        """The support of the whole distribution."""
+        return self.whole.support
+
+    def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> AnyArray:
+        """Draw from the whole distribution."""
+        return self.whole.sample(key, sample_shape)
+
+    def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
+        """Return the share of the log density."""
+        return self.share * self.whole.log_prob(value)

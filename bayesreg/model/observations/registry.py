@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
 from bayesreg.model.observations.images.section import ImagesSection
 from bayesreg.model.observations.landmarks import LandmarksSection
 from bayesreg.model.observations.section import ObservationSection
+from bayesreg.model.observations.surface import SurfaceSection
 
 GROUP = "bayesreg.observations"
 _registered: dict[str, type[ObservationSection]] = {}
@@ -32,7 +33,7 @@ def register(section: type[ObservationSection]) -> type[ObservationSection]:
     return section
 
 
-for _section in (ImagesSection, LandmarksSection):
+for _section in (ImagesSection, LandmarksSection, SurfaceSection):
     register(_section)
 
 
