@@ -191,6 +191,7 @@ def test_a_landmark_that_nothing_else_determines_is_told():
     left_out = leave_out(predict_at_mean(post, post.data.terms["landmarks"], rest), NormalNoise())
     assert np.isnan(left_out.residual).all()
     assert np.isinf(left_out.covariance).all()
+    assert np.isnan(left_out.share).all()
 
 
 # The wider prior allows the sd of the joint mode, next to zero, where the nodes follow every landmark.

@@ -22,6 +22,7 @@ from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.landmarks_report import (
     describe_wrong_pairs,
     distance_figure,
+    doubt_intervals,
     landmark_table,
 )
 from bayesreg.model.observations.left_out import Predictions, leave_out, predict_at_draws, predict_at_mean
@@ -185,8 +186,8 @@ class Landmarks:
         return predict_at_mean(posterior, term, posterior.estimands(state.values))
 
     def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
-        """Name the pairs that are probably wrong, for the terminal and the first page of the report."""
-        return describe_wrong_pairs(self.name, summary)
+        """Name pairs that are probably wrong, and judge intervals, for the terminal and the first page of the report."""
+        return [*describe_wrong_pairs(self.name, summary), *doubt_intervals(self.name, summary)]
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""
