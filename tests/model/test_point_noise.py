@@ -54,6 +54,16 @@ def test_the_density_is_that_of_scipy_up_to_the_known_normaliser(noise, sd):
     np.testing.assert_allclose(term.pointwise_log_likelihood(state_of(U)), whole, rtol=1e-10)
 
 
+def test_every_point_of_a_sample_has_an_error_and_a_weight_of_its_own():
+    """Sizes of errors of two points, with the distribution that they should have, do not depend on one another."""
+    noise, sd = StudentTNoise(nu=4.0), jnp.array([[0.5] * 3, [2.0] * 3])
+    samples = np.asarray(noise.distribution(jnp.ones((2, 3)), sd).sample(jax.random.key(0), (4000,)))
+    squares = (((samples - 1) / np.asarray(sd)) ** 2).sum(axis=-1)
+    for point in squares.T:
+        assert stats.kstest(point / 3, stats.f(3, noise.nu).cdf).pvalue > 1e-3
+    assert stats.spearmanr(*squares.T).pvalue > 1e-3
+
+
 @pytest.mark.parametrize("noise", NOISES, ids=["normal", "student_t"])
 def test_the_two_parts_of_the_curvature_are_its_second_derivative(noise):
     term = placed(BY_AXIS, noise).term

@@ -77,7 +77,8 @@ class StudentTNoise(Section):
 
     def distribution(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
         """Return the distribution of points about their means (k, 3), with scales (k, 3)."""
-        return dist.MultivariateStudentT(self.nu, mean, jnp.eye(3) * sd[..., None])
+        # With one number for ν, NumPyro would draw one weight for all points.
+        return dist.MultivariateStudentT(jnp.full(mean.shape[:-1], self.nu), mean, jnp.eye(3) * sd[..., None])
 
     def draw_weights(self, key: AnyArray, squares: AnyArray) -> AnyArray:
         """Draw τ given z²: it has the distribution Gamma((ν + 3)/2, (ν + z²)/2)."""
