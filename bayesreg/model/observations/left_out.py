@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import softmax
 
 from bayesreg.model.blocks import Values
 from bayesreg.model.coordinates import complete, estimands_of, fill
@@ -42,11 +43,14 @@ class Predictions(NamedTuple):
         That of u(p) given the others, mm².
     sd : (draws, k, 3) array
         That of a landmark's error, mm, before it is drawn from Student's t.
+    weights : (draws, k) array
+        The weight of each draw for each landmark; their sum over draws is one.
     """
 
     residual: Float[np.ndarray, "draws k 3"]
     covariance: Float[np.ndarray, "draws k 3 3"]
     sd: Float[np.ndarray, "draws k 3"]
+    weights: Float[np.ndarray, "draws k"]
 
 
 class LeftOut(NamedTuple):
@@ -78,19 +82,21 @@ def leave_out(predictions: Predictions, noise: Any) -> LeftOut:
     predictions : Predictions
     noise : StudentTNoise or NormalNoise
     """
-    residual = predictions.residual.mean(axis=0)
+    w = predictions.weights
+    residual = np.einsum("sk,ski->ki", w, predictions.residual)
     away = predictions.residual - residual
-    own = noise.variance * (predictions.sd**2).mean(axis=0)[:, :, None] * np.eye(3)
-    covariance = predictions.covariance.mean(axis=0) + np.einsum("ski,skj->kij", away, away) / len(away) + own
+    own = noise.variance * np.einsum("sk,ski->ki", w, predictions.sd**2)[:, :, None] * np.eye(3)
+    covariance = np.einsum("sk,skij->kij", w, predictions.covariance) + np.einsum("sk,ski,skj->kij", w, away, away) + own
     found = np.isfinite(residual).all(axis=1)
     share = np.full(len(residual), np.nan)
     # The share is the same after the axes of each landmark are scaled to the covariance one.
     whitening = np.linalg.inv(np.linalg.cholesky(covariance[found]))
     values, vectors = np.linalg.eigh(predictions.covariance[:, found])
     roots = whitening @ (vectors * np.sqrt(values.clip(0.0))[..., None, :])
-    white = (np.einsum("kij,...kj->k...i", whitening, array[..., found, :]) for array in (residual, away))
-    errors = np.moveaxis(predictions.sd[:, found], 1, 0)
-    share[found] = _shares_nearer(noise, jax.random.key(0), *white, np.moveaxis(roots, 1, 0), whitening, errors)
+    residuals = np.einsum("kij,kj->ki", whitening, residual[found])
+    by_draw = (np.einsum("kij,skj->ski", whitening, away[:, found]), roots, predictions.sd[:, found], w[:, found])
+    landmarks = residuals, whitening, *(np.moveaxis(array, 1, 0) for array in by_draw)
+    share[found] = _shares_nearer(noise, jax.random.key(0), *landmarks)
     return LeftOut(residual, np.where(found[:, None, None], covariance, np.inf), share)
 
 
@@ -99,12 +105,13 @@ def _shares_nearer(noise: Any, key: AnyArray, *landmarks: AnyArray) -> Float[Any
     """Simulate landmarks, and compute the share of them that lies nearer to their mean than the residual of each."""
 
     def share(landmark: tuple[AnyArray, ...]) -> AnyArray:
-        key, residual, away, roots, whitening, sd = landmark
+        key, residual, whitening, away, roots, sd, weights = landmark
         repeats = math.ceil(SIMULATED / len(away))
         key_u, key_error = jax.random.split(key)
         u = jnp.einsum("sij,rsj->rsi", roots, jax.random.normal(key_u, (repeats, *away.shape)))
         error = noise.distribution(jnp.zeros_like(sd), sd).sample(key_error, (repeats,)) @ whitening.T
-        return (((u + error - away) ** 2).sum(axis=-1) < (residual**2).sum()).mean()
+        is_nearer = ((u + error - away) ** 2).sum(axis=-1) < (residual**2).sum()
+        return is_nearer.mean(axis=0) @ weights
 
     return jax.lax.map(share, (jax.random.split(key, len(landmarks[0])), *landmarks))
 
@@ -131,25 +138,27 @@ def predict_at_mean(posterior: Posterior, term: Any, estimands: dict[str, AnyArr
     # The components of a field come first in the rows.
     components = len(curvature) - 3 * len(posterior.sampled)
     H = curvature[components:, components:]
-    predicted, response = (np.asarray(array) for array in _predicted_with_response(data, term, values))
-    A = response.reshape(3 * len(predicted), -1)
+    moved, response = (np.asarray(array) for array in _predicted_with_response(data, term, values))
+    A = response.reshape(3 * len(moved), -1)
     u = state_of(data.body, data.blocks, values).u
     W = np.asarray(term.gauss_newton(u, values).matrices)
-    pull = np.einsum("kij,kj->ki", W, np.asarray(term.shift) - predicted)
+    pull = np.einsum("kij,kj->ki", W, np.asarray(term.shift) - moved)
     information, regularised = (
         W - W @ _spreads(H + trace * np.trace(H) * np.eye(len(H)), A) @ W for trace in (TRACE, MORE * TRACE)
     )
     variances = 1 / np.diagonal(W, axis1=1, axis2=2)
     least, least_regularised = (_least_share(P, variances) for P in (information, regularised))
     information[least_regularised > 2 * least] = 0.0
-    return Predictions(*(array[None] for array in (*_without(pull, information, variances), term.sd(values))))
+    predicted = *_without(pull, information, variances), np.asarray(term.sd(values)), np.ones(len(term.shift))
+    return Predictions(*(array[None] for array in predicted))
 
 
 def predict_at_draws(posterior: Posterior, term: Any, draws: Values) -> Predictions:
     """Predict each landmark at the stiffness, scales and weights of draws, with the displacements integrated out.
 
-    Its posterior has a marginal (`bayesreg.model.marginal`). Scales and weights have seen the landmark. The barrier is
-    left out.
+    The posterior has a marginal (`bayesreg.model.marginal`). Its draws have seen the landmark. A weight, the inverse of
+    the density of the landmark given stiffness, scales, and the others with their weights, makes draws of the posterior
+    without it of them (importance sampling, Gelfand 1992). The barrier is left out.
 
     Parameters
     ----------
@@ -166,7 +175,27 @@ def predict_at_draws(posterior: Posterior, term: Any, draws: Values) -> Predicti
     points = points_of(posterior.data)
     own = np.repeat([other.name == term.name for other in points], [len(other.shift) for other in points])
     variances = given[-1].reshape(pulls.shape)
-    return Predictions(*_without(pulls[:, own], information[:, own], variances[:, own]), sd)
+    predicted = *_without(pulls[:, own], information[:, own], variances[:, own]), sd
+    return Predictions(*predicted, softmax(-_log_densities(*predicted, term.noise), axis=0))
+
+
+def _log_densities(
+    residual: Float[np.ndarray, "draws k 3"],
+    covariance: Float[np.ndarray, "draws k 3 3"],
+    sd: Float[np.ndarray, "draws k 3"],
+    noise: Any,
+) -> Float[np.ndarray, "draws k"]:
+    """Compute the log density of residuals, up to a constant for each landmark."""
+    found = np.isfinite(residual).all(axis=-1, keepdims=True)
+    r, C = np.where(found, residual / sd, 0.0), np.where(found[..., None], covariance, 0.0)
+    values, vectors = np.linalg.eigh(C / (sd[..., :, None] * sd[..., None, :]))
+    squares = np.einsum("...ij,...i->...j", vectors, r) ** 2
+    log_density = np.full(residual.shape[:2], -np.inf)
+    for precision, log_probability in noise.mixture:
+        variances = values.clip(0.0) + 1 / precision
+        log_given = -(np.log(variances) + squares / variances).sum(axis=-1) / 2
+        log_density = np.logaddexp(log_density, log_probability + log_given)
+    return log_density - np.log(sd).sum(axis=-1)
 
 
 @jax.jit

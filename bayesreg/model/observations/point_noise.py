@@ -17,6 +17,8 @@ from bayesreg.types import AnyArray
 
 # A point is wrong if the standard deviation of its own error is more than this multiple of sd.
 WRONG = 3.0
+# The least and the greatest weight of a point that count: errors of 10,000 sd are foreseen.
+EXTREME_WEIGHTS = 1e-8, 1e2
 
 
 @jax.tree_util.register_static
@@ -29,6 +31,11 @@ class NormalNoise(Section):
     def variance(self) -> float:
         """The variance of each coordinate, in units of sd²."""
         return 1.0
+
+    @property
+    def mixture(self) -> list[tuple[float, float]]:
+        """Pairs of a weight τ and the logarithm of its probability, of which the error is a mixture."""
+        return [(1.0, 0.0)]
 
     def weight(self, squares: AnyArray) -> AnyArray:
         """Return −2 times the derivative of the log density by z²: one."""
@@ -66,6 +73,13 @@ class StudentTNoise(Section):
     def variance(self) -> float:
         """The variance of each coordinate, in units of sd²."""
         return self.nu / (self.nu - 2)
+
+    @property
+    def mixture(self) -> list[tuple[float, float]]:
+        """Pairs of a weight τ and the logarithm of its probability, of which the error is nearly a mixture."""
+        log_tau, step = np.linspace(*np.log(EXTREME_WEIGHTS), 101, retstep=True)
+        log_probability = stats.gamma(self.nu / 2, scale=2 / self.nu).logpdf(np.exp(log_tau)) + log_tau + np.log(step)
+        return list(zip(np.exp(log_tau), log_probability, strict=True))
 
     def weight(self, squares: AnyArray) -> AnyArray:
         """Return −2 times the derivative of the log density by z², the mean of τ given z²: (ν + 3) / (ν + z²)."""
