@@ -28,6 +28,7 @@ FIXED = RNG.uniform(2, 18, (9, 3))
 FIXED[0, 0] = -1.0
 MOVING = FIXED * np.array([0.95, 1.0, 1.05]) + RNG.normal(0.5, 0.4, FIXED.shape)
 MOVING[3] += 6.0
+FIXED_STIFFNESS = {"mu": {"organ": 1.0}, "lam": {"organ": 1.0}}
 SCALES = {"body_load": 0.05, "surface_load": 0.2, "landmarks_sd": 0.6}
 
 
@@ -110,6 +111,36 @@ def test_each_left_out_point_is_predicted_by_the_others():
             residual, covariance = np.asarray(term.shift)[k] - rows @ mean, rows @ np.linalg.solve(precision, rows.T)
             np.testing.assert_allclose(predictions.residual[s, k], residual, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(predictions.covariance[s, k], covariance, rtol=1e-5, atol=1e-6)
+
+
+def test_weighted_draws_have_not_seen_the_landmark():
+    """Against quadratures of the density of an unknown sd, of all points and of all points but one."""
+    moving = MOVING.copy()
+    moving[3] -= 6.0
+
+    def posterior_of(points: np.ndarray) -> br.Posterior:
+        loads = br.RandomLoads(body=0.05, surface=0.2)
+        model = br.ModelConfig(preset="registration", elastic_prior=loads, least_volume=0.0, fixed=FIXED_STIFFNESS)
+        landmarks = br.Landmarks(FIXED[points], moving[points], br.ScalePrior(median=1.0), noise=NormalNoise())
+        return br.build_posterior(MESH, [landmarks], model)
+
+    sd, everything = jnp.exp(jnp.linspace(-4.0, 3.0, 1401)), np.arange(len(FIXED))
+    nodes = jnp.zeros((len(sd), *MESH.points.shape))
+
+    def shares_of(own: br.Posterior) -> np.ndarray:
+        """Return the posterior probability of every sd."""
+        marginal, ones = marginal_of(own), jnp.ones(len(own.observations["landmarks"].labels))
+        log = jax.vmap(lambda sd: marginal.log({"landmarks_sd": sd, "u_boundary": nodes[0]}, ones))(sd) + jnp.log(sd)
+        return np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+
+    whole = posterior_of(everything)
+    draws = {"landmarks_sd": sd, "u_boundary": nodes, **{name: np.ones((len(sd), 1)) for name in ("lam", "mu")}}
+    draws |= {name: np.full(len(sd), size) for name, size in (("body_load", 0.05), ("surface_load", 0.2))}
+    predictions = predict_at_draws(whole, whole.data.terms["landmarks"], draws)
+    weighted = shares_of(whole)[:, None] * predictions.weights
+    for k in (0, 4, 8):
+        expected = shares_of(posterior_of(everything[everything != k]))
+        np.testing.assert_allclose(weighted[:, k] / weighted[:, k].sum(), expected, atol=1e-6)
 
 
 def test_weights_of_the_others_stay_when_a_point_is_left_out():
