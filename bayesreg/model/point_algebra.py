@@ -11,8 +11,8 @@ With G = K⁺ Bᵀ and H = B R, the covariance of y at a given rigid motion c, a
 S = Gᵀ (D − D R (Rᵀ D R)⁻¹ Rᵀ D) G + Σ,
 log p(y) = −½ (log det S + log det Hᵀ S⁻¹ H + yᵀ S⁻¹ (y − H b)) + const,  b = (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ y.
 
-With P = S⁻¹ − S⁻¹ H (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ and its 3 × 3 blocks P_kk, the other points alone predict point k with the residual
-P_kk⁻¹ (P y)_k, whose covariance is P_kk⁻¹.
+With P = S⁻¹ − S⁻¹ H (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ and its 3 × 3 blocks P_kk, the other points alone predict point k with the
+residual P_kk⁻¹ (P y)_k, whose covariance is P_kk⁻¹.
 
 S has three rows for each point and none for the nodes, and only λ changes Gᵀ M G and Gᵀ A G. At a known μ,
 K = μ K_μ + λ K_λ. The generalised eigenvectors of (K_λ, μ K_μ), with values 0 ≤ ω ≤ 3 / (2 μ), since

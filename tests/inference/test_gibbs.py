@@ -103,7 +103,7 @@ def test_each_left_out_point_is_predicted_by_the_others():
     own = posterior(NormalNoise())
     term, every = own.data.terms["landmarks"], [estimands(), estimands(body_load=1.0, landmarks_sd=0.1, lam=[40.0])]
     draws = {name: np.stack([given[name] for given in every]) for name in every[0]} | {"mu": np.ones((2, 1))}
-    predictions = predict_at_draws(own, term, draws)
+    predictions = predict_at_draws(marginal_of(own), term, draws)
     for s, given in enumerate(every):
         np.testing.assert_allclose(predictions.sd[s], term.sd(given))
         for k, rows in enumerate(interpolation_of(own)):
@@ -136,7 +136,7 @@ def test_weighted_draws_have_not_seen_the_landmark():
     whole = posterior_of(everything)
     draws = {"landmarks_sd": sd, "u_boundary": nodes, **{name: np.ones((len(sd), 1)) for name in ("lam", "mu")}}
     draws |= {name: np.full(len(sd), size) for name, size in (("body_load", 0.05), ("surface_load", 0.2))}
-    predictions = predict_at_draws(whole, whole.data.terms["landmarks"], draws)
+    predictions = predict_at_draws(marginal_of(whole), whole.data.terms["landmarks"], draws)
     weighted = shares_of(whole)[:, None] * predictions.weights
     for k in (0, 4, 8):
         expected = shares_of(posterior_of(everything[everything != k]))

@@ -20,8 +20,12 @@ def test_the_share_that_lies_nearer_is_uniform_where_the_prediction_is_right(noi
     if noise == StudentTNoise():
         error /= np.sqrt(rng.gamma(noise.nu / 2, 2 / noise.nu, size=(count, 1)))
     of_each = which, np.arange(count)
-    landmark = means[which, 0] + np.einsum("kij,kj->ki", roots[of_each], rng.normal(size=(count, 3))) + sd[of_each] * error
+    landmark = (
+        means[which, 0] + np.einsum("kij,kj->ki", roots[of_each], rng.normal(size=(count, 3))) + sd[of_each] * error
+    )
     left_out = leave_out(Predictions(landmark - means, roots @ roots.mT, sd, np.full((3, count), 1 / 3)), noise)
     assert stats.kstest(left_out.share, "uniform").pvalue > 1e-3
-    mean_square = np.einsum("ki,kij,kj->k", left_out.residual, np.linalg.inv(left_out.covariance), left_out.residual).mean()
+    mean_square = np.einsum(
+        "ki,kij,kj->k", left_out.residual, np.linalg.inv(left_out.covariance), left_out.residual
+    ).mean()
     assert mean_square == pytest.approx(3.0, rel=0.25)

@@ -38,7 +38,9 @@ def test_region_probability_is_uniform_where_the_covariance_is_right():
 def test_what_was_left_out_is_counted():
     table = landmark_table("landmarks", summary(np.diag([0.1, 1.8, 9.0]), np.array([0.003, 0.93, 1.0])))
     assert "mean is 3.63 mm" in table.caption
-    expected = "Of 3 landmarks, each predicted from the others, 1 lie in their 50 %, 1 lie in their 90 %, 2 lie in their 95 % "
+    expected = (
+        "Of 3 landmarks, each predicted from the others, 1 lie in their 50 %, 1 lie in their 90 %, 2 lie in their 95 % "
+    )
     assert expected in table.caption
     assert "Chance allows such numbers" in table.caption
     assert [row[0] for row in table.rows] == ["0", "1", "2"]
@@ -48,7 +50,10 @@ def test_what_was_left_out_is_counted():
     ("power", "sentence"),
     [
         (1.0, None),
-        (0.3, "So few in regions of 50 % and 90 % and 95 % are beyond chance (99 % of it): the intervals are too sure."),
+        (
+            0.3,
+            "So few in regions of 50 % and 90 % and 95 % are beyond chance (99 % of it): the intervals are too sure.",
+        ),
         (3.0, "So many in regions of 50 % are beyond chance (99 % of it): the intervals are too careful."),
     ],
 )

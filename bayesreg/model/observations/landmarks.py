@@ -45,8 +45,6 @@ FEWEST = 4
 # The greatest number of unknowns for which the memory suffices to leave landmarks out in turn, and of these unknowns
 # times the coordinates of the landmarks.
 MOST_UNKNOWNS, MOST_ENTRIES = 12_000, 20_000_000
-# The greatest number of draws at whose scales landmarks are left out.
-LEFT_OUT_DRAWS = 200
 
 _log = logging.getLogger(__name__)
 
@@ -176,17 +174,16 @@ class Landmarks:
         return summary | {f"left_out_{name}": array for name, array in left_out.items()}
 
     def _predictions(self, posterior: Any, term: ComparedPoints, state: State, draws: Values) -> Predictions | None:
-        """Predict each landmark by all other observations; None where no node is sampled, or the memory is too small."""
-        if posterior.target.prepare_marginal is not None:
-            stride = -(-len(draws["u_boundary"]) // LEFT_OUT_DRAWS)
-            return predict_at_draws(posterior, term, {name: values[::stride] for name, values in draws.items()})
+        """Predict each landmark by all other observations; None if no node is sampled, or the memory is too small."""
+        if (prepare_marginal := posterior.target.prepare_marginal) is not None:
+            return predict_at_draws(prepare_marginal(), term, draws)
         unknowns = 3 * len(posterior.sampled)
         if not unknowns or unknowns > MOST_UNKNOWNS or 3 * len(self.labels) * unknowns > MOST_ENTRIES:
             return None
         return predict_at_mean(posterior, term, posterior.estimands(state.values))
 
     def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
-        """Name pairs that are probably wrong, and judge intervals, for the terminal and the first page of the report."""
+        """Name pairs that are probably wrong, and judge the intervals, for the terminal and the report's first page."""
         return [*describe_wrong_pairs(self.name, summary), *doubt_intervals(self.name, summary)]
 
     def recorded(self, term: ComparedPoints) -> Recorded:

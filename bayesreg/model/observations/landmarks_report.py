@@ -81,12 +81,14 @@ def _caption(summary: Arrays) -> str:
 def _describe_coverage(summary: Arrays) -> str:
     """Say how many landmarks lie in their regions."""
     held, count = _count_held(summary)
-    shares = [f"{number} lie in their {level:.0%}".replace("%", " %") for number, level in zip(held, LEVELS, strict=True)]
+    shares = [
+        f"{number} lie in their {level:.0%}".replace("%", " %") for number, level in zip(held, LEVELS, strict=True)
+    ]
     return f"Of {count} landmarks, each predicted from the others, {', '.join(shares)} regions."
 
 
 def _describe_intervals(summary: Arrays) -> list[str]:
-    """Say that intervals are too sure or too careful; nothing where chance allows the numbers of `_describe_coverage`."""
+    """Say that intervals are too sure or too careful; nothing where chance allows these numbers of landmarks."""
     held, count = _count_held(summary)
     fewest, most = stats.binom(count, LEVELS).interval(CHANCE)
     return [

@@ -86,7 +86,9 @@ def leave_out(predictions: Predictions, noise: Any) -> LeftOut:
     residual = np.einsum("sk,ski->ki", w, predictions.residual)
     away = predictions.residual - residual
     own = noise.variance * np.einsum("sk,ski->ki", w, predictions.sd**2)[:, :, None] * np.eye(3)
-    covariance = np.einsum("sk,skij->kij", w, predictions.covariance) + np.einsum("sk,ski,skj->kij", w, away, away) + own
+    covariance = (
+        np.einsum("sk,skij->kij", w, predictions.covariance) + np.einsum("sk,ski,skj->kij", w, away, away) + own
+    )
     found = np.isfinite(residual).all(axis=1)
     share = np.full(len(residual), np.nan)
     # The share is the same after the axes of each landmark are scaled to the covariance one.
@@ -153,26 +155,25 @@ def predict_at_mean(posterior: Posterior, term: Any, estimands: dict[str, AnyArr
     return Predictions(*(array[None] for array in predicted))
 
 
-def predict_at_draws(posterior: Posterior, term: Any, draws: Values) -> Predictions:
+def predict_at_draws(marginal: Marginal, term: Any, draws: Values) -> Predictions:
     """Predict each landmark at the stiffness, scales and weights of draws, with the displacements integrated out.
 
-    The posterior has a marginal (`bayesreg.model.marginal`). Its draws have seen the landmark. A weight, the inverse of
-    the density of the landmark given stiffness, scales, and the others with their weights, makes draws of the posterior
-    without it of them (importance sampling, Gelfand 1992). The barrier is left out.
+    The draws have seen the landmark. A weight, the inverse of the density of the landmark given stiffness, scales, and
+    the others with their weights, makes draws of the posterior without it of them (importance sampling, Gelfand 1992).
+    The barrier is left out.
 
     Parameters
     ----------
-    posterior : Posterior
+    marginal : Marginal
     term : ComparedPoints
         The posterior's term of the landmarks.
     draws : dict
         Values of blocks, whose leading axis is that of the draws.
     """
-    marginal = posterior.target.prepare_marginal()
     keys = jax.random.split(jax.random.key(0), len(draws["u_boundary"]))
     *given, sd = map(np.asarray, _given_at_draws(marginal, term, keys, dict(draws)))
     pulls, information = algebra_of(marginal.number).leave_out(*given)
-    points = points_of(posterior.data)
+    points = points_of(marginal.problem)
     own = np.repeat([other.name == term.name for other in points], [len(other.shift) for other in points])
     variances = given[-1].reshape(pulls.shape)
     predicted = *_without(pulls[:, own], information[:, own], variances[:, own]), sd
@@ -202,7 +203,7 @@ def _log_densities(
 def _given_at_draws(
     marginal: Marginal, term: Any, keys: AnyArray, draws: dict[str, AnyArray]
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """Draw the weights; return λ, the squared sizes of the loads, the variances of all errors, and the sd of the term."""
+    """Draw the weights of the points; return what `PointAlgebra.leave_out` takes, and the sd of the term."""
     blocks = marginal.problem.blocks
 
     def of_draw(key: AnyArray, draw: dict[str, AnyArray]) -> tuple[AnyArray, ...]:

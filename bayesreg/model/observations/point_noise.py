@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import jax
@@ -18,7 +19,7 @@ from bayesreg.types import AnyArray
 # A point is wrong if the standard deviation of its own error is more than this multiple of sd.
 WRONG = 3.0
 # The least and the greatest weight of a point that count: errors of 10,000 sd are foreseen.
-EXTREME_WEIGHTS = 1e-8, 1e2
+LEAST_WEIGHT, GREATEST_WEIGHT = 1e-8, 1e2
 
 
 @jax.tree_util.register_static
@@ -77,7 +78,7 @@ class StudentTNoise(Section):
     @property
     def mixture(self) -> list[tuple[float, float]]:
         """Pairs of a weight τ and the logarithm of its probability, of which the error is nearly a mixture."""
-        log_tau, step = np.linspace(*np.log(EXTREME_WEIGHTS), 101, retstep=True)
+        log_tau, step = np.linspace(math.log(LEAST_WEIGHT), math.log(GREATEST_WEIGHT), 101, retstep=True)
         log_probability = stats.gamma(self.nu / 2, scale=2 / self.nu).logpdf(np.exp(log_tau)) + log_tau + np.log(step)
         return list(zip(np.exp(log_tau), log_probability, strict=True))
 
