@@ -6,7 +6,7 @@ DATA is a folder with `dirlab/case*.csv` (DIR-Lab 4DCT, 300 pairs a patient; Cas
 (beads in a hydrogel, µm; Yang et al. 2022), and, in it or beside it, `resect/Case*.tag` (RESECT, some 15 pairs of the
 MRI and the ultrasound of a brain before the resection of a tumour; Xiao et al. 2017). A SET is the name of a file such
 as case1, beads, or resect1 for Case1 of RESECT; the default is all. DIR-Lab: 100 pairs at random are data and 200 are
-held out, three times. Gel: 400 are data and 5,000 held out. RESECT: each pair is predicted by the others of its patient.
+held out, three times. Gel: 400 are data and 5,000 held out. RESECT: each pair is predicted by the others.
 
 bayesreg gets the points and a mask, the convex hull of all points of the set with a margin, and no other option. The
 table shows for each method the mean, median and 95 % error at the held-out points, the share of them in the predicted

@@ -50,11 +50,8 @@ def test_what_was_left_out_is_counted():
     ("power", "sentence"),
     [
         (1.0, None),
-        (
-            0.3,
-            "So few in regions of 50 % and 90 % and 95 % are beyond chance (99 % of it): the intervals are too sure.",
-        ),
-        (3.0, "So many in regions of 50 % are beyond chance (99 % of it): the intervals are too careful."),
+        (0.3, "so few would lie in their regions of 50 % and 90 % and 95 % less than once in a hundred times: the "),
+        (3.0, "so many would lie in their regions of 50 % less than once in a hundred times: the intervals are too c"),
     ],
 )
 def test_intervals_are_judged_by_what_chance_allows(power, sentence):

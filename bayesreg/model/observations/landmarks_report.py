@@ -14,7 +14,7 @@ from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTabl
 from bayesreg.types import AnyArray
 
 LEVELS = (0.5, 0.9, 0.95)
-# The probability of the numbers of landmarks in their regions that chance allows.
+# The probability of all the numbers of landmarks in their regions that chance allows.
 CHANCE = 0.99
 # The greatest number of landmarks that the figure shows, and of pairs that a sentence names.
 MOST_SHOWN, MOST_NAMED = 60, 8
@@ -92,8 +92,9 @@ def _describe_intervals(summary: Arrays) -> list[str]:
     held, count = _count_held(summary)
     fewest, most = stats.binom(count, LEVELS).interval(CHANCE)
     return [
-        f"So {word} in regions of {' and '.join(f'{100 * level:.0f} %' for level in np.array(LEVELS)[found])} are "
-        f"beyond chance ({100 * CHANCE:.0f} % of it): the intervals are too {judged}."
+        f"By chance alone, so {word} would lie in their regions of "
+        f"{' and '.join(f'{100 * level:.0f} %' for level in np.array(LEVELS)[found])} less than once in a hundred "
+        f"times: the intervals are too {judged}."
         for found, word, judged in ((held < fewest, "few", "sure"), (held > most, "many", "careful"))
         if found.any()
     ]
