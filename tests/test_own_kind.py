@@ -32,7 +32,7 @@ class MeanDisplacement:
     def log(self, state: Any) -> Any:
         return -0.5 * (self.standardised_residual(state) ** 2).sum()
 
-    def summarise(self, posterior: Any, state: Any) -> dict[str, np.ndarray]:
+    def summarise(self, posterior: Any, state: Any, draws: Any) -> dict[str, np.ndarray]:
         return {"found": np.asarray(state.at(self.points).mean(axis=0))}
 
 

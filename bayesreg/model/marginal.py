@@ -64,7 +64,7 @@ class Marginal(NamedTuple):
         """Compute log p(y, θ | τ) up to a constant; the displacements of the estimands have no effect."""
         values = complete(self.problem.blocks, estimands)
         prior = evaluation.evaluate(self.problem._replace(terms={}), values).logdensity
-        log = prior + point_algebra.log_density(self.number, *self._given(values, weights))
+        log = prior + point_algebra.log_density(self.number, *self.given(values, weights))
         return jnp.where(jnp.isnan(log), -jnp.inf, log)
 
     def draw_displacements(
@@ -72,7 +72,7 @@ class Marginal(NamedTuple):
     ) -> Float[AnyArray, "nodes 3"]:
         """Draw u given θ and τ, mm."""
         values = complete(self.problem.blocks, estimands)
-        lam, sizes, noise = self._given(values, weights)
+        lam, sizes, noise = self.given(values, weights)
         key_load, key_error = jax.random.split(key)
         white = jax.random.normal(key_load, (values["u_boundary"].size,))
         errors = jax.random.normal(key_error, noise.shape)
@@ -85,8 +85,8 @@ class Marginal(NamedTuple):
         others = (term for term in self.problem.terms.values() if not isinstance(term, LoadsTerm | ComparedPoints))
         return sum((term.log(state) for term in others), jnp.zeros(()))
 
-    def _given(self, values: Values, weights: AnyArray) -> tuple[Scalar, AnyArray, AnyArray]:
-        """Return λ, the squared sizes of the loads, and the variances of the errors."""
+    def given(self, values: Values, weights: AnyArray) -> tuple[Scalar, AnyArray, AnyArray]:
+        """Return λ, the squared sizes of the loads, and the variances of the errors of all coordinates."""
         sd = jnp.concatenate([term.sd(values) for term in points_of(self.problem)])
         sizes = jnp.stack([values["body_load"] ** 2, values["surface_load"] ** 2])
         return values["lam"][0], sizes, (sd**2 / weights[:, None]).reshape(-1)

@@ -11,6 +11,9 @@ With G = K⁺ Bᵀ and H = B R, the covariance of y at a given rigid motion c, a
 S = Gᵀ (D − D R (Rᵀ D R)⁻¹ Rᵀ D) G + Σ,
 log p(y) = −½ (log det S + log det Hᵀ S⁻¹ H + yᵀ S⁻¹ (y − H b)) + const,  b = (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ y.
 
+With P = S⁻¹ − S⁻¹ H (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ and its 3 × 3 blocks P_kk, the other points alone predict point k with the
+residual P_kk⁻¹ (P y)_k, whose covariance is P_kk⁻¹.
+
 S has three rows for each point and none for the nodes, and only λ changes Gᵀ M G and Gᵀ A G. At a known μ,
 K = μ K_μ + λ K_λ. The generalised eigenvectors of (K_λ, μ K_μ), with values 0 ≤ ω ≤ 3 / (2 μ), since
 (tr ε)² ≤ 3 ε : ε, diagonalise K for all λ at once; its inverse has the factors 1 / (1 + λ ω). They are analytic
@@ -38,17 +41,19 @@ import numpy as np
 import scipy.fft
 import scipy.linalg
 from jaxtyping import Float
-from scipy.linalg.lapack import dpotrf, dpotrs
 from threadpoolctl import ThreadpoolController
 
 from bayesreg.fem.elasticity import stiffness
 from bayesreg.fem.elements import Elements
 from bayesreg.mesh import TetMesh
 from bayesreg.model.elastic.loads import LoadsTerm
+from bayesreg.model.point_gaussian import GivenShifts
 from bayesreg.types import AnyArray, Scalar
 
 # The relative error of the interpolation in λ; the elastic solves of other posteriors have a similar one.
 PRECISION = 1e-8
+# The number of draws whose matrices are in memory together.
+BLOCK = 8
 
 
 class Spectrum(NamedTuple):
@@ -133,7 +138,7 @@ class PointAlgebra:
         factors = np.stack([self._factors(value) for value in lam.ravel()])
         variances = sizes.reshape(-1, 2) @ self._masses
         with _one_thread_each() as side_by_side:
-            conditionals = list(side_by_side(_Given.factorised, self._given(lam, sizes, noise)))
+            conditionals = list(side_by_side(GivenShifts.factorised, self._given(lam, sizes, noise)))
 
             def balanced(load: np.ndarray) -> np.ndarray:
                 """Return loads (chains as rows), less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
@@ -152,10 +157,28 @@ class PointAlgebra:
             u = modes @ self._vectors.T + motions @ self._rigid.T
         return u.reshape(white.shape)
 
+    def leave_out(
+        self, lam: np.ndarray, sizes: np.ndarray, noise: np.ndarray
+    ) -> tuple[Float[np.ndarray, "draws k 3"], Float[np.ndarray, "draws k 3 3"]]:
+        """Compute (P y)_k and P_kk of every point k, for draws, which are the leading axis of all arguments."""
+
+        def leave_out(given: GivenShifts) -> tuple[np.ndarray, np.ndarray]:
+            return given.factorised().leave_out(self._shift)
+
+        blocks = (slice(first, first + BLOCK) for first in range(0, len(lam), BLOCK))
+        with _one_thread_each() as side_by_side:
+            parts = [
+                part
+                for block in blocks
+                for part in side_by_side(leave_out, self._given(lam[block], sizes[block], noise[block]))
+            ]
+        pulls, information = zip(*parts, strict=True)
+        return np.stack(pulls), np.stack(information)
+
     def _factors(self, lam: float) -> Float[np.ndarray, "modes"]:
         return 1 / (1 + lam * self.spectrum.ratios)
 
-    def _given(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray) -> list[_Given]:
+    def _given(self, lam: AnyArray, sizes: AnyArray, noise: AnyArray) -> list[GivenShifts]:
         """Return the Gaussian of y of every chain, not factorised."""
         low, high = self._bounds
         x, sizes = np.log1p(self._steepness * np.ravel(lam)), np.reshape(sizes, (-1, 2))
@@ -165,80 +188,7 @@ class PointAlgebra:
         squares, pushes = (np.tensordot(weights, array, axes=2) for array in (self._squares, self._pushes))
         balances = np.linalg.inv(np.tensordot(sizes, self._balances, axes=1))
         chains = zip(squares, pushes, balances, np.reshape(noise, (len(x), -1)), strict=True)
-        return [_Given(self._rigid_at_points, self._triangle, *arrays) for arrays in chains]
-
-
-class _Given(NamedTuple):
-    """The Gaussian of y at given λ, sizes and errors.
-
-    Attributes
-    ----------
-    rigid : (m, 6) array
-        H.
-    triangle : two (t,) int arrays
-        The rows and columns of the upper triangle of an (m, m) array.
-    square : (t,) array
-        Gᵀ D G there.
-    push : (6, m) array
-        Rᵀ D G.
-    balance : (6, 6) array
-        (Rᵀ D R)⁻¹.
-    noise : (m,) array
-        The diagonal of Σ, mm².
-    """
-
-    rigid: Float[np.ndarray, "coordinates 6"]
-    triangle: tuple[np.ndarray, np.ndarray]
-    square: Float[np.ndarray, "entries"]
-    push: Float[np.ndarray, "6 coordinates"]
-    balance: Float[np.ndarray, "6 6"]
-    noise: Float[np.ndarray, "coordinates"]
-
-    def factorised(self) -> _Factorised:
-        """Compute S, factorise it, and solve with it for H."""
-        covariance = np.zeros((len(self.noise),) * 2)
-        covariance[self.triangle] = self.square
-        covariance -= self.push.T @ (self.balance @ self.push)
-        covariance[np.diag_indices(len(covariance))] += self.noise
-        lower, failure = dpotrf(covariance.T, lower=1, overwrite_a=1)
-        if failure:
-            lower = np.full_like(lower, np.nan)
-        whitened = dpotrs(lower, self.rigid, lower=1)[0]
-        return _Factorised(lower, whitened, self.rigid.T @ whitened, self.balance)
-
-    def log_density(self, shift: Float[np.ndarray, "coordinates"]) -> float:
-        """Compute log p(y) for shifts y, mm, up to a constant."""
-        factorised = self.factorised()
-        # NaN where S is not positive definite.
-        with np.errstate(invalid="ignore"):
-            log_dets = np.log(np.diag(factorised.lower)).sum() + np.linalg.slogdet(factorised.information)[1] / 2
-        return float(-log_dets - shift @ factorised.solve(shift)[0] / 2)
-
-
-class _Factorised(NamedTuple):
-    """The factors of S and of the information about the rigid motion.
-
-    Attributes
-    ----------
-    lower : (m, m) array
-        The Cholesky factor of S; NaN if S is not positive definite.
-    whitened : (m, 6) array
-        S⁻¹ H.
-    information : (6, 6) array
-        Hᵀ S⁻¹ H.
-    balance : (6, 6) array
-        (Rᵀ D R)⁻¹.
-    """
-
-    lower: Float[np.ndarray, "coordinates coordinates"]
-    whitened: Float[np.ndarray, "coordinates 6"]
-    information: Float[np.ndarray, "6 6"]
-    balance: Float[np.ndarray, "6 6"]
-
-    def solve(self, shift: Float[np.ndarray, "coordinates"]) -> tuple[Float[np.ndarray, "coordinates"], np.ndarray]:
-        """Return S⁻¹ (y − H b) and b for shifts y, mm."""
-        rigid = np.linalg.solve(self.information, self.whitened.T @ shift)
-        return dpotrs(self.lower, shift, lower=1)[0] - self.whitened @ rigid, rigid
+        return [GivenShifts(self._rigid_at_points, self._triangle, *arrays) for arrays in chains]
 
 
 # The algebras that something else holds.
@@ -283,14 +233,19 @@ def draw(
     return jax.pure_callback(_draw_all, result, *arguments, vmap_method="broadcast_all")
 
 
+def algebra_of(number: AnyArray) -> PointAlgebra:
+    """Return the algebra of this number; all entries of an array are the same."""
+    return _by_number[int(np.ravel(number)[0])]
+
+
 def _log_densities(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains"]:
     lam, sizes, noise = map(np.asarray, given)
-    return _by_number[int(np.ravel(number)[0])].log_densities(lam, sizes, noise)
+    return algebra_of(number).log_densities(lam, sizes, noise)
 
 
 def _draw_all(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains unknowns"]:
     lam, sizes, noise, white, errors = map(np.asarray, given)
-    return _by_number[int(np.ravel(number)[0])].draw_all(lam, sizes, noise, white, errors)
+    return algebra_of(number).draw_all(lam, sizes, noise, white, errors)
 
 
 @contextmanager

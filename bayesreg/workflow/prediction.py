@@ -120,21 +120,24 @@ def predict(
         motion=np.concatenate(compose(pose, centre, kept_arrays.pop("motion")), axis=-1),
         centre=centre,
         total_sd=None if pose.is_identity else summary.sd["turned"],
-        observations=kept_arrays | _summaries(posterior, mean),
+        observations=kept_arrays | _summaries(posterior, mean, thinned),
         **(_stiffness(summary) if posterior.data.body.field is not None else {}),
     )
 
 
-def _summaries(posterior: Posterior, mean: Mapping[str, AnyArray]) -> dict[str, np.ndarray]:
+def _summaries(
+    posterior: Posterior, mean: Mapping[str, AnyArray], thinned: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
     """Collect the arrays that the observations compute for the report, by "<observation>/<array>"."""
     state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(mean))
+    draws = {name: values.reshape(-1, *values.shape[2:]) for name, values in thinned.items() if name != "number"}
     summarised = {
         name: observation for name, observation in posterior.observations.items() if isinstance(observation, Summarised)
     }
     return {
         f"{name}/{key}": value
         for name, observation in summarised.items()
-        for key, value in observation.summarise(posterior, state).items()
+        for key, value in observation.summarise(posterior, state, draws).items()
     }
 
 

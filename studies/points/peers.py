@@ -6,6 +6,7 @@ variance by axis; the variance is None for a method that states none.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,9 @@ class Predicted(NamedTuple):
 
     mean: Float[np.ndarray, "k 3"]
     variance: Float[np.ndarray, "k 3"] | None = None
+
+
+Method = Callable[[Points, Points, Points], Predicted]
 
 
 def rigid(fixed: Points, shift: Points, places: Points) -> Predicted:

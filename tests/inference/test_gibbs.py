@@ -14,7 +14,9 @@ import bayesreg as br
 from bayesreg.fem.elasticity import stiffness
 from bayesreg.inference.samplers.registry import choose_sampler
 from bayesreg.model.marginal import Marginal
+from bayesreg.model.observations.left_out import predict_at_draws
 from bayesreg.model.observations.point_noise import NormalNoise, StudentTNoise
+from bayesreg.model.point_algebra import algebra_of
 from bayesreg.model.state import state_of
 from tests.phantoms import box_mesh
 
@@ -26,6 +28,7 @@ FIXED = RNG.uniform(2, 18, (9, 3))
 FIXED[0, 0] = -1.0
 MOVING = FIXED * np.array([0.95, 1.0, 1.05]) + RNG.normal(0.5, 0.4, FIXED.shape)
 MOVING[3] += 6.0
+FIXED_STIFFNESS = {"mu": {"organ": 1.0}, "lam": {"organ": 1.0}}
 SCALES = {"body_load": 0.05, "surface_load": 0.2, "landmarks_sd": 0.6}
 
 
@@ -89,6 +92,70 @@ def test_displacements_are_drawn_from_their_conditional():
     assert np.abs(covariance - np.diag(np.diag(covariance))).max() < 6 / np.sqrt(4000)
 
 
+def interpolation_of(own: br.Posterior) -> np.ndarray:
+    """Return the rows of every point, (k, 3, unknowns)."""
+    unit = jnp.eye(MESH.points.size).reshape(-1, 3, MESH.points.size)
+    return np.asarray(own.data.terms["landmarks"].interpolate(unit))
+
+
+def test_each_left_out_point_is_predicted_by_the_others():
+    """From matrices in the nodes, in which the point has no weight."""
+    own = posterior(NormalNoise())
+    term, every = own.data.terms["landmarks"], [estimands(), estimands(body_load=1.0, landmarks_sd=0.1, lam=[40.0])]
+    draws = {name: np.stack([given[name] for given in every]) for name in every[0]} | {"mu": np.ones((2, 1))}
+    predictions = predict_at_draws(marginal_of(own), term, draws)
+    for s, given in enumerate(every):
+        np.testing.assert_allclose(predictions.sd[s], term.sd(given))
+        for k, rows in enumerate(interpolation_of(own)):
+            precision, mean = dense_conditional(own, given, (np.arange(len(FIXED)) != k).astype(float))
+            residual, covariance = np.asarray(term.shift)[k] - rows @ mean, rows @ np.linalg.solve(precision, rows.T)
+            np.testing.assert_allclose(predictions.residual[s, k], residual, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(predictions.covariance[s, k], covariance, rtol=1e-5, atol=1e-6)
+
+
+def test_weighted_draws_have_not_seen_the_landmark():
+    """Against quadratures of the density of an unknown sd, of all points and of all points but one."""
+    moving = MOVING.copy()
+    moving[3] -= 6.0
+
+    def posterior_of(points: np.ndarray) -> br.Posterior:
+        loads = br.RandomLoads(body=0.05, surface=0.2)
+        model = br.ModelConfig(preset="registration", elastic_prior=loads, least_volume=0.0, fixed=FIXED_STIFFNESS)
+        landmarks = br.Landmarks(FIXED[points], moving[points], br.ScalePrior(median=1.0), noise=NormalNoise())
+        return br.build_posterior(MESH, [landmarks], model)
+
+    sd, everything = jnp.exp(jnp.linspace(-4.0, 3.0, 1401)), np.arange(len(FIXED))
+    nodes = jnp.zeros((len(sd), *MESH.points.shape))
+
+    def shares_of(own: br.Posterior) -> np.ndarray:
+        """Return the posterior probability of every sd."""
+        marginal, ones = marginal_of(own), jnp.ones(len(own.observations["landmarks"].labels))
+        log = jax.vmap(lambda sd: marginal.log({"landmarks_sd": sd, "u_boundary": nodes[0]}, ones))(sd) + jnp.log(sd)
+        return np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+
+    whole = posterior_of(everything)
+    draws = {"landmarks_sd": sd, "u_boundary": nodes, **{name: np.ones((len(sd), 1)) for name in ("lam", "mu")}}
+    draws |= {name: np.full(len(sd), size) for name, size in (("body_load", 0.05), ("surface_load", 0.2))}
+    predictions = predict_at_draws(marginal_of(whole), whole.data.terms["landmarks"], draws)
+    weighted = shares_of(whole)[:, None] * predictions.weights
+    for k in (0, 4, 8):
+        expected = shares_of(posterior_of(everything[everything != k]))
+        np.testing.assert_allclose(weighted[:, k] / weighted[:, k].sum(), expected, atol=1e-6)
+
+
+def test_weights_of_the_others_stay_when_a_point_is_left_out():
+    own, weights = posterior(), np.linspace(0.1, 2.0, len(FIXED))
+    marginal, shift = marginal_of(own), np.asarray(own.data.terms["landmarks"].shift)
+    given = (np.asarray(array)[None] for array in marginal.given({**estimands(), "mu": np.ones(1)}, weights))
+    (pulls,), (information,) = algebra_of(marginal.number).leave_out(*given)
+    for k, rows in enumerate(interpolation_of(own)):
+        precision, mean = dense_conditional(own, estimands(), np.where(np.arange(len(FIXED)) == k, 0.0, weights))
+        variance = np.diag(np.asarray(own.data.terms["landmarks"].sd(estimands()))[k] ** 2 / weights[k])
+        np.testing.assert_allclose(np.linalg.solve(information[k], pulls[k]), shift[k] - rows @ mean, atol=1e-5)
+        expected = rows @ np.linalg.solve(precision, rows.T) + variance
+        np.testing.assert_allclose(np.linalg.inv(information[k]), expected, rtol=1e-5, atol=1e-6)
+
+
 def test_lam_has_the_posterior_of_a_quadrature():
     own, ones = posterior(NormalNoise(), sd=0.5, known_loads=True), jnp.ones(len(FIXED))
     marginal, u = marginal_of(own), estimands()["u_boundary"]
@@ -148,7 +215,8 @@ def test_an_outlier_of_40_mm_is_named_and_moves_nothing_else():
         mean = {name: draws[name].mean(("chain", "draw")).values for name in own.reference()}
         observation = own.observations["landmarks"]
         state = state_of(own.data.body, own.data.blocks, own.fill(mean))
-        means.append((state.u, observation.doubts(observation.summarise(own, state))))
+        every = {name: draws[name].values.reshape(-1, *draws[name].shape[2:]) for name in own.reference()}
+        means.append((state.u, observation.doubts(observation.summarise(own, state, every))))
     (without, no_doubt), (with_outlier, doubts) = means
     assert no_doubt == []
     assert len(doubts) == 1

@@ -17,7 +17,7 @@ from bayesreg.model.adequacy import describe_observations
 from bayesreg.model.build import require_observations
 from bayesreg.model.curvature import _assemble, displacement_curvature
 from bayesreg.model.external_curvature import FixedState, _curvature_of_term
-from bayesreg.model.observations.left_out import leave_out
+from bayesreg.model.observations.left_out import leave_out, predict_at_mean
 from bayesreg.model.observations.point_noise import NormalNoise
 from bayesreg.model.state import State
 from bayesreg.model.term import ExternalTerm, PointCurvature, SharedCurvature
@@ -172,7 +172,7 @@ def test_samplers_meet_mean_and_covariance(sampler, with_region):
 def test_left_out_landmarks_are_predicted_as_by_a_posterior_without_them():
     post = posterior(True)
     mean = jnp.asarray(exact(True)[0].reshape(-1, 3))
-    left_out = leave_out(post, post.data.terms["landmarks"], {"u_boundary": mean})
+    left_out = leave_out(predict_at_mean(post, post.data.terms["landmarks"], {"u_boundary": mean}), NormalNoise())
     points, moved, sd = places()
     for k in range(len(points)):
         rows = np.kron(barycentric(points[k : k + 1]), np.eye(3)) @ prior()[1]
@@ -188,9 +188,10 @@ def test_a_landmark_that_nothing_else_determines_is_told():
     rest = {"u_boundary": jnp.zeros((len(MESH.boundary), 3))}
     points, moved, sd = (array[:3] for array in places())
     post = br.build_posterior(MESH, [br.Landmarks(points, moved, sd, noise=NormalNoise())], model)
-    left_out = leave_out(post, post.data.terms["landmarks"], rest)
+    left_out = leave_out(predict_at_mean(post, post.data.terms["landmarks"], rest), NormalNoise())
     assert np.isnan(left_out.residual).all()
     assert np.isinf(left_out.covariance).all()
+    assert np.isnan(left_out.share).all()
 
 
 # The wider prior allows the sd of the joint mode, next to zero, where the nodes follow every landmark.

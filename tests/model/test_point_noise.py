@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 import bayesreg as br
 from bayesreg.fem.elements import elements_of
@@ -52,6 +53,25 @@ def test_the_density_is_that_of_scipy_up_to_the_known_normaliser(noise, sd):
     known = [log_pdf(np.zeros(3), s) for s in known_sd]
     np.testing.assert_allclose(float(term.log(state_of(U))), sum(whole) - sum(known), rtol=1e-10)
     np.testing.assert_allclose(term.pointwise_log_likelihood(state_of(U)), whole, rtol=1e-10)
+
+
+@pytest.mark.parametrize("nu", [2.5, 4.0, 30.0])
+def test_an_error_of_student_t_is_a_mixture_of_normal_ones(nu):
+    taus, log_probabilities = np.array(StudentTNoise(nu=nu).mixture).T
+    residual = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, -1.0], [40.0, 0.0, 0.0], [0.0, 1000.0, 0.0]])
+    log_normal = [stats.multivariate_normal.logpdf(residual, cov=np.eye(3) / tau) for tau in taus]
+    log_density = logsumexp(np.transpose(log_normal) + log_probabilities, axis=1)
+    np.testing.assert_allclose(log_density, stats.multivariate_t.logpdf(residual, shape=np.eye(3), df=nu), atol=1e-3)
+
+
+def test_every_point_of_a_sample_has_an_error_and_a_weight_of_its_own():
+    """Sizes of errors of two points, with the distribution that they should have, do not depend on one another."""
+    noise, sd = StudentTNoise(nu=4.0), jnp.array([[0.5] * 3, [2.0] * 3])
+    samples = np.asarray(noise.distribution(jnp.ones((2, 3)), sd).sample(jax.random.key(0), (4000,)))
+    squares = (((samples - 1) / np.asarray(sd)) ** 2).sum(axis=-1)
+    for point in squares.T:
+        assert stats.kstest(point / 3, stats.f(3, noise.nu).cdf).pvalue > 1e-3
+    assert stats.spearmanr(*squares.T).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("noise", NOISES, ids=["normal", "student_t"])

@@ -17,14 +17,15 @@ from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.points import read_point_pairs
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh
-from bayesreg.model.blocks import scale_block
+from bayesreg.model.blocks import Values, scale_block
 from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.landmarks_report import (
     describe_wrong_pairs,
     distance_figure,
+    doubt_intervals,
     landmark_table,
 )
-from bayesreg.model.observations.left_out import leave_out
+from bayesreg.model.observations.left_out import Predictions, leave_out, predict_at_draws, predict_at_mean
 from bayesreg.model.observations.observation import Placed, Recorded
 from bayesreg.model.observations.point_noise import Noise, NormalNoise, StudentTNoise
 from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
@@ -44,7 +45,6 @@ FEWEST = 4
 # The greatest number of unknowns for which the memory suffices to leave landmarks out in turn, and of these unknowns
 # times the coordinates of the landmarks.
 MOST_UNKNOWNS, MOST_ENTRIES = 12_000, 20_000_000
-
 
 _log = logging.getLogger(__name__)
 
@@ -156,8 +156,8 @@ class Landmarks:
         observation.sd, observation.labels = self.sd[~far], tuple(np.array(self.labels)[~far].tolist())
         return observation
 
-    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
-        """Summarise the residuals at a state, and the predictions of landmarks by all other observations."""
+    def summarise(self, posterior: Any, state: State, draws: Values) -> dict[str, np.ndarray]:
+        """Summarise the residuals at the mean, and the predictions of landmarks by all other observations."""
         term = posterior.data.terms[self.name]
         summary = {
             "names": np.array(self.labels),
@@ -167,15 +167,24 @@ class Landmarks:
         }
         if (wrong := term.probability_of_wrong(state)) is not None:
             summary["wrong"] = wrong
+        predictions = self._predictions(posterior, term, state, draws)
+        if predictions is None:
+            return summary
+        left_out = leave_out(predictions, self.noise)._asdict()
+        return summary | {f"left_out_{name}": array for name, array in left_out.items()}
+
+    def _predictions(self, posterior: Any, term: ComparedPoints, state: State, draws: Values) -> Predictions | None:
+        """Predict each landmark by all other observations; None if no node is sampled, or the memory is too small."""
+        if (prepare_marginal := posterior.target.prepare_marginal) is not None:
+            return predict_at_draws(prepare_marginal(), term, draws)
         unknowns = 3 * len(posterior.sampled)
         if not unknowns or unknowns > MOST_UNKNOWNS or 3 * len(self.labels) * unknowns > MOST_ENTRIES:
-            return summary
-        left_out = leave_out(posterior, term, posterior.estimands(state.values))
-        return summary | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
+            return None
+        return predict_at_mean(posterior, term, posterior.estimands(state.values))
 
     def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
-        """Name the pairs that are probably wrong, for the terminal and the first page of the report."""
-        return describe_wrong_pairs(self.name, summary)
+        """Name pairs that are probably wrong, and judge the intervals, for the terminal and the report's first page."""
+        return [*describe_wrong_pairs(self.name, summary), *doubt_intervals(self.name, summary)]
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""

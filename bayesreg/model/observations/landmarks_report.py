@@ -13,7 +13,9 @@ from bayesreg.model.observations.point_noise import WRONG
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
 from bayesreg.types import AnyArray
 
-LEVELS = (0.5, 0.95)
+LEVELS = (0.5, 0.9, 0.95)
+# The probability of all the numbers of landmarks in their regions that chance allows.
+CHANCE = 0.99
 # The greatest number of landmarks that the figure shows, and of pairs that a sentence names.
 MOST_SHOWN, MOST_NAMED = 60, 8
 
@@ -48,13 +50,12 @@ def _wrong_cell(summary: Arrays, k: int) -> list[str]:
 
 
 def _left_out_cells(summary: Arrays, k: int) -> list[Any]:
-    if "left_out_residual" not in summary:
+    if "left_out_share" not in summary:
         return [None, None]
-    residual = summary["left_out_residual"][k]
-    if not np.isfinite(residual).all():
+    share = summary["left_out_share"][k]
+    if np.isnan(share):
         return ["not determined", None]
-    inside = region_probability(residual[None], summary["left_out_covariance"][k : k + 1])[0]
-    return [float(np.linalg.norm(residual)), f"{100 * inside:.1f} %"]
+    return [float(np.linalg.norm(summary["left_out_residual"][k])), f"{100 * share:.1f} %"]
 
 
 def _caption(summary: Arrays) -> str:
@@ -64,20 +65,51 @@ def _caption(summary: Arrays) -> str:
     )
     if "wrong" in summary:
         text += f" {_describe_wrong(summary)}"
-    if "left_out_residual" not in summary:
+    if "left_out_share" not in summary:
         return f"{text} They were not left out in turn: no node is sampled, or there are too many."
-    residual = summary["left_out_residual"]
-    is_finite = np.isfinite(residual).all(axis=1)
-    if not is_finite.any():
+    if np.isnan(summary["left_out_share"]).all():
         return f"{text} Left out, no landmark is determined by the other observations."
-    inside = region_probability(residual, summary["left_out_covariance"])[is_finite]
-    shares = [f"{(inside <= level).mean():.0%} of the landmarks lie in their {level:.0%} region" for level in LEVELS]
-    mean = np.linalg.norm(residual[is_finite], axis=1).mean()
+    mean = np.nanmean(np.linalg.norm(summary["left_out_residual"], axis=1))
     return (
-        f"{text} Left out: the same distance where all other observations predict the landmark, at the mean stiffness; "
-        f"its mean is {mean:.3g} mm. Its region: the share of the prediction that lies nearer. "
-        f"{', '.join(shares)}.".replace("%", " %")
+        f"{text} Left out: the same distance where all other observations predict the landmark, at stiffnesses and "
+        f"scales that have seen it; its mean is {mean:.3g} mm. Its region: the share of predicted landmarks, with "
+        f"their own errors, that lie nearer. {_describe_coverage(summary)} "
+        f"{' '.join(_describe_intervals(summary)) or 'Chance allows such numbers.'}"
     )
+
+
+def _describe_coverage(summary: Arrays) -> str:
+    """Say how many landmarks lie in their regions."""
+    held, count = _count_held(summary)
+    shares = [
+        f"{number} lie in their {level:.0%}".replace("%", " %") for number, level in zip(held, LEVELS, strict=True)
+    ]
+    return f"Of {count} landmarks, each predicted from the others, {', '.join(shares)} regions."
+
+
+def _describe_intervals(summary: Arrays) -> list[str]:
+    """Say that intervals are too sure or too careful; nothing where chance allows these numbers of landmarks."""
+    held, count = _count_held(summary)
+    fewest, most = stats.binom(count, LEVELS).interval(CHANCE)
+    return [
+        f"By chance alone, so {word} would lie in their regions of "
+        f"{' and '.join(f'{100 * level:.0f} %' for level in np.array(LEVELS)[found])} less than once in a hundred "
+        f"times: the intervals are too {judged}."
+        for found, word, judged in ((held < fewest, "few", "sure"), (held > most, "many", "careful"))
+        if found.any()
+    ]
+
+
+def _count_held(summary: Arrays) -> tuple[np.ndarray, int]:
+    """Count the landmarks in their region of each level, and all that the others determine."""
+    share = summary["left_out_share"][~np.isnan(summary["left_out_share"])]
+    return (share[:, None] <= LEVELS).sum(axis=0), len(share)
+
+
+def doubt_intervals(name: str, summary: Arrays) -> list[str]:
+    """Return a sentence on intervals that are too sure or too careful; none if they have held."""
+    doubts = _describe_intervals(summary) if "left_out_share" in summary else []
+    return [f"{name}: {_describe_coverage(summary)} {' '.join(doubts)}"] if doubts else []
 
 
 def _describe_wrong(summary: Arrays) -> str:

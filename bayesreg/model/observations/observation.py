@@ -84,8 +84,8 @@ class Checked(Protocol):
 class Summarised(Protocol):
     """An observation that stores arrays for the report."""
 
-    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
-        """Return arrays, by name, at the state of the mean of the draws."""
+    def summarise(self, posterior: Any, state: State, draws: Values) -> dict[str, np.ndarray]:
+        """Return arrays, by name, from the state of the mean and from some draws of all values, in a leading axis."""
 
 
 @runtime_checkable

@@ -5,6 +5,7 @@ A point that was measured with its partner has errors along three dimensions, on
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import jax
@@ -20,6 +21,8 @@ from bayesreg.types import AnyArray
 
 # A point is wrong if the standard deviation of its own error is more than this multiple of sd.
 WRONG = 3.0
+# The least and the greatest weight of a point that count: errors of 10,000 sd are foreseen.
+LEAST_WEIGHT, GREATEST_WEIGHT = 1e-8, 1e2
 
 
 @jax.tree_util.register_static
@@ -32,6 +35,11 @@ class NormalNoise(Section):
     def variance(self) -> float:
         """The variance of each coordinate, in units of sd²."""
         return 1.0
+
+    @property
+    def mixture(self) -> list[tuple[float, float]]:
+        """Pairs of a weight τ and the logarithm of its probability, of which the error is a mixture."""
+        return [(1.0, 0.0)]
 
     def weight(self, squares: AnyArray, dimensions: int = 3) -> AnyArray:
         """Return −2 times the derivative of the log density by z²: one."""
@@ -76,6 +84,13 @@ class StudentTNoise(Section):
         """The variance of each coordinate, in units of sd²."""
         return self.nu / (self.nu - 2)
 
+    @property
+    def mixture(self) -> list[tuple[float, float]]:
+        """Pairs of a weight τ and the logarithm of its probability, of which the error is nearly a mixture."""
+        log_tau, step = np.linspace(math.log(LEAST_WEIGHT), math.log(GREATEST_WEIGHT), 101, retstep=True)
+        log_probability = stats.gamma(self.nu / 2, scale=2 / self.nu).logpdf(np.exp(log_tau)) + log_tau + np.log(step)
+        return list(zip(np.exp(log_tau), log_probability, strict=True))
+
     def weight(self, squares: AnyArray, dimensions: int = 3) -> AnyArray:
         """Return −2 times the derivative of the log density by z², the mean of τ given z²: (ν + d) / (ν + z²)."""
         return (self.nu + dimensions) / (self.nu + squares)
@@ -86,7 +101,8 @@ class StudentTNoise(Section):
 
     def distribution(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
         """Return the distribution of points about their means (k, 3), with scales (k, 3)."""
-        return dist.MultivariateStudentT(self.nu, mean, jnp.eye(3) * sd[..., None])
+        # With one number for ν, NumPyro would draw one weight for all points.
+        return dist.MultivariateStudentT(jnp.full(mean.shape[:-1], self.nu), mean, jnp.eye(3) * sd[..., None])
 
     def distribution_along(self, mean: AnyArray, sd: AnyArray) -> dist.Distribution:
         """Return the distribution of numbers about their means, for errors along one dimension."""

@@ -168,7 +168,7 @@ class PreparedPair:
             for name, x in (("observed", z), ("replicated", noise))
         }
 
-    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
+    def summarise(self, posterior: Any, state: State, draws: Values) -> dict[str, np.ndarray]:
         """Return the residual at a state, in units of the noise, and the tissue of each of its points."""
         term = posterior.data.terms[self.name]
         residual = term.scaled_residual(state.u, state.values)
