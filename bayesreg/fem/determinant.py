@@ -128,7 +128,7 @@ def rigid_freedom(
 
 def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLayout:
     """Order some unknowns (3 · node + axis) of K into a narrow band, cut into block columns."""
-    order = _narrow_order(mesh, unknowns)
+    order = narrow_order(mesh, unknowns)
     row, column, is_stored = band_entries(mesh, order)
     width = -(-int(np.abs(row - column)[is_stored].max()) // BLOCKS_BELOW)
     columns, block, below = -(-len(unknowns) // width), column // width, row // width - column // width
@@ -141,7 +141,7 @@ def band_layout(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> BandLay
     return BandLayout(HostBand(mesh, order), places, jnp.asarray(padding, float))
 
 
-def _narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[np.ndarray, "unknowns"]:
+def narrow_order(mesh: TetMesh, unknowns: Int[np.ndarray, "unknowns"]) -> Int[np.ndarray, "unknowns"]:
     """Order the unknowns node by node, with the nodes in the order of Cuthill and McKee of the narrowest band."""
     nodes, count = np.unique(unknowns // 3), len(mesh.points)
     pairs = np.repeat(mesh.cells, 4, axis=1).ravel(), np.tile(mesh.cells, (1, 4)).ravel()

@@ -169,6 +169,14 @@ class Marginal(Protocol):
     def problem(self) -> Any:
         """The data of the posterior."""
 
+    @property
+    def costly(self) -> tuple[str, ...]:
+        """The names of the parameters whose change makes `log` costly."""
+
+    @property
+    def drawn(self) -> tuple[str, ...]:
+        """The names of the parameters that `draw_weights` draws given the displacements, and `log` does not know."""
+
     def draw_weights(self, key: AnyArray, estimands: Estimands) -> tuple[AnyArray, dict[str, AnyArray]]:
         """Draw the weights given all estimands; return them, and all estimands, of which some move with the weights."""
 

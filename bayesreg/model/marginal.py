@@ -1,11 +1,17 @@
-"""The posterior of pairs of points alone with the displacements integrated out, for one tissue and random loads."""
+"""The posterior of points and surfaces alone with the displacements integrated out, for random loads.
+
+Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so: a Gaussian that
+has its slope and curvature at the mode (`bayesreg.model.quadratic`) stands for it where displacements are integrated out
+or drawn. The difference between the two is one of the terms that the sampler tests.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,18 +20,27 @@ from jaxtyping import Float, Int
 
 from bayesreg.mesh import TetMesh
 from bayesreg.model import evaluation, point_algebra
-from bayesreg.model.blocks import Values
+from bayesreg.model.blocks import LAME, Values
 from bayesreg.model.coordinates import complete
 from bayesreg.model.elastic.barrier import Barrier
 from bayesreg.model.elastic.loads import LoadsTerm
+from bayesreg.model.elastic.rigid import RigidPrior
+from bayesreg.model.factorised_response import FactorisedResponse
 from bayesreg.model.observations.compared_points import ComparedPoints
+from bayesreg.model.observations.measured_surface import MeasuredSurface
 from bayesreg.model.point_algebra import PointAlgebra
 from bayesreg.model.program import Problem
+from bayesreg.model.quadratic import Quadratic, approximate
+from bayesreg.model.spectral_response import SpectralResponse
 from bayesreg.model.state import state_of
+from bayesreg.model.stiffness_parts import has_few_entries
+from bayesreg.model.surface_mode import find_mode
 from bayesreg.types import AnyArray, Scalar
 
-# The eigenvectors of more unknowns take minutes, and the matrices of more coordinates of points a gigabyte.
+# The matrices of more unknowns take minutes, and those of more coordinates of points a gigabyte.
 MOST_UNKNOWNS, MOST_COORDINATES = 5000, 1500
+# The terms that are Gaussian in the displacements, and those that may stand beside them.
+GAUSSIAN, BESIDE = LoadsTerm | RigidPrior | ComparedPoints, MeasuredSurface | Barrier
 
 
 class Marginal(NamedTuple):
@@ -37,13 +52,26 @@ class Marginal(NamedTuple):
         The posterior's own, with the determinant of K from its eigenvalues.
     number : scalar integer
         That of its `PointAlgebra`.
+    approximations : dict
+        The Gaussian that stands for each surface, by name.
     """
 
     problem: Problem
     number: Int[AnyArray, ""]
+    approximations: dict[str, Quadratic]
+
+    @property
+    def costly(self) -> tuple[str, ...]:
+        """The names of the parameters whose change costs a factorisation."""
+        return () if has_one_tissue(self.problem) else LAME
+
+    @property
+    def drawn(self) -> tuple[str, ...]:
+        """The names of the parameters that `draw_weights` draws, and that the Gaussians do not depend on."""
+        return tuple(name for term in surfaces_of(self.problem) for name in term.hyperparameters)
 
     def draw_weights(self, key: AnyArray, estimands: Values) -> tuple[Float[AnyArray, "points"], dict[str, AnyArray]]:
-        """Draw the weight τ of every point given all estimands, and the sd of points with their weights.
+        """Draw the weight τ of every point given all estimands, the sd of points with their weights, and that of surfaces.
 
         Returns
         -------
@@ -52,12 +80,15 @@ class Marginal(NamedTuple):
         estimands : dict
             With other sds of points.
         """
-        values, drawn = complete(self.problem.blocks, estimands), []
-        points = points_of(self.problem)
-        for term, key_term in zip(points, jax.random.split(key, len(points)), strict=True):
+        values, drawn = complete(self.problem.blocks, estimands), [jnp.zeros(0)]
+        points, surfaces = points_of(self.problem), surfaces_of(self.problem)
+        keys = jax.random.split(key, len(points) + len(surfaces))
+        for term, key_term in zip(points, keys[: len(points)], strict=True):
             weights, scales = term.draw_weights(key_term, values, self.problem.blocks)
             values = {**values, **scales}
             drawn.append(weights)
+        for surface, key_surface in zip(surfaces, keys[len(points) :], strict=True):
+            values = {**values, **surface.draw_sd(key_surface, values, self.problem.blocks)}
         return jnp.concatenate(drawn), {**estimands, **{name: values[name] for name in estimands}}
 
     def log(self, estimands: Values, weights: Float[AnyArray, "points"]) -> Scalar:
@@ -72,24 +103,28 @@ class Marginal(NamedTuple):
     ) -> Float[AnyArray, "nodes 3"]:
         """Draw u given θ and τ, mm."""
         values = complete(self.problem.blocks, estimands)
-        lam, sizes, noise = self.given(values, weights)
+        stiffness, sizes, noise = self.given(values, weights)
         key_load, key_error = jax.random.split(key)
-        white = jax.random.normal(key_load, (values["u_boundary"].size,))
+        white = jax.random.normal(key_load, (6 + values["u_boundary"].size,))
         errors = jax.random.normal(key_error, noise.shape)
-        return point_algebra.draw(self.number, lam, sizes, noise, white, errors).reshape(-1, 3)
+        return point_algebra.draw(self.number, stiffness, sizes, noise, white, errors).reshape(-1, 3)
 
     def log_others(self, estimands: Values) -> Scalar:
-        """Compute the sum of the logs of all terms that are not Gaussian in u: the barrier."""
+        """Compute the log of what the Gaussians leave out: the barrier, and each surface over its approximation."""
         values = complete(self.problem.blocks, estimands)
         state = state_of(self.problem.body, self.problem.blocks, values)
-        others = (term for term in self.problem.terms.values() if not isinstance(term, LoadsTerm | ComparedPoints))
-        return sum((term.log(state) for term in others), jnp.zeros(()))
+        others = (term for term in self.problem.terms.values() if not isinstance(term, GAUSSIAN))
+        log = sum((term.log(state) for term in others), jnp.zeros(()))
+        return log - sum((quadratic.log(state.u) for quadratic in self.approximations.values()), jnp.zeros(()))
 
-    def given(self, values: Values, weights: AnyArray) -> tuple[Scalar, AnyArray, AnyArray]:
-        """Return λ, the squared sizes of the loads, and the variances of the errors of all coordinates."""
-        sd = jnp.concatenate([term.sd(values) for term in points_of(self.problem)])
+    def given(self, values: Values, weights: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+        """Return λ and μ of all entries, the squared sizes of the loads, and the variances of all coordinates."""
+        sd = jnp.concatenate([jnp.zeros((0, 3)), *(term.sd(values) for term in points_of(self.problem))])
         sizes = jnp.stack([values["body_load"] ** 2, values["surface_load"] ** 2])
-        return values["lam"][0], sizes, (sd**2 / weights[:, None]).reshape(-1)
+        # The rows of an approximation have the variance one.
+        rows = sum(len(quadratic.shift) for quadratic in self.approximations.values())
+        noise = jnp.concatenate([(sd**2 / weights[:, None]).reshape(-1), jnp.ones(rows)])
+        return jnp.concatenate([values[name] for name in LAME]), sizes, noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,43 +135,89 @@ class Marginalisation:
     ----------
     problem : Problem
     mesh : TetMesh
+    start : mapping or None
+        Estimands near the mode.
     """
 
     problem: Problem
     mesh: TetMesh
+    start: Values | None = None
     _lock: Lock = field(default_factory=Lock)
 
     @classmethod
-    def of(cls, problem: Problem, mesh: TetMesh) -> Marginalisation | None:
-        """Return that of a posterior; None if it has other terms, several tissues, an unknown μ, or is too large."""
-        points = points_of(problem)
-        known_terms = all(isinstance(term, LoadsTerm | ComparedPoints | Barrier) for term in problem.terms.values())
-        if not (points and known_terms and "elastic" in problem.terms) or problem.body.field is not None:
+    def of(cls, problem: Problem, mesh: TetMesh, start: Values | None = None) -> Marginalisation | None:
+        """Return that of a posterior; None if it has other terms, a stiffness in many entries, or is too large."""
+        points, surfaces = points_of(problem), surfaces_of(problem)
+        known_terms = all(isinstance(term, GAUSSIAN | BESIDE) for term in problem.terms.values())
+        if not ((points or surfaces) and known_terms and "elastic" in problem.terms):
             return None
-        one_tissue = np.shape(problem.blocks["lam"].reference()) == (1,) and not problem.blocks["mu"].is_sampled
+        if problem.body.field is not None or not has_few_entries(problem.body):
+            return None
         is_small = 3 * len(mesh.points) <= MOST_UNKNOWNS
         is_small &= 3 * sum(len(term.shift) for term in points) <= MOST_COORDINATES
-        return cls(problem, mesh) if one_tissue and is_small and np.isfinite(_range_of_lam(problem)[1]) else None
+        is_bounded = all(np.isfinite(_range(problem, name)).all() for name in LAME)
+        return cls(problem, mesh, start) if is_small and is_bounded else None
 
     def __call__(self) -> Marginal:
         """Return the marginal; several threads may ask for it."""
         with self._lock:
-            elastic = self.problem.terms["elastic"]._replace(determinant=self._algebra.spectrum)
-            return Marginal(self.problem.with_term("elastic", elastic), jnp.asarray(self._algebra.number))
+            algebra, problem = self._algebra, self.problem
+            if (determinant := algebra.response.determinant) is not None:
+                elastic = problem.terms["elastic"]._replace(determinant=determinant)
+                problem = problem.with_term("elastic", elastic)
+            return Marginal(problem, jnp.asarray(algebra.number), self._approximations)
+
+    def count_independent_points(self, observations: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
+        """Count the independent points of surfaces, by name; return the counts, and all values at the mode."""
+        mode = find_mode(self.problem, self.mesh, observations, self.start)
+        counts = {term.name: float(term.independent_points) for term in surfaces_of(mode.problem)}
+        return counts, mode.values
+
+    @cached_property
+    def _approximations(self) -> dict[str, Quadratic]:
+        surfaces = surfaces_of(self.problem)
+        if not surfaces:
+            return {}
+        values = find_mode(self.problem, self.mesh, start=self.start).values
+        u = values["u_boundary"]
+        return {term.name: approximate(term, u, values).without_flat_directions() for term in surfaces}
 
     @cached_property
     def _algebra(self) -> PointAlgebra:
-        points, unknowns = points_of(self.problem), 3 * len(self.mesh.points)
+        elastic, unknowns = self.problem.terms["elastic"], 3 * len(self.mesh.points)
+        rigid, prior = np.asarray(elastic.rigid), self.problem.terms.get("rigid")
+        masses = np.repeat(np.stack([np.asarray(elastic.volumes), np.asarray(elastic.areas)]), 3, axis=1)
+        precision = 0.0 if prior is None else 1 / (len(self.mesh.points) * float(prior.sd) ** 2)
+        interpolation, shift = self._rows(unknowns)
+        return PointAlgebra(self._response(rigid, masses, interpolation), rigid, masses, precision, interpolation, shift)
+
+    def _rows(self, unknowns: int) -> tuple[Float[np.ndarray, "rows unknowns"], Float[np.ndarray, "rows"]]:
+        """Return B and y: the coordinates of all points, then the rows of the surfaces' approximations."""
         identity = jnp.eye(unknowns).reshape(-1, 3, unknowns)
-        interpolation = np.concatenate([np.asarray(term.interpolate(identity)) for term in points])
-        return PointAlgebra(
-            self.mesh,
-            self.problem.terms["elastic"],
-            interpolation.reshape(-1, unknowns),
-            np.concatenate([np.asarray(term.shift) for term in points]).ravel(),
-            float(np.asarray(self.problem.blocks["mu"].reference())[0]),
-            _range_of_lam(self.problem),
+        points, approximations = points_of(self.problem), self._approximations.values()
+        rows = [np.asarray(term.interpolate(identity)).reshape(-1, unknowns) for term in points]
+        rows += [quadratic.interpolation(unknowns) for quadratic in approximations]
+        shifts = [np.asarray(term.shift).ravel() for term in points]
+        return np.concatenate(rows), np.concatenate(
+            [*shifts, *(np.asarray(quadratic.shift) for quadratic in approximations)]
         )
+
+    def _response(
+        self,
+        rigid: Float[np.ndarray, "unknowns 6"],
+        masses: Float[np.ndarray, "2 unknowns"],
+        interpolation: Float[np.ndarray, "rows unknowns"],
+    ) -> SpectralResponse | FactorisedResponse:
+        if not has_one_tissue(self.problem):
+            entries = np.asarray(self.problem.body.cell_entry)
+            return FactorisedResponse(self.mesh, entries, rigid, masses, interpolation, point_algebra.side_by_side)
+        mu = float(np.asarray(self.problem.blocks["mu"].reference())[0])
+        return SpectralResponse(self.mesh, rigid, masses, interpolation, mu, _range(self.problem, "lam"))
+
+
+def has_one_tissue(problem: Problem) -> bool:
+    """Check whether there is one λ, and one μ that is known."""
+    return np.shape(problem.blocks["lam"].reference()) == (1,) and not problem.blocks["mu"].is_sampled
 
 
 def points_of(problem: Problem) -> list[ComparedPoints]:
@@ -144,8 +225,13 @@ def points_of(problem: Problem) -> list[ComparedPoints]:
     return [term for term in problem.terms.values() if isinstance(term, ComparedPoints)]
 
 
-def _range_of_lam(problem: Problem) -> tuple[float, float]:
-    """Return the least and the greatest λ that its prior allows; both are the known one."""
-    block = problem.blocks["lam"]
+def surfaces_of(problem: Problem) -> list[MeasuredSurface]:
+    """Return the terms of surfaces."""
+    return [term for term in problem.terms.values() if isinstance(term, MeasuredSurface)]
+
+
+def _range(problem: Problem, name: str) -> tuple[float, float]:
+    """Return the least λ or μ, and the greatest, that the priors allow; both are the known one if none is sampled."""
+    block = problem.blocks[name]
     low, high = (block.low, block.high) if block.is_sampled else (block.reference(),) * 2
-    return float(np.asarray(low)[0]), float(np.asarray(high)[0])
+    return float(np.asarray(low).min()), float(np.asarray(high).max())

@@ -29,6 +29,8 @@ class GivenShifts(NamedTuple):
         (Rᵀ D R)⁻¹.
     noise : (m,) array
         The diagonal of Σ, mm².
+    precision : float
+        The diagonal of Λ, 1/mm².
     """
 
     rigid: Float[np.ndarray, "coordinates 6"]
@@ -37,6 +39,7 @@ class GivenShifts(NamedTuple):
     push: Float[np.ndarray, "6 coordinates"]
     balance: Float[np.ndarray, "6 6"]
     noise: Float[np.ndarray, "coordinates"]
+    precision: float
 
     def factorised(self) -> Factorised:
         """Compute S, factorise it, and solve with it for H."""
@@ -48,7 +51,8 @@ class GivenShifts(NamedTuple):
         if failure:
             lower = np.full_like(lower, np.nan)
         whitened = dpotrs(lower, self.rigid, lower=1)[0]
-        return Factorised(lower, whitened, self.rigid.T @ whitened, self.balance)
+        information = self.rigid.T @ whitened + self.precision * np.eye(6)
+        return Factorised(lower, whitened, information, self.balance)
 
     def log_density(self, shift: Float[np.ndarray, "coordinates"]) -> float:
         """Compute log p(y) for shifts y, mm, up to a constant."""
@@ -69,7 +73,7 @@ class Factorised(NamedTuple):
     whitened : (m, 6) array
         S⁻¹ H.
     information : (6, 6) array
-        Hᵀ S⁻¹ H.
+        Hᵀ S⁻¹ H + Λ.
     balance : (6, 6) array
         (Rᵀ D R)⁻¹.
     """

@@ -165,6 +165,11 @@ class Posterior:
             data = data.with_term(name, data.terms[name].with_independent_points(count))
         return replace(self, data=data, tempered=True)
 
+    def tempered_by(self, counts: Mapping[str, float], values: Values) -> Posterior:
+        """Return the posterior with these counts of independent points, whose searches start at some values."""
+        start = {name: value for name, value in self.estimands(values).items()}
+        return replace(self.with_independent_points(counts), search_start=start)
+
     @property
     def independent_points(self) -> dict[str, float]:
         """The number of independent quadrature points that the likelihood assumes, by name of the pair of images."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -125,7 +125,7 @@ class PosteriorTarget:
     @cached_property
     def prepare_marginal(self) -> Marginalisation | None:
         """The function that prepares the posterior with the displacements integrated out, where this is possible."""
-        return Marginalisation.of(self.data, self.posterior.mesh)
+        return Marginalisation.of(self.data, self.posterior.mesh, self.posterior.search_start)
 
     @property
     def mode_search(self) -> ModeSearch:
@@ -137,6 +137,6 @@ class PosteriorTarget:
 
     def _temper(self, estimands: Values) -> PosteriorTarget:
         """Return the target tempered by the residuals at these estimands, from which a search may continue."""
-        counts = self.posterior.count_independent_points(coordinates.complete(self.data.blocks, estimands))
-        tempered = self.posterior.with_independent_points(counts)
-        return PosteriorTarget(replace(tempered, search_start=dict(estimands)))
+        complete_values = coordinates.complete(self.data.blocks, estimands)
+        counts = self.posterior.count_independent_points(complete_values)
+        return PosteriorTarget(self.posterior.tempered_by(counts, complete_values))

@@ -106,13 +106,16 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadl
     """Temper the posterior by its numbers of independent points, unless it is tempered already."""
     if posterior.tempered:
         return posterior
-    _log.info("first search for the mode, to count the independent points of the images there")
-    start = start_of(config, inputs, posterior)
-    target = temper_target(posterior.target, config.sampler.chains, config.seed, start, deadline)
-    assert isinstance(target, PosteriorTarget)
-    tempered = target.posterior
+    _log.info("first search for the mode, to count the independent points there")
+    if (marginalisation := posterior.target.prepare_marginal) is not None:
+        tempered = posterior.tempered_by(*marginalisation.count_independent_points(posterior.observations))
+    else:
+        start = start_of(config, inputs, posterior)
+        target = temper_target(posterior.target, config.sampler.chains, config.seed, start, deadline)
+        assert isinstance(target, PosteriorTarget)
+        tempered = target.posterior
     for name, count in tempered.independent_points.items():
-        _log.info(f"{name}: {count:,.0f} of {len(tempered.data.terms[name].positions):,} points are independent")
+        _log.info(f"{name}: {count:,.0f} of {len(tempered.data.terms[name].observed()):,} points are independent")
     return tempered
 
 

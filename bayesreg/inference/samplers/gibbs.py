@@ -5,9 +5,9 @@ given τ, with u integrated out, and u given both. Random-walk Metropolis moves 
 scales of its prior would move each other in small steps only. This is a partially collapsed Gibbs sampler (van Dyk and
 Park 2008).
 
-Terms that are not Gaussian in u, the barrier, are left out of these conditionals. The moves of θ are reversible, and u
+What is not Gaussian in u, such as the barrier, is left out of these conditionals. The moves of θ are reversible, and u
 is independent of its last value. The proposal of both is therefore reversible with respect to the posterior without
-the barrier, and Metropolis' rule for the barrier alone makes it exact.
+these terms, and Metropolis' rule for them alone makes it exact.
 """
 
 from __future__ import annotations
@@ -51,13 +51,6 @@ class Setup(NamedTuple):
     unit: Float[AnyArray, "parameters parameters"]
 
 
-class State(NamedTuple):
-    """The estimands of a chain, and the log of the terms that its conditionals leave out."""
-
-    estimands: dict[str, AnyArray]
-    log_others: AnyArray
-
-
 def gibbs(target: Target, settings: Gibbs) -> Sampler:
     """Make a Gibbs sampler.
 
@@ -80,51 +73,68 @@ def gibbs(target: Target, settings: Gibbs) -> Sampler:
         prepare=prepare,
         data=lambda _setup: prepare_marginal(),
         blank=partial(_first_setup, target),
-        init=lambda marginal, _setup, estimands: State(dict(estimands), marginal.log_others(estimands)),
-        step=partial(_step, target),
-        observe=lambda marginal, _setup, state: Draw(
-            state.estimands, target.evaluate_estimands(marginal.problem, state.estimands)
+        init=lambda _marginal, _setup, estimands: dict(estimands),
+        step=partial(_step, target, is_tested=True),
+        observe=lambda marginal, _setup, estimands: Draw(
+            estimands, target.evaluate_estimands(marginal.problem, estimands)
         ),
         exact=True,
     )
 
 
-def _step(target: Target, marginal: Any, setup: Setup, key: AnyArray, state: State) -> tuple[State, Info]:
+def _step(
+    target: Target, marginal: Any, setup: Setup, key: AnyArray, estimands: Estimands, is_tested: bool
+) -> tuple[dict[str, AnyArray], Info]:
     """Draw weights and displacements twice, the second time with θ between them, which costs more."""
     key_first, key_second = jax.random.split(key)
-    state, first_rate = _sweep(marginal, lambda _key, estimands, _weights: estimands, key_first, state)
-    state, second_rate = _sweep(marginal, partial(_walk, target, marginal, setup), key_second, state)
-    rate, nothing, no = (first_rate + second_rate) / 2, jnp.zeros((), int), jnp.zeros((), bool)
-    return state, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
+    moves = lambda _key, estimands, _weights: dict(estimands), partial(_walk, target, marginal, setup)
+    rate = jnp.zeros(())
+    for move, key_sweep in zip(moves, (key_first, key_second), strict=True):
+        estimands, acceptance = _sweep(marginal, move, key_sweep, estimands, is_tested)
+        rate += acceptance / len(moves)
+    nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
+    return estimands, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
 
 
 def _sweep(
-    marginal: Any, move: Callable[[AnyArray, Estimands, AnyArray], Estimands], key: AnyArray, state: State
-) -> tuple[State, AnyArray]:
-    """Draw the weights, move θ, and draw the displacements; return the probability that the barrier accepts both."""
+    marginal: Any,
+    move: Callable[[AnyArray, Estimands, AnyArray], dict[str, AnyArray]],
+    key: AnyArray,
+    estimands: Estimands,
+    is_tested: bool,
+) -> tuple[dict[str, AnyArray], AnyArray]:
+    """Draw the weights, move θ, and draw the displacements; return the probability that the other terms accept both."""
     key_weights, key_move, key_u, key_accept = jax.random.split(key, 4)
-    weights, estimands = marginal.draw_weights(key_weights, state.estimands)
+    weights, estimands = marginal.draw_weights(key_weights, estimands)
     parameters = move(key_move, estimands, weights)
     proposal = {**parameters, "u_boundary": marginal.draw_displacements(key_u, parameters, weights)}
-    log_others = jnp.nan_to_num(marginal.log_others(proposal), nan=-jnp.inf)
-    acceptance = jnp.minimum(1.0, jnp.exp(log_others - state.log_others))
+    if not is_tested:
+        return proposal, jnp.ones(())
+    gain = jnp.nan_to_num(marginal.log_others(proposal), nan=-jnp.inf) - marginal.log_others(estimands)
+    acceptance = jnp.minimum(1.0, jnp.exp(gain))
     is_accepted = jax.random.uniform(key_accept) < acceptance
-    stayed = State(estimands, state.log_others)
-    return jax.tree.map(partial(jnp.where, is_accepted), State(proposal, log_others), stayed), acceptance
+    return jax.tree.map(partial(jnp.where, is_accepted), proposal, dict(estimands)), acceptance
 
 
 def _walk(
     target: Target, marginal: Any, setup: Setup, key: AnyArray, estimands: Estimands, weights: AnyArray
 ) -> dict[str, AnyArray]:
-    """Move θ by steps of Metropolis with the displacements integrated out."""
+    """Move θ by steps of Metropolis with the displacements integrated out.
+
+    Where some parameters are costly, all but the first step leave them where they are.
+    """
     position = target.coordinates.unconstrain(marginal.problem, estimands)
-    u_boundary = position.pop("u_boundary")
-    start, unravel = ravel_pytree(position)
+    names, costly = _walked(marginal, position)
+    others = {name: value for name, value in position.items() if name not in names}
+    start, unravel = ravel_pytree([position[name] for name in names])
     if not start.size:
         return dict(estimands)
+    # The unit of a step is triangular: directions from here on leave the costly parameters alone.
+    first_cheap = sum(position[name].size for name in costly)
 
     def estimands_of(flat: AnyArray) -> tuple[dict[str, AnyArray], AnyArray]:
-        return target.coordinates.constrain(marginal.problem, {**unravel(flat), "u_boundary": u_boundary})
+        walked = dict(zip(names, unravel(flat), strict=True))
+        return target.coordinates.constrain(marginal.problem, {**others, **walked})
 
     def density(flat: AnyArray) -> AnyArray:
         estimands, log_jacobian = estimands_of(flat)
@@ -133,13 +143,14 @@ def _walk(
     def step(now: tuple[AnyArray, AnyArray], key_and_number: tuple[AnyArray, AnyArray]) -> tuple[Any, None]:
         (flat, height), (key, number) = now, key_and_number
         key_kind, key_width, key_which, key_move, key_accept = jax.random.split(key, 5)
-        is_independent = jax.random.bernoulli(key_kind, INDEPENDENT)
+        # The first step only evaluates the density at the start, so that the density is compiled once.
+        is_first, is_cheap = number == 0, (number > 1) & (0 < first_cheap < len(start))
+        is_independent = jax.random.bernoulli(key_kind, INDEPENDENT) & ~is_cheap
         width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
         move = jax.random.t(key_move, FREEDOM, start.shape)
-        along = setup.unit @ (move * jax.nn.one_hot(jax.random.randint(key_which, (), 0, len(start)), len(start)))
+        which = jax.random.randint(key_which, (), jnp.where(is_cheap, first_cheap, 0), len(start))
+        along = setup.unit @ (move * jax.nn.one_hot(which, len(start)))
         candidate = jnp.where(is_independent, setup.centre + setup.unit @ move, flat + width * along)
-        # The first step only evaluates the density at the start, so that the density is compiled once.
-        is_first = number == 0
         candidate = jnp.where(is_first, flat, candidate)
         candidate_height = density(candidate)
         balance = jnp.where(is_independent, _log_tail(setup, flat) - _log_tail(setup, candidate), 0.0)
@@ -162,39 +173,45 @@ def _warm_up(target: Target, length: int, points: Any, key: AnyArray, deadline: 
     """Move the chains away from their start, and tune the steps of θ by the places that they visit."""
     assert target.prepare_marginal is not None
     marginal = target.prepare_marginal()
-    states = jax.vmap(lambda estimands: State(dict(estimands), marginal.log_others(estimands)))(points)
-    setup = _first_setup(target)
+    states, setup = points, _first_setup(target)
     for number, share in enumerate(STAGES):
         places = []
         for key_draw in jax.random.split(jax.random.fold_in(key, number), math.ceil(share * length)):
             if deadline.has_passed:
-                return setup, states.estimands
+                return setup, states
             states, flats = _transition(target, marginal, setup, key_draw, states)
             places.append(np.asarray(flats))
         late = np.concatenate(places[len(places) // 4 :])
         covariance = np.cov(late, rowvar=False).reshape(late.shape[1:] * 2) + LEAST_VARIANCE * np.eye(late.shape[1])
         setup = Setup(jnp.asarray(late.mean(axis=0)), jnp.asarray(np.linalg.cholesky(covariance)))
-    return setup, states.estimands
+    return setup, states
 
 
 # One transition is one call, so that a signal and the deadline are noticed between two of them.
 @partial(jax.jit, static_argnums=0)
 def _transition(
-    target: Target, marginal: Any, setup: Setup, key: AnyArray, states: State
-) -> tuple[State, Float[AnyArray, "chains parameters"]]:
-    """Move every chain, out of places that the barrier forbids, too; return its state and θ."""
-    states = states._replace(log_others=jnp.full_like(states.log_others, -jnp.inf))
-    keys = jax.random.split(key, len(states.log_others))
-    states, _ = jax.vmap(partial(_step, target, marginal, setup))(keys, states)
-    return states, jax.vmap(partial(_flat_parameters, target, marginal.problem))(states.estimands)
+    target: Target, marginal: Any, setup: Setup, key: AnyArray, states: Estimands
+) -> tuple[dict[str, AnyArray], Float[AnyArray, "chains parameters"]]:
+    """Move every chain, out of places that the other terms forbid, too; return its state and θ."""
+    keys = jax.random.split(key, len(states["u_boundary"]))
+    states, _ = jax.vmap(partial(_step, target, marginal, setup, is_tested=False))(keys, states)
+    return states, jax.vmap(partial(_flat_parameters, target, marginal))(states)
 
 
 def _first_setup(target: Target) -> Setup:
-    centre = _flat_parameters(target, target.data, target.coordinates.reference())
+    assert target.prepare_marginal is not None
+    centre = _flat_parameters(target, target.prepare_marginal(), target.coordinates.reference())
     return Setup(centre, FIRST_UNIT * jnp.eye(len(centre)))
 
 
-def _flat_parameters(target: Target, problem: Any, estimands: Estimands) -> AnyArray:
+def _flat_parameters(target: Target, marginal: Any, estimands: Estimands) -> AnyArray:
     """Return the position of θ."""
-    position = target.coordinates.unconstrain(problem, estimands)
-    return ravel_pytree({name: value for name, value in position.items() if name != "u_boundary"})[0]
+    position = target.coordinates.unconstrain(marginal.problem, estimands)
+    return ravel_pytree([position[name] for name in _walked(marginal, position)[0]])[0]
+
+
+def _walked(marginal: Any, position: Estimands) -> tuple[list[str], list[str]]:
+    """Return the names of θ, the costly parameters first, and those of the latter."""
+    names = sorted(name for name in position if name != "u_boundary" and name not in marginal.drawn)
+    costly = [name for name in names if name in marginal.costly]
+    return costly + [name for name in names if name not in costly], costly

@@ -109,6 +109,11 @@ class ComparedPoints(NamedTuple):
         bend = self.noise.bend(self.squares(u, sd))
         return PointCurvature(self.nodes, self.weights, bend[:, None, None] * push[:, :, None] * push[:, None, :])
 
+    def score(self, u: Float[AnyArray, "nodes 3"], values: Values) -> Float[AnyArray, "k 3"]:
+        """Return the slope of the log density in the displacement of every point, 1/mm."""
+        sd = self.sd(values)
+        return self.noise.weight(self.squares(u, sd))[:, None] * (self.shift - self.interpolate(u)) / sd**2
+
     def squares(self, u: Float[AnyArray, "nodes 3"], sd: Float[AnyArray, "k 3"]) -> Float[AnyArray, "k"]:
         """Return z², the squared distance of every landmark from its predicted place, in units of sd."""
         return (((self.shift - self.interpolate(u)) / sd) ** 2).sum(axis=1)

@@ -1,0 +1,95 @@
+"""A Gaussian factor that stands for an observation near one displacement."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from bayesreg.model.blocks import Values
+from bayesreg.types import AnyArray, Scalar
+
+# Directions of one point, and of all points, with less than these shares of the greatest curvature are left out.
+LEAST_CURVATURE, LEAST_SHARE = 1e-10, 1e-6
+
+
+class Quadratic(NamedTuple):
+    """exp(−½ |E u − y|²), where u has some unknowns of the nodes (a pytree).
+
+    Attributes
+    ----------
+    unknowns : (t,) int array
+        3 · node + axis.
+    root : (r, t) array
+        E.
+    shift : (r,) array
+        y.
+    """
+
+    unknowns: Int[AnyArray, "touched"]
+    root: Float[AnyArray, "rows touched"]
+    shift: Float[AnyArray, "rows"]
+
+    def log(self, u: Float[AnyArray, "nodes 3"]) -> Scalar:
+        """Return −½ |E u − y|²."""
+        return -0.5 * ((self.root @ u.reshape(-1)[self.unknowns] - self.shift) ** 2).sum()
+
+    def without_flat_directions(self) -> Quadratic:
+        """Return fewer rows, without directions along which the factor hardly changes: those along a surface."""
+        left, sizes, right = np.linalg.svd(np.asarray(self.root), full_matrices=False)
+        kept = sizes**2 > LEAST_SHARE * sizes[0] ** 2
+        shift = left[:, kept].T @ np.asarray(self.shift)
+        return self._replace(root=jnp.asarray(sizes[kept, None] * right[kept]), shift=jnp.asarray(shift))
+
+    def interpolation(self, unknowns: int) -> Float[np.ndarray, "rows unknowns"]:
+        """Return E with a column for every unknown."""
+        whole = np.zeros((len(self.shift), unknowns))
+        whole[:, np.asarray(self.unknowns)] = np.asarray(self.root)
+        return whole
+
+
+def approximate(term: Any, u: Float[np.ndarray, "nodes 3"], values: Values) -> Quadratic:
+    """Return the Gaussian that has a term's slope and Gauss–Newton curvature at a displacement.
+
+    Parameters
+    ----------
+    term : ComparedPoints or MeasuredSurface
+    u : (n, 3) array
+        mm.
+    values : mapping
+        Values of all blocks.
+    """
+    own_values = {name: values[name] for name in term.hyperparameters}
+    nodes, weights, matrices, scores = map(np.asarray, _slope_and_curvature(term, jnp.asarray(u), own_values))
+    squares, axes = np.linalg.eigh(matrices)
+    kept = squares > LEAST_CURVATURE * squares.max()
+    point, axis = np.nonzero(kept)
+    stiffness, directions = np.sqrt(squares[kept]), axes[point, :, axis]
+    columns = 3 * nodes[point][:, :, None] + np.arange(3)
+    unknowns, index = np.unique(columns, return_inverse=True)
+    rows = np.zeros((len(point), len(unknowns)))
+    entries = stiffness[:, None, None] * weights[point][:, :, None] * directions[:, None, :]
+    # The nodes of a place on the surface of a mesh are three and one of them again.
+    np.add.at(rows, (np.arange(len(point))[:, None, None], index.reshape(columns.shape)), entries)
+    push = (scores[point] * directions).sum(axis=1) / stiffness
+    root, shift = _compress(rows, rows @ u.ravel()[unknowns] + push)
+    return Quadratic(jnp.asarray(unknowns), jnp.asarray(root), jnp.asarray(shift))
+
+
+@jax.jit
+def _slope_and_curvature(term: Any, u: AnyArray, values: Values) -> tuple[AnyArray, ...]:
+    curvature = term.gauss_newton(u, values)
+    return curvature.nodes, curvature.weights, curvature.matrices, term.score(u, values)
+
+
+def _compress(
+    rows: Float[np.ndarray, "rows touched"], shift: Float[np.ndarray, "rows"]
+) -> tuple[Float[np.ndarray, "r touched"], Float[np.ndarray, "r"]]:
+    """Return at most as many rows as unknowns with the same sum of squares, up to a constant."""
+    if len(rows) <= rows.shape[1]:
+        return rows, shift
+    q, r = np.linalg.qr(rows)
+    return r, q.T @ shift

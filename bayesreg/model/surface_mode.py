@@ -1,0 +1,180 @@
+"""The mode of a posterior with points and surfaces alone, by repeated Gaussian approximations.
+
+Each step replaces every observation by the Gaussian that it has at the last displacement (`Quadratic`), takes the scales
+of the loads and of the errors that maximise the evidence, and then the mean displacement. The stiffness stays at its
+reference. For Student's t and a flat surface, the steps are those of iteratively reweighted least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+from bayesreg.fem.elasticity import stiffness
+from bayesreg.mesh import TetMesh
+from bayesreg.model.blocks import Values
+from bayesreg.model.coordinates import complete, reference_values
+from bayesreg.model.observations.observation import Correlated
+from bayesreg.model.program import Problem
+from bayesreg.model.quadratic import approximate
+from bayesreg.model.state import state_of
+
+# The search ends where no node moves further than this, mm, or after so many steps.
+SETTLED, MOST_STEPS = 0.05, 25
+# Before so many steps, the residuals are still those of the motion, and all points count.
+FREE_STEPS = 3
+# Evaluations of the evidence in one step, which need not find its maximum exactly.
+EVALUATIONS = 40
+# The sd of each rigid motion that stands for a flat prior, mm.
+WIDE = 1e3
+
+
+class Mode(NamedTuple):
+    """The displacement and the scales of the greatest evidence.
+
+    Attributes
+    ----------
+    problem : Problem
+        With the counted numbers of independent points.
+    values : dict
+        Values of all blocks, the displacements included.
+    """
+
+    problem: Problem
+    values: dict[str, Any]
+
+
+def find_mode(
+    problem: Problem, mesh: TetMesh, observations: Mapping[str, Any] | None = None, start: Values | None = None
+) -> Mode:
+    """Find the mode of a posterior of points and surfaces.
+
+    Parameters
+    ----------
+    problem : Problem
+        With random loads.
+    mesh : TetMesh
+    observations : mapping, optional
+        Those whose independent points are to be counted on the way, by name.
+    start : mapping, optional
+        Estimands to begin with.
+    """
+    values = reference_values(problem.blocks) if start is None else complete(problem.blocks, start)
+    values = {name: np.asarray(value) for name, value in values.items()}
+    solver = _Solver(problem, mesh, values)
+    correlated = {name: each for name, each in (observations or {}).items() if isinstance(each, Correlated)}
+    for number in range(MOST_STEPS):
+        gaussian = _Step(solver, problem, values["u_boundary"], values)
+        values = {**values, **_best_scales(gaussian, {name: float(values[name]) for name in _scales(problem)})}
+        u, last = gaussian.mean(values), values["u_boundary"]
+        values = {**values, "u_boundary": u}
+        if number + 1 < FREE_STEPS:
+            continue
+        for name, observation in correlated.items():
+            term = problem.terms[name]
+            count = observation.count_independent_points(term, u, values)
+            problem = problem.with_term(name, term.with_independent_points(count))
+        if np.abs(u - last).max() < SETTLED:
+            break
+    return Mode(problem, values)
+
+
+def _best_scales(gaussian: _Step, start: dict[str, float]) -> dict[str, float]:
+    """Return scales of a greater evidence, nearly the greatest."""
+
+    def scales(logs: np.ndarray) -> dict[str, float]:
+        return dict(zip(start, np.exp(logs), strict=True))
+
+    options = {"maxfev": EVALUATIONS, "xatol": 0.02, "fatol": 0.05}
+    logs = np.log(list(start.values()))
+    found = minimize(lambda logs: -gaussian.log_evidence(scales(logs)), logs, method="Nelder-Mead", options=options)
+    return scales(found.x)
+
+
+def observed_terms(problem: Problem) -> list[Any]:
+    """Return the terms of points and surfaces: those with a slope for each point."""
+    return [term for term in problem.terms.values() if hasattr(term, "score")]
+
+
+def _scales(problem: Problem) -> list[str]:
+    """Return the names of the sampled scales of loads and errors."""
+    names = [name for term in problem.terms.values() for name in getattr(term, "hyperparameters", ())]
+    return [name for name in names if problem.blocks[name].is_sampled]
+
+
+class _Solver:
+    """The Gaussian of the displacements at the reference stiffness."""
+
+    def __init__(self, problem: Problem, mesh: TetMesh, values: Values) -> None:
+        elastic = problem.terms["elastic"]
+        self.rigid = np.asarray(elastic.rigid)
+        self.masses = np.repeat(np.stack([np.asarray(elastic.volumes), np.asarray(elastic.areas)]), 3, axis=1)
+        prior = problem.terms.get("rigid")
+        # A flat prior of the rigid motion is the limit of a wide one.
+        self.rigid_root = np.sqrt(len(mesh.points)) * (WIDE if prior is None else float(prior.sd)) * self.rigid
+        K = stiffness(mesh, *(np.asarray(by_cell) for by_cell in problem.body.lame_by_cell(values))).toarray()
+        # K⁺ of balanced loads: the rigid motions get a stiffness of their own.
+        self._factor = scipy.linalg.cho_factor(K + np.diag(K).mean() * self.rigid @ self.rigid.T)
+
+    def respond(self, loads: Float[np.ndarray, "unknowns columns"]) -> Float[np.ndarray, "unknowns columns"]:
+        """Return K⁺ times loads."""
+        u = scipy.linalg.cho_solve(self._factor, loads - self.rigid @ (self.rigid.T @ loads))
+        return u - self.rigid @ (self.rigid.T @ u)
+
+
+class _Step:
+    """The Gaussian approximation at one displacement, for all scales."""
+
+    def __init__(self, solver: _Solver, problem: Problem, u: Float[np.ndarray, "nodes 3"], values: Values) -> None:
+        self._solver, self._problem, self._u, self._values = solver, problem, u, values
+        touched = [np.asarray(approximate(term, u, values).unknowns) for term in observed_terms(problem)]
+        self._touched = np.unique(np.concatenate(touched))
+        self._response = solver.respond(np.eye(u.size)[:, self._touched])
+        self._squares = [self._response.T @ (mass[:, None] * self._response) for mass in solver.masses]
+
+    def log_evidence(self, scales: dict[str, Any]) -> float:
+        """Compute the log of the evidence of some scales, up to a constant."""
+        values, blocks = {**self._values, **scales}, self._problem.blocks
+        prior = sum(float(blocks[name].prior().log_prob(scale)) + np.log(scale) for name, scale in scales.items())
+        E, y = self._rows(values)
+        push, balance = self._balance(values)
+        covariance = sum(size * square for size, square in zip(_sizes(values), self._squares, strict=True))
+        covariance = covariance - push.T @ np.linalg.solve(balance, push)
+        rigid = self._solver.rigid_root[self._touched]
+        lower = np.linalg.cholesky(np.eye(len(y)) + E @ (covariance + rigid @ rigid.T) @ E.T)
+        white = scipy.linalg.solve_triangular(lower, y, lower=True)
+        state = state_of(self._problem.body, blocks, {**values, "u_boundary": jnp.asarray(self._u)})
+        # What the observations have beyond their Gaussians, at u.
+        rest = sum(float(term.log(state)) for term in observed_terms(self._problem))
+        rest += ((E @ self._u.ravel()[self._touched] - y) ** 2).sum() / 2
+        return float(prior + rest - np.log(np.diag(lower)).sum() - white @ white / 2)
+
+    def mean(self, values: Values) -> Float[np.ndarray, "nodes 3"]:
+        """Compute the mean displacement, mm."""
+        E, y = self._rows(values)
+        push, balance = self._balance(values)
+        variances = _sizes(values) @ self._solver.masses
+        load = variances[:, None] * (self._response - self._solver.rigid @ np.linalg.solve(balance, push))
+        rigid = self._solver.rigid_root
+        with_rows = (self._solver.respond(load) + rigid @ rigid[self._touched].T) @ E.T
+        return (with_rows @ np.linalg.solve(np.eye(len(y)) + E @ with_rows[self._touched], y)).reshape(-1, 3)
+
+    def _rows(self, values: Values) -> tuple[Float[np.ndarray, "rows touched"], Float[np.ndarray, "rows"]]:
+        factors = [approximate(term, self._u, values) for term in observed_terms(self._problem)]
+        rows = [factor.interpolation(self._u.size)[:, self._touched] for factor in factors]
+        return np.concatenate(rows), np.concatenate([np.asarray(factor.shift) for factor in factors])
+
+    def _balance(self, values: Values) -> tuple[Float[np.ndarray, "6 touched"], Float[np.ndarray, "6 6"]]:
+        """Return Rᵀ D G and Rᵀ D R."""
+        DR = (_sizes(values) @ self._solver.masses)[:, None] * self._solver.rigid
+        return DR.T @ self._response, self._solver.rigid.T @ DR
+
+
+def _sizes(values: Values) -> Float[np.ndarray, "2"]:
+    return np.array([float(values["body_load"]) ** 2, float(values["surface_load"]) ** 2])
