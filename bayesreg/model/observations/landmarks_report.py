@@ -71,9 +71,10 @@ def _caption(summary: Arrays) -> str:
         return f"{text} Left out, no landmark is determined by the other observations."
     mean = np.nanmean(np.linalg.norm(summary["left_out_residual"], axis=1))
     return (
-        f"{text} Left out: the same distance where all other observations predict the landmark, at stiffnesses and "
-        f"scales that have seen it; its mean is {mean:.3g} mm. Its region: the share of predicted landmarks, with "
-        f"their own errors, that lie nearer. {_describe_coverage(summary)} "
+        f"{text} Left out: the same distance where all other observations predict the landmark (beside images, at the "
+        f"mean stiffness and scales, which have seen it); its mean is {mean:.3g} mm. Its region: the share of "
+        "landmarks with their own errors, simulated by that prediction, that lie nearer. "
+        f"{_describe_coverage(summary)} "
         f"{' '.join(_describe_intervals(summary)) or 'Chance allows such numbers.'}"
     )
 
