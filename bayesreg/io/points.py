@@ -15,11 +15,8 @@ from jaxtyping import Int
 from bayesreg.io.atomic import write_text
 from bayesreg.io.point_formats import READERS, PointPairs, Points
 from bayesreg.io.spaces import Space
-from bayesreg.printable import require_printable
+from bayesreg.printable import join_some, require_printable
 from bayesreg.types import InputError
-
-# The greatest number of points that a message names.
-MOST_NAMED = 8
 
 _log = logging.getLogger(__name__)
 
@@ -144,9 +141,8 @@ def _tell_left_out(fixed_points: Points, moving_points: Points, path: str | Path
     """Log which points have no position, so that their pairs are left out."""
     for points, file in ((fixed_points, path), (moving_points, moving)):
         if points.undefined:
-            named = ", ".join(points.names[k] or f"number {k + 1}" for k in points.undefined[:MOST_NAMED])
-            more = ", …" * (len(points.undefined) > MOST_NAMED)
-            _log.warning("%s: points without a position are left out with their partners: %s%s", file, named, more)
+            named = join_some([points.names[k] or f"number {k + 1}" for k in points.undefined])
+            _log.warning("%s: points without a position are left out with their partners: %s", file, named)
 
 
 def _read(path: Path, space: Space | None = None) -> Points | PointPairs:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from copy import copy
+from types import MappingProxyType
 from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bayesreg.fem.location import nearest_places
+from bayesreg.image import Image
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.points import read_point_pairs
 from bayesreg.io.records import Inputs
@@ -26,11 +28,20 @@ from bayesreg.model.observations.landmarks_report import (
 )
 from bayesreg.model.observations.left_out import leave_out
 from bayesreg.model.observations.observation import Placed, Recorded
+from bayesreg.model.observations.odd_points import (
+    Reading,
+    describe_contradictions,
+    describe_plane,
+    first_of_each,
+    lie_near,
+    other_readings,
+    suspect_reading,
+)
 from bayesreg.model.observations.point_noise import Noise, NormalNoise, StudentTNoise
 from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
 from bayesreg.model.state import State
 from bayesreg.model.term import Label
-from bayesreg.printable import require_printable
+from bayesreg.printable import join_some, require_printable
 from bayesreg.settings import FoundFile, KnownOrInferred, ScalePrior
 from bayesreg.types import InputError
 
@@ -72,6 +83,9 @@ class Landmarks:
     labels : sequence of str, optional
         The name of each pair in the report; the default is its number.
     noise : StudentTNoise or NormalNoise, default StudentTNoise(nu=4)
+    grids : mapping of str to Image, optional
+        Images in the space of the fixed image, by a name such as "the labels". Points outside the mesh that would lie
+        in it as voxel indices of a grid are told to be such.
 
     Raises
     ------
@@ -89,6 +103,7 @@ class Landmarks:
         name: str = "landmarks",
         labels: Sequence[str] | None = None,
         noise: NormalNoise | StudentTNoise = ROBUST,
+        grids: Mapping[str, Image] = MappingProxyType({}),
     ) -> None:
         self.fixed_points, self.moving_points = (_points(points, name) for points in (fixed_points, moving_points))
         shapes = self.fixed_points.shape, self.moving_points.shape
@@ -99,7 +114,8 @@ class Landmarks:
             raise InputError(f"{name}: every coordinate must be a finite number")
         if isinstance(labels, str) or (labels is not None and len(labels) != count):
             raise InputError(f"{name}: labels must be a list of {count}, one for each point; got {labels!r:.60}")
-        self.name, self.noise = name, noise
+        self.name, self.noise, self.grids = name, noise, grids
+        self.remarks: tuple[str, ...] = ()
         self.labels = tuple(map(str, range(1, count + 1) if labels is None else labels))
         require_printable(self.labels, f"{name}: labels")
         priors = sd if _has_prior(sd) else [sd] * 3 if isinstance(sd, ScalePrior) else [None] * 3
@@ -120,40 +136,69 @@ class Landmarks:
         InputError
             If points lie so far outside of the mesh that fewer than `FEWEST` are left.
         """
-        nodes, weights, distance = nearest_places(mesh, self.fixed_points)
-        observation = self._within(distance, mesh.boundary_edge)
-        near = distance <= mesh.boundary_edge
+        observation = self._counted_once()._near(mesh)._examined()
+        for sentence in observation.remarks:
+            _log.warning("%s", sentence)
+        nodes, weights, distance = nearest_places(mesh, observation.fixed_points)
         term = ComparedPoints(
             label=Label(self.name),
             noise=self.noise,
             scales=tuple(Label(self.scales[axis][0]) if axis in self.scales else None for axis in range(3)),
-            nodes=jnp.asarray(nodes[near]),
-            weights=jnp.asarray(weights[near]),
+            nodes=jnp.asarray(nodes),
+            weights=jnp.asarray(weights),
             shift=jnp.asarray(observation.moving_points - observation.fixed_points),
             known_sd=jnp.asarray(observation.sd),
-            beyond=jnp.asarray(STRAIN * distance[near]),
+            beyond=jnp.asarray(STRAIN * distance),
         )
         return Placed(observation, term, {scale: scale_block(prior) for scale, prior in self.scales.values()})
 
-    def _within(self, distance: Float[np.ndarray, "k"], reach: float) -> Landmarks:
-        """Return the landmarks that lie no further outside the mesh than `reach`, mm; say which do not."""
-        far = distance > reach
-        if far.any():
-            names = [self.labels[k] for k in np.flatnonzero(far)]
-            sentence = (
-                f"{self.name}: {far.sum()} of {len(far)} points lie {distance[far].min():.3g} mm or more outside the "
-                f"mesh, further than the length of its edges ({reach:.3g} mm): {', '.join(names[:8])}"
-                f"{', …' * (len(names) > 8)}"
-            )
-            if (~far).sum() < FEWEST:
-                raise InputError(
-                    f"{sentence}; fewer than {FEWEST} points are left; are they in the space of the fixed image "
-                    "(world RAS, mm), and is the organ meshed whole?"
-                )
-            _log.warning("%s; they are left out", sentence)
+    def _counted_once(self) -> Landmarks:
+        """Return the landmarks without exact copies of a pair, which are no measurements of their own."""
+        kept = np.zeros(len(self.labels), bool)
+        kept[first_of_each(self.fixed_points, self.moving_points)] = True
+        repeated = join_some([label for label, is_kept in zip(self.labels, kept, strict=True) if not is_kept])
+        return self._selected(
+            kept, f"{self.name}: these pairs repeat another one exactly, and do not count: {repeated}."
+        )
+
+    def _near(self, mesh: TetMesh) -> Landmarks:
+        """Return the landmarks that lie no further outside the mesh than its edges are long; say which do not."""
+        distance, reach = nearest_places(mesh, self.fixed_points)[2], mesh.boundary_edge
+        near = distance <= reach
+        if near.all():
+            return self
+        swap = Reading(
+            "swapped with their partners", "swap the fixed and moving points", lie_near(mesh, self.moving_points)
+        )
+        suspicion = suspect_reading(near, [*other_readings(mesh, self.fixed_points, self.grids), swap])
+        labels = join_some([self.labels[k] for k in np.flatnonzero(~near)])
+        sentence = (
+            f"{self.name}: {(~near).sum()} of {len(near)} points lie {distance[~near].min():.3g} mm or more outside "
+            f"the mesh, further than the length of its edges ({reach:.3g} mm): {labels}; "
+        )
+        if near.sum() < FEWEST:
+            question = "are they in the space of the fixed image (world RAS, mm), and is the organ meshed whole?"
+            raise InputError(f"{sentence}fewer than {FEWEST} points are left; {suspicion or question}")
+        return self._selected(near, f"{sentence}they are left out{'; ' * bool(suspicion)}{suspicion}.")
+
+    def _selected(self, kept: Bool[np.ndarray, "k"], reason: str) -> Landmarks:
+        """Return some of the landmarks, with the reason why others are left out as a remark."""
+        if kept.all():
+            return self
         observation = copy(self)
-        observation.fixed_points, observation.moving_points = self.fixed_points[~far], self.moving_points[~far]
-        observation.sd, observation.labels = self.sd[~far], tuple(np.array(self.labels)[~far].tolist())
+        observation.fixed_points, observation.moving_points = self.fixed_points[kept], self.moving_points[kept]
+        observation.sd, observation.labels = self.sd[kept], tuple(np.array(self.labels)[kept].tolist())
+        observation.remarks = (*self.remarks, reason)
+        return observation
+
+    def _examined(self) -> Landmarks:
+        """Return the landmarks with remarks on what remains odd about them."""
+        observation = copy(self)
+        observation.remarks = (
+            *self.remarks,
+            *describe_contradictions(self.name, self.fixed_points, self.moving_points, self.labels),
+            *describe_plane(self.name, self.fixed_points),
+        )
         return observation
 
     def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
@@ -174,8 +219,8 @@ class Landmarks:
         return summary | {"left_out_residual": left_out.residual, "left_out_covariance": left_out.covariance}
 
     def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
-        """Name the pairs that are probably wrong, for the terminal and the first page of the report."""
-        return describe_wrong_pairs(self.name, summary)
+        """Say what is odd about the points, and which pairs are probably wrong."""
+        return [*self.remarks, *describe_wrong_pairs(self.name, summary)]
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""
@@ -245,7 +290,8 @@ class LandmarksSection(ObservationSection):
         if isinstance(sd, tuple) and not any(isinstance(prior, ScalePrior) for prior in sd):
             sd = np.array([sd])
         moving = inputs.matching.pose.inverse.place(pairs.moving)
-        return [Landmarks(pairs.fixed, moving, sd, self.name, labels, self.noise)]
+        grid = {"the labels": inputs.tissue} if inputs.fixed is None else {"the fixed image": inputs.fixed}
+        return [Landmarks(pairs.fixed, moving, sd, self.name, labels, self.noise, grid)]
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:

@@ -11,11 +11,12 @@ from scipy import stats
 
 from bayesreg.model.observations.point_noise import WRONG
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
+from bayesreg.printable import join_some
 from bayesreg.types import AnyArray
 
 LEVELS = (0.5, 0.95)
-# The greatest number of landmarks that the figure shows, and of pairs that a sentence names.
-MOST_SHOWN, MOST_NAMED = 60, 8
+# The greatest number of landmarks that the figure shows.
+MOST_SHOWN = 60
 
 
 def region_probability(
@@ -97,7 +98,7 @@ def describe_wrong_pairs(name: str, summary: Arrays) -> list[str]:
     which = "pair of points is" if len(wrong) == 1 else "pairs of points are"
     return [
         f"{name}: {len(wrong)} {which} probably wrong (distance from where the others have it, probability): "
-        f"{', '.join(named[:MOST_NAMED])}{', …' * (len(named) > MOST_NAMED)}. They count little; look at them again."
+        f"{join_some(named)}. They count little; look at them again."
     ]
 
 
