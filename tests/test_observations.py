@@ -291,6 +291,23 @@ def test_landmarks_without_an_sd_have_it_inferred(folder, tmp_path):
     assert 0.05 < float(result.idata.posterior["landmarks_sd"].median()) < 0.8
 
 
+def test_a_second_reading_tells_the_sd_and_the_run_says_both(folder, tmp_path, caplog):
+    """The error of the points is 0.2 mm, that of the second reading, too."""
+    caplog.set_level(logging.INFO)
+    moved = br.read_point_pairs(folder / "plain.csv").moving
+    again = moved + np.sqrt(2) * 0.2 * np.random.default_rng(7).normal(size=moved.shape)
+    np.savetxt(tmp_path / "second.csv", again, delimiter=",", header="x,y,z", comments="")
+    entry = {"kind": "landmarks", "file": "plain.csv", "second_file": str(tmp_path / "second.csv")}
+    with without_reports():
+        result = br.run(configuration(folder, [entry], LABELS), tmp_path / "out", progress=False)
+    medians = [result.run.manifest["scales"][f"landmarks_sd_{axis}"]["median"] for axis in "xyz"]
+    np.testing.assert_allclose(medians, np.sqrt(((again - moved) ** 2).mean(axis=0) / 2), rtol=1e-5)
+    inferred = result.idata.posterior["landmarks_sd_x"].mean()
+    told = f"an sd of {medians[0]:.2g} mm along x, .*; the run infers {inferred:.2g} mm along x, "
+    assert sum(bool(re.search(told, message)) for message in caplog.messages) == 1
+    assert re.search(told, result.run.manifest["appraisal"]["notes"][-1])
+
+
 def test_an_entry_of_observations_is_overridden_by_its_number(folder):
     path = configuration(folder, [PAIRS, PAIRS | {"name": "other"}], LABELS)
     config = br.load_config(path, ["observations.1.sd=2.5"])

@@ -22,6 +22,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import scale_block
 from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.landmarks_report import (
+    describe_readings,
     describe_wrong_pairs,
     distance_figure,
     landmark_table,
@@ -48,6 +49,10 @@ from bayesreg.types import InputError
 ROBUST = StudentTNoise()
 # The prior of an sd of which nothing is told, mm: its 95 % interval is 0.02 to 50 mm.
 UNKNOWN_SD = ScalePrior(median=1.0, log_sd=2.0)
+# The log-sd of the prior of an sd whose median two readings tell: its 95 % interval is a factor of 4 to both sides.
+# Readings of one observer share errors, and those of the fixed points and of the model come on top: on DIR-Lab, runs
+# inferred 0.7 to 3.4 times the sd of the readings.
+READINGS_LOG_SD = 0.7
 # The sd of the displacement's change over a distance outside the mesh, over this distance: a strain that tissue has.
 STRAIN = 0.2
 # The least number of landmarks if others lie too far outside the mesh.
@@ -74,15 +79,19 @@ class Landmarks:
         further off is left out.
     moving_points : (k, 3) array
         q, world RAS mm, in the space of the moving image.
-    sd : float, (k,), (k, 3) or (1, 3) array, ScalePrior, or three numbers and priors
+    sd : float, (k,), (k, 3) or (1, 3) array, ScalePrior, three numbers and priors, or None
         Standard deviation of the error of each coordinate, mm, positive; or the prior of one sd for all points, which
         is then inferred as "<name>_sd"; or a sequence with at least one prior for the axes x, y and z, inferred as
-        "<name>_sd_x" and so on. Errors of Student's t have this scale, and are wider by √(ν / (ν − 2)).
+        "<name>_sd_x" and so on. None takes the prior from `second_points`: its median for each axis is the root mean
+        square difference of both readings over √2, the sd of one reading, and its log-sd is `READINGS_LOG_SD`. Errors
+        of Student's t have this scale, and are wider by √(ν / (ν − 2)).
     name : str, default "landmarks"
         The name of the observation in tables and in the NumPyro program.
     labels : sequence of str, optional
         The name of each pair in the report; the default is its number.
     noise : StudentTNoise or NormalNoise, default StudentTNoise(nu=4)
+    second_points : (k, 3) array, optional
+        q as it was read a second time, world RAS mm. It is not compared with the model.
     grids : mapping of str to Image, optional
         Images in the space of the fixed image, by a name such as "the labels". Points outside the mesh that would lie
         in it as voxel indices of a grid are told to be such.
@@ -103,6 +112,7 @@ class Landmarks:
         name: str = "landmarks",
         labels: Sequence[str] | None = None,
         noise: NormalNoise | StudentTNoise = ROBUST,
+        second_points: Any = None,
         grids: Mapping[str, Image] = MappingProxyType({}),
     ) -> None:
         self.fixed_points, self.moving_points = (_points(points, name) for points in (fixed_points, moving_points))
@@ -118,6 +128,9 @@ class Landmarks:
         self.remarks: tuple[str, ...] = ()
         self.labels = tuple(map(str, range(1, count + 1) if labels is None else labels))
         require_printable(self.labels, f"{name}: labels")
+        self.reading_sd = None if second_points is None else _reading_sd(self.moving_points, second_points, name)
+        if sd is None and self.reading_sd is not None:
+            sd = tuple(ScalePrior(median=float(median), log_sd=READINGS_LOG_SD) for median in self.reading_sd)
         priors = sd if _has_prior(sd) else [sd] * 3 if isinstance(sd, ScalePrior) else [None] * 3
         scale_names = [f"{name}_sd"] * 3 if isinstance(sd, ScalePrior) else [f"{name}_sd_{axis}" for axis in "xyz"]
         self.scales = {
@@ -210,6 +223,10 @@ class Landmarks:
             "sd": np.sqrt((np.asarray(term.sd(state.values)) ** 2).mean(axis=1)),
             "residual": np.asarray(term.shift - term.predicted(state)),
         }
+        if self.reading_sd is not None:
+            scales = (None if scale is None else state.values[scale.name] for scale in term.scales)
+            inferred = np.array([np.nan if scale is None else float(scale) for scale in scales])
+            summary |= {"reading_sd": self.reading_sd, "inferred_sd": inferred}
         if (wrong := term.probability_of_wrong(state)) is not None:
             summary["wrong"] = wrong
         unknowns = 3 * len(posterior.sampled)
@@ -221,6 +238,10 @@ class Landmarks:
     def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
         """Say what is odd about the points, and which pairs are probably wrong."""
         return [*self.remarks, *describe_wrong_pairs(self.name, summary)]
+
+    def notes(self, summary: Mapping[str, np.ndarray]) -> list[str]:
+        """Put the sd of the readings beside the sd that the run inferred, if the points were read twice."""
+        return describe_readings(self.name, summary)
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""
@@ -234,6 +255,22 @@ def _points(points: Any, name: str) -> np.ndarray:
         return np.asarray(points, float)
     except (TypeError, ValueError):
         raise InputError(f"{name}: points must be numbers in an array of shape (k, 3)") from None
+
+
+def _reading_sd(moving_points: Float[np.ndarray, "k 3"], second: Any, name: str) -> Float[np.ndarray, "3"]:
+    """Return the sd of one reading along each axis, mm: differences of two like it have twice its variance."""
+    second = _points(second, name)
+    if second.shape != moving_points.shape or not np.isfinite(second).all():
+        raise InputError(
+            f"{name}: second_points must be finite, one for each of {len(moving_points)} pairs; got {second.shape}"
+        )
+    sd = np.sqrt(((second - moving_points) ** 2).mean(axis=0) / 2)
+    if not (sd > 0).all():
+        raise InputError(
+            f"{name}: both readings of the moving points are equal along {'xyz'[int(sd.argmin())]}, and tell no sd; "
+            "give sd, or leave the second reading out"
+        )
+    return sd
 
 
 def _has_prior(sd: Any) -> bool:
@@ -271,27 +308,30 @@ class LandmarksSection(ObservationSection):
     .mrk.json, .tag)."""
     moving_file: FoundFile | None = None
     """The points in the moving image, where they stand in a file of their own."""
+    second_file: FoundFile | None = None
+    """The points in the moving image as read a second time, where they are no columns of the file: they tell the sd."""
     sd: KnownOrInferred | tuple[KnownOrInferred, KnownOrInferred, KnownOrInferred] | None = None
     """Sd of the error of each coordinate, mm, or its prior, or three of these for the axes x, y and z; null takes the
-    column sd of the file, and without one infers it."""
+    column sd of the file, and without one infers it, by a second reading where there is one."""
     noise: Noise = ROBUST
     """The distribution of the errors: student_t, with a few large ones, or normal."""
 
     def read(self) -> dict[str, np.ndarray]:
         """Read the points from the files, world RAS mm."""
-        return read_point_pairs(self.file, self.moving_file).as_arrays()
+        return read_point_pairs(self.file, self.moving_file, self.second_file).as_arrays()
 
     def observe(self, inputs: Inputs) -> Sequence[Landmarks]:
         """Make the landmarks; those of the moving image are transformed into the world of the fixed one."""
         pairs = PointPairs.of_arrays(inputs.observed[self.name])
         labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
         given = pairs.sd if self.sd is None else self.sd
-        sd = UNKNOWN_SD if given is None else given
+        sd = UNKNOWN_SD if given is None and pairs.second is None else given
         if isinstance(sd, tuple) and not any(isinstance(prior, ScalePrior) for prior in sd):
             sd = np.array([sd])
-        moving = inputs.matching.pose.inverse.place(pairs.moving)
+        aligned = inputs.matching.pose.inverse
+        moving, second = (None if side is None else aligned.place(side) for side in (pairs.moving, pairs.second))
         grid = {"the labels": inputs.tissue} if inputs.fixed is None else {"the fixed image": inputs.fixed}
-        return [Landmarks(pairs.fixed, moving, sd, self.name, labels, self.noise, grid)]
+        return [Landmarks(pairs.fixed, moving, sd, self.name, labels, self.noise, second, grid)]
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
