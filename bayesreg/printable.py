@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from bayesreg.types import InputError
 
@@ -14,6 +14,9 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff
 
 # The text for a missing number.
 NONE = "–"
+
+# The greatest number of names in a sentence.
+MOST_NAMED = 8
 
 
 def find_unprintable(text: str) -> str | None:
@@ -27,6 +30,11 @@ def require_printable(names: Iterable[str], where: str) -> None:
     for name in names:
         if (odd := find_unprintable(name)) is not None or "\n" in name:
             raise InputError(f"{where}: the name {name!r:.80} holds {odd or 'an end of line'}; give it another one")
+
+
+def join_some(names: Sequence[str]) -> str:
+    """Join names for a sentence; of many, the first ones."""
+    return f"{', '.join(names[:MOST_NAMED])}{', …' * (len(names) > MOST_NAMED)}"
 
 
 def number(value: float | int | None, digits: int = 3) -> str:

@@ -106,6 +106,50 @@ def test_landmarks_without_any_image(folder, tmp_path, data):
         assert "Before and after" not in page
 
 
+@pytest.fixture(scope="module")
+def odd_run(tmp_path_factory):
+    """An organ far from the origin, in the moving image 70 mm from where it was; a point has two partners."""
+    folder = tmp_path_factory.mktemp("odd")
+    box = box_mesh(2, size=40.0)
+    mesh = br.TetMesh.from_arrays(
+        box.points + np.array([60, 20, -30]), box.cells, np.zeros(len(box.cells), int), ("organ",)
+    )
+    br.save_mesh(mesh, folder / "mesh.vtu")
+    fixed = mesh.points[[0, 3, 7, 12, 18, 20, 25, 25]]
+    moving = fixed + (70.0, 0.0, 0.0) + 12.0 * (np.arange(8) == 7)[:, None] * (0, 0, 1)
+    header = "fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z"
+    np.savetxt(folder / "pairs.csv", np.hstack([fixed, moving]), delimiter=",", header=header, comments="")
+    observations = [{"kind": "landmarks", "file": "pairs.csv", "sd": 1.0}]
+    file = configuration(folder, observations)
+    with without_reports():
+        return br.run(br.load_config(file, ["model.rigid_sd=null"]), folder / "run", progress=False)
+
+
+def test_what_is_odd_stands_among_the_warnings(odd_run):
+    """They stand on the first page of the report."""
+    sentence = "lie apart in the moving image (by how much): 7 and 8 (12 mm)"
+    assert sum(sentence in warning for warning in odd_run.run.manifest["appraisal"]["warnings"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("reading", "claim"),
+    [
+        (lambda grid, points: grid.world_to_voxel(points), "voxel indices of the labels; then convert them"),
+        (lambda grid, points: points * (-1, -1, 1), "by which LPS and RAS differ; then state"),
+        (lambda grid, points: points + np.array([70, 0, 0]), "points of the moving image; then give --inverse"),
+        (lambda grid, points: points, None),
+    ],
+    ids=["voxels", "LPS", "moving", "as they are"],
+)
+def test_apply_suspects_another_reading(odd_run, tmp_path, caplog, reading, claim):
+    points = reading(odd_run.run.tissue, odd_run.mesh.points)
+    np.savetxt(tmp_path / "p.csv", points, delimiter=",", header="x,y,z", comments="")
+    br.apply(odd_run.folder, tmp_path / "out", points=tmp_path / "p.csv", draws=30)
+    suspected = [message for message in caplog.messages if "would lie in the mesh or near it" in message]
+    assert len(suspected) == (claim is not None)
+    assert all(claim in message for message in suspected)
+
+
 def test_a_budget_that_is_spent_at_once_leaves_a_valid_folder(folder, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     stop = {"max_minutes": 1e-5, "rhat": 1.01, "ess": 400}
@@ -245,6 +289,23 @@ def test_landmarks_without_an_sd_have_it_inferred(folder, tmp_path):
     with without_reports():
         result = br.run(path, tmp_path / "out", progress=False)
     assert 0.05 < float(result.idata.posterior["landmarks_sd"].median()) < 0.8
+
+
+def test_a_second_reading_tells_the_sd_and_the_run_says_both(folder, tmp_path, caplog):
+    """The error of the points is 0.2 mm, that of the second reading, too."""
+    caplog.set_level(logging.INFO)
+    moved = br.read_point_pairs(folder / "plain.csv").moving
+    again = moved + np.sqrt(2) * 0.2 * np.random.default_rng(7).normal(size=moved.shape)
+    np.savetxt(tmp_path / "second.csv", again, delimiter=",", header="x,y,z", comments="")
+    entry = {"kind": "landmarks", "file": "plain.csv", "second_file": str(tmp_path / "second.csv")}
+    with without_reports():
+        result = br.run(configuration(folder, [entry], LABELS), tmp_path / "out", progress=False)
+    medians = [result.run.manifest["scales"][f"landmarks_sd_{axis}"]["median"] for axis in "xyz"]
+    np.testing.assert_allclose(medians, np.sqrt(((again - moved) ** 2).mean(axis=0) / 2), rtol=1e-5)
+    inferred = result.idata.posterior["landmarks_sd_x"].mean()
+    told = f"an sd of {medians[0]:.2g} mm along x, .*; the run infers {inferred:.2g} mm along x, "
+    assert sum(bool(re.search(told, message)) for message in caplog.messages) == 1
+    assert re.search(told, result.run.manifest["appraisal"]["notes"][-1])
 
 
 def test_an_entry_of_observations_is_overridden_by_its_number(folder):

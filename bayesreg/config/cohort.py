@@ -28,7 +28,7 @@ RESERVED = ("cohort.csv", "cohort.parquet", "cohort.html")
 # The last parts of those keys of a configuration that name files.
 FILES = (
     "fixed", "moving", "labels", "intracranial", "fixed_ignore", "moving_ignore", "label_names", "t1", "file",
-    "moving_file", "field", "known_boundary", "landmarks", "moving_landmarks",
+    "moving_file", "second_file", "field", "known_boundary", "landmarks", "moving_landmarks",
 )  # fmt: skip
 # Longer names of folders are cut here, and a digest is added.
 LONGEST_NAME = 100

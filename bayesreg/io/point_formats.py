@@ -1,8 +1,9 @@
 """Formats of points: CSV, 3D Slicer's .fcsv and .mrk.json, MNI's .tag; from text to points in world RAS, mm.
 
 A CSV has a header: `fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z` for pairs or `x, y, z` for points, and
-optionally `sd` (mm) and `name`. It is in RAS unless it has a line `# CoordinateSystem = LPS`. The other formats state
-whether they are in LPS or RAS; MNI's format is in RAS.
+optionally `sd` (mm) and `name`; for pairs also `second_x, second_y, second_z`, the moving points as read again. It is
+in RAS unless it has a line `# CoordinateSystem = LPS`. The other formats state whether they are in LPS or RAS; MNI's
+format is in RAS.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from jaxtyping import Float
 from bayesreg.io.spaces import TO_RAS, Space
 from bayesreg.types import InputError
 
-FIXED, MOVING = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving"))
+FIXED, MOVING, SECOND = (tuple(f"{side}_{axis}" for axis in "xyz") for side in ("fixed", "moving", "second"))
 PLAIN = ("x", "y", "z")
 # Factors that convert points from a file's coordinate system to RAS.
 SYSTEMS = {**TO_RAS, "0": TO_RAS["RAS"], "1": TO_RAS["LPS"]}
@@ -65,12 +66,15 @@ class PointPairs(NamedTuple):
     names : tuple of str
     sd : (k,) array or None
         Standard deviation of each coordinate, mm, if the file gives it.
+    second : (k, 3) array or None
+        The moving points as they were read a second time, world RAS, mm.
     """
 
     fixed: Float[np.ndarray, "k 3"]
     moving: Float[np.ndarray, "k 3"]
     names: tuple[str, ...]
     sd: Float[np.ndarray, "k"] | None = None
+    second: Float[np.ndarray, "k 3"] | None = None
 
     def as_arrays(self) -> dict[str, np.ndarray]:
         """Convert the fields that are not None to named arrays, for files."""
@@ -79,7 +83,8 @@ class PointPairs(NamedTuple):
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PointPairs:
         """Create pairs from the arrays of `as_arrays`."""
-        return cls(arrays["fixed"], arrays["moving"], tuple(arrays["names"].tolist()), arrays.get("sd"))
+        names = tuple(arrays["names"].tolist())
+        return cls(arrays["fixed"], arrays["moving"], names, arrays.get("sd"), arrays.get("second"))
 
 
 def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
@@ -92,6 +97,8 @@ def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
     header, *rows = [(number, [cell.strip() for cell in next(csv.reader([line]))]) for number, line in lines]
     columns = [column.lower() for column in header[1]]
     wanted = FIXED + MOVING if set(FIXED + MOVING) <= set(columns) else PLAIN
+    if wanted != PLAIN and set(SECOND) & set(columns):
+        wanted += SECOND
     if wanted == PLAIN and "t" in columns and space is None and not _named_system(text, "", path):
         raise InputError(
             f"{path} has the columns x, y, z, t, as ANTs writes points, whose coordinates are LPS; say whether these "
@@ -101,8 +108,8 @@ def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
         raise InputError(f"{path}: expected one column {twice[0]}; got {', '.join(header[1])}")
     if not set(wanted) <= set(columns):
         raise InputError(
-            f"{path}: expected a header with {', '.join(FIXED + MOVING)}, or with {', '.join(PLAIN)}; got "
-            f"{', '.join(header[1])}"
+            f"{path}: expected a header with {', '.join(FIXED + MOVING)}, with these and "
+            f"{', '.join(SECOND)}, or with {', '.join(PLAIN)}; got {', '.join(header[1])}"
         )
     for number, cells in rows:
         if len(cells) != len(columns):
@@ -118,8 +125,8 @@ def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
     sd = values(["sd"])[:, 0] if "sd" in columns else None
     if wanted == PLAIN:
         return Points(_in_ras(values(PLAIN), system, path), names, sd)
-    fixed, moving = (_in_ras(values(side), system, path) for side in (FIXED, MOVING))
-    return PointPairs(fixed, moving, names, sd)
+    fixed, moving, *second = (_in_ras(values(wanted[k : k + 3]), system, path) for k in range(0, len(wanted), 3))
+    return PointPairs(fixed, moving, names, sd, *second)
 
 
 def _read_fcsv(text: str, path: str, space: Space | None) -> Points:

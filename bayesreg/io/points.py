@@ -10,16 +10,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from bayesreg.io.atomic import write_text
 from bayesreg.io.point_formats import READERS, PointPairs, Points
 from bayesreg.io.spaces import Space
-from bayesreg.printable import require_printable
+from bayesreg.printable import join_some, require_printable
 from bayesreg.types import InputError
-
-# The greatest number of points that a message names.
-MOST_NAMED = 8
 
 _log = logging.getLogger(__name__)
 
@@ -70,8 +67,10 @@ def write_table(path: str | Path, columns: Mapping[str, Sequence[Any]]) -> None:
     write_text(path, lines.getvalue())
 
 
-def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> PointPairs:
-    """Read pairs of points, from one file or from two.
+def read_point_pairs(
+    path: str | Path, moving: str | Path | None = None, second: str | Path | None = None
+) -> PointPairs:
+    """Read pairs of points, from one file or from two, and the moving points as read again, if there are any.
 
     Parameters
     ----------
@@ -82,12 +81,29 @@ def read_point_pairs(path: str | Path, moving: str | Path | None = None) -> Poin
         the same names. They are paired in order if names repeat or the files share no name. Unique names of which only
         some agree are an error. Points without a position (Slicer's `positionStatus`) are left out with their partners,
         once pairs are made.
+    second : path, optional
+        The points in the moving image as read a second time, one for each pair: by name or in order likewise. A CSV of
+        pairs may have them in its columns second_x, second_y, second_z.
 
     Raises
     ------
     InputError
         If a file is missing or of an unknown kind, its content is invalid, or the files do not fit each other.
     """
+    pairs = _read_once(path, moving)
+    return pairs if second is None else _with_second(pairs, path, second)
+
+
+def _with_second(pairs: PointPairs, path: str | Path, second: str | Path) -> PointPairs:
+    if pairs.second is not None:
+        raise InputError(f"{path} has the columns of a second reading; expected no second file, got {second}")
+    again = read_points(second)
+    _, partners = _partners(Points(pairs.moving, pairs.names), again, path, second)
+    return pairs._replace(second=again.points[partners])
+
+
+def _read_once(path: str | Path, moving: str | Path | None) -> PointPairs:
+    """Read pairs of points, from one file or from two."""
     points = _read(Path(path))
     if isinstance(points, PointPairs):
         if moving is not None:
@@ -144,9 +160,8 @@ def _tell_left_out(fixed_points: Points, moving_points: Points, path: str | Path
     """Log which points have no position, so that their pairs are left out."""
     for points, file in ((fixed_points, path), (moving_points, moving)):
         if points.undefined:
-            named = ", ".join(points.names[k] or f"number {k + 1}" for k in points.undefined[:MOST_NAMED])
-            more = ", …" * (len(points.undefined) > MOST_NAMED)
-            _log.warning("%s: points without a position are left out with their partners: %s%s", file, named, more)
+            named = join_some([points.names[k] or f"number {k + 1}" for k in points.undefined])
+            _log.warning("%s: points without a position are left out with their partners: %s", file, named)
 
 
 def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
@@ -165,8 +180,12 @@ def _read(path: Path, space: Space | None = None) -> Points | PointPairs:
     return points
 
 
+def _places(pairs: PointPairs) -> Float[np.ndarray, "k coordinates"]:
+    return np.hstack([side for side in (pairs.fixed, pairs.moving, pairs.second) if side is not None])
+
+
 def _require_sound(points: Points | PointPairs, path: Path) -> None:
-    places = points.defined.points if isinstance(points, Points) else np.hstack([points.fixed, points.moving])
+    places = points.defined.points if isinstance(points, Points) else _places(points)
     if not len(places):
         raise InputError(f"{path} holds no point")
     require_printable(points.names, str(path))

@@ -17,9 +17,9 @@ NAMES = [
 
 
 def notes(study: Study) -> Sentences | None:
-    """List the findings on pose and contrast from before the search, a sentence each; None without findings."""
+    """List the findings on pose, contrast and points, a sentence each; None without findings."""
     sentences = nested_entry(study.manifest, "appraisal", "notes")
-    return Sentences("What was found of the images", list(sentences)) if sentences else None
+    return Sentences("What was found of images and points", list(sentences)) if sentences else None
 
 
 def pose_table(study: Study) -> Table:

@@ -22,6 +22,7 @@ from bayesreg.io.volumes import load_image, load_whole_numbers, save_image, writ
 from bayesreg.results.carried_labels import carry_labels
 from bayesreg.results.displacement_fields import around_displaced
 from bayesreg.results.nodal_draws import POINT_DRAWS, transform_of
+from bayesreg.results.readings import own_grids, suspect_other_reading
 from bayesreg.results.result import Result, load_result
 from bayesreg.results.transform import Spread, Transform, distances_of, spread
 from bayesreg.types import InputError
@@ -113,7 +114,8 @@ def apply(
     tasks: list[Callable[[Transform], list[Path]]] = []
     if points is not None:
         side: Literal["fixed", "moving"] = "moving" if inverse else "fixed"
-        tasks.append(partial(_carry_points, read_side(points, side, space), Path(points), how))
+        given = read_side(points, side, space)
+        tasks.append(partial(_carry_points, given, Path(points), own_grids(result, side), how))
     if mesh is not None:
         tasks.append(partial(_carry_surface, read_surface(mesh, space), Path(mesh), how))
     if image is not None:
@@ -234,9 +236,13 @@ def _grid(result: Result, like: str | Path | None, inverse: bool) -> Image:
     return run.matching.pose.inverse.aligned(run.moving)
 
 
-def _carry_points(points: Points, path: Path, how: _How, transform: Transform) -> list[Path]:
+def _carry_points(
+    points: Points, path: Path, grids: Mapping[str, Image], how: _How, transform: Transform
+) -> list[Path]:
     posterior = spread(transform, points.points, how.far)
     how.tell_of_outside(posterior.inside, f"points of {path}")
+    if suspicion := suspect_other_reading(points.points, grids, transform):
+        _log.warning("%s: %s", path, suspicion)
     columns: dict[str, Any] = {"name": points.names}
     for name, values in _values(posterior, how).items():
         axes = [name] if values.ndim == 1 else [f"{name}{end}" for end in ENDS[name]]

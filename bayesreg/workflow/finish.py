@@ -17,7 +17,7 @@ from bayesreg.io import checkpoints, store
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.records import Inputs, Predicted, Run
 from bayesreg.io.run_folder import RunFolder
-from bayesreg.model.observations.observation import Doubtful
+from bayesreg.model.observations.observation import Doubtful, Noted
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import warp_image
 from bayesreg.report.metrics import compute_metrics
@@ -54,7 +54,7 @@ def finish(
         metrics = compute_metrics(inputs.mesh, samples.u_mean, inputs.truth, draws)
     mean, deformer = mean_values(posterior, draws, samples.u_mean), Deformer(inputs.mesh)
     predicted = predict(posterior, draws, mean, samples.u_mean, samples.u_sd, config.report.places, config.seed, pose)
-    provenance = _with_doubts(provenance, posterior, predicted)
+    provenance = _with_findings(provenance, posterior, predicted)
 
     def transform(most: int) -> Transform:
         u = nodal_draws(config.model, inputs, draws, most)
@@ -93,18 +93,22 @@ def finish(
     return Result(folder.path, finished)
 
 
-def _with_doubts(provenance: dict[str, Any], posterior: Posterior, predicted: Predicted) -> dict[str, Any]:
-    """Log what observations doubt, and add it to the warnings of the appraisal."""
-    doubts = [
-        sentence
-        for name, observation in posterior.observations.items()
-        if isinstance(observation, Doubtful)
-        for sentence in observation.doubts(predicted.of_observation(name))
-    ]
-    for sentence in doubts:
-        _log.warning("%s", sentence)
+def _with_findings(provenance: dict[str, Any], posterior: Posterior, predicted: Predicted) -> dict[str, Any]:
+    """Log what observations doubt and what they note, and add it to the appraisal."""
+    warnings: list[str] = []
+    notes: list[str] = []
+    for name, observation in posterior.observations.items():
+        summary = predicted.of_observation(name)
+        if isinstance(observation, Doubtful):
+            warnings += observation.doubts(summary)
+        if isinstance(observation, Noted):
+            notes += observation.notes(summary)
+    for level, sentences in ((logging.WARNING, warnings), (logging.INFO, notes)):
+        for sentence in sentences:
+            _log.log(level, "%s", sentence)
     appraisal = provenance.get("appraisal", {})
-    return provenance | {"appraisal": appraisal | {"warnings": [*appraisal.get("warnings", ()), *doubts]}}
+    added = {"warnings": warnings, "notes": notes}
+    return provenance | {"appraisal": appraisal | {key: [*appraisal.get(key, ()), *added[key]] for key in added}}
 
 
 def _store_draws(posterior: Posterior, samples: Samples, folder: RunFolder, seed: int) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import bayesreg as br
+from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.points import read_point_pairs, read_points
 
 PLACES = np.array([[1.0, -2.0, 3.0], [4.5, 5.0, -6.0]])
@@ -111,6 +112,34 @@ def test_pairs_from_two_files_go_by_name_or_by_order(tmp_path):
     file_of_one = written(tmp_path, "one.csv", "x,y,z\n1,2,3\n")
     with pytest.raises(br.InputError, match=r"holds 2 points and .*one\.csv 1"):
         read_point_pairs(first, file_of_one)
+
+
+def test_moving_points_may_be_read_twice(tmp_path):
+    again = MOVED + 0.25
+    columns = ",".join(f"{side}_{axis}" for side in ("fixed", "moving", "second") for axis in "xyz")
+    flipped = np.hstack([side * [-1, -1, 1] for side in (PLACES, MOVED, again)])
+    rows = [f"{name}," + ",".join(map(str, row)) for name, row in zip("ab", flipped, strict=True)]
+    whole = written(tmp_path, "p.csv", "\n".join(["# CoordinateSystem = LPS", "name," + columns, *rows]))
+    np.testing.assert_allclose(read_point_pairs(whole).second, again)
+    first = written(tmp_path, "f.fcsv", fcsv("LPS", LPS))
+    moving = written(tmp_path, "m.mrk.json", markups("RAS", MOVED[::-1], labels=("b", "a")))
+    named = written(tmp_path, "n.mrk.json", markups("RAS", again[::-1], labels=("b", "a")))
+    unnamed = written(tmp_path, "s.csv", "x,y,z\n" + "".join(",".join(map(str, q)) + "\n" for q in again))
+    for second in (named, unnamed):
+        pairs = read_point_pairs(first, moving, second)
+        np.testing.assert_allclose(pairs.second, again)
+        np.testing.assert_allclose(PointPairs.of_arrays(pairs.as_arrays()).second, again)
+    assert read_point_pairs(first, moving).second is None
+    with pytest.raises(br.InputError, match="has the columns of a second reading; expected no second file"):
+        read_point_pairs(whole, second=unnamed)
+    with pytest.raises(br.InputError, match=r"holds 2 points and .*one\.csv 1"):
+        read_point_pairs(first, moving, written(tmp_path, "one.csv", "x,y,z\n1,2,3\n"))
+    part = written(tmp_path, "part.csv", columns.removesuffix(",second_z") + "\n1,2,3,4,5,6,7,8\n")
+    with pytest.raises(br.InputError, match="second_x, second_y, second_z, or with x, y, z; got fixed_x"):
+        read_point_pairs(part)
+    bad = written(tmp_path, "bad.csv", columns + "\n1,2,3,4,5,6,7,8,nan\n")
+    with pytest.raises(br.InputError, match="point 1 is not finite"):
+        read_point_pairs(bad)
 
 
 @pytest.mark.parametrize(

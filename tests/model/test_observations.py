@@ -363,6 +363,23 @@ def test_wrong_observations_are_told(observations, message):
         br.build_posterior(MESH, observations, MODEL)
 
 
+def test_two_readings_tell_the_sd_of_one():
+    rng, sd = np.random.default_rng(0), np.array([0.3, 0.6, 1.0])
+    fixed = rng.uniform(2, 18, (4000, 3))
+    first, second = (fixed + sd * rng.normal(size=fixed.shape) for _ in range(2))
+    observation = br.Landmarks(fixed, first, None, second_points=second)
+    medians = [prior.median for _, prior in observation.scales.values()]
+    np.testing.assert_allclose(medians, sd, rtol=0.05)
+    assert [name for name, _ in observation.scales.values()] == [f"landmarks_sd_{axis}" for axis in "xyz"]
+    known = br.Landmarks(fixed, first, 2.0, second_points=second)
+    assert not known.scales
+    np.testing.assert_allclose(known.reading_sd, medians)
+    with pytest.raises(br.InputError, match="both readings of the moving points are equal along z, and tell no sd"):
+        br.Landmarks(fixed, first, None, second_points=np.c_[second[:, :2], first[:, 2]])
+    with pytest.raises(br.InputError, match="one for each of 4000 pairs"):
+        br.Landmarks(fixed, first, None, second_points=second[1:])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 from bayesreg.model.observations.landmarks_report import (
+    describe_readings,
     distance_figure,
     doubt_intervals,
     landmark_table,
@@ -44,6 +45,19 @@ def test_what_was_left_out_is_counted():
     assert expected in table.caption
     assert "Chance allows such numbers" in table.caption
     assert [row[0] for row in table.rows] == ["0", "1", "2"]
+
+
+def test_both_sds_are_told_where_points_were_read_twice():
+    arrays = summary(None, None) | {"reading_sd": np.array([0.2, 0.3, 0.5]), "inferred_sd": np.array([0.4, 0.3, 1.2])}
+    (sentence,) = describe_readings("landmarks", arrays)
+    assert "has an sd of 0.2 mm along x, 0.3 mm along y, 0.5 mm along z by both" in sentence
+    assert "the run infers 0.4 mm along x, 0.3 mm along y, 1.2 mm along z" in sentence
+    (sentence,) = describe_readings("landmarks", arrays | {"inferred_sd": np.full(3, np.nan)})
+    assert "infers" not in sentence
+    assert describe_readings("landmarks", summary(None, None)) == []
+    # The figure takes what belongs to each point.
+    many = arrays | {name: np.repeat(values, 2, axis=0) for name, values in summary(None, None).items()}
+    assert _drawing(distance_figure("landmarks", many)).uri.startswith("data:image/svg")
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from copy import copy
+from types import MappingProxyType
 from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bayesreg.fem.location import nearest_places
+from bayesreg.image import Image
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.points import read_point_pairs
 from bayesreg.io.records import Inputs
@@ -20,6 +22,7 @@ from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values, scale_block
 from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.landmarks_report import (
+    describe_readings,
     describe_wrong_pairs,
     distance_figure,
     doubt_intervals,
@@ -27,17 +30,30 @@ from bayesreg.model.observations.landmarks_report import (
 )
 from bayesreg.model.observations.left_out import Predictions, leave_out, predict_at_draws, predict_at_mean
 from bayesreg.model.observations.observation import Placed, Recorded
+from bayesreg.model.observations.odd_points import (
+    Reading,
+    describe_contradictions,
+    describe_plane,
+    first_of_each,
+    lie_near,
+    other_readings,
+    suspect_reading,
+)
 from bayesreg.model.observations.point_noise import Noise, NormalNoise, StudentTNoise
 from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
 from bayesreg.model.state import State
 from bayesreg.model.term import Label
-from bayesreg.printable import require_printable
+from bayesreg.printable import join_some, require_printable
 from bayesreg.settings import FoundFile, KnownOrInferred, ScalePrior
 from bayesreg.types import InputError
 
 ROBUST = StudentTNoise()
 # The prior of an sd of which nothing is told, mm: its 95 % interval is 0.02 to 50 mm.
 UNKNOWN_SD = ScalePrior(median=1.0, log_sd=2.0)
+# The log-sd of the prior of an sd whose median two readings tell: its 95 % interval is a factor of 4 to both sides.
+# Readings of one observer share errors, and those of the fixed points and of the model come on top: on DIR-Lab's case 1
+# (30 pairs) the run inferred 0.8 to 1.9 times the sd of the readings.
+READINGS_LOG_SD = 0.7
 # The sd of the displacement's change over a distance outside the mesh, over this distance: a strain that tissue has.
 STRAIN = 0.2
 # The least number of landmarks if others lie too far outside the mesh.
@@ -63,15 +79,22 @@ class Landmarks:
         further off is left out.
     moving_points : (k, 3) array
         q, world RAS mm, in the space of the moving image.
-    sd : float, (k,), (k, 3) or (1, 3) array, ScalePrior, or three numbers and priors
+    sd : float, (k,), (k, 3) or (1, 3) array, ScalePrior, three numbers and priors, or None
         Standard deviation of the error of each coordinate, mm, positive; or the prior of one sd for all points, which
         is then inferred as "<name>_sd"; or a sequence with at least one prior for the axes x, y and z, inferred as
-        "<name>_sd_x" and so on. Errors of Student's t have this scale, and are wider by √(ν / (ν − 2)).
+        "<name>_sd_x" and so on. None takes the prior from `second_points`: its median for each axis is the root mean
+        square difference of both readings over √2, the sd of one reading, and its log-sd is `READINGS_LOG_SD`. Errors
+        of Student's t have this scale, and are wider by √(ν / (ν − 2)).
     name : str, default "landmarks"
         The name of the observation in tables and in the NumPyro program.
     labels : sequence of str, optional
         The name of each pair in the report; the default is its number.
     noise : StudentTNoise or NormalNoise, default StudentTNoise(nu=4)
+    second_points : (k, 3) array, optional
+        q as it was read a second time, world RAS mm. It is not compared with the model.
+    grids : mapping of str to Image, optional
+        Images in the space of the fixed image, by a name such as "the labels". Points outside the mesh that would lie
+        in it as voxel indices of a grid are told to be such.
 
     Raises
     ------
@@ -89,6 +112,8 @@ class Landmarks:
         name: str = "landmarks",
         labels: Sequence[str] | None = None,
         noise: NormalNoise | StudentTNoise = ROBUST,
+        second_points: Any = None,
+        grids: Mapping[str, Image] = MappingProxyType({}),
     ) -> None:
         self.fixed_points, self.moving_points = (_points(points, name) for points in (fixed_points, moving_points))
         shapes = self.fixed_points.shape, self.moving_points.shape
@@ -99,9 +124,13 @@ class Landmarks:
             raise InputError(f"{name}: every coordinate must be a finite number")
         if isinstance(labels, str) or (labels is not None and len(labels) != count):
             raise InputError(f"{name}: labels must be a list of {count}, one for each point; got {labels!r:.60}")
-        self.name, self.noise = name, noise
+        self.name, self.noise, self.grids = name, noise, grids
+        self.remarks: tuple[str, ...] = ()
         self.labels = tuple(map(str, range(1, count + 1) if labels is None else labels))
         require_printable(self.labels, f"{name}: labels")
+        self.reading_sd = None if second_points is None else _reading_sd(self.moving_points, second_points, name)
+        if sd is None and self.reading_sd is not None:
+            sd = tuple(ScalePrior(median=float(median), log_sd=READINGS_LOG_SD) for median in self.reading_sd)
         priors = sd if _has_prior(sd) else [sd] * 3 if isinstance(sd, ScalePrior) else [None] * 3
         scale_names = [f"{name}_sd"] * 3 if isinstance(sd, ScalePrior) else [f"{name}_sd_{axis}" for axis in "xyz"]
         self.scales = {
@@ -120,40 +149,69 @@ class Landmarks:
         InputError
             If points lie so far outside of the mesh that fewer than `FEWEST` are left.
         """
-        nodes, weights, distance = nearest_places(mesh, self.fixed_points)
-        observation = self._within(distance, mesh.boundary_edge)
-        near = distance <= mesh.boundary_edge
+        observation = self._counted_once()._near(mesh)._examined()
+        for sentence in observation.remarks:
+            _log.warning("%s", sentence)
+        nodes, weights, distance = nearest_places(mesh, observation.fixed_points)
         term = ComparedPoints(
             label=Label(self.name),
             noise=self.noise,
             scales=tuple(Label(self.scales[axis][0]) if axis in self.scales else None for axis in range(3)),
-            nodes=jnp.asarray(nodes[near]),
-            weights=jnp.asarray(weights[near]),
+            nodes=jnp.asarray(nodes),
+            weights=jnp.asarray(weights),
             shift=jnp.asarray(observation.moving_points - observation.fixed_points),
             known_sd=jnp.asarray(observation.sd),
-            beyond=jnp.asarray(STRAIN * distance[near]),
+            beyond=jnp.asarray(STRAIN * distance),
         )
         return Placed(observation, term, {scale: scale_block(prior) for scale, prior in self.scales.values()})
 
-    def _within(self, distance: Float[np.ndarray, "k"], reach: float) -> Landmarks:
-        """Return the landmarks that lie no further outside the mesh than `reach`, mm; say which do not."""
-        far = distance > reach
-        if far.any():
-            names = [self.labels[k] for k in np.flatnonzero(far)]
-            sentence = (
-                f"{self.name}: {far.sum()} of {len(far)} points lie {distance[far].min():.3g} mm or more outside the "
-                f"mesh, further than the length of its edges ({reach:.3g} mm): {', '.join(names[:8])}"
-                f"{', …' * (len(names) > 8)}"
-            )
-            if (~far).sum() < FEWEST:
-                raise InputError(
-                    f"{sentence}; fewer than {FEWEST} points are left; are they in the space of the fixed image "
-                    "(world RAS, mm), and is the organ meshed whole?"
-                )
-            _log.warning("%s; they are left out", sentence)
+    def _counted_once(self) -> Landmarks:
+        """Return the landmarks without exact copies of a pair, which are no measurements of their own."""
+        kept = np.zeros(len(self.labels), bool)
+        kept[first_of_each(self.fixed_points, self.moving_points)] = True
+        repeated = join_some([label for label, is_kept in zip(self.labels, kept, strict=True) if not is_kept])
+        return self._selected(
+            kept, f"{self.name}: these pairs repeat another one exactly, and do not count: {repeated}."
+        )
+
+    def _near(self, mesh: TetMesh) -> Landmarks:
+        """Return the landmarks that lie no further outside the mesh than its edges are long; say which do not."""
+        distance, reach = nearest_places(mesh, self.fixed_points)[2], mesh.boundary_edge
+        near = distance <= reach
+        if near.all():
+            return self
+        swap = Reading(
+            "swapped with their partners", "swap the fixed and moving points", lie_near(mesh, self.moving_points)
+        )
+        suspicion = suspect_reading(near, [*other_readings(mesh, self.fixed_points, self.grids), swap])
+        labels = join_some([self.labels[k] for k in np.flatnonzero(~near)])
+        sentence = (
+            f"{self.name}: {(~near).sum()} of {len(near)} points lie {distance[~near].min():.3g} mm or more outside "
+            f"the mesh, further than the length of its edges ({reach:.3g} mm): {labels}; "
+        )
+        if near.sum() < FEWEST:
+            question = "are they in the space of the fixed image (world RAS, mm), and is the organ meshed whole?"
+            raise InputError(f"{sentence}fewer than {FEWEST} points are left; {suspicion or question}")
+        return self._selected(near, f"{sentence}they are left out{'; ' * bool(suspicion)}{suspicion}.")
+
+    def _selected(self, kept: Bool[np.ndarray, "k"], reason: str) -> Landmarks:
+        """Return some of the landmarks, with the reason why others are left out as a remark."""
+        if kept.all():
+            return self
         observation = copy(self)
-        observation.fixed_points, observation.moving_points = self.fixed_points[~far], self.moving_points[~far]
-        observation.sd, observation.labels = self.sd[~far], tuple(np.array(self.labels)[~far].tolist())
+        observation.fixed_points, observation.moving_points = self.fixed_points[kept], self.moving_points[kept]
+        observation.sd, observation.labels = self.sd[kept], tuple(np.array(self.labels)[kept].tolist())
+        observation.remarks = (*self.remarks, reason)
+        return observation
+
+    def _examined(self) -> Landmarks:
+        """Return the landmarks with remarks on what remains odd about them."""
+        observation = copy(self)
+        observation.remarks = (
+            *self.remarks,
+            *describe_contradictions(self.name, self.fixed_points, self.moving_points, self.labels),
+            *describe_plane(self.name, self.fixed_points),
+        )
         return observation
 
     def summarise(self, posterior: Any, state: State, draws: Values) -> dict[str, np.ndarray]:
@@ -165,6 +223,10 @@ class Landmarks:
             "sd": np.sqrt((np.asarray(term.sd(state.values)) ** 2).mean(axis=1)),
             "residual": np.asarray(term.shift - term.predicted(state)),
         }
+        if self.reading_sd is not None:
+            scales = (None if scale is None else state.values[scale.name] for scale in term.scales)
+            inferred = np.array([np.nan if scale is None else float(scale) for scale in scales])
+            summary |= {"reading_sd": self.reading_sd, "inferred_sd": inferred}
         if (wrong := term.probability_of_wrong(state)) is not None:
             summary["wrong"] = wrong
         predictions = self._predictions(posterior, term, state, draws)
@@ -183,8 +245,13 @@ class Landmarks:
         return predict_at_mean(posterior, term, posterior.estimands(state.values))
 
     def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
-        """Name pairs that are probably wrong, and judge the intervals, for the terminal and the report's first page."""
-        return [*describe_wrong_pairs(self.name, summary), *doubt_intervals(self.name, summary)]
+        """Say what is odd about the points, name pairs that are probably wrong, and judge the intervals."""
+        wrong, intervals = describe_wrong_pairs(self.name, summary), doubt_intervals(self.name, summary)
+        return [*self.remarks, *wrong, *intervals]
+
+    def notes(self, summary: Mapping[str, np.ndarray]) -> list[str]:
+        """Put the sd of the readings beside the sd that the run inferred, if the points were read twice."""
+        return describe_readings(self.name, summary)
 
     def recorded(self, term: ComparedPoints) -> Recorded:
         """Return the displacements of the landmarks, mm."""
@@ -198,6 +265,22 @@ def _points(points: Any, name: str) -> np.ndarray:
         return np.asarray(points, float)
     except (TypeError, ValueError):
         raise InputError(f"{name}: points must be numbers in an array of shape (k, 3)") from None
+
+
+def _reading_sd(moving_points: Float[np.ndarray, "k 3"], second: Any, name: str) -> Float[np.ndarray, "3"]:
+    """Return the sd of one reading along each axis, mm: differences of two like it have twice its variance."""
+    second = _points(second, name)
+    if second.shape != moving_points.shape or not np.isfinite(second).all():
+        raise InputError(
+            f"{name}: second_points must be finite, one for each of {len(moving_points)} pairs; got {second.shape}"
+        )
+    sd = np.sqrt(((second - moving_points) ** 2).mean(axis=0) / 2)
+    if not (sd > 0).all():
+        raise InputError(
+            f"{name}: both readings of the moving points are equal along {'xyz'[int(sd.argmin())]}, and tell no sd; "
+            "give sd, or leave the second reading out"
+        )
+    return sd
 
 
 def _has_prior(sd: Any) -> bool:
@@ -235,26 +318,30 @@ class LandmarksSection(ObservationSection):
     .mrk.json, .tag)."""
     moving_file: FoundFile | None = None
     """The points in the moving image, where they stand in a file of their own."""
+    second_file: FoundFile | None = None
+    """The points in the moving image as read a second time, where they are no columns of the file: they tell the sd."""
     sd: KnownOrInferred | tuple[KnownOrInferred, KnownOrInferred, KnownOrInferred] | None = None
     """Sd of the error of each coordinate, mm, or its prior, or three of these for the axes x, y and z; null takes the
-    column sd of the file, and without one infers it."""
+    column sd of the file, and without one infers it, by a second reading where there is one."""
     noise: Noise = ROBUST
     """The distribution of the errors: student_t, with a few large ones, or normal."""
 
     def read(self) -> dict[str, np.ndarray]:
         """Read the points from the files, world RAS mm."""
-        return read_point_pairs(self.file, self.moving_file).as_arrays()
+        return read_point_pairs(self.file, self.moving_file, self.second_file).as_arrays()
 
     def observe(self, inputs: Inputs) -> Sequence[Landmarks]:
         """Make the landmarks; those of the moving image are transformed into the world of the fixed one."""
         pairs = PointPairs.of_arrays(inputs.observed[self.name])
         labels = [name or str(index) for index, name in enumerate(pairs.names, start=1)] or None
         given = pairs.sd if self.sd is None else self.sd
-        sd = UNKNOWN_SD if given is None else given
+        sd = UNKNOWN_SD if given is None and pairs.second is None else given
         if isinstance(sd, tuple) and not any(isinstance(prior, ScalePrior) for prior in sd):
             sd = np.array([sd])
-        moving = inputs.matching.pose.inverse.place(pairs.moving)
-        return [Landmarks(pairs.fixed, moving, sd, self.name, labels, self.noise)]
+        aligned = inputs.matching.pose.inverse
+        moving, second = (None if side is None else aligned.place(side) for side in (pairs.moving, pairs.second))
+        grid = {"the labels": inputs.tissue} if inputs.fixed is None else {"the fixed image": inputs.fixed}
+        return [Landmarks(pairs.fixed, moving, sd, self.name, labels, self.noise, second, grid)]
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:

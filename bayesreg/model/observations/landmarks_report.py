@@ -11,13 +11,14 @@ from scipy import stats
 
 from bayesreg.model.observations.point_noise import WRONG
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
+from bayesreg.printable import join_some
 from bayesreg.types import AnyArray
 
 LEVELS = (0.5, 0.9, 0.95)
 # The probability of all the numbers of landmarks in their regions that chance allows.
 CHANCE = 0.99
-# The greatest number of landmarks that the figure shows, and of pairs that a sentence names.
-MOST_SHOWN, MOST_NAMED = 60, 8
+# The greatest number of landmarks that the figure shows.
+MOST_SHOWN = 60
 
 
 def region_probability(
@@ -130,8 +131,23 @@ def describe_wrong_pairs(name: str, summary: Arrays) -> list[str]:
     which = "pair of points is" if len(wrong) == 1 else "pairs of points are"
     return [
         f"{name}: {len(wrong)} {which} probably wrong (distance from where the others have it, probability): "
-        f"{', '.join(named[:MOST_NAMED])}{', …' * (len(named) > MOST_NAMED)}. They count little; look at them again."
+        f"{join_some(named)}. They count little; look at them again."
     ]
+
+
+def describe_readings(name: str, summary: Arrays) -> list[str]:
+    """Return a sentence with the sd of the readings and the sd that the run inferred; none without a second reading."""
+    if "reading_sd" not in summary:
+        return []
+    read, inferred = (_along_axes(summary[key]) for key in ("reading_sd", "inferred_sd"))
+    text = f"{name}: one reading of the moving points has an sd of {read} by both readings"
+    if np.isnan(summary["inferred_sd"]).all():
+        return [f"{text}."]
+    return [f"{text}; the run infers {inferred}, which holds the errors of the fixed points and of the model, too."]
+
+
+def _along_axes(sd: Float[AnyArray, "3"]) -> str:
+    return ", ".join(f"{value:.2g} mm along {axis}" for axis, value in zip("xyz", sd, strict=True) if value == value)
 
 
 def _probably_wrong(summary: Arrays) -> np.ndarray:
@@ -154,7 +170,9 @@ def distance_figure(name: str, summary: Arrays) -> ReportFigure:
     )
     alt = f"Distances of {count} landmarks, with and without each among the data."
     height = max(1.6, 0.17 * count + 0.9)
-    draw = partial(_draw_distances, {key: np.asarray(values)[chosen] for key, values in summary.items()})
+    of_each = ("names", "sd", "residual", "left_out_residual")
+    shown = {key: np.asarray(summary[key])[chosen] for key in of_each if key in summary}
+    draw = partial(_draw_distances, shown)
     return ReportFigure(f"landmarks-{name}", "Distances of the landmarks", caption, alt, height, draw)
 
 

@@ -105,6 +105,14 @@ class Doubtful(Protocol):
 
 
 @runtime_checkable
+class Noted(Protocol):
+    """An observation that may have sentences on what was found, for the terminal and the report."""
+
+    def notes(self, summary: Mapping[str, np.ndarray]) -> list[str]:
+        """Return these sentences, from the arrays of `summarise`."""
+
+
+@runtime_checkable
 class Correlated(Protocol):
     """An observation whose values depend on one another, so that its likelihood counts too many of them."""
 
