@@ -180,7 +180,8 @@ class Marginalisation:
             return {}
         values = find_mode(self.problem, self.mesh, start=self.start).values
         u = values["u_boundary"]
-        return {term.name: approximate(term, u, values).without_flat_directions() for term in surfaces}
+        reduced = {term.name: approximate(term, u, values).without_flat_directions() for term in surfaces}
+        return jax.tree.map(jnp.asarray, reduced)
 
     @cached_property
     def _algebra(self) -> PointAlgebra:

@@ -39,10 +39,10 @@ class Quadratic(NamedTuple):
 
     def without_flat_directions(self) -> Quadratic:
         """Return fewer rows, without directions along which the factor hardly changes: those along a surface."""
-        left, sizes, right = np.linalg.svd(np.asarray(self.root), full_matrices=False)
+        left, sizes, right = np.linalg.svd(self.root, full_matrices=False)
         kept = sizes**2 > LEAST_SHARE * sizes[0] ** 2
-        shift = left[:, kept].T @ np.asarray(self.shift)
-        return self._replace(root=jnp.asarray(sizes[kept, None] * right[kept]), shift=jnp.asarray(shift))
+        shift = left[:, kept].T @ self.shift
+        return self._replace(root=sizes[kept, None] * right[kept], shift=shift)
 
     def interpolation(self, unknowns: int) -> Float[np.ndarray, "rows unknowns"]:
         """Return E with a column for every unknown."""
@@ -75,8 +75,7 @@ def approximate(term: Any, u: Float[np.ndarray, "nodes 3"], values: Values) -> Q
     # The nodes of a place on the surface of a mesh are three and one of them again.
     np.add.at(rows, (np.arange(len(point))[:, None, None], index.reshape(columns.shape)), entries)
     push = (scores[point] * directions).sum(axis=1) / stiffness
-    root, shift = _compress(rows, rows @ u.ravel()[unknowns] + push)
-    return Quadratic(jnp.asarray(unknowns), jnp.asarray(root), jnp.asarray(shift))
+    return Quadratic(unknowns, rows, rows @ u.ravel()[unknowns] + push)
 
 
 @jax.jit
@@ -84,12 +83,3 @@ def _slope_and_curvature(term: Any, u: AnyArray, values: Values) -> tuple[AnyArr
     curvature = term.gauss_newton(u, values)
     return curvature.nodes, curvature.weights, curvature.matrices, term.score(u, values)
 
-
-def _compress(
-    rows: Float[np.ndarray, "rows touched"], shift: Float[np.ndarray, "rows"]
-) -> tuple[Float[np.ndarray, "r touched"], Float[np.ndarray, "r"]]:
-    """Return at most as many rows as unknowns with the same sum of squares, up to a constant."""
-    if len(rows) <= rows.shape[1]:
-        return rows, shift
-    q, r = np.linalg.qr(rows)
-    return r, q.T @ shift

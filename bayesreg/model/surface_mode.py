@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -24,6 +25,7 @@ from bayesreg.model.observations.observation import Correlated
 from bayesreg.model.program import Problem
 from bayesreg.model.quadratic import approximate
 from bayesreg.model.state import state_of
+from bayesreg.types import Scalar
 
 # The search ends where no node moves further than this, mm, or after so many steps.
 SETTLED, MOST_STEPS = 0.05, 25
@@ -74,7 +76,7 @@ def find_mode(
         values = {**values, **_best_scales(gaussian, {name: float(values[name]) for name in _scales(problem)})}
         u, last = gaussian.mean(values), values["u_boundary"]
         values = {**values, "u_boundary": u}
-        if number + 1 < FREE_STEPS:
+        if correlated and number + 1 < FREE_STEPS:
             continue
         for name, observation in correlated.items():
             term = problem.terms[name]
@@ -139,21 +141,22 @@ class _Step:
         self._squares = [self._response.T @ (mass[:, None] * self._response) for mass in solver.masses]
 
     def log_evidence(self, scales: dict[str, Any]) -> float:
-        """Compute the log of the evidence of some scales, up to a constant."""
-        values, blocks = {**self._values, **scales}, self._problem.blocks
-        prior = sum(float(blocks[name].prior().log_prob(scale)) + np.log(scale) for name, scale in scales.items())
-        E, y = self._rows(values)
+        """Compute the log of the evidence of some scales, up to a constant.
+
+        With the covariance C of the touched unknowns, and the curvature J and the slope J v of the observations' Gaussians,
+        it is −½ log det(1 + C J) + ½ (J v)ᵀ (1 + C J)⁻¹ C J v, and what the observations have beyond their Gaussians, at u.
+        """
+        values = {**self._values, **scales}
         push, balance = self._balance(values)
-        covariance = sum(size * square for size, square in zip(_sizes(values), self._squares, strict=True))
-        covariance = covariance - push.T @ np.linalg.solve(balance, push)
+        C = sum(size * square for size, square in zip(_sizes(values), self._squares, strict=True))
         rigid = self._solver.rigid_root[self._touched]
-        lower = np.linalg.cholesky(np.eye(len(y)) + E @ (covariance + rigid @ rigid.T) @ E.T)
-        white = scipy.linalg.solve_triangular(lower, y, lower=True)
-        state = state_of(self._problem.body, blocks, {**values, "u_boundary": jnp.asarray(self._u)})
-        # What the observations have beyond their Gaussians, at u.
-        rest = sum(float(term.log(state)) for term in observed_terms(self._problem))
-        rest += ((E @ self._u.ravel()[self._touched] - y) ** 2).sum() / 2
-        return float(prior + rest - np.log(np.diag(lower)).sum() - white @ white / 2)
+        C = C - push.T @ np.linalg.solve(balance, push) + rigid @ rigid.T
+        E, y = self._rows(values)
+        J, slope = E.T @ E, E.T @ y
+        M = np.eye(len(C)) + C @ J
+        beyond = ((E @ self._u.ravel()[self._touched] - y) ** 2).sum() / 2 - y @ y / 2
+        log = -np.linalg.slogdet(M)[1] / 2 + slope @ np.linalg.solve(M, C @ slope) / 2 + beyond
+        return float(log + _log_terms(self._problem, scales, {**values, "u_boundary": self._u}))
 
     def mean(self, values: Values) -> Float[np.ndarray, "nodes 3"]:
         """Compute the mean displacement, mm."""
@@ -162,8 +165,9 @@ class _Step:
         variances = _sizes(values) @ self._solver.masses
         load = variances[:, None] * (self._response - self._solver.rigid @ np.linalg.solve(balance, push))
         rigid = self._solver.rigid_root
-        with_rows = (self._solver.respond(load) + rigid @ rigid[self._touched].T) @ E.T
-        return (with_rows @ np.linalg.solve(np.eye(len(y)) + E @ with_rows[self._touched], y)).reshape(-1, 3)
+        covariance = self._solver.respond(load) + rigid @ rigid[self._touched].T
+        M = np.eye(len(self._touched)) + E.T @ E @ covariance[self._touched]
+        return (covariance @ np.linalg.solve(M, E.T @ y)).reshape(-1, 3)
 
     def _rows(self, values: Values) -> tuple[Float[np.ndarray, "rows touched"], Float[np.ndarray, "rows"]]:
         factors = [approximate(term, self._u, values) for term in observed_terms(self._problem)]
@@ -174,6 +178,14 @@ class _Step:
         """Return Rᵀ D G and Rᵀ D R."""
         DR = (_sizes(values) @ self._solver.masses)[:, None] * self._solver.rigid
         return DR.T @ self._response, self._solver.rigid.T @ DR
+
+
+@jax.jit
+def _log_terms(problem: Problem, scales: dict[str, Any], values: dict[str, Any]) -> Scalar:
+    """Compute the logs of the observations, and of the priors of some scales by their logarithms."""
+    state = state_of(problem.body, problem.blocks, values)
+    priors = (problem.blocks[name].prior().log_prob(scale) + jnp.log(scale) for name, scale in scales.items())
+    return sum((term.log(state) for term in observed_terms(problem)), jnp.zeros(())) + sum(priors)
 
 
 def _sizes(values: Values) -> Float[np.ndarray, "2"]:
