@@ -41,12 +41,15 @@ class Kept(NamedTuple):
         The upper triangles of Gᵀ M G and Gᵀ A G.
     pushes : (2, 6, m) array
         Rᵀ M G and Rᵀ A G.
+    log_determinant : float
+        log det of K without the removed unknowns.
     """
 
     diagonal: list[Float[np.ndarray, "b b"]]
     below: list[Float[np.ndarray, "b b"]]
     squares: Float[np.ndarray, "2 entries"]
     pushes: Float[np.ndarray, "2 6 coordinates"]
+    log_determinant: float
 
 
 class FactorisedResponse:
@@ -68,7 +71,6 @@ class FactorisedResponse:
     """
 
     costly = ("lam", "mu")
-    determinant = None
 
     def __init__(
         self,
@@ -83,13 +85,14 @@ class FactorisedResponse:
         self._balanced = self._without_rigid(interpolation.T)
         self._triangle = np.triu_indices(len(interpolation))
         isostatic = scipy.linalg.qr(rigid.T, pivoting=True, mode="r")[1][:6]
+        self._log_null = 2 * float(np.linalg.slogdet(rigid[isostatic])[1])
         self._order = narrow_order(mesh, np.setdiff1d(np.arange(len(rigid)), isostatic))
         self._entries, self._places, self._shape = _blocks(mesh, entries, self._order)
         self._kept: OrderedDict[bytes, Kept] = OrderedDict()
         self._lock = Lock()
 
     def covariances(
-        self, stiffnesses: Float[np.ndarray, "chains entries"], sizes: Float[np.ndarray, "chains 2"]
+        self, stiffnesses: Float[np.ndarray, "chains parameters"], sizes: Float[np.ndarray, "chains 2"]
     ) -> tuple[Float[np.ndarray, "chains entries"], Float[np.ndarray, "chains 6 coordinates"]]:
         """Return the upper triangles of Gᵀ D G, and Rᵀ D G."""
         kept = list(self._map(self._at, stiffnesses))
@@ -97,7 +100,7 @@ class FactorisedResponse:
         return squares, np.stack([np.tensordot(size, each.pushes, 1) for size, each in zip(sizes, kept, strict=True)])
 
     def solve(
-        self, stiffnesses: Float[np.ndarray, "chains entries"], loads: Float[np.ndarray, "chains unknowns"]
+        self, stiffnesses: Float[np.ndarray, "chains parameters"], loads: Float[np.ndarray, "chains unknowns"]
     ) -> Float[np.ndarray, "chains unknowns"]:
         """Return K⁺ times loads."""
 
@@ -109,7 +112,14 @@ class FactorisedResponse:
 
         return np.stack(list(self._map(solve, zip(stiffnesses, loads, strict=True))))
 
-    def _at(self, given: Float[np.ndarray, "entries"]) -> Kept:
+    def log_pseudo_determinants(
+        self, stiffnesses: Float[np.ndarray, "chains parameters"]
+    ) -> Float[np.ndarray, "chains"]:
+        """Return log pdet K; the kept factorisations have it already."""
+        kept = self._map(self._at, stiffnesses)
+        return np.array([each.log_determinant for each in kept]) - self._log_null
+
+    def _at(self, given: Float[np.ndarray, "parameters"]) -> Kept:
         key = given.tobytes()
         with self._lock:
             if (kept := self._kept.get(key)) is not None:
@@ -122,14 +132,16 @@ class FactorisedResponse:
                 self._kept.popitem(last=False)
         return kept
 
-    def _factorise(self, given: Float[np.ndarray, "entries"]) -> Kept:
+    def _factorise(self, given: Float[np.ndarray, "parameters"]) -> Kept:
         diagonal, below = self._cholesky(given)
         G = self._without_rigid(self._solve(diagonal, below, self._balanced))
         squares = np.stack([(G.T @ (mass[:, None] * G))[self._triangle] for mass in self._masses])
         pushes = np.stack([(mass[:, None] * self._rigid).T @ G for mass in self._masses])
-        return Kept(diagonal, below, squares, pushes)
+        used = np.concatenate([np.diag(lower) for lower in diagonal])[: len(self._order)]
+        with np.errstate(invalid="ignore"):
+            return Kept(diagonal, below, squares, pushes, float(2 * np.log(used).sum()))
 
-    def _cholesky(self, given: Float[np.ndarray, "entries"]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _cholesky(self, given: Float[np.ndarray, "parameters"]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Compute L_k L_kᵀ = K_kk − W_{k−1} W_{k−1}ᵀ and W_k = K_{k+1,k} L_k⁻ᵀ; NaN if K is not positive definite."""
         blocks = np.zeros(self._shape)
         blocks.ravel()[self._places] = self._entries @ given

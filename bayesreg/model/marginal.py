@@ -1,8 +1,8 @@
 """The posterior of points and surfaces alone with the displacements integrated out, for random loads.
 
-Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so: a Gaussian that
-has its slope and curvature at the mode (`bayesreg.model.quadratic`) stands for it where displacements are integrated out
-or drawn. The difference between the two is one of the terms that the sampler tests.
+Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so: a Gaussian
+that has its slope and curvature at the mode (`bayesreg.model.quadratic`) stands for it where displacements are
+integrated out or drawn. The difference between the two is one of the terms that the sampler tests.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from bayesreg.model.elastic.rigid import RigidPrior
 from bayesreg.model.factorised_response import FactorisedResponse
 from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.measured_surface import MeasuredSurface
-from bayesreg.model.point_algebra import PointAlgebra
+from bayesreg.model.point_algebra import PointAlgebra, ResponseDeterminant
 from bayesreg.model.program import Problem
 from bayesreg.model.quadratic import Quadratic, approximate
 from bayesreg.model.spectral_response import SpectralResponse
@@ -71,7 +71,7 @@ class Marginal(NamedTuple):
         return tuple(name for term in surfaces_of(self.problem) for name in term.hyperparameters)
 
     def draw_weights(self, key: AnyArray, estimands: Values) -> tuple[Float[AnyArray, "points"], dict[str, AnyArray]]:
-        """Draw the weight τ of every point given all estimands, the sd of points with their weights, and that of surfaces.
+        """Draw the weight τ of every point given all estimands, and the sds of points and surfaces.
 
         Returns
         -------
@@ -80,16 +80,17 @@ class Marginal(NamedTuple):
         estimands : dict
             With other sds of points.
         """
-        values, drawn = complete(self.problem.blocks, estimands), [jnp.zeros(0)]
-        points, surfaces = points_of(self.problem), surfaces_of(self.problem)
+        blocks, drawn = self.problem.blocks, [jnp.zeros(0)]
+        scales: dict[str, AnyArray] = {}
+        values, points, surfaces = complete(blocks, estimands), points_of(self.problem), surfaces_of(self.problem)
         keys = jax.random.split(key, len(points) + len(surfaces))
         for term, key_term in zip(points, keys[: len(points)], strict=True):
-            weights, scales = term.draw_weights(key_term, values, self.problem.blocks)
-            values = {**values, **scales}
+            weights, term_scales = term.draw_weights(key_term, values, blocks)
             drawn.append(weights)
+            scales |= term_scales
         for surface, key_surface in zip(surfaces, keys[len(points) :], strict=True):
-            values = {**values, **surface.draw_sd(key_surface, values, self.problem.blocks)}
-        return jnp.concatenate(drawn), {**estimands, **{name: values[name] for name in estimands}}
+            scales |= surface.draw_sd(key_surface, values, blocks)
+        return jnp.concatenate(drawn), {**estimands, **scales}
 
     def log(self, estimands: Values, weights: Float[AnyArray, "points"]) -> Scalar:
         """Compute log p(y, θ | τ) up to a constant; the displacements of the estimands have no effect."""
@@ -161,11 +162,10 @@ class Marginalisation:
     def __call__(self) -> Marginal:
         """Return the marginal; several threads may ask for it."""
         with self._lock:
-            algebra, problem = self._algebra, self.problem
-            if (determinant := algebra.response.determinant) is not None:
-                elastic = problem.terms["elastic"]._replace(determinant=determinant)
-                problem = problem.with_term("elastic", elastic)
-            return Marginal(problem, jnp.asarray(algebra.number), self._approximations)
+            number, cells = self._algebra.number, np.unique(self.problem.body.cell_entry, return_index=True)[1]
+            determinant = ResponseDeterminant(jnp.asarray(number), jnp.asarray(cells))
+            elastic = self.problem.terms["elastic"]._replace(determinant=determinant)
+            return Marginal(self.problem.with_term("elastic", elastic), determinant.number, self._approximations)
 
     def count_independent_points(self, observations: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
         """Count the independent points of surfaces, by name; return the counts, and all values at the mode."""
@@ -190,7 +190,9 @@ class Marginalisation:
         masses = np.repeat(np.stack([np.asarray(elastic.volumes), np.asarray(elastic.areas)]), 3, axis=1)
         precision = 0.0 if prior is None else 1 / (len(self.mesh.points) * float(prior.sd) ** 2)
         interpolation, shift = self._rows(unknowns)
-        return PointAlgebra(self._response(rigid, masses, interpolation), rigid, masses, precision, interpolation, shift)
+        return PointAlgebra(
+            self._response(rigid, masses, interpolation), rigid, masses, precision, interpolation, shift
+        )
 
     def _rows(self, unknowns: int) -> tuple[Float[np.ndarray, "rows unknowns"], Float[np.ndarray, "rows"]]:
         """Return B and y: the coordinates of all points, then the rows of the surfaces' approximations."""

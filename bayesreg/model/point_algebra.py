@@ -36,7 +36,7 @@ from weakref import WeakValueDictionary
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from threadpoolctl import ThreadpoolController
 
 from bayesreg.model.point_gaussian import GivenShifts
@@ -44,6 +44,28 @@ from bayesreg.types import AnyArray, Scalar
 
 # The number of draws whose matrices are in memory together.
 BLOCK = 8
+
+
+class ResponseDeterminant(NamedTuple):
+    """log pdet K from the response of an algebra (a pytree), in place of a determinant in the elastic prior.
+
+    Attributes
+    ----------
+    number : scalar integer
+        `PointAlgebra.number`.
+    cells : (entries,) int array
+        A cell of each entry of λ and μ.
+    """
+
+    number: Int[AnyArray, ""]
+    cells: Int[AnyArray, "entries"]
+
+    def log_pseudo_determinant(
+        self, _elements: Any, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
+    ) -> Scalar:
+        """Compute log pdet K for λ and μ by cell."""
+        stiffness, result = jnp.concatenate([lam[self.cells], mu[self.cells]]), jax.ShapeDtypeStruct((), float)
+        return jax.pure_callback(_log_pseudo_determinants, result, self.number, stiffness, vmap_method="broadcast_all")
 
 
 class PointAlgebra:
@@ -153,7 +175,10 @@ _numbers = itertools.count()
 
 
 def log_density(
-    number: AnyArray, stiffness: Float[AnyArray, "entries"], sizes: Float[AnyArray, "2"], noise: Float[AnyArray, "coordinates"]
+    number: AnyArray,
+    stiffness: Float[AnyArray, "entries"],
+    sizes: Float[AnyArray, "2"],
+    noise: Float[AnyArray, "coordinates"],
 ) -> Scalar:
     """Compute log p(y) as part of a JAX program, up to a constant; NaN where S is not positive definite.
 
@@ -193,6 +218,13 @@ def draw(
 def algebra_of(number: AnyArray) -> PointAlgebra:
     """Return the algebra of this number; all entries of an array are the same."""
     return _by_number[int(np.ravel(number)[0])]
+
+
+def _log_pseudo_determinants(number: AnyArray, stiffness: AnyArray) -> Float[np.ndarray, "*chains"]:
+    stiffness = np.asarray(stiffness)
+    rows = stiffness.reshape(-1, stiffness.shape[-1])
+    with one_thread_each():
+        return algebra_of(number).response.log_pseudo_determinants(rows).reshape(stiffness.shape[:-1])
 
 
 def _log_densities(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains"]:

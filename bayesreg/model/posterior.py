@@ -167,8 +167,7 @@ class Posterior:
 
     def tempered_by(self, counts: Mapping[str, float], values: Values) -> Posterior:
         """Return the posterior with these counts of independent points, whose searches start at some values."""
-        start = {name: value for name, value in self.estimands(values).items()}
-        return replace(self.with_independent_points(counts), search_start=start)
+        return replace(self.with_independent_points(counts), search_start=self.estimands(values))
 
     @property
     def independent_points(self) -> dict[str, float]:

@@ -13,7 +13,7 @@ from bayesreg.model.blocks import Values
 from bayesreg.types import AnyArray, Scalar
 
 # Directions of one point, and of all points, with less than these shares of the greatest curvature are left out.
-LEAST_CURVATURE, LEAST_SHARE = 1e-10, 1e-6
+LEAST_CURVATURE, LEAST_SHARE = 1e-10, 1e-5
 
 
 class Quadratic(NamedTuple):
@@ -82,4 +82,3 @@ def approximate(term: Any, u: Float[np.ndarray, "nodes 3"], values: Values) -> Q
 def _slope_and_curvature(term: Any, u: AnyArray, values: Values) -> tuple[AnyArray, ...]:
     curvature = term.gauss_newton(u, values)
     return curvature.nodes, curvature.weights, curvature.matrices, term.score(u, values)
-

@@ -1,8 +1,8 @@
 """The response K⁺ of one tissue to loads, for all λ at once.
 
 Only λ changes Gᵀ M G and Gᵀ A G (`bayesreg.model.point_algebra` has the symbols). At a known μ, K = μ K_μ + λ K_λ. The
-generalised eigenvectors of (K_λ, μ K_μ), with values 0 ≤ ω ≤ 3 / (2 μ), since (tr ε)² ≤ 3 ε : ε, diagonalise K for all λ
-at once; its inverse has the factors 1 / (1 + λ ω). They are analytic functions of x = log(1 + 3 λ / (2 μ)) up to the
+generalised eigenvectors of (K_λ, μ K_μ), with values 0 ≤ ω ≤ 3 / (2 μ), since (tr ε)² ≤ 3 ε : ε, diagonalise K for all
+λ at once; its inverse has the factors 1 / (1 + λ ω). They are analytic functions of x = log(1 + 3 λ / (2 μ)) up to the
 distance π from the real axis. Chebyshev's polynomials of a moderate degree therefore give Gᵀ M G and Gᵀ A G at every λ
 to about `PRECISION`.
 """
@@ -10,42 +10,18 @@ to about `PRECISION`.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.fft
 import scipy.linalg
 from jaxtyping import Float
 
 from bayesreg.fem.elasticity import stiffness
-from bayesreg.fem.elements import Elements
 from bayesreg.mesh import TetMesh
-from bayesreg.types import AnyArray, Scalar
+from bayesreg.types import AnyArray
 
 # The relative error of the interpolation in λ; the elastic solves of other posteriors have a similar one.
 PRECISION = 1e-8
-
-
-class Spectrum(NamedTuple):
-    """The eigenvalues of K by λ at a known μ (a pytree); it takes the place of a determinant in the elastic prior.
-
-    Attributes
-    ----------
-    ratios : (3n − 6,) array
-        ω of (K_λ, μ K_μ).
-    log_of_shear : scalar
-        log pdet μ K_μ.
-    """
-
-    ratios: Float[AnyArray, "modes"]
-    log_of_shear: Scalar
-
-    def log_pseudo_determinant(
-        self, elements: Elements, lam: Float[AnyArray, "cells"], mu: Float[AnyArray, "cells"]
-    ) -> Scalar:
-        """Compute log pdet K for a λ that is the same in all cells, at the known μ."""
-        return self.log_of_shear + jnp.log1p(lam[0] * self.ratios).sum()
 
 
 class SpectralResponse:
@@ -77,7 +53,7 @@ class SpectralResponse:
         lam: tuple[float, float],
     ) -> None:
         self._steepness = 1.5 / mu
-        self._vectors, self.determinant = _eigenvectors(mesh, mu, rigid)
+        self._vectors, self._ratios, self._log_of_shear = _eigenvectors(mesh, mu, rigid)
         pulled = self._vectors.T @ interpolation.T
         self._bounds = low, high = np.log1p(self._steepness * np.array(lam))
         degrees = _degrees(high - low)
@@ -108,21 +84,25 @@ class SpectralResponse:
         factors = self._factors(stiffnesses[:, :1])
         return (factors * (loads @ self._vectors)) @ self._vectors.T
 
+    def log_pseudo_determinants(self, stiffnesses: Float[np.ndarray, "chains 2"]) -> Float[np.ndarray, "chains"]:
+        """Return log pdet K."""
+        return self._log_of_shear + np.log1p(stiffnesses[:, :1] * self._ratios).sum(axis=1)
+
     def _factors(self, lam: AnyArray | float) -> Float[np.ndarray, "*chains modes"]:
-        return 1 / (1 + lam * np.asarray(self.determinant.ratios))
+        return 1 / (1 + lam * self._ratios)
 
 
 def _eigenvectors(
     mesh: TetMesh, mu: float, rigid: Float[np.ndarray, "unknowns 6"]
-) -> tuple[Float[np.ndarray, "unknowns modes"], Spectrum]:
-    """Compute the eigenvectors V of (K_λ, μ K_μ) in the complement of the rigid motions, Vᵀ μ K_μ V = 1, and ω."""
+) -> tuple[Float[np.ndarray, "unknowns modes"], Float[np.ndarray, "modes"], float]:
+    """Compute the eigenvectors V of (K_λ, μ K_μ) without rigid motions, Vᵀ μ K_μ V = 1, ω, and log pdet μ K_μ."""
     ones, nothing = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells))
     complement = scipy.linalg.qr(rigid)[0][:, 6:]
     volume, shear = (
         complement.T @ (stiffness(mesh, *moduli) @ complement) for moduli in ((ones, nothing), (nothing, mu * ones))
     )
     ratios, vectors = scipy.linalg.eigh(volume, shear)
-    return complement @ vectors, Spectrum(ratios, np.linalg.slogdet(shear)[1])
+    return complement @ vectors, ratios, float(np.linalg.slogdet(shear)[1])
 
 
 def _degrees(extent: float) -> int:

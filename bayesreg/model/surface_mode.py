@@ -1,8 +1,8 @@
 """The mode of a posterior with points and surfaces alone, by repeated Gaussian approximations.
 
-Each step replaces every observation by the Gaussian that it has at the last displacement (`Quadratic`), takes the scales
-of the loads and of the errors that maximise the evidence, and then the mean displacement. The stiffness stays at its
-reference. For Student's t and a flat surface, the steps are those of iteratively reweighted least squares.
+Each step replaces every observation by the Gaussian that it has at the last displacement (`Quadratic`), takes the
+scales of the loads and of the errors that maximise the evidence, and then the mean displacement. The stiffness stays at
+its reference. For Student's t and a flat surface, the steps are those of iteratively reweighted least squares.
 """
 
 from __future__ import annotations
@@ -89,6 +89,8 @@ def find_mode(
 
 def _best_scales(gaussian: _Step, start: dict[str, float]) -> dict[str, float]:
     """Return scales of a greater evidence, nearly the greatest."""
+    if not start:
+        return {}
 
     def scales(logs: np.ndarray) -> dict[str, float]:
         return dict(zip(start, np.exp(logs), strict=True))
@@ -143,8 +145,9 @@ class _Step:
     def log_evidence(self, scales: dict[str, Any]) -> float:
         """Compute the log of the evidence of some scales, up to a constant.
 
-        With the covariance C of the touched unknowns, and the curvature J and the slope J v of the observations' Gaussians,
-        it is −½ log det(1 + C J) + ½ (J v)ᵀ (1 + C J)⁻¹ C J v, and what the observations have beyond their Gaussians, at u.
+        C is the covariance of the touched unknowns; J and J v are the curvature and the slope of the Gaussians of all
+        observations. It is −½ log det(1 + C J) + ½ (J v)ᵀ (1 + C J)⁻¹ C J v, and what the observations have beyond
+        their Gaussians, at u.
         """
         values = {**self._values, **scales}
         push, balance = self._balance(values)

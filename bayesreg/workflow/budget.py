@@ -6,12 +6,15 @@ import numpy as np
 
 from bayesreg.config import Config
 from bayesreg.memory import memory_of_machine
+from bayesreg.model.marginal import has_one_tissue
 from bayesreg.model.posterior import Posterior
 from bayesreg.types import InputError
 
 # BLOCK is the number of draws between two checks of the stop rule, for up to POINTS quadrature points. More points give
 # smaller blocks, of at least FEWEST draws, because each block writes the whole state.
 BLOCK, POINTS, FEWEST = 100, 20_000, 10
+# The number of draws per block where each changes the stiffness of several tissues, which costs factorisations of K.
+FACTORISED = 25
 
 
 def max_seconds(config: Config) -> float | None:
@@ -44,5 +47,8 @@ def block_length(posterior: Posterior) -> int:
 
     The number depends on the size of the problem and not on measured time, so that a seed always gives the same draws.
     """
+    marginalisation = posterior.target.prepare_marginal
+    if marginalisation is not None and not has_one_tissue(marginalisation.problem):
+        return FACTORISED
     points = sum(len(getattr(term, "positions", ())) for term in posterior.data.terms.values())
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)

@@ -14,7 +14,7 @@ from bayesreg.io.grids import Grid
 from bayesreg.io.readers import read_grid
 from bayesreg.io.volumes import load_whole_numbers, shorten
 from bayesreg.label_tables import TABLES, recognise_tables
-from bayesreg.model.observations.landmarks import LandmarksSection
+from bayesreg.model.observations.landmarks_section import LandmarksSection
 from bayesreg.model.observations.surface import SurfaceSection
 from bayesreg.tissues import ORGAN
 from bayesreg.types import InputError
@@ -23,7 +23,7 @@ from bayesreg.types import InputError
 QUICK = {"sampler": {"name": "laplace"}, "stop": {"rhat": None, "ess": None, "max_steps": 100}}
 
 
-# The sd of each rigid motion, mm, where points on a surface are all that is observed: how well navigation knows the pose.
+# The sd of each rigid motion, mm, where points on a surface are all that is observed: that of a navigated scan.
 RIGID_SD = 1.0
 
 

@@ -54,7 +54,8 @@ def test_one_place_with_two_partners_is_told_and_the_neighbours_decide(caplog):
     draws = br.sample(own, chains=2, draws=60, seed=1, progress=False).idata.posterior
     mean = {name: draws[name].mean(("chain", "draw")).values for name in own.reference()}
     state, observation = state_of(own.data.body, own.data.blocks, own.fill(mean)), own.observations["landmarks"]
-    contradiction, wrong = observation.doubts(observation.summarise(own, state))
+    by_draw = {name: draws[name].values.reshape(-1, *draws[name].shape[2:]) for name in own.reference()}
+    contradiction, wrong = observation.doubts(observation.summarise(own, state, by_draw))
     assert caplog.messages[0] == contradiction
     assert "share one place in the fixed image" in contradiction
     assert "5 and 31 (12 mm)" in contradiction

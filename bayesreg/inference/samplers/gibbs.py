@@ -87,13 +87,15 @@ def _step(
 ) -> tuple[dict[str, AnyArray], Info]:
     """Draw weights and displacements twice, the second time with θ between them, which costs more."""
     key_first, key_second = jax.random.split(key)
-    moves = lambda _key, estimands, _weights: dict(estimands), partial(_walk, target, marginal, setup)
-    rate = jnp.zeros(())
-    for move, key_sweep in zip(moves, (key_first, key_second), strict=True):
-        estimands, acceptance = _sweep(marginal, move, key_sweep, estimands, is_tested)
-        rate += acceptance / len(moves)
+    drawn, first_rate = _sweep(marginal, _stay, key_first, estimands, is_tested)
+    drawn, second_rate = _sweep(marginal, partial(_walk, target, marginal, setup), key_second, drawn, is_tested)
+    rate = (first_rate + second_rate) / 2
     nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
-    return estimands, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
+    return drawn, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
+
+
+def _stay(_key: AnyArray, estimands: Estimands, _weights: AnyArray) -> dict[str, AnyArray]:
+    return dict(estimands)
 
 
 def _sweep(

@@ -63,8 +63,6 @@ def _cells_behind(mesh: TetMesh) -> Int[np.ndarray, "faces"]:
     """Return the cell to which each face of the boundary belongs."""
     opposite = ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2])
     owner = {
-        tuple(sorted(face)): cell
-        for corners in opposite
-        for cell, face in enumerate(mesh.cells[:, corners].tolist())
+        tuple(sorted(face)): cell for corners in opposite for cell, face in enumerate(mesh.cells[:, corners].tolist())
     }
     return np.array([owner[tuple(sorted(face))] for face in mesh.boundary_faces.tolist()])

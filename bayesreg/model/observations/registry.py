@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args
 from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
 
 from bayesreg.model.observations.images.section import ImagesSection
-from bayesreg.model.observations.landmarks import LandmarksSection
+from bayesreg.model.observations.landmarks_section import LandmarksSection
 from bayesreg.model.observations.section import ObservationSection
 from bayesreg.model.observations.surface import SurfaceSection
 

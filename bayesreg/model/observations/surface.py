@@ -46,8 +46,8 @@ class Surface:
     """Points on the moved surface of the organ, or of some of its tissues, without partners.
 
     log p = κ Σ_k log t(φ_k / sd), with Student's t or a Normal density. φ_k is the signed distance from the surface at
-    rest of the place that the displacement takes to point k. Neighbouring points share the inexactness of the surface at
-    rest and of the mesh. Their residuals determine κ, the share of points that are independent.
+    rest of the place that the displacement takes to point k. Neighbouring points share the inexactness of the surface
+    at rest and of the mesh. Their residuals determine κ, the share of points that are independent.
 
     Parameters
     ----------
@@ -141,9 +141,7 @@ class Surface:
         """Return the term with a wider error: the points draw the surface from further off."""
         return term._replace(wider=jnp.asarray(sd))
 
-    def count_independent_points(
-        self, term: MeasuredSurface, u: Float[np.ndarray, "nodes 3"], values: Values
-    ) -> float:
+    def count_independent_points(self, term: MeasuredSurface, u: Float[np.ndarray, "nodes 3"], values: Values) -> float:
         """Count the independent points, from the correlation of their forces on the displacement."""
         return count_independent(np.asarray(term.score(jnp.asarray(u), values)), self.points)
 

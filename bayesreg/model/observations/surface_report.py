@@ -49,7 +49,7 @@ def describe_far_surface(name: str, summary: Arrays) -> list[str]:
         return []
     return [
         f"{name}: {wrong.sum()} of {len(wrong)} points are probably wrong, and the median distance from the moved "
-        f"surface is {median:.2g} mm; are they in the space of the moving image (world RAS, mm), and is it this surface?"
+        f"surface is {median:.2g} mm; are they in the space of the moving image (world RAS, mm), and of this surface?"
     ]
 
 
