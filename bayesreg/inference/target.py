@@ -174,6 +174,10 @@ class Marginal(Protocol):
         """The names of the parameters whose change makes `log` costly."""
 
     @property
+    def tries(self) -> int:
+        """The number of displacements to propose in turn where the other parameters stay."""
+
+    @property
     def drawn(self) -> tuple[str, ...]:
         """The names of the parameters that `draw_weights` draws given the displacements, and `log` does not know."""
 
@@ -183,11 +187,22 @@ class Marginal(Protocol):
     def log(self, estimands: Estimands, weights: AnyArray) -> Scalar:
         """Compute the log density of all estimands but "u_boundary", which may have any value, given the weights."""
 
-    def draw_displacements(self, key: AnyArray, estimands: Estimands, weights: AnyArray) -> AnyArray:
-        """Draw "u_boundary" given the other estimands and the weights."""
+    def draw_displacements(self, key: AnyArray, estimands: Estimands, weights: AnyArray, count: int) -> AnyArray:
+        """Draw "u_boundary" given the other estimands and the weights so many times: (count, …)."""
 
     def log_others(self, estimands: Estimands) -> Scalar:
         """Compute the log of the terms of the posterior that the other functions leave out."""
+
+
+class Marginalisation(Protocol):
+    """The function that prepares, at its first call, a posterior with the displacements integrated out."""
+
+    @property
+    def is_costly(self) -> bool:
+        """Whether each new stiffness costs a factorisation."""
+
+    def __call__(self) -> Marginal:
+        """Return the posterior with the displacements integrated out."""
 
 
 @runtime_checkable
@@ -237,11 +252,8 @@ class Target(Hashable, Protocol):
         """
 
     @property
-    def prepare_marginal(self) -> Callable[[], Marginal] | None:
-        """The function that prepares, at its first call, the posterior with the displacements integrated out.
-
-        It is None if they cannot be integrated out in closed form.
-        """
+    def prepare_marginal(self) -> Marginalisation | None:
+        """The marginalisation; None if the displacements cannot be integrated out in closed form."""
 
     @property
     def mode_search(self) -> ModeSearch | None:

@@ -39,6 +39,8 @@ from bayesreg.types import AnyArray, Scalar
 
 # The matrices of more unknowns take minutes, and those of more coordinates of points a gigabyte.
 MOST_UNKNOWNS, MOST_COORDINATES = 5000, 1500
+# The Gaussian of a surface has about every third draw accepted, and more draws at once cost little more than one.
+TRIES = 6
 # The terms that are Gaussian in the displacements, and those that may stand beside them.
 GAUSSIAN, BESIDE = LoadsTerm | RigidPrior | ComparedPoints, MeasuredSurface | Barrier
 
@@ -64,6 +66,11 @@ class Marginal(NamedTuple):
     def costly(self) -> tuple[str, ...]:
         """The names of the parameters whose change costs a factorisation."""
         return () if has_one_tissue(self.problem) else LAME
+
+    @property
+    def tries(self) -> int:
+        """The number of displacements that are worth proposing at given parameters: more than one for surfaces."""
+        return TRIES if self.approximations else 1
 
     @property
     def drawn(self) -> tuple[str, ...]:
@@ -100,15 +107,15 @@ class Marginal(NamedTuple):
         return jnp.where(jnp.isnan(log), -jnp.inf, log)
 
     def draw_displacements(
-        self, key: AnyArray, estimands: Values, weights: Float[AnyArray, "points"]
-    ) -> Float[AnyArray, "nodes 3"]:
-        """Draw u given θ and τ, mm."""
+        self, key: AnyArray, estimands: Values, weights: Float[AnyArray, "points"], count: int
+    ) -> Float[AnyArray, "draws nodes 3"]:
+        """Draw u given θ and τ so many times, independently, mm."""
         values = complete(self.problem.blocks, estimands)
         stiffness, sizes, noise = self.given(values, weights)
         key_load, key_error = jax.random.split(key)
-        white = jax.random.normal(key_load, (6 + values["u_boundary"].size,))
-        errors = jax.random.normal(key_error, noise.shape)
-        return point_algebra.draw(self.number, stiffness, sizes, noise, white, errors).reshape(-1, 3)
+        white = jax.random.normal(key_load, (count, 6 + values["u_boundary"].size))
+        errors = jax.random.normal(key_error, (count, len(noise)))
+        return point_algebra.draw(self.number, stiffness, sizes, noise, white, errors).reshape(count, -1, 3)
 
     def log_others(self, estimands: Values) -> Scalar:
         """Compute the log of what the Gaussians leave out: the barrier, and each surface over its approximation."""
@@ -158,6 +165,11 @@ class Marginalisation:
         is_small &= 3 * sum(len(term.shift) for term in points) <= MOST_COORDINATES
         is_bounded = all(np.isfinite(_range(problem, name)).all() for name in LAME)
         return cls(problem, mesh, start) if is_small and is_bounded else None
+
+    @property
+    def is_costly(self) -> bool:
+        """Whether each new stiffness costs a factorisation of K."""
+        return not has_one_tissue(self.problem)
 
     def __call__(self) -> Marginal:
         """Return the marginal; several threads may ask for it."""

@@ -118,29 +118,33 @@ class PointAlgebra:
 
     def draw_all(
         self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray, white: np.ndarray, errors: np.ndarray
-    ) -> Float[np.ndarray, "*chains unknowns"]:
+    ) -> Float[np.ndarray, "*chains draws unknowns"]:
         """Compute `draw` of chains, which are the leading axes of all arguments."""
-        variances = sizes.reshape(-1, 2) @ self._masses
-        given_stiffness = stiffness.reshape(len(variances), -1)
-        white = white.reshape(len(variances), -1)
+        draws, chains = white.shape[-2], np.shape(sizes)[:-1]
         with one_thread_each() as side_by_side:
             conditionals = list(side_by_side(GivenShifts.factorised, self._given(stiffness, sizes, noise)))
+        # Rows are the draws of all chains.
+        of_chain = np.repeat(np.arange(len(conditionals)), draws)
+        variances = (sizes.reshape(-1, 2) @ self._masses)[of_chain]
+        given_stiffness = stiffness.reshape(len(conditionals), -1)[of_chain]
+        balances = np.stack([given.balance for given in conditionals])[of_chain]
+        white = white.reshape(len(of_chain), -1)
 
-            def respond(load: np.ndarray) -> np.ndarray:
-                """Return K⁺ times loads (chains as rows), less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
-                parts = [given.balance @ row for given, row in zip(conditionals, load @ self._rigid, strict=True)]
-                return self.response.solve(given_stiffness, load - variances * (np.stack(parts) @ self._rigid.T))
+        def respond(load: np.ndarray) -> np.ndarray:
+            """Return K⁺ times loads, less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
+            parts = np.einsum("rij,rj->ri", balances, load @ self._rigid)
+            return self.response.solve(given_stiffness, load - variances * (parts @ self._rigid.T))
 
-            u = respond(np.sqrt(variances) * white[:, 6:])
-            if self._precision:
-                u += white[:, :6] @ self._rigid.T / math.sqrt(self._precision)
-            error = (np.sqrt(noise) * errors).reshape(len(u), -1)
-            apart = self._shift - u @ self._interpolation.T - error
-            solutions = [given.solve(shift) for given, shift in zip(conditionals, apart, strict=True)]
-            weights, motions = (np.stack(part) for part in zip(*solutions, strict=True))
-            u += respond(variances * self.response.solve(given_stiffness, weights @ self._interpolation))
-            u += motions @ self._rigid.T
-        return u.reshape(*np.shape(sizes)[:-1], -1)
+        u = respond(np.sqrt(variances) * white[:, 6:])
+        if self._precision:
+            u += white[:, :6] @ self._rigid.T / math.sqrt(self._precision)
+        error = (np.sqrt(noise)[..., None, :] * errors).reshape(len(u), -1)
+        apart = self._shift - u @ self._interpolation.T - error
+        solutions = [conditionals[chain].solve(shift) for chain, shift in zip(of_chain, apart, strict=True)]
+        weights, motions = (np.stack(part) for part in zip(*solutions, strict=True))
+        u += respond(variances * self.response.solve(given_stiffness, weights @ self._interpolation))
+        u += motions @ self._rigid.T
+        return u.reshape(*chains, draws, -1)
 
     def leave_out(
         self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray
@@ -202,15 +206,15 @@ def draw(
     stiffness: Float[AnyArray, "entries"],
     sizes: Float[AnyArray, "2"],
     noise: Float[AnyArray, "coordinates"],
-    white: Float[AnyArray, "motions_and_unknowns"],
-    errors: Float[AnyArray, "coordinates"],
-) -> Float[AnyArray, "unknowns"]:
+    white: Float[AnyArray, "draws motions_and_unknowns"],
+    errors: Float[AnyArray, "draws coordinates"],
+) -> Float[AnyArray, "draws unknowns"]:
     """Draw u given y as part of a JAX program, mm, from independent Normal numbers for c and loads, and for errors.
 
     A draw of the prior is corrected by its difference from y (Matheron's rule). The flat prior of the rigid motion is
     the limit of a wide one.
     """
-    result = jax.ShapeDtypeStruct((len(white) - 6,), float)
+    result = jax.ShapeDtypeStruct((len(white), white.shape[1] - 6), float)
     arguments = number, stiffness, sizes, noise, white, errors
     return jax.pure_callback(_draw_all, result, *arguments, vmap_method="broadcast_all")
 

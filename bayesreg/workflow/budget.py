@@ -6,7 +6,6 @@ import numpy as np
 
 from bayesreg.config import Config
 from bayesreg.memory import memory_of_machine
-from bayesreg.model.marginal import has_one_tissue
 from bayesreg.model.posterior import Posterior
 from bayesreg.types import InputError
 
@@ -48,7 +47,7 @@ def block_length(posterior: Posterior) -> int:
     The number depends on the size of the problem and not on measured time, so that a seed always gives the same draws.
     """
     marginalisation = posterior.target.prepare_marginal
-    if marginalisation is not None and not has_one_tissue(marginalisation.problem):
+    if marginalisation is not None and marginalisation.is_costly:
         return FACTORISED
     points = sum(len(getattr(term, "positions", ())) for term in posterior.data.terms.values())
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)

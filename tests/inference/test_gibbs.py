@@ -83,7 +83,9 @@ def test_the_marginal_density_is_the_joint_one_with_u_integrated_out():
 def test_displacements_are_drawn_from_their_conditional():
     own, weights = posterior(NormalNoise()), np.linspace(0.3, 2.0, len(FIXED))
     precision, mean = dense_conditional(own, estimands(), weights)
-    draw = jax.jit(jax.vmap(lambda key: marginal_of(own).draw_displacements(key, estimands(), jnp.asarray(weights))))
+    draw = jax.jit(
+        jax.vmap(lambda key: marginal_of(own).draw_displacements(key, estimands(), jnp.asarray(weights), 1)[0])
+    )
     draws = np.asarray(draw(jax.random.split(jax.random.key(1), 4000))).reshape(4000, -1)
     whitened = (draws - mean) @ np.linalg.cholesky(precision)
     assert np.abs(whitened.mean(axis=0)).max() < 5 / np.sqrt(4000)
@@ -192,8 +194,10 @@ def test_the_default_is_gibbs_where_it_can_be():
     points = br.Landmarks(FIXED, MOVING, 1.0)
     other = br.build_posterior(two_tissues, [points], br.ModelConfig(preset="registration"))
     assert choose_sampler("auto", other.target).name == "hmc"
-    with pytest.raises(br.InputError, match="pairs of points alone"):
-        choose_sampler("gibbs", other.target)
+    assert choose_sampler("gibbs", other.target).name == "gibbs"
+    by_element = br.ModelConfig(preset="registration", elasticity="element")
+    with pytest.raises(br.InputError, match="points and surfaces alone"):
+        choose_sampler("gibbs", br.build_posterior(MESH, [points], by_element).target)
 
 
 def test_the_same_seed_gives_the_same_draws_in_any_blocks():

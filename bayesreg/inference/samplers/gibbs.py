@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
+from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
 from bayesreg.inference.deadline import Deadline
@@ -62,8 +63,8 @@ def gibbs(target: Target, settings: Gibbs) -> Sampler:
     prepare_marginal = target.prepare_marginal
     if prepare_marginal is None:
         raise InputError(
-            "gibbs samples pairs of points alone, on a mesh of one tissue with random loads and at most some hundred "
-            "points; use the sampler hmc"
+            "gibbs samples points and surfaces alone, with random loads, a λ and a μ for each tissue, and at most some "
+            "hundred points; use the sampler hmc"
         )
 
     def prepare(points: Any, key: AnyArray, deadline: Deadline, _on_mode: OnMode) -> tuple[Setup, Any]:
@@ -105,16 +106,32 @@ def _sweep(
     estimands: Estimands,
     is_tested: bool,
 ) -> tuple[dict[str, AnyArray], AnyArray]:
-    """Draw the weights, move θ, and draw the displacements; return the probability that the other terms accept both."""
-    key_weights, key_move, key_u, key_accept = jax.random.split(key, 4)
+    """Draw the weights, move θ, and draw the displacements; return the probability that the other terms accept them.
+
+    Several displacements are tried at once (Liu, Liang and Wong 2000): one of those drawn at the new θ is chosen in
+    proportion to the factors of the other terms, and accepted by the ratio of the sum of their factors to that of the
+    present displacement and of others drawn at the present θ. With one try it is Metropolis' rule.
+    """
+    key_weights, key_move, key_new, key_old, key_choice, key_accept = jax.random.split(key, 6)
     weights, estimands = marginal.draw_weights(key_weights, estimands)
-    parameters = move(key_move, estimands, weights)
-    proposal = {**parameters, "u_boundary": marginal.draw_displacements(key_u, parameters, weights)}
+    parameters, tries = move(key_move, estimands, weights), marginal.tries
+    candidates = marginal.draw_displacements(key_new, parameters, weights, tries)
     if not is_tested:
-        return proposal, jnp.ones(())
-    gain = jnp.nan_to_num(marginal.log_others(proposal), nan=-jnp.inf) - marginal.log_others(estimands)
-    acceptance = jnp.minimum(1.0, jnp.exp(gain))
+        return {**parameters, "u_boundary": candidates[0]}, jnp.ones(())
+
+    def logs(parameters: Estimands, displacements: AnyArray) -> AnyArray:
+        log_others = jax.vmap(lambda u: marginal.log_others({**parameters, "u_boundary": u}))(displacements)
+        return jnp.nan_to_num(log_others, nan=-jnp.inf)
+
+    present = estimands["u_boundary"][None]
+    if tries > 1:
+        others = marginal.draw_displacements(key_old, estimands, weights, tries - 1)
+        present = jnp.concatenate([present, others])
+    candidate_logs = logs(parameters, candidates)
+    chosen = jax.random.categorical(key_choice, candidate_logs)
+    acceptance = jnp.minimum(1.0, jnp.exp(logsumexp(candidate_logs) - logsumexp(logs(estimands, present))))
     is_accepted = jax.random.uniform(key_accept) < acceptance
+    proposal = {**parameters, "u_boundary": candidates[chosen]}
     return jax.tree.map(partial(jnp.where, is_accepted), proposal, dict(estimands)), acceptance
 
 

@@ -64,7 +64,7 @@ class Chosen:
         object.__setattr__(self, "sampler", SAMPLERS[self.name].make(self.target, self.settings))
 
 
-# The name of the sampler that suits the target: gibbs if the displacements can be integrated out, else hmc.
+# The name of the sampler that suits the target: gibbs if the displacements can be integrated out at a low cost, else hmc.
 AUTO = "auto"
 
 
@@ -77,7 +77,8 @@ def choose_sampler(name: str, target: Target, **settings: Any) -> Chosen:
         If there is no such sampler or setting, a setting is out of range, or the sampler does not accept the target.
     """
     if name == AUTO:
-        name = "hmc" if target.prepare_marginal is None else "gibbs"
+        marginalisation = target.prepare_marginal
+        name = "hmc" if marginalisation is None or marginalisation.is_costly else "gibbs"
     if name not in SAMPLERS:
         raise InputError(f"unknown sampler {name!r}; there are {', '.join([AUTO, *SAMPLERS])}")
     record = SAMPLERS[name].settings
