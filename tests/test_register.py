@@ -1,6 +1,7 @@
 """`bayesreg register`: what it understands of paths alone, and what it says before it begins."""
 
 from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 
 import nibabel as nib
@@ -201,6 +202,17 @@ def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):
     assert counts == {"fixed": 1, "moving": 1, "labels": 2, "mask": 1, "cavity": 2, "a,b": 2}
 
 
+def test_a_surface_needs_no_images(register, tmp_path):
+    points = tmp_path / "laser.csv"
+    points.write_text("x,y,z\n" + "\n".join(f"{k},1,2" for k in range(12)))
+    config = understand(labels=Path(register.path("labels")), surface=points).config
+    assert [(section.kind, section.file) for section in config.observations] == [("surface", points)]
+    assert (config.model.elasticity, config.model.rigid_sd) == ("uniform", 1.0)
+    both = understand(labels=Path(register.path("labels")), surface=points, landmarks=points).config
+    assert [section.kind for section in both.observations] == ["landmarks", "surface"]
+    assert both.model.rigid_sd is None
+
+
 def test_points_need_no_images(register):
     pairs = register.folder / "pairs.csv"
     pairs.write_text("fixed_x,fixed_y,fixed_z,moving_x,moving_y,moving_z\n1,2,3,4,5,6\n")
@@ -218,7 +230,7 @@ def test_points_need_no_images(register):
     ("arguments", "message"),
     [
         (["fixed"], "is one image; give FIXED and MOVING"),
-        ([], "nothing is observed; give two images or --landmarks"),
+        ([], "nothing is observed; give two images, --landmarks or --surface"),
         (["--landmarks", "mask"], "without images, --labels says where the organ is"),
     ],
 )

@@ -38,7 +38,7 @@ class RandomWalk(settings.RandomWalk, _Chains):
 
 
 class Auto(settings.Settings, _Chains):
-    """The default: gibbs if the displacements can be integrated out, as with points and surfaces alone and one stiffness, else hmc."""
+    """The default: gibbs with points and surfaces alone and one stiffness, else hmc."""
 
     name: Literal["auto"] = "auto"
 

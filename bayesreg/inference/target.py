@@ -194,6 +194,7 @@ class Marginal(Protocol):
         """Compute the log of the terms of the posterior that the other functions leave out."""
 
 
+@runtime_checkable
 class Marginalisation(Protocol):
     """The function that prepares, at its first call, a posterior with the displacements integrated out."""
 

@@ -93,9 +93,9 @@ def test_a_surface_that_is_flat_has_the_gaussian_posterior_of_its_heights():
     posterior = br.build_posterior(mesh, [br.Surface(points, sd=0.3, noise=br.NormalNoise())], model)
     posterior = posterior.with_independent_points({"surface": 60.0})
     assert choose_sampler("auto", posterior.target).name == "gibbs"
-    result = br.sample(posterior, chains=4, draws=500, seed=0)
+    result = br.sample(posterior, chains=4, draws=250, seed=0)
     assert result.idata.sample_stats.acceptance_rate.mean() > 0.9
-    u = result.idata.posterior.u_boundary.values.reshape(2000, -1)
+    u = result.idata.posterior.u_boundary.values.reshape(1000, -1)
     # Heights are linear in the displacements, since the points stand over the flat top.
     term = posterior.data.terms["surface"]
     slope = np.asarray(jax.jacrev(lambda u: term.height(u))(jnp.zeros(mesh.points.shape))).reshape(60, -1)
@@ -108,5 +108,5 @@ def test_a_surface_that_is_flat_has_the_gaussian_posterior_of_its_heights():
     precision = prior + slope.T @ slope / 0.3**2
     mean = np.linalg.solve(precision, -slope.T @ np.asarray(term.height(jnp.zeros(mesh.points.shape))) / 0.3**2)
     sd = np.sqrt(np.diag(np.linalg.inv(precision)))
-    np.testing.assert_allclose(u.mean(axis=0), mean, atol=5 / np.sqrt(2000) * sd.max())
-    np.testing.assert_allclose(u.std(axis=0), sd, rtol=0.08)
+    np.testing.assert_allclose(u.mean(axis=0), mean, atol=5 / np.sqrt(1000) * sd.max())
+    np.testing.assert_allclose(u.std(axis=0), sd, rtol=0.12)

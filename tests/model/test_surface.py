@@ -14,6 +14,8 @@ from bayesreg.fem.location import interpolation_at
 from bayesreg.model.elastic.loads import RandomLoads
 from bayesreg.model.observations.level_set import distance_from_mask
 from bayesreg.model.observations.surface import Surface, count_independent
+from bayesreg.model.observations.surface_report import describe_far_surface, height_figure, surface_table
+from bayesreg.report import style
 from tests.phantoms import ball_mesh, box_mesh
 
 MESH = box_mesh(4)
@@ -105,11 +107,11 @@ def test_the_gradient_is_that_of_differences():
 
 
 def test_the_curvature_is_that_of_the_density():
-    """Along any displacement, for a plane: gauss_newton plus remainder is the second derivative."""
+    """Along a displacement in which the heights over a plane are linear: along z, and the same at every depth."""
     term = Surface(points_above(0.5), sd=0.4).on(MESH).term
-    rng = np.random.default_rng(3)
-    # With displacements along z alone, the heights over a plane are linear in them.
-    u, direction = rng.normal(size=(2, *MESH.points.shape)) * [0, 0, 1]
+    x, y = MESH.points[:, 0], MESH.points[:, 1]
+    u = np.c_[np.zeros((len(x), 2)), 0.1 * np.cos(y / 15)]
+    direction = np.c_[np.zeros((len(x), 2)), 1 + np.sin(x / 10)]
 
     def energy(step):
         height = term.height(jnp.asarray(u + step * direction))
@@ -151,3 +153,23 @@ def test_wrong_surfaces_are_told(arguments, message):
 def test_an_unknown_tissue_is_told():
     with pytest.raises(br.InputError, match="of: the mesh has no tissue spleen; expected boundary or some of"):
         Surface(points_above(0.0), of="spleen").on(MESH)
+
+
+def test_the_report_says_how_far_the_points_lie_from_the_surface():
+    height = np.r_[np.linspace(-0.4, 0.4, 40), 9.0]
+    summary = {
+        "points": np.random.default_rng(0).normal(size=(41, 3)), "height": height, "height_at_rest": height + 5,
+        "sd": np.array(0.3), "independent": np.array(12.0), "wrong": (height > 5).astype(float),
+    }  # fmt: skip
+    table = surface_table("surface", summary)
+    assert "1 of 41 points are probably wrong" in table.caption
+    assert "12 independent ones" in table.caption
+    assert [row[0] for row in table.rows] == ["At rest", "At the posterior mean"]
+    assert table.rows[1][3] == pytest.approx(0.4)
+    assert describe_far_surface("surface", summary) == []
+    (sentence,) = describe_far_surface("surface", summary | {"wrong": np.ones(41)})
+    assert "41 of 41 points are probably wrong" in sentence
+    figure = height_figure("surface", summary)
+    drawn = style.new_figure(figure.height)
+    figure.draw(drawn, style)
+    assert len(drawn.axes) == 4

@@ -64,7 +64,7 @@ class Chosen:
         object.__setattr__(self, "sampler", SAMPLERS[self.name].make(self.target, self.settings))
 
 
-# The name of the sampler that suits the target: gibbs if the displacements can be integrated out at a low cost, else hmc.
+# The name of the sampler that suits the target: gibbs if displacements are integrated out at a low cost, else hmc.
 AUTO = "auto"
 
 
