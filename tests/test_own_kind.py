@@ -112,6 +112,6 @@ def test_what_is_wrong_in_its_section_is_told_with_its_place(tmp_path):
     assert "observations.0.points: missing" in str(error.value)
     (tmp_path / "run.yaml").write_text(text.replace("region", "regions"))
     with pytest.raises(
-        br.InputError, match=r"no kind of observation 'regions'; expected one of images, landmarks, region"
+        br.InputError, match=r"no kind of observation 'regions'; expected one of images, landmarks, surface, region"
     ):
         br.load_config(tmp_path / "run.yaml")

@@ -30,17 +30,19 @@ from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.measured_surface import MeasuredSurface
 from bayesreg.model.point_algebra import PointAlgebra, ResponseDeterminant
 from bayesreg.model.program import Problem
-from bayesreg.model.quadratic import Quadratic, approximate
+from bayesreg.model.quadratic import Quadratic, approximate_about
 from bayesreg.model.spectral_response import SpectralResponse
 from bayesreg.model.state import state_of
 from bayesreg.model.stiffness_parts import has_few_entries
-from bayesreg.model.surface_mode import find_mode
+from bayesreg.model.surface_mode import draw_about_mode, find_mode
 from bayesreg.types import AnyArray, Scalar
 
 # The matrices of more unknowns take minutes, and those of more coordinates of points a gigabyte.
 MOST_UNKNOWNS, MOST_COORDINATES = 5000, 1500
 # The Gaussian of a surface has about every third draw accepted, and more draws at once cost little more than one.
 TRIES = 6
+# The number of displacements about the mode over which a surface's slope and curvature are averaged.
+PLACES = 16
 # The terms that are Gaussian in the displacements, and those that may stand beside them.
 GAUSSIAN, BESIDE = LoadsTerm | RigidPrior | ComparedPoints, MeasuredSurface | Barrier
 
@@ -190,10 +192,10 @@ class Marginalisation:
         surfaces = surfaces_of(self.problem)
         if not surfaces:
             return {}
-        values = find_mode(self.problem, self.mesh, start=self.start).values
-        u = values["u_boundary"]
-        reduced = {term.name: approximate(term, u, values).without_flat_directions() for term in surfaces}
-        return jax.tree.map(jnp.asarray, reduced)
+        mode = find_mode(self.problem, self.mesh, start=self.start)
+        places = draw_about_mode(self.problem, self.mesh, mode, PLACES)
+        factors = {term.name: approximate_about(term, places, mode.values) for term in surfaces}
+        return jax.tree.map(jnp.asarray, factors)
 
     @cached_property
     def _algebra(self) -> PointAlgebra:

@@ -51,6 +51,16 @@ class Quadratic(NamedTuple):
         return whole
 
 
+def approximate_about(term: Any, places: Float[np.ndarray, "places nodes 3"], values: Values) -> Quadratic:
+    """Return the Gaussian that has a term's mean slope and mean curvature over several displacements."""
+    factors = [approximate(term, u, values) for u in places]
+    unknowns = np.unique(np.concatenate([factor.unknowns for factor in factors]))
+    root = np.concatenate([factor.interpolation(places[0].size)[:, unknowns] for factor in factors])
+    shift = np.concatenate([factor.shift for factor in factors])
+    scale = 1 / np.sqrt(len(places))
+    return Quadratic(unknowns, scale * root, scale * shift).without_flat_directions()
+
+
 def approximate(term: Any, u: Float[np.ndarray, "nodes 3"], values: Values) -> Quadratic:
     """Return the Gaussian that has a term's slope and Gauss–Newton curvature at a displacement.
 

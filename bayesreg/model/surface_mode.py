@@ -87,6 +87,12 @@ def find_mode(
     return Mode(problem, values)
 
 
+def draw_about_mode(problem: Problem, mesh: TetMesh, mode: Mode, count: int) -> Float[np.ndarray, "count nodes 3"]:
+    """Draw displacements from the Gaussian at a mode, at its scales, mm."""
+    gaussian = _Step(_Solver(problem, mesh, mode.values), problem, mode.values["u_boundary"], mode.values)
+    return gaussian.draw(mode.values, count)
+
+
 def _best_scales(gaussian: _Step, start: dict[str, float]) -> dict[str, float]:
     """Return scales of a greater evidence, nearly the greatest."""
     if not start:
@@ -164,13 +170,30 @@ class _Step:
     def mean(self, values: Values) -> Float[np.ndarray, "nodes 3"]:
         """Compute the mean displacement, mm."""
         E, y = self._rows(values)
+        return self._response_to(E, y[:, None], values).reshape(-1, 3)
+
+    def draw(self, values: Values, count: int) -> Float[np.ndarray, "count nodes 3"]:
+        """Draw displacements, mm: those of the prior, corrected by their difference from what is observed."""
+        rng, (E, y) = np.random.default_rng(0), self._rows(values)
+        variances, (_, balance) = _sizes(values) @ self._solver.masses, self._balance(values)
+        load = np.sqrt(variances)[:, None] * rng.normal(size=(self._u.size, count))
+        DR = variances[:, None] * self._solver.rigid
+        load -= DR @ np.linalg.solve(balance, self._solver.rigid.T @ load)
+        u = self._solver.respond(load) + self._solver.rigid_root @ rng.normal(size=(6, count))
+        apart = y[:, None] - E @ u[self._touched] - rng.normal(size=(len(y), count))
+        return (u + self._response_to(E, apart, values)).T.reshape(count, -1, 3)
+
+    def _response_to(
+        self, E: Float[np.ndarray, "rows touched"], shifts: Float[np.ndarray, "rows columns"], values: Values
+    ) -> Float[np.ndarray, "unknowns columns"]:
+        """Return the mean displacement of a prior of mean zero, given what E u is observed to be."""
         push, balance = self._balance(values)
         variances = _sizes(values) @ self._solver.masses
         load = variances[:, None] * (self._response - self._solver.rigid @ np.linalg.solve(balance, push))
         rigid = self._solver.rigid_root
         covariance = self._solver.respond(load) + rigid @ rigid[self._touched].T
         M = np.eye(len(self._touched)) + E.T @ E @ covariance[self._touched]
-        return (covariance @ np.linalg.solve(M, E.T @ y)).reshape(-1, 3)
+        return covariance @ np.linalg.solve(M, E.T @ shifts)
 
     def _rows(self, values: Values) -> tuple[Float[np.ndarray, "rows touched"], Float[np.ndarray, "rows"]]:
         factors = [approximate(term, self._u, values) for term in observed_terms(self._problem)]

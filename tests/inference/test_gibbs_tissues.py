@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.linalg
 from scipy import stats
 
@@ -81,6 +82,7 @@ def test_displacements_of_two_tissues_are_drawn_from_their_conditional():
     assert (drawn / expected).max() < stats.chi2(len(keys)).ppf(1 - 1e-4) / len(keys)
 
 
+@pytest.mark.long
 def test_a_surface_that_is_flat_has_the_gaussian_posterior_of_its_heights():
     """A half-space moved along its normal: the sampled top of a box against dense matrices."""
     mesh = box_mesh(3)
