@@ -13,8 +13,10 @@ import bayesreg as br
 from bayesreg.fem.location import interpolation_at
 from bayesreg.model.elastic.loads import RandomLoads
 from bayesreg.model.observations.level_set import distance_from_mask
+from bayesreg.model.observations.observation import Summarised
 from bayesreg.model.observations.surface import Surface, count_independent
 from bayesreg.model.observations.surface_report import describe_far_surface, height_figure, surface_table
+from bayesreg.model.state import state_of
 from bayesreg.report import style
 from tests.phantoms import ball_mesh, box_mesh
 
@@ -43,6 +45,13 @@ def test_the_density_is_that_of_the_distance_from_a_plane(noise, law):
         values = {**posterior.reference(), "u_boundary": lifted(height)}
         expected = 200 * (law.logpdf((1.3 - height) / 0.4) - np.log(0.4))
         np.testing.assert_allclose(posterior.energies(values)["surface"], expected, rtol=1e-4)
+    observation = posterior.observations["surface"]
+    state = state_of(posterior.data.body, posterior.data.blocks, posterior.fill(values))
+    summary = observation.summarise(posterior, state, {})
+    np.testing.assert_allclose(summary["height"], 0.0, atol=1e-4)
+    np.testing.assert_allclose(summary["height_at_rest"], 1.3, atol=1e-4)
+    assert isinstance(observation, Summarised)
+    assert observation.recorded(posterior.data.terms["surface"]).values.shape == (200,)
 
 
 MODEL = br.ModelConfig(

@@ -145,7 +145,7 @@ class Surface:
         """Count the independent points, from the correlation of their forces on the displacement."""
         return count_independent(np.asarray(term.score(jnp.asarray(u), values)), self.points)
 
-    def summarise(self, posterior: Any, state: State) -> dict[str, np.ndarray]:
+    def summarise(self, posterior: Any, state: State, draws: Values) -> dict[str, np.ndarray]:
         """Summarise the heights of the points over the surface at rest and at a state, and which points are wrong."""
         term = posterior.data.terms[self.name]
         height = np.asarray(term.height(state.u))
