@@ -70,8 +70,6 @@ class FactorisedResponse:
         A map that calls a function for several chains, each in a thread.
     """
 
-    costly = ("lam", "mu")
-
     def __init__(
         self,
         mesh: TetMesh,

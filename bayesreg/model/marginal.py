@@ -39,7 +39,7 @@ from bayesreg.types import AnyArray, Scalar
 
 # The matrices of more unknowns take minutes, and those of more coordinates of points a gigabyte.
 MOST_UNKNOWNS, MOST_COORDINATES = 5000, 1500
-# The Gaussian of a surface has about every third draw accepted, and more draws at once cost little more than one.
+# Not every draw from the Gaussian of a surface is accepted, and more draws at once cost little more than one.
 TRIES = 6
 # The number of displacements about the mode over which a surface's slope and curvature are averaged.
 PLACES = 16
@@ -201,9 +201,9 @@ class Marginalisation:
     def _algebra(self) -> PointAlgebra:
         elastic, unknowns = self.problem.terms["elastic"], 3 * len(self.mesh.points)
         rigid, prior = np.asarray(elastic.rigid), self.problem.terms.get("rigid")
-        masses = np.repeat(np.stack([np.asarray(elastic.volumes), np.asarray(elastic.areas)]), 3, axis=1)
         precision = 0.0 if prior is None else 1 / (len(self.mesh.points) * float(prior.sd) ** 2)
         interpolation, shift = self._rows(unknowns)
+        masses = elastic.masses
         return PointAlgebra(
             self._response(rigid, masses, interpolation), rigid, masses, precision, interpolation, shift
         )

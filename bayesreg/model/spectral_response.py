@@ -41,8 +41,6 @@ class SpectralResponse:
         The least and the greatest λ.
     """
 
-    costly = ()
-
     def __init__(
         self,
         mesh: TetMesh,

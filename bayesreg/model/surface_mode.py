@@ -124,7 +124,7 @@ class _Solver:
     def __init__(self, problem: Problem, mesh: TetMesh, values: Values) -> None:
         elastic = problem.terms["elastic"]
         self.rigid = np.asarray(elastic.rigid)
-        self.masses = np.repeat(np.stack([np.asarray(elastic.volumes), np.asarray(elastic.areas)]), 3, axis=1)
+        self.masses = elastic.masses
         prior = problem.terms.get("rigid")
         # A flat prior of the rigid motion is the limit of a wide one.
         self.rigid_root = np.sqrt(len(mesh.points)) * (WIDE if prior is None else float(prior.sd)) * self.rigid

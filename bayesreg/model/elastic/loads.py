@@ -95,6 +95,11 @@ class LoadsTerm(NamedTuple):
         """The name of the term."""
         return "elastic"
 
+    @property
+    def masses(self) -> Float[np.ndarray, "2 rows"]:
+        """The diagonals of M and A with one number for each unknown of a node."""
+        return np.repeat(np.stack([np.asarray(self.volumes), np.asarray(self.areas)]), 3, axis=1)
+
     def variances(self, values: Values) -> Float[AnyArray, "nodes"]:
         """Return the diagonal of D at each node: the variance of every component of its load."""
         return values["body_load"] ** 2 * self.volumes + values["surface_load"] ** 2 * self.areas

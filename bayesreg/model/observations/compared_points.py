@@ -11,7 +11,7 @@ import numpyro.distributions as dist
 from jaxtyping import Float, Int
 
 from bayesreg.model.blocks import Blocks, Values
-from bayesreg.model.observations.point_noise import NormalNoise, PartlyNormalised
+from bayesreg.model.observations.point_noise import Adjusted, NormalNoise
 from bayesreg.model.state import State
 from bayesreg.model.term import Label, PointCurvature
 from bayesreg.types import AnyArray, Scalar
@@ -77,7 +77,8 @@ class ComparedPoints(NamedTuple):
         """Return the distribution about u(p), without the known part of its normaliser."""
         mean, known_sd = self.predicted(state), self._with_distance(self.known_sd)
         whole = self.noise.distribution(mean, self.sd(state.values))
-        return PartlyNormalised(whole, self.noise.distribution(jnp.zeros_like(known_sd), known_sd).log_prob(0.0 * mean))
+        known_part = self.noise.distribution(jnp.zeros_like(known_sd), known_sd).log_prob(0.0 * mean)
+        return Adjusted(whole, constant=known_part)
 
     def predicted(self, state: State) -> Float[AnyArray, "k 3"]:
         """Return the predicted displacement u(p), mm."""

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Blocks, Values
-from bayesreg.model.observations.point_noise import Tempered
+from bayesreg.model.observations.point_noise import Adjusted
 from bayesreg.model.state import State
 from bayesreg.model.term import Label, PointCurvature
 from bayesreg.types import AnyArray, Scalar
@@ -131,7 +131,7 @@ class MeasuredSurface(NamedTuple):
     def likelihood(self, state: State) -> dist.Distribution:
         """Return the distribution of the observed zeros, tempered: an error, less the height at this state."""
         height = self.height(state.u)
-        return Tempered(self.noise.distribution_along(-height, self.sd(state.values)), self.share)
+        return Adjusted(self.noise.distribution_along(-height, self.sd(state.values)), self.share)
 
     def height(self, u: Float[AnyArray, "n 3"]) -> Float[AnyArray, "k"]:
         """Return φ(x), the height of every point over the moved surface, mm; positive outside."""

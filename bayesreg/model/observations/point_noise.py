@@ -120,18 +120,22 @@ class StudentTNoise(Section):
 Noise = Annotated[NormalNoise | StudentTNoise, Field(discriminator="kind"), BeforeValidator(by_kind)]
 
 
-class PartlyNormalised(dist.Distribution):
-    """A distribution whose log density lacks a constant, such as the known part of its normaliser.
+class Adjusted(dist.Distribution):
+    """A distribution whose log density counts by a share, and lacks a constant; replicates are drawn from the whole.
 
     Parameters
     ----------
     whole : Distribution
-    constant : array
-        The part of its log density that is left out.
+    share : scalar, default 1
+        The share of points that are independent, where they depend on one another.
+    constant : array, default 0
+        The part of the log density that is left out, such as the known part of its normaliser.
     """
 
-    def __init__(self, whole: dist.Distribution, constant: AnyArray) -> None:
-        self.whole, self.constant = whole, constant
+    def __init__(
+        self, whole: dist.Distribution, share: AnyArray | float = 1.0, constant: AnyArray | float = 0.0
+    ) -> None:
+        self.whole, self.share, self.constant = whole, share, constant
         super().__init__(whole.batch_shape, whole.event_shape)
 
     @property
@@ -144,34 +148,5 @@ class PartlyNormalised(dist.Distribution):
         return self.whole.sample(key, sample_shape)
 
     def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
-        """Return the log density less the constant."""
-        return self.whole.log_prob(value) - self.constant
-
-
-class Tempered(dist.Distribution):
-    """A distribution whose log density counts by a share, as that of points that depend on one another.
-
-    Replicates are drawn from the whole distribution.
-
-    Parameters
-    ----------
-    whole : Distribution
-    share : scalar
-    """
-
-    def __init__(self, whole: dist.Distribution, share: AnyArray) -> None:
-        self.whole, self.share = whole, share
-        super().__init__(whole.batch_shape, whole.event_shape)
-
-    @property
-    def support(self):  # type: ignore[no-untyped-def]
-        """The support of the whole distribution."""
-        return self.whole.support
-
-    def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> AnyArray:
-        """Draw from the whole distribution."""
-        return self.whole.sample(key, sample_shape)
-
-    def log_prob(self, value: AnyArray, intermediates: None = None) -> AnyArray:
-        """Return the share of the log density."""
-        return self.share * self.whole.log_prob(value)
+        """Return the share of the log density, less the constant."""
+        return self.share * self.whole.log_prob(value) - self.constant
