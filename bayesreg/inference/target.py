@@ -174,8 +174,8 @@ class Marginal(Protocol):
         """The names of the parameters whose change makes `log` costly."""
 
     @property
-    def tries(self) -> int:
-        """The number of displacements to propose in turn where the other parameters stay."""
+    def touched_nodes(self) -> AnyArray:
+        """The nodes whose unknowns v are the arguments of factors that are not Gaussian; it may be empty."""
 
     @property
     def drawn(self) -> tuple[str, ...]:
@@ -187,11 +187,25 @@ class Marginal(Protocol):
     def log(self, estimands: Estimands, weights: AnyArray) -> Scalar:
         """Compute the log density of all estimands but "u_boundary", which may have any value, given the weights."""
 
-    def draw_displacements(self, key: AnyArray, estimands: Estimands, weights: AnyArray, count: int) -> AnyArray:
-        """Draw "u_boundary" given the other estimands and the weights so many times: (count, …)."""
+    def draw_displacements(
+        self, key: AnyArray, estimands: Estimands, weights: AnyArray, v: AnyArray | None = None
+    ) -> AnyArray:
+        """Draw "u_boundary" given the other estimands and the weights, and v if it is there."""
+
+    def draw_touched(self, key: AnyArray, estimands: Estimands) -> AnyArray:
+        """Draw v given all estimands, near to the touched unknowns."""
+
+    def touched(self, estimands: Estimands, weights: AnyArray) -> Any:
+        """Compute the `log`, and the `mean` and Cholesky `root` of the Gaussian of v, with "u_boundary" of any value."""
+
+    def log_surfaces(self, estimands: Estimands, v: AnyArray) -> Scalar:
+        """Compute the log of the factors that are functions of v."""
+
+    def log_approximations(self, v: AnyArray) -> Scalar:
+        """Compute the log of the Gaussian factors that stand for them in `log`."""
 
     def log_others(self, estimands: Estimands) -> Scalar:
-        """Compute the log of the terms of the posterior that the other functions leave out."""
+        """Compute the log of the terms of the posterior that are not Gaussian."""
 
 
 @runtime_checkable

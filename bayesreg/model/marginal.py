@@ -1,12 +1,14 @@
 """The posterior of points and surfaces alone with the displacements integrated out, for random loads.
 
-Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so: a Gaussian
-that has its slope and curvature at the mode (`bayesreg.model.quadratic`) stands for it where displacements are
-integrated out or drawn. The difference between the two is one of the terms that the sampler tests.
+Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so, and depends on
+few unknowns of the nodes: those that it touches. A Gaussian that has its slope and curvature near the mode
+(`bayesreg.model.quadratic`) stands for it where displacements are integrated out. Given the touched unknowns v and all
+else, the displacements are exactly Gaussian.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -29,18 +31,17 @@ from bayesreg.model.factorised_response import FactorisedResponse
 from bayesreg.model.observations.compared_points import ComparedPoints
 from bayesreg.model.observations.measured_surface import MeasuredSurface
 from bayesreg.model.point_algebra import PointAlgebra, ResponseDeterminant
+from bayesreg.model.point_gaussian import LEAST_VARIANCE, TouchedGaussian
 from bayesreg.model.program import Problem
 from bayesreg.model.quadratic import Quadratic, approximate_about
 from bayesreg.model.spectral_response import SpectralResponse
 from bayesreg.model.state import state_of
 from bayesreg.model.stiffness_parts import has_few_entries
-from bayesreg.model.surface_mode import draw_about_mode, find_mode
+from bayesreg.model.surface_mode import Mode, draw_about_mode, find_mode
 from bayesreg.types import AnyArray, Scalar
 
 # The matrices of more unknowns take minutes, and those of more coordinates of points a gigabyte.
 MOST_UNKNOWNS, MOST_COORDINATES = 5000, 1500
-# Not every draw from the Gaussian of a surface is accepted, and more draws at once cost little more than one.
-TRIES = 6
 # The number of displacements about the mode over which a surface's slope and curvature are averaged.
 PLACES = 16
 # The terms that are Gaussian in the displacements, and those that may stand beside them.
@@ -57,22 +58,23 @@ class Marginal(NamedTuple):
     number : scalar integer
         That of its `PointAlgebra`.
     approximations : dict
-        The Gaussian that stands for each surface, by name.
+        The Gaussian of v that stands for each surface, by name.
+    restricted : dict
+        The term of each surface on the touched nodes alone, by name.
+    touched_nodes : (t,) int array
+        The nodes whose unknowns surfaces touch; none without surfaces.
     """
 
     problem: Problem
     number: Int[AnyArray, ""]
     approximations: dict[str, Quadratic]
+    restricted: dict[str, MeasuredSurface]
+    touched_nodes: Int[AnyArray, "touched"]
 
     @property
     def costly(self) -> tuple[str, ...]:
         """The names of the parameters whose change costs a factorisation."""
         return () if has_one_tissue(self.problem) else LAME
-
-    @property
-    def tries(self) -> int:
-        """The number of displacements that are worth proposing at given parameters: more than one for surfaces."""
-        return TRIES if self.approximations else 1
 
     @property
     def drawn(self) -> tuple[str, ...]:
@@ -109,23 +111,46 @@ class Marginal(NamedTuple):
         return jnp.where(jnp.isnan(log), -jnp.inf, log)
 
     def draw_displacements(
-        self, key: AnyArray, estimands: Values, weights: Float[AnyArray, "points"], count: int
-    ) -> Float[AnyArray, "draws nodes 3"]:
-        """Draw u given θ and τ so many times, independently, mm."""
+        self,
+        key: AnyArray,
+        estimands: Values,
+        weights: Float[AnyArray, "points"],
+        v: Float[AnyArray, "touched"] | None = None,
+    ) -> Float[AnyArray, "nodes 3"]:
+        """Draw u given θ and τ, mm, and given v in place of the Gaussians of surfaces if it is there."""
         values = complete(self.problem.blocks, estimands)
-        stiffness, sizes, noise = self.given(values, weights)
-        key_load, key_error = jax.random.split(key)
-        white = jax.random.normal(key_load, (count, 6 + values["u_boundary"].size))
-        errors = jax.random.normal(key_error, (count, len(noise)))
-        return point_algebra.draw(self.number, stiffness, sizes, noise, white, errors).reshape(count, -1, 3)
+        given, unknowns = self.given(values, weights), values["u_boundary"].size
+        return point_algebra.draw(self.number, *given, jnp.zeros(0) if v is None else v, key, unknowns).reshape(-1, 3)
+
+    def draw_touched(self, key: AnyArray, estimands: Values) -> Float[AnyArray, "touched"]:
+        """Draw v given the displacements, mm: the touched unknowns up to a micrometre."""
+        u = estimands["u_boundary"][self.touched_nodes].reshape(-1)
+        return u + math.sqrt(LEAST_VARIANCE) * jax.random.normal(key, u.shape)
+
+    def touched(self, estimands: Values, weights: Float[AnyArray, "points"]) -> TouchedGaussian:
+        """Compute the Gaussian of v given θ and τ, and log p(y, θ | τ) up to a constant, as `log` does."""
+        values = complete(self.problem.blocks, estimands)
+        prior = evaluation.evaluate(self.problem._replace(terms={}), values).logdensity
+        count = 3 * len(self.touched_nodes)
+        gaussian = point_algebra.touched_given(self.number, *self.given(values, weights), count)
+        log = prior + gaussian.log
+        return gaussian._replace(log=jnp.where(jnp.isnan(log), -jnp.inf, log))
+
+    def log_surfaces(self, estimands: Values, v: Float[AnyArray, "touched"]) -> Scalar:
+        """Compute the log of the surfaces as functions of v."""
+        values, u = complete(self.problem.blocks, estimands), v.reshape(-1, 3)
+        return sum((term.log_at(u, values) for term in self.restricted.values()), jnp.zeros(()))
+
+    def log_approximations(self, v: Float[AnyArray, "touched"]) -> Scalar:
+        """Compute the log of the Gaussians that stand for the surfaces."""
+        return sum((quadratic.log(v) for quadratic in self.approximations.values()), jnp.zeros(()))
 
     def log_others(self, estimands: Values) -> Scalar:
-        """Compute the log of what the Gaussians leave out: the barrier, and each surface over its approximation."""
+        """Compute the log of the terms that are not Gaussian in the displacements: the barrier, and the surfaces."""
         values = complete(self.problem.blocks, estimands)
         state = state_of(self.problem.body, self.problem.blocks, values)
         others = (term for term in self.problem.terms.values() if not isinstance(term, GAUSSIAN))
-        log = sum((term.log(state) for term in others), jnp.zeros(()))
-        return log - sum((quadratic.log(state.u) for quadratic in self.approximations.values()), jnp.zeros(()))
+        return sum((term.log(state) for term in others), jnp.zeros(()))
 
     def given(self, values: Values, weights: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return λ and μ of all entries, the squared sizes of the loads, and the variances of all coordinates."""
@@ -146,7 +171,7 @@ class Marginalisation:
     problem : Problem
     mesh : TetMesh
     start : mapping or None
-        Estimands near the mode.
+        Estimands at the mode, if an earlier search has found it.
     """
 
     problem: Problem
@@ -164,7 +189,7 @@ class Marginalisation:
         if problem.body.field is not None or not has_few_entries(problem.body):
             return None
         is_small = 3 * len(mesh.points) <= MOST_UNKNOWNS
-        is_small &= 3 * sum(len(term.shift) for term in points) <= MOST_COORDINATES
+        is_small &= 3 * _count_points(problem) <= MOST_COORDINATES
         is_bounded = all(np.isfinite(_range(problem, name)).all() for name in LAME)
         return cls(problem, mesh, start) if is_small and is_bounded else None
 
@@ -179,7 +204,11 @@ class Marginalisation:
             number, cells = self._algebra.number, np.unique(self.problem.body.cell_entry, return_index=True)[1]
             determinant = ResponseDeterminant(jnp.asarray(number), jnp.asarray(cells))
             elastic = self.problem.terms["elastic"]._replace(determinant=determinant)
-            return Marginal(self.problem.with_term("elastic", elastic), determinant.number, self._approximations)
+            touched, terms = self._touched_nodes, {term.name: term for term in surfaces_of(self.problem)}
+            approximations = {name: each.among(unknowns_of(touched)) for name, each in self._approximations.items()}
+            restricted = {name: term.restricted_to(touched) for name, term in terms.items()}
+            arrays = jax.tree.map(jnp.asarray, (approximations, restricted, touched))
+            return Marginal(self.problem.with_term("elastic", elastic), determinant.number, *arrays)
 
     def count_independent_points(self, observations: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
         """Count the independent points of surfaces, by name; return the counts, and all values at the mode."""
@@ -192,10 +221,17 @@ class Marginalisation:
         surfaces = surfaces_of(self.problem)
         if not surfaces:
             return {}
-        mode = find_mode(self.problem, self.mesh, start=self.start)
+        if self.start is None:
+            mode = find_mode(self.problem, self.mesh)
+        else:
+            mode = Mode(self.problem, jax.tree.map(np.asarray, complete(self.problem.blocks, self.start)))
         places = draw_about_mode(self.problem, self.mesh, mode, PLACES)
-        factors = {term.name: approximate_about(term, places, mode.values) for term in surfaces}
-        return jax.tree.map(jnp.asarray, factors)
+        return {term.name: approximate_about(term, places, mode.values) for term in surfaces}
+
+    @cached_property
+    def _touched_nodes(self) -> Int[np.ndarray, "touched"]:
+        touched = [np.asarray(quadratic.unknowns) // 3 for quadratic in self._approximations.values()]
+        return np.unique(np.concatenate([np.zeros(0, int), *touched]))
 
     @cached_property
     def _algebra(self) -> PointAlgebra:
@@ -204,20 +240,19 @@ class Marginalisation:
         precision = 0.0 if prior is None else 1 / (len(self.mesh.points) * float(prior.sd) ** 2)
         interpolation, shift = self._rows(unknowns)
         masses = elastic.masses
-        return PointAlgebra(
-            self._response(rigid, masses, interpolation), rigid, masses, precision, interpolation, shift
-        )
+        response, points = self._response(rigid, masses, interpolation), 3 * _count_points(self.problem)
+        return PointAlgebra(response, rigid, masses, precision, interpolation, shift, points)
 
-    def _rows(self, unknowns: int) -> tuple[Float[np.ndarray, "rows unknowns"], Float[np.ndarray, "rows"]]:
-        """Return B and y: the coordinates of all points, then the rows of the surfaces' approximations."""
+    def _rows(self, unknowns: int) -> tuple[Float[np.ndarray, "rows unknowns"], Float[np.ndarray, "observed"]]:
+        """Return B and y: the coordinates of all points, the rows of the approximations; B has touched unknowns, too."""
         identity = jnp.eye(unknowns).reshape(-1, 3, unknowns)
         points, approximations = points_of(self.problem), self._approximations.values()
         rows = [np.asarray(term.interpolate(identity)).reshape(-1, unknowns) for term in points]
         rows += [quadratic.interpolation(unknowns) for quadratic in approximations]
+        rows.append(np.eye(unknowns)[unknowns_of(self._touched_nodes)])
         shifts = [np.asarray(term.shift).ravel() for term in points]
-        return np.concatenate(rows), np.concatenate(
-            [*shifts, *(np.asarray(quadratic.shift) for quadratic in approximations)]
-        )
+        shifts += [np.asarray(quadratic.shift) for quadratic in approximations]
+        return np.concatenate(rows), np.concatenate(shifts)
 
     def _response(
         self,
@@ -245,6 +280,15 @@ def points_of(problem: Problem) -> list[ComparedPoints]:
 def surfaces_of(problem: Problem) -> list[MeasuredSurface]:
     """Return the terms of surfaces."""
     return [term for term in problem.terms.values() if isinstance(term, MeasuredSurface)]
+
+
+def unknowns_of(nodes: Int[np.ndarray, "n"]) -> Int[np.ndarray, "unknowns"]:
+    """Return 3 · node + axis of some nodes."""
+    return (3 * nodes[:, None] + np.arange(3)).ravel()
+
+
+def _count_points(problem: Problem) -> int:
+    return sum(len(term.shift) for term in points_of(problem))
 
 
 def _range(problem: Problem, name: str) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Pairs of points with the displacements integrated out, for one tissue and random loads: its algebra on the host.
+"""Points and surfaces with the displacements integrated out, for random loads: the algebra on the host.
 
 Given λ, the sizes s and t of the loads, and the variances Σ of the errors, the displacements u and the observed shifts
 y of the points are jointly Gaussian. With the loads' variances D = s² M + t² A, the rigid motions R, and the
@@ -13,6 +13,11 @@ log p(y) = −½ (log det S + log det Hᵀ S⁻¹ H + yᵀ S⁻¹ (y − H b)) +
 
 With P = S⁻¹ − S⁻¹ H (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ and its 3 × 3 blocks P_kk, the other points alone predict point k with the
 residual P_kk⁻¹ (P y)_k, whose covariance is P_kk⁻¹.
+
+A surface is not linear in u. It depends on few unknowns, those that it touches. A Gaussian factor stands for it: rows of
+B and y with errors of variance one. The difference between both is a function of v, which are the touched unknowns up
+to a micrometre. Further rows of B, which are not observed, select them: v given y is Gaussian, too, and then y without
+the factor and v determine the Gaussian of u.
 
 A Gaussian prior of the rigid motion, c ~ N(0, Λ⁻¹), adds Λ to Hᵀ S⁻¹ H; a flat one is its limit. S has three rows for
 each point and none for the nodes, and only the stiffness changes Gᵀ M G and Gᵀ A G
@@ -39,7 +44,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from threadpoolctl import ThreadpoolController
 
-from bayesreg.model.point_gaussian import GivenShifts
+from bayesreg.model.point_gaussian import LEAST_VARIANCE, Factorised, GivenShifts, TouchedGaussian
 from bayesreg.types import AnyArray, Scalar
 
 # The number of draws whose matrices are in memory together.
@@ -85,9 +90,11 @@ class PointAlgebra:
     precision : float
         That of each entry of c, 1/mm²; zero for a flat prior.
     interpolation : (m, 3n) array
-        B, with m coordinates of points.
-    shift : (m,) array
-        y, mm.
+        B: coordinates of points, rows of the factors of surfaces, and touched unknowns.
+    shift : (o,) array
+        y, mm, of points and factors.
+    points : int
+        The number of coordinates of points.
     """
 
     def __init__(
@@ -97,15 +104,16 @@ class PointAlgebra:
         masses: Float[np.ndarray, "2 unknowns"],
         precision: float,
         interpolation: Float[np.ndarray, "coordinates unknowns"],
-        shift: Float[np.ndarray, "coordinates"],
+        shift: Float[np.ndarray, "observed"],
+        points: int,
     ) -> None:
         self.number = next(_numbers)
         _by_number[self.number] = self
         self.response, self._rigid, self._masses, self._precision = response, rigid, masses, precision
-        self._interpolation, self._shift = interpolation, shift
+        self._interpolation, self._shift, self._points = interpolation, shift, points
         self._rigid_at_points = interpolation @ rigid
         # S is symmetric: its upper triangle is enough, which is the lower one of LAPACK's order of columns.
-        self._triangle = np.triu_indices(len(shift))
+        self._triangle = np.triu_indices(len(interpolation))
         self._balances = np.stack([rigid.T @ (mass[:, None] * rigid) for mass in masses])
 
     def log_densities(
@@ -116,35 +124,52 @@ class PointAlgebra:
             logs = side_by_side(lambda given: given.log_density(self._shift), self._given(stiffness, sizes, noise))
             return np.reshape(list(logs), np.shape(sizes)[:-1])
 
-    def draw_all(
-        self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray, white: np.ndarray, errors: np.ndarray
-    ) -> Float[np.ndarray, "*chains draws unknowns"]:
-        """Compute `draw` of chains, which are the leading axes of all arguments."""
-        draws, chains = white.shape[-2], np.shape(sizes)[:-1]
+    def touched_all(self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray) -> TouchedGaussian:
+        """Compute `touched_given` of chains, which are the leading axes of all arguments."""
         with one_thread_each() as side_by_side:
-            conditionals = list(side_by_side(GivenShifts.factorised, self._given(stiffness, sizes, noise)))
-        # Rows are the draws of all chains.
-        of_chain = np.repeat(np.arange(len(conditionals)), draws)
-        variances = (sizes.reshape(-1, 2) @ self._masses)[of_chain]
-        given_stiffness = stiffness.reshape(len(conditionals), -1)[of_chain]
-        balances = np.stack([given.balance for given in conditionals])[of_chain]
-        white = white.reshape(len(of_chain), -1)
+            given = self._given(stiffness, sizes, noise)
+            touched = list(side_by_side(lambda given: given.touched(self._shift), given))
+        chains = np.shape(sizes)[:-1]
+        return TouchedGaussian(*(np.reshape(part, chains + np.shape(part[0])) for part in zip(*touched, strict=True)))
+
+    def draw_all(
+        self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray, v: np.ndarray, white: np.ndarray
+    ) -> Float[np.ndarray, "*chains unknowns"]:
+        """Compute `draw` of chains, which are the leading axes of all arguments."""
+        chains, observed, points = np.shape(sizes)[:-1], len(self._shift), self._points
+        is_touched = v.shape[-1] > 0
+
+        def factorised(given: GivenShifts) -> Factorised:
+            return given.factorised_with_touched(points) if is_touched else given.factorised()
+
+        with one_thread_each() as side_by_side:
+            conditionals = list(side_by_side(factorised, self._given(stiffness, sizes, noise)))
+        # Rows are chains.
+        count = len(conditionals)
+        variances, given_stiffness = sizes.reshape(-1, 2) @ self._masses, stiffness.reshape(count, -1)
+        balances = np.stack([given.balance for given in conditionals])
+        noise, white = noise.reshape(count, -1), white.reshape(count, -1)
+        shift, rows = np.broadcast_to(self._shift, (count, observed)), self._interpolation[:observed]
+        if is_touched:
+            shift = np.concatenate([shift[:, :points], v.reshape(count, -1)], axis=1)
+            rows = self._interpolation[np.r_[:points, observed : len(self._interpolation)]]
+            noise = np.concatenate([noise[:, :points], np.full((count, v.shape[-1]), LEAST_VARIANCE)], axis=1)
+        motions, loads, errors = np.split(white, [6, 6 + variances.shape[1]], axis=1)
 
         def respond(load: np.ndarray) -> np.ndarray:
             """Return K⁺ times loads, less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
             parts = np.einsum("rij,rj->ri", balances, load @ self._rigid)
             return self.response.solve(given_stiffness, load - variances * (parts @ self._rigid.T))
 
-        u = respond(np.sqrt(variances) * white[:, 6:])
+        u = respond(np.sqrt(variances) * loads)
         if self._precision:
-            u += white[:, :6] @ self._rigid.T / math.sqrt(self._precision)
-        error = (np.sqrt(noise)[..., None, :] * errors).reshape(len(u), -1)
-        apart = self._shift - u @ self._interpolation.T - error
-        solutions = [conditionals[chain].solve(shift) for chain, shift in zip(of_chain, apart, strict=True)]
+            u += motions @ self._rigid.T / math.sqrt(self._precision)
+        apart = shift - u @ rows.T - np.sqrt(noise) * errors[:, : shift.shape[1]]
+        solutions = [given.solve(each) for given, each in zip(conditionals, apart, strict=True)]
         weights, motions = (np.stack(part) for part in zip(*solutions, strict=True))
-        u += respond(variances * self.response.solve(given_stiffness, weights @ self._interpolation))
+        u += respond(variances * self.response.solve(given_stiffness, weights @ rows))
         u += motions @ self._rigid.T
-        return u.reshape(*chains, draws, -1)
+        return u.reshape(*chains, -1)
 
     def leave_out(
         self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray
@@ -152,7 +177,7 @@ class PointAlgebra:
         """Compute (P y)_k and P_kk of every point k, for draws, which are the leading axis of all arguments."""
 
         def leave_out(given: GivenShifts) -> tuple[np.ndarray, np.ndarray]:
-            return given.factorised().leave_out(self._shift)
+            return given.factorised().leave_out(self._shift, self._points)
 
         blocks = (slice(first, first + BLOCK) for first in range(0, len(sizes), BLOCK))
         with one_thread_each() as side_by_side:
@@ -182,7 +207,7 @@ def log_density(
     number: AnyArray,
     stiffness: Float[AnyArray, "entries"],
     sizes: Float[AnyArray, "2"],
-    noise: Float[AnyArray, "coordinates"],
+    noise: Float[AnyArray, "observed"],
 ) -> Scalar:
     """Compute log p(y) as part of a JAX program, up to a constant; NaN where S is not positive definite.
 
@@ -194,28 +219,44 @@ def log_density(
         λ of all entries, then μ of all entries.
     sizes : (2,) array
         s² and t².
-    noise : (m,) array
+    noise : (o,) array
         The diagonal of Σ, mm².
     """
     result = jax.ShapeDtypeStruct((), float)
     return jax.pure_callback(_log_densities, result, number, stiffness, sizes, noise, vmap_method="broadcast_all")
 
 
+def touched_given(
+    number: AnyArray,
+    stiffness: Float[AnyArray, "entries"],
+    sizes: Float[AnyArray, "2"],
+    noise: Float[AnyArray, "observed"],
+    touched: int,
+) -> TouchedGaussian:
+    """Compute the Gaussian of so many touched unknowns given y as part of a JAX program, and log p(y)."""
+    shapes = (), (touched,), (touched, touched)
+    result = TouchedGaussian(*(jax.ShapeDtypeStruct(shape, float) for shape in shapes))
+    return jax.pure_callback(_touched_all, result, number, stiffness, sizes, noise, vmap_method="broadcast_all")
+
+
 def draw(
     number: AnyArray,
     stiffness: Float[AnyArray, "entries"],
     sizes: Float[AnyArray, "2"],
-    noise: Float[AnyArray, "coordinates"],
-    white: Float[AnyArray, "draws motions_and_unknowns"],
-    errors: Float[AnyArray, "draws coordinates"],
-) -> Float[AnyArray, "draws unknowns"]:
-    """Draw u given y as part of a JAX program, mm, from independent Normal numbers for c and loads, and for errors.
+    noise: Float[AnyArray, "observed"],
+    v: Float[AnyArray, "touched"],
+    key: AnyArray,
+    unknowns: int,
+) -> Float[AnyArray, "unknowns"]:
+    """Draw u given y as part of a JAX program, mm; if v is not empty, given v in place of the factors of surfaces.
 
-    A draw of the prior is corrected by its difference from y (Matheron's rule). The flat prior of the rigid motion is
-    the limit of a wide one.
+    A draw of the prior is corrected by its difference from what is given (Matheron's rule). The flat prior of the rigid
+    motion is the limit of a wide one.
     """
-    result = jax.ShapeDtypeStruct((len(white), white.shape[1] - 6), float)
-    arguments = number, stiffness, sizes, noise, white, errors
+    # Independent Normal numbers for c, the loads and the errors.
+    white = jax.random.normal(key, (6 + unknowns + len(noise) + len(v),))
+    result = jax.ShapeDtypeStruct((unknowns,), float)
+    arguments = number, stiffness, sizes, noise, v, white
     return jax.pure_callback(_draw_all, result, *arguments, vmap_method="broadcast_all")
 
 
@@ -232,13 +273,15 @@ def _log_pseudo_determinants(number: AnyArray, stiffness: AnyArray) -> Float[np.
 
 
 def _log_densities(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains"]:
-    stiffness, sizes, noise = map(np.asarray, given)
-    return algebra_of(number).log_densities(stiffness, sizes, noise)
+    return algebra_of(number).log_densities(*map(np.asarray, given))
+
+
+def _touched_all(number: AnyArray, *given: AnyArray) -> TouchedGaussian:
+    return algebra_of(number).touched_all(*map(np.asarray, given))
 
 
 def _draw_all(number: AnyArray, *given: AnyArray) -> Float[np.ndarray, "*chains unknowns"]:
-    stiffness, sizes, noise, white, errors = map(np.asarray, given)
-    return algebra_of(number).draw_all(stiffness, sizes, noise, white, errors)
+    return algebra_of(number).draw_all(*map(np.asarray, given))
 
 
 @contextmanager

@@ -33,16 +33,13 @@ class Quadratic(NamedTuple):
     root: Float[AnyArray, "rows touched"]
     shift: Float[AnyArray, "rows"]
 
-    def log(self, u: Float[AnyArray, "nodes 3"]) -> Scalar:
+    def log(self, u: Float[AnyArray, "unknowns"]) -> Scalar:
         """Return −½ |E u − y|²."""
-        return -0.5 * ((self.root @ u.reshape(-1)[self.unknowns] - self.shift) ** 2).sum()
+        return -0.5 * ((self.root @ u[self.unknowns] - self.shift) ** 2).sum()
 
-    def without_flat_directions(self) -> Quadratic:
-        """Return fewer rows, without directions along which the factor hardly changes: those along a surface."""
-        left, sizes, right = np.linalg.svd(self.root, full_matrices=False)
-        kept = sizes**2 > LEAST_SHARE * sizes[0] ** 2
-        shift = left[:, kept].T @ self.shift
-        return self._replace(root=sizes[kept, None] * right[kept], shift=shift)
+    def among(self, unknowns: Int[np.ndarray, "t"]) -> Quadratic:
+        """Return the same factor with the places of its unknowns among these, which are sorted, for their numbers."""
+        return self._replace(unknowns=np.searchsorted(unknowns, self.unknowns))
 
     def interpolation(self, unknowns: int) -> Float[np.ndarray, "rows unknowns"]:
         """Return E with a column for every unknown."""
@@ -52,13 +49,21 @@ class Quadratic(NamedTuple):
 
 
 def approximate_about(term: Any, places: Float[np.ndarray, "places nodes 3"], values: Values) -> Quadratic:
-    """Return the Gaussian that has a term's mean slope and mean curvature over several displacements."""
+    """Return the Gaussian that has a term's mean slope and mean curvature over several displacements.
+
+    It has no rows for directions along which it hardly changes: those along a surface.
+    """
     factors = [approximate(term, u, values) for u in places]
     unknowns = np.unique(np.concatenate([factor.unknowns for factor in factors]))
-    root = np.concatenate([factor.interpolation(places[0].size)[:, unknowns] for factor in factors])
-    shift = np.concatenate([factor.shift for factor in factors])
-    scale = 1 / np.sqrt(len(places))
-    return Quadratic(unknowns, scale * root, scale * shift).without_flat_directions()
+    curvature, slope = np.zeros((len(unknowns),) * 2), np.zeros(len(unknowns))
+    for factor in factors:
+        own = np.searchsorted(unknowns, factor.unknowns)
+        curvature[np.ix_(own, own)] += factor.root.T @ factor.root / len(places)
+        slope[own] += factor.root.T @ factor.shift / len(places)
+    squares, directions = np.linalg.eigh(curvature)
+    kept = squares > LEAST_SHARE * squares[-1]
+    sizes, directions = np.sqrt(squares[kept]), directions[:, kept]
+    return Quadratic(unknowns, sizes[:, None] * directions.T, directions.T @ slope / sizes)
 
 
 def approximate(term: Any, u: Float[np.ndarray, "nodes 3"], values: Values) -> Quadratic:

@@ -69,7 +69,7 @@ def test_displacements_of_two_tissues_are_drawn_from_their_conditional():
     marginal = posterior.target.prepare_marginal()
     estimands = estimands_at(posterior, (5.0, 2.0), (1.0, 3.0), (0.1, 0.2))
     keys = jax.random.split(jax.random.key(0), 4000)
-    draws = jax.vmap(lambda key: marginal.draw_displacements(key, estimands, jnp.ones(len(FIXED)), 1)[0])(keys)
+    draws = jax.vmap(lambda key: marginal.draw_displacements(key, estimands, jnp.ones(len(FIXED))))(keys)
     values = complete(posterior.data.blocks, estimands)
     covariance = np.linalg.inv(
         displacement_curvature(posterior.data, values, np.zeros(LAYERS.points.shape)).gauss_newton

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import logsumexp
 from jaxtyping import Float
 
 from bayesreg.inference.deadline import Deadline
@@ -34,6 +33,9 @@ from bayesreg.types import AnyArray, InputError
 # The number of steps of θ in one transition. Some go along one direction of its unit by a random multiple, spread
 # evenly on a logarithmic axis, so that also tails and narrow parts of its posterior are visited.
 STEPS, NARROWEST, WIDEST = 6, 0.5, 4.0
+# The same in each half of a transition with touched unknowns, and the number of turns of their trajectory, each by an
+# angle: a quarter of a circle in all leads to a place that is nearly independent.
+HALF_STEPS, TURNS, ANGLE = 2, 5, 0.35
 # The share of the other steps, which propose θ independently of where it is, and the degrees of freedom of Student's t,
 # from which every component of both kinds is drawn.
 INDEPENDENT, FREEDOM = 0.6, 5.0
@@ -86,11 +88,18 @@ def gibbs(target: Target, settings: Gibbs) -> Sampler:
 def _step(
     target: Target, marginal: Any, setup: Setup, key: AnyArray, estimands: Estimands, is_tested: bool
 ) -> tuple[dict[str, AnyArray], Info]:
-    """Draw weights and displacements twice, the second time with θ between them, which costs more."""
-    key_first, key_second = jax.random.split(key)
-    drawn, first_rate = _sweep(marginal, _stay, key_first, estimands, is_tested)
-    drawn, second_rate = _sweep(marginal, partial(_walk, target, marginal, setup), key_second, drawn, is_tested)
-    rate = (first_rate + second_rate) / 2
+    """Draw weights and displacements twice, the second time with θ between them, which costs more.
+
+    Where some factors are functions of the touched unknowns v, this happens once, with a trajectory of v.
+    """
+    if is_tested and len(marginal.touched_nodes):
+        drawn, rate = _move_with_touched(target, marginal, setup, key, estimands)
+    else:
+        key_first, key_second = jax.random.split(key)
+        drawn, first_rate = _sweep(marginal, _stay, key_first, estimands, is_tested)
+        walk = partial(_walk, target, marginal, setup)
+        drawn, second_rate = _sweep(marginal, walk, key_second, drawn, is_tested)
+        rate = (first_rate + second_rate) / 2
     nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
     return drawn, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
 
@@ -106,33 +115,102 @@ def _sweep(
     estimands: Estimands,
     is_tested: bool,
 ) -> tuple[dict[str, AnyArray], AnyArray]:
-    """Draw the weights, move θ, and draw the displacements; return the probability that the other terms accept them.
-
-    Several displacements are tried at once (Liu, Liang and Wong 2000): one of those drawn at the new θ is chosen in
-    proportion to the factors of the other terms, and accepted by the ratio of the sum of their factors to that of the
-    present displacement and of others drawn at the present θ. With one try it is Metropolis' rule.
-    """
-    key_weights, key_move, key_new, key_old, key_choice, key_accept = jax.random.split(key, 6)
+    """Draw the weights, move θ, and draw the displacements; return the probability that the other terms accept them."""
+    key_weights, key_move, key_draw, key_accept = jax.random.split(key, 4)
     weights, estimands = marginal.draw_weights(key_weights, estimands)
-    parameters, tries = move(key_move, estimands, weights), marginal.tries
-    candidates = marginal.draw_displacements(key_new, parameters, weights, tries)
+    parameters = move(key_move, estimands, weights)
+    proposal = {**parameters, "u_boundary": marginal.draw_displacements(key_draw, parameters, weights)}
     if not is_tested:
-        return {**parameters, "u_boundary": candidates[0]}, jnp.ones(())
+        return proposal, jnp.ones(())
+    gain = marginal.log_others(proposal) - marginal.log_others(estimands)
+    return _accept(key_accept, gain, proposal, dict(estimands))
 
-    def logs(parameters: Estimands, displacements: AnyArray) -> AnyArray:
-        log_others = jax.vmap(lambda u: marginal.log_others({**parameters, "u_boundary": u}))(displacements)
-        return jnp.nan_to_num(log_others, nan=-jnp.inf)
 
-    present = estimands["u_boundary"][None]
-    if tries > 1:
-        others = marginal.draw_displacements(key_old, estimands, weights, tries - 1)
-        present = jnp.concatenate([present, others])
-    candidate_logs = logs(parameters, candidates)
-    chosen = jax.random.categorical(key_choice, candidate_logs)
-    acceptance = jnp.minimum(1.0, jnp.exp(logsumexp(candidate_logs) - logsumexp(logs(estimands, present))))
-    is_accepted = jax.random.uniform(key_accept) < acceptance
-    proposal = {**parameters, "u_boundary": candidates[chosen]}
-    return jax.tree.map(partial(jnp.where, is_accepted), proposal, dict(estimands)), acceptance
+def _move_with_touched(
+    target: Target, marginal: Any, setup: Setup, key: AnyArray, estimands: Estimands
+) -> tuple[dict[str, AnyArray], AnyArray]:
+    """Draw the weights, move θ and v with the other unknowns integrated out, and draw the displacements given both.
+
+    v = m + L ζ with the mean and the Cholesky factor of its Gaussian, which θ determines. θ moves at a fixed ζ, so that
+    v stays where its Gaussian is (Murray and Adams 2010), and ζ moves at a fixed θ. The walks before and after the
+    trajectory of ζ make the whole reversible. v has all factors of the posterior but the barrier, and the micrometre by
+    which it differs from the displacements: Metropolis' rule for these makes it exact.
+    """
+    keys = jax.random.split(key, 7)
+    weights, present = marginal.draw_weights(keys[0], estimands)
+    v = marginal.draw_touched(keys[1], present)
+    flat, _, estimands_of = _walked_position(target, marginal, present)
+
+    def log_factors(gaussian: Any, zeta: AnyArray) -> AnyArray:
+        """Return the log of the surfaces over that of the Gaussians that stand for them."""
+        at = gaussian.mean + gaussian.root @ zeta
+        return marginal.log_surfaces(present, at) - marginal.log_approximations(at)
+
+    def touched(flat: AnyArray) -> Any:
+        estimands, log_jacobian = estimands_of(flat)
+        gaussian = marginal.touched(estimands, weights)
+        return gaussian._replace(log=gaussian.log + log_jacobian)
+
+    def walk(key: AnyArray, flat: AnyArray, gaussian: Any, zeta: AnyArray) -> tuple[AnyArray, Any]:
+        if not flat.size:
+            return flat, gaussian
+
+        def step(now: tuple[AnyArray, Any, AnyArray], key: AnyArray) -> tuple[Any, None]:
+            flat, gaussian, factors = now
+            key_move, key_accept = jax.random.split(key)
+            candidate, balance = _propose(setup, key_move, flat, 0)
+            new = touched(candidate)
+            new_factors = log_factors(new, zeta)
+            gain = new.log + new_factors - gaussian.log - factors + balance
+            return _accept(key_accept, gain, (candidate, new, new_factors), now)[0], None
+
+        start = flat, gaussian, log_factors(gaussian, zeta)
+        return jax.lax.scan(step, start, jax.random.split(key, HALF_STEPS))[0][:2]
+
+    gaussian = touched(flat)
+    zeta = solve_triangular(gaussian.root, v - gaussian.mean, lower=True)
+    flat, gaussian = walk(keys[2], flat, gaussian, zeta)
+    zeta, rate = _rotate(partial(log_factors, gaussian), keys[3], zeta)
+    flat, gaussian = walk(keys[4], flat, gaussian, zeta)
+    moved, new_v = estimands_of(flat)[0], gaussian.mean + gaussian.root @ zeta
+    proposal = {**moved, "u_boundary": marginal.draw_displacements(keys[5], moved, weights, new_v)}
+    gain = marginal.log_others(proposal) - marginal.log_surfaces(present, new_v)
+    gain -= marginal.log_others(present) - marginal.log_surfaces(present, v)
+    drawn, accepted = _accept(keys[6], gain, proposal, dict(present))
+    return drawn, accepted * rate
+
+
+def _rotate(log_factors: Callable[[AnyArray], AnyArray], key: AnyArray, zeta: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Move ζ, Normal but for some factors, by a Hamiltonian trajectory (Beskos et al. 2011).
+
+    The Normal part alone turns ζ and its momentum around the origin, exactly; the factors change the momentum.
+    """
+    key_momentum, key_angle, key_accept = jax.random.split(key, 3)
+    momentum = jax.random.normal(key_momentum, zeta.shape)
+    angle = ANGLE * jax.random.uniform(key_angle, minval=0.7, maxval=1.3)
+    value_and_force = jax.value_and_grad(log_factors)
+
+    def turn(now: tuple[AnyArray, ...], _: None) -> tuple[tuple[AnyArray, ...], None]:
+        zeta, momentum, _, force = now
+        momentum = momentum + angle / 2 * force
+        zeta, momentum = (
+            jnp.cos(angle) * zeta + jnp.sin(angle) * momentum,
+            jnp.cos(angle) * momentum - jnp.sin(angle) * zeta,
+        )
+        value, force = value_and_force(zeta)
+        return (zeta, momentum + angle / 2 * force, value, force), None
+
+    start = (zeta, momentum, *value_and_force(zeta))
+    end, _ = jax.lax.scan(turn, start, None, length=TURNS)
+    energies = [(x**2).sum() / 2 + (p**2).sum() / 2 - value for x, p, value, _ in (start, end)]
+    return _accept(key_accept, energies[0] - energies[1], end[0], zeta)
+
+
+def _accept(key: AnyArray, gain: AnyArray, proposal: Any, present: Any) -> tuple[Any, AnyArray]:
+    """Return one of both by Metropolis' rule, and the probability of the proposal."""
+    acceptance = jnp.minimum(1.0, jnp.exp(jnp.nan_to_num(gain, nan=-jnp.inf)))
+    is_accepted = jax.random.uniform(key) < acceptance
+    return jax.tree.map(partial(jnp.where, is_accepted), proposal, present), acceptance
 
 
 def _walk(
@@ -142,18 +220,9 @@ def _walk(
 
     Where some parameters are costly, all but the first step leave them where they are.
     """
-    position = target.coordinates.unconstrain(marginal.problem, estimands)
-    names, costly = _walked(marginal, position)
-    others = {name: value for name, value in position.items() if name not in names}
-    start, unravel = ravel_pytree([position[name] for name in names])
+    start, costly, estimands_of = _walked_position(target, marginal, estimands)
     if not start.size:
         return dict(estimands)
-    # The unit of a step is triangular: directions from here on leave the costly parameters alone.
-    first_cheap = sum(position[name].size for name in costly)
-
-    def estimands_of(flat: AnyArray) -> tuple[dict[str, AnyArray], AnyArray]:
-        walked = dict(zip(names, unravel(flat), strict=True))
-        return target.coordinates.constrain(marginal.problem, {**others, **walked})
 
     def density(flat: AnyArray) -> AnyArray:
         estimands, log_jacobian = estimands_of(flat)
@@ -161,25 +230,49 @@ def _walk(
 
     def step(now: tuple[AnyArray, AnyArray], key_and_number: tuple[AnyArray, AnyArray]) -> tuple[Any, None]:
         (flat, height), (key, number) = now, key_and_number
-        key_kind, key_width, key_which, key_move, key_accept = jax.random.split(key, 5)
+        key_move, key_accept = jax.random.split(key)
         # The first step only evaluates the density at the start, so that the density is compiled once.
-        is_first, is_cheap = number == 0, (number > 1) & (0 < first_cheap < len(start))
-        is_independent = jax.random.bernoulli(key_kind, INDEPENDENT) & ~is_cheap
-        width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
-        move = jax.random.t(key_move, FREEDOM, start.shape)
-        which = jax.random.randint(key_which, (), jnp.where(is_cheap, first_cheap, 0), len(start))
-        along = setup.unit @ (move * jax.nn.one_hot(which, len(start)))
-        candidate = jnp.where(is_independent, setup.centre + setup.unit @ move, flat + width * along)
+        is_first, is_cheap = number == 0, (number > 1) & (0 < costly < len(start))
+        candidate, balance = _propose(setup, key_move, flat, jnp.where(is_cheap, costly, 0))
         candidate = jnp.where(is_first, flat, candidate)
         candidate_height = density(candidate)
-        balance = jnp.where(is_independent, _log_tail(setup, flat) - _log_tail(setup, candidate), 0.0)
-        gain = candidate_height - height + balance
-        is_accepted = is_first | (jnp.log(jax.random.uniform(key_accept)) < gain)
-        return jax.tree.map(partial(jnp.where, is_accepted), (candidate, candidate_height), now), None
+        gain = jnp.where(is_first, jnp.inf, candidate_height - height + balance)
+        return _accept(key_accept, gain, (candidate, candidate_height), now)[0], None
 
     keys = jax.random.split(key, 1 + STEPS)
     (end, _), _ = jax.lax.scan(step, (start, jnp.zeros(())), (keys, jnp.arange(1 + STEPS)))
     return estimands_of(end)[0]
+
+
+def _walked_position(
+    target: Target, marginal: Any, estimands: Estimands
+) -> tuple[AnyArray, int, Callable[[AnyArray], tuple[dict[str, AnyArray], AnyArray]]]:
+    """Return the position of θ, costly parameters first, their number, and its map to estimands and the Jacobian."""
+    position = target.coordinates.unconstrain(marginal.problem, estimands)
+    names, costly = _walked(marginal, position)
+    others = {name: value for name, value in position.items() if name not in names}
+    flat, unravel = ravel_pytree([position[name] for name in names])
+
+    def estimands_of(flat: AnyArray) -> tuple[dict[str, AnyArray], AnyArray]:
+        walked = dict(zip(names, unravel(flat), strict=True))
+        return target.coordinates.constrain(marginal.problem, {**others, **walked})
+
+    return flat, sum(position[name].size for name in costly), estimands_of
+
+
+def _propose(setup: Setup, key: AnyArray, flat: AnyArray, first: AnyArray | int) -> tuple[AnyArray, AnyArray]:
+    """Propose another θ; return it and the log of the backward over the forward density of the proposal.
+
+    The unit of a step is triangular: directions from `first` on, if it is above zero, leave the parameters before it
+    alone.
+    """
+    key_kind, key_width, key_which, key_move = jax.random.split(key, 4)
+    is_independent = jax.random.bernoulli(key_kind, INDEPENDENT) & (first == 0)
+    width = NARROWEST * (WIDEST / NARROWEST) ** jax.random.uniform(key_width)
+    move = jax.random.t(key_move, FREEDOM, flat.shape)
+    along = setup.unit @ (move * jax.nn.one_hot(jax.random.randint(key_which, (), first, len(flat)), len(flat)))
+    candidate = jnp.where(is_independent, setup.centre + setup.unit @ move, flat + width * along)
+    return candidate, jnp.where(is_independent, _log_tail(setup, flat) - _log_tail(setup, candidate), 0.0)
 
 
 def _log_tail(setup: Setup, flat: AnyArray) -> AnyArray:

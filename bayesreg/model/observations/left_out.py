@@ -175,7 +175,7 @@ def predict_at_draws(marginal: Marginal, term: Any, draws: Values) -> Prediction
     pulls, information = algebra_of(marginal.number).leave_out(*given)
     points = points_of(marginal.problem)
     own = np.repeat([other.name == term.name for other in points], [len(other.shift) for other in points])
-    variances = given[-1].reshape(pulls.shape)
+    variances = given[-1][:, : 3 * len(own)].reshape(pulls.shape)
     predicted = *_without(pulls[:, own], information[:, own], variances[:, own]), sd
     return Predictions(*predicted, softmax(-_log_densities(*predicted, term.noise), axis=0))
 

@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Float, Int
+from scipy import ndimage
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Blocks, Values
@@ -28,7 +30,7 @@ from bayesreg.types import AnyArray, Scalar
 
 # Each step takes a point back by the displacement of the cell in which the last step ended. Its error shrinks by the
 # difference of the strains of two neighbouring cells.
-STEPS = 4
+STEPS = 2
 # Steps of Metropolis for the sd, each of which costs little.
 SD_STEPS = 4
 
@@ -122,7 +124,11 @@ class MeasuredSurface(NamedTuple):
 
     def log(self, state: State) -> Scalar:
         """Return the log density of all points, times the share of independent ones."""
-        return self.likelihood(state).log_prob(self.observed()).sum()
+        return self.log_at(state.u, state.values)
+
+    def log_at(self, u: Float[AnyArray, "n 3"], values: Values) -> Scalar:
+        """Return the log density of all points at a displacement, times the share of independent ones."""
+        return self._likelihood(u, values).log_prob(self.observed()).sum()
 
     def observed(self) -> AnyArray:
         """Return zero, the error of points that lie on the surface, less the height that a state gives them."""
@@ -130,8 +136,7 @@ class MeasuredSurface(NamedTuple):
 
     def likelihood(self, state: State) -> dist.Distribution:
         """Return the distribution of the observed zeros, tempered: an error, less the height at this state."""
-        height = self.height(state.u)
-        return Adjusted(self.noise.distribution_along(-height, self.sd(state.values)), self.share)
+        return self._likelihood(state.u, state.values)
 
     def height(self, u: Float[AnyArray, "n 3"]) -> Float[AnyArray, "k"]:
         """Return φ(x), the height of every point over the moved surface, mm; positive outside."""
@@ -180,6 +185,22 @@ class MeasuredSurface(NamedTuple):
         log_sd, _ = jax.lax.scan(step, jnp.log(values[name]), jax.random.split(key, SD_STEPS))
         return {name: jnp.exp(log_sd)}
 
+    def restricted_to(self, nodes: Int[np.ndarray, "n"]) -> MeasuredSurface:
+        """Return the term of some nodes alone: points come from the nearest cells whose nodes are all among them."""
+        cells, table = np.asarray(self.cells), np.asarray(self.table.cells)
+        is_whole = np.isin(cells, nodes).all(axis=1)
+        nearest = ndimage.distance_transform_edt(~is_whole[table], return_distances=False, return_indices=True)
+        numbers = np.zeros(len(self.rest), int)
+        numbers[nodes] = np.arange(len(nodes))
+        return self._replace(
+            table=self.table._replace(cells=jnp.asarray(table[tuple(nearest)])),
+            cells=jnp.asarray(numbers[np.where(is_whole[:, None], cells, nodes[0])]),
+            rest=self.rest[nodes],
+        )
+
+    def _likelihood(self, u: Float[AnyArray, "n 3"], values: Values) -> dist.Distribution:
+        return Adjusted(self.noise.distribution_along(-self.height(u), self.sd(values)), self.share)
+
     def _curvature(self, u: Float[AnyArray, "n 3"], stiffness: Float[AnyArray, "k"]) -> PointCurvature:
         cells, directions = self._find_cells(u), self._directions(u)
         matrices = stiffness[:, None, None] * directions[:, :, None] * directions[:, None, :]
@@ -204,13 +225,14 @@ class MeasuredSurface(NamedTuple):
 
         y has the same barycentric coordinates in the moved cell as x in the cell at rest.
         """
-        nodes = self.cells[cells]
-        at_rest, moved = self.rest[nodes], (self.rest + u)[nodes]
+        # Points along the last axis: the operations on three coordinates are then those of long vectors.
+        nodes = self.cells.T[:, cells]
+        at_rest, moved = self.rest.T[:, nodes], (self.rest + u).T[:, nodes]
         a, b, c = (moved[:, corner] - moved[:, 0] for corner in (1, 2, 3))
-        away = points - moved[:, 0]
+        away = points.T - moved[:, 0]
         # Cramer's rule: the volumes of the tetrahedra in which the point takes the place of a corner.
-        faces = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
-        volume = (a * faces[0]).sum(axis=1)
-        last_three = jnp.stack([(away * face).sum(axis=1) / volume for face in faces], axis=1)
-        weights = jnp.concatenate([1 - last_three.sum(axis=1, keepdims=True), last_three], axis=1)
-        return jnp.einsum("ka,kai->ki", weights, at_rest), weights
+        faces = [jnp.cross(*edges, axis=0) for edges in ((b, c), (c, a), (a, b))]
+        volume = (a * faces[0]).sum(axis=0)
+        last_three = jnp.stack([(away * face).sum(axis=0) / volume for face in faces])
+        weights = jnp.concatenate([1 - last_three.sum(axis=0, keepdims=True), last_three])
+        return (at_rest * weights).sum(axis=1).T, weights.T
