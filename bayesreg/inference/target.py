@@ -196,7 +196,7 @@ class Marginal(Protocol):
         """Draw v given all estimands, near to the touched unknowns."""
 
     def touched(self, estimands: Estimands, weights: AnyArray) -> Any:
-        """Compute the `log`, and the `mean` and Cholesky `root` of the Gaussian of v, with "u_boundary" of any value."""
+        """Compute the `log`, and the `mean` and the Cholesky factor `root` of the Gaussian of v given θ and weights."""
 
     def log_surfaces(self, estimands: Estimands, v: AnyArray) -> Scalar:
         """Compute the log of the factors that are functions of v."""
@@ -215,6 +215,10 @@ class Marginalisation(Protocol):
     @property
     def is_costly(self) -> bool:
         """Whether each new stiffness costs a factorisation."""
+
+    @property
+    def has_costly_draws(self) -> bool:
+        """Whether a draw takes a part of a second."""
 
     def __call__(self) -> Marginal:
         """Return the posterior with the displacements integrated out."""

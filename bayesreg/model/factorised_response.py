@@ -80,7 +80,7 @@ class FactorisedResponse:
         side_by_side: Map,
     ) -> None:
         self._rigid, self._masses, self._map = rigid, masses, side_by_side
-        self._balanced = self._without_rigid(interpolation.T)
+        self._interpolation, self._balanced = interpolation, self._without_rigid(interpolation.T)
         self._triangle = np.triu_indices(len(interpolation))
         isostatic = scipy.linalg.qr(rigid.T, pivoting=True, mode="r")[1][:6]
         self._log_null = 2 * float(np.linalg.slogdet(rigid[isostatic])[1])
@@ -109,6 +109,18 @@ class FactorisedResponse:
             return self._without_rigid(self._solve(kept.diagonal, kept.below, balanced))[:, 0]
 
         return np.stack(list(self._map(solve, zip(stiffnesses, loads, strict=True))))
+
+    def at_coordinates(
+        self, stiffnesses: Float[np.ndarray, "chains parameters"], loads: Float[np.ndarray, "chains unknowns"]
+    ) -> Float[np.ndarray, "chains coordinates"]:
+        """Return Gᵀ times loads."""
+        return self.solve(stiffnesses, loads) @ self._interpolation.T
+
+    def to_coordinates(
+        self, stiffnesses: Float[np.ndarray, "chains parameters"], weights: Float[np.ndarray, "chains coordinates"]
+    ) -> Float[np.ndarray, "chains unknowns"]:
+        """Return G times weights."""
+        return self.solve(stiffnesses, weights @ self._interpolation)
 
     def log_pseudo_determinants(
         self, stiffnesses: Float[np.ndarray, "chains parameters"]

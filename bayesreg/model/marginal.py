@@ -1,7 +1,7 @@
 """The posterior of points and surfaces alone with the displacements integrated out, for random loads.
 
-Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so, and depends on
-few unknowns of the nodes: those that it touches. A Gaussian that has its slope and curvature near the mode
+Pairs of points are Gaussian in the displacements, given a weight for every point. A surface is nearly so, and depends
+on few unknowns of the nodes: those that it touches. A Gaussian that has its slope and curvature near the mode
 (`bayesreg.model.quadratic`) stands for it where displacements are integrated out. Given the touched unknowns v and all
 else, the displacements are exactly Gaussian.
 """
@@ -197,6 +197,11 @@ class Marginalisation:
     def is_costly(self) -> bool:
         """Whether each new stiffness costs a factorisation of K."""
         return not has_one_tissue(self.problem)
+
+    @property
+    def has_costly_draws(self) -> bool:
+        """Whether a draw takes a part of a second: with surfaces, or where each stiffness is factorised."""
+        return self.is_costly or bool(surfaces_of(self.problem))
 
     def __call__(self) -> Marginal:
         """Return the marginal; several threads may ask for it."""

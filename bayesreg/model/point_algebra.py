@@ -145,31 +145,34 @@ class PointAlgebra:
         with one_thread_each() as side_by_side:
             conditionals = list(side_by_side(factorised, self._given(stiffness, sizes, noise)))
         # Rows are chains.
-        count = len(conditionals)
+        count, unknowns = len(conditionals), len(self._rigid)
         variances, given_stiffness = sizes.reshape(-1, 2) @ self._masses, stiffness.reshape(count, -1)
         balances = np.stack([given.balance for given in conditionals])
-        noise, white = noise.reshape(count, -1), white.reshape(count, -1)
-        shift, rows = np.broadcast_to(self._shift, (count, observed)), self._interpolation[:observed]
+        errors, shift = np.sqrt(noise.reshape(count, -1)), np.broadcast_to(self._shift, (count, observed))
+        kept = np.arange(observed)
         if is_touched:
+            kept = np.r_[:points, observed : len(self._interpolation)]
             shift = np.concatenate([shift[:, :points], v.reshape(count, -1)], axis=1)
-            rows = self._interpolation[np.r_[:points, observed : len(self._interpolation)]]
-            noise = np.concatenate([noise[:, :points], np.full((count, v.shape[-1]), LEAST_VARIANCE)], axis=1)
-        motions, loads, errors = np.split(white, [6, 6 + variances.shape[1]], axis=1)
+            least = np.full((count, v.shape[-1]), math.sqrt(LEAST_VARIANCE))
+            errors = np.concatenate([errors[:, :points], least], axis=1)
+        ends = [6, 6 + unknowns, 6 + unknowns + len(kept)]
+        motions, loads, own_errors, _ = np.split(white.reshape(count, -1), ends, axis=1)
+        motion = motions @ self._rigid.T / math.sqrt(self._precision) if self._precision else np.zeros_like(variances)
 
-        def respond(load: np.ndarray) -> np.ndarray:
-            """Return K⁺ times loads, less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
+        def balanced(load: np.ndarray) -> np.ndarray:
+            """Return loads less D R (Rᵀ D R)⁻¹ Rᵀ of them."""
             parts = np.einsum("rij,rj->ri", balances, load @ self._rigid)
-            return self.response.solve(given_stiffness, load - variances * (parts @ self._rigid.T))
+            return load - variances * (parts @ self._rigid.T)
 
-        u = respond(np.sqrt(variances) * loads)
-        if self._precision:
-            u += motions @ self._rigid.T / math.sqrt(self._precision)
-        apart = shift - u @ rows.T - np.sqrt(noise) * errors[:, : shift.shape[1]]
+        load = balanced(np.sqrt(variances) * loads)
+        drawn = self.response.at_coordinates(given_stiffness, load) + motion @ self._interpolation.T
+        apart = shift - drawn[:, kept] - errors * own_errors
         solutions = [given.solve(each) for given, each in zip(conditionals, apart, strict=True)]
-        weights, motions = (np.stack(part) for part in zip(*solutions, strict=True))
-        u += respond(variances * self.response.solve(given_stiffness, weights @ rows))
-        u += motions @ self._rigid.T
-        return u.reshape(*chains, -1)
+        weights = np.zeros_like(drawn)
+        weights[:, kept] = [solution[0] for solution in solutions]
+        load += balanced(variances * self.response.to_coordinates(given_stiffness, weights))
+        u = self.response.solve(given_stiffness, load) + motion
+        return (u + np.stack([solution[1] for solution in solutions]) @ self._rigid.T).reshape(*chains, -1)
 
     def leave_out(
         self, stiffness: np.ndarray, sizes: np.ndarray, noise: np.ndarray

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri, dtrtrs
-
 
 # The variance of the difference of v from the touched unknowns, mm²: that of one micrometre. It keeps the covariance of
 # v regular, which is known up to rounding.
@@ -90,20 +90,20 @@ class GivenShifts(NamedTuple):
         """Compute the Gaussian of v given y: the observed coordinates correct a mean of zero."""
         observed, covariance = len(self.noise), self.covariance()
         factorised = self._factorise(covariance[:observed, :observed], self.rigid[:observed], self.noise)
-        across, own = covariance[:observed, observed:], covariance[observed:, observed:]
+        across, upper = covariance[:observed, observed:], covariance[observed:, observed:]
         weights, motion = factorised.solve(shift)
         rigid = self.rigid[observed:] - across.T @ factorised.whitened
-        half = dtrtrs(factorised.lower, across, lower=1)[0]
-        own = np.triu(own) + np.triu(own, 1).T - half.T @ half
-        own += rigid @ np.linalg.solve(factorised.information, rigid.T) + LEAST_VARIANCE * np.eye(len(own))
-        root, failure = dpotrf(own, lower=1)
+        upper -= dsyrk(1.0, dtrtrs(factorised.lower, across, lower=1)[0], trans=1)
+        upper += rigid @ np.linalg.solve(factorised.information, rigid.T)
+        upper[np.diag_indices(len(upper))] += LEAST_VARIANCE
+        root, failure = dpotrf(upper.T, lower=1)
         log = np.nan if failure else factorised.log_density(shift)
         return TouchedGaussian(log, across.T @ weights + self.rigid[observed:] @ motion, root)
 
     def _factorise(
         self, upper: Float[np.ndarray, "o o"], rigid: Float[np.ndarray, "o 6"], noise: Float[np.ndarray, "o"]
     ) -> Factorised:
-        upper = upper + np.diag(noise)
+        upper[np.diag_indices(len(upper))] += noise
         lower, failure = dpotrf(upper.T, lower=1)
         if failure:
             lower = np.full_like(lower, np.nan)

@@ -52,7 +52,7 @@ class SpectralResponse:
     ) -> None:
         self._steepness = 1.5 / mu
         self._vectors, self._ratios, self._log_of_shear = _eigenvectors(mesh, mu, rigid)
-        pulled = self._vectors.T @ interpolation.T
+        self._pulled = pulled = self._vectors.T @ interpolation.T
         self._bounds = low, high = np.log1p(self._steepness * np.array(lam))
         degrees = _degrees(high - low)
         # Chebyshev's nodes, at which a cosine transform gives the coefficients.
@@ -81,6 +81,18 @@ class SpectralResponse:
         """Return K⁺ times loads. Rows are chains, so that each product reads its matrix once for all of them."""
         factors = self._factors(stiffnesses[:, :1])
         return (factors * (loads @ self._vectors)) @ self._vectors.T
+
+    def at_coordinates(
+        self, stiffnesses: Float[np.ndarray, "chains 2"], loads: Float[np.ndarray, "chains unknowns"]
+    ) -> Float[np.ndarray, "chains coordinates"]:
+        """Return Gᵀ times loads."""
+        return (self._factors(stiffnesses[:, :1]) * (loads @ self._vectors)) @ self._pulled
+
+    def to_coordinates(
+        self, stiffnesses: Float[np.ndarray, "chains 2"], weights: Float[np.ndarray, "chains coordinates"]
+    ) -> Float[np.ndarray, "chains unknowns"]:
+        """Return G times weights."""
+        return (self._factors(stiffnesses[:, :1]) * (weights @ self._pulled.T)) @ self._vectors.T
 
     def log_pseudo_determinants(self, stiffnesses: Float[np.ndarray, "chains 2"]) -> Float[np.ndarray, "chains"]:
         """Return log pdet K."""

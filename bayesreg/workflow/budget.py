@@ -12,8 +12,8 @@ from bayesreg.types import InputError
 # BLOCK is the number of draws between two checks of the stop rule, for up to POINTS quadrature points. More points give
 # smaller blocks, of at least FEWEST draws, because each block writes the whole state.
 BLOCK, POINTS, FEWEST = 100, 20_000, 10
-# The number of draws per block where each changes the stiffness of several tissues, which costs factorisations of K.
-FACTORISED = 25
+# The number of draws per block where each takes a part of a second.
+COSTLY_DRAWS = 25
 
 
 def max_seconds(config: Config) -> float | None:
@@ -47,7 +47,7 @@ def block_length(posterior: Posterior) -> int:
     The number depends on the size of the problem and not on measured time, so that a seed always gives the same draws.
     """
     marginalisation = posterior.target.prepare_marginal
-    if marginalisation is not None and marginalisation.is_costly:
-        return FACTORISED
+    if marginalisation is not None and marginalisation.has_costly_draws:
+        return COSTLY_DRAWS
     points = sum(len(getattr(term, "positions", ())) for term in posterior.data.terms.values())
     return max(BLOCK * POINTS // max(points, POINTS), FEWEST)

@@ -83,9 +83,7 @@ def test_the_marginal_density_is_the_joint_one_with_u_integrated_out():
 def test_displacements_are_drawn_from_their_conditional():
     own, weights = posterior(NormalNoise()), np.linspace(0.3, 2.0, len(FIXED))
     precision, mean = dense_conditional(own, estimands(), weights)
-    draw = jax.jit(
-        jax.vmap(lambda key: marginal_of(own).draw_displacements(key, estimands(), jnp.asarray(weights)))
-    )
+    draw = jax.jit(jax.vmap(lambda key: marginal_of(own).draw_displacements(key, estimands(), jnp.asarray(weights))))
     draws = np.asarray(draw(jax.random.split(jax.random.key(1), 4000))).reshape(4000, -1)
     whitened = (draws - mean) @ np.linalg.cholesky(precision)
     assert np.abs(whitened.mean(axis=0)).max() < 5 / np.sqrt(4000)
@@ -220,7 +218,9 @@ def test_an_outlier_of_40_mm_is_named_and_moves_nothing_else():
         observation = own.observations["landmarks"]
         state = state_of(own.data.body, own.data.blocks, own.fill(mean))
         every = {name: draws[name].values.reshape(-1, *draws[name].shape[2:]) for name in own.reference()}
-        means.append((own.data.terms["landmarks"].predicted(state), observation.doubts(observation.summarise(own, state, every))))
+        means.append(
+            (own.data.terms["landmarks"].predicted(state), observation.doubts(observation.summarise(own, state, every)))
+        )
     (without, no_doubt), (with_outlier, doubts) = means
     assert no_doubt == []
     assert len(doubts) == 1

@@ -92,14 +92,16 @@ def _step(
 
     Where some factors are functions of the touched unknowns v, this happens once, with a trajectory of v.
     """
-    if is_tested and len(marginal.touched_nodes):
-        drawn, rate = _move_with_touched(target, marginal, setup, key, estimands)
-    else:
-        key_first, key_second = jax.random.split(key)
+    key_first, key_second = jax.random.split(key)
+    walk = partial(_walk, target, marginal, setup)
+    if not len(marginal.touched_nodes):
         drawn, first_rate = _sweep(marginal, _stay, key_first, estimands, is_tested)
-        walk = partial(_walk, target, marginal, setup)
         drawn, second_rate = _sweep(marginal, walk, key_second, drawn, is_tested)
         rate = (first_rate + second_rate) / 2
+    elif is_tested:
+        drawn, rate = _move_with_touched(target, marginal, setup, key, estimands)
+    else:
+        drawn, rate = _sweep(marginal, walk, key, estimands, is_tested)
     nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
     return drawn, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
 

@@ -188,7 +188,7 @@ class MeasuredSurface(NamedTuple):
     def restricted_to(self, nodes: Int[np.ndarray, "n"]) -> MeasuredSurface:
         """Return the term of some nodes alone: points come from the nearest cells whose nodes are all among them."""
         cells, table = np.asarray(self.cells), np.asarray(self.table.cells)
-        is_whole = np.isin(cells, nodes).all(axis=1)
+        is_whole = np.asarray(np.isin(cells, nodes).all(axis=1))
         nearest = ndimage.distance_transform_edt(~is_whole[table], return_distances=False, return_indices=True)
         numbers = np.zeros(len(self.rest), int)
         numbers[nodes] = np.arange(len(nodes))
