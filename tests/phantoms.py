@@ -52,6 +52,11 @@ def box_mesh(
     return _delaunay_mesh(grid * size + origin, flat=1e-9)
 
 
+def of_one_tissue(mesh: TetMesh) -> TetMesh:
+    """Return a mesh whose cells all are of the tissue "organ"."""
+    return TetMesh.from_arrays(mesh.points, mesh.cells, np.zeros(len(mesh.cells), int), ("organ",))
+
+
 def save_grid(path: Path, points: np.ndarray, cells: np.ndarray, tissue: np.ndarray | None = None) -> None:
     """Write tetrahedra as they are, sound or not, by PyVista alone."""
     grid = pyvista.UnstructuredGrid({pyvista.CellType.TETRA: cells}, points)

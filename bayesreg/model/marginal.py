@@ -249,7 +249,7 @@ class Marginalisation:
         return PointAlgebra(response, rigid, masses, precision, interpolation, shift, points)
 
     def _rows(self, unknowns: int) -> tuple[Float[np.ndarray, "rows unknowns"], Float[np.ndarray, "observed"]]:
-        """Return B and y: the coordinates of all points, the rows of the approximations; B has touched unknowns, too."""
+        """Return B and y: coordinates of all points and rows of approximations; B has touched unknowns, too."""
         identity = jnp.eye(unknowns).reshape(-1, 3, unknowns)
         points, approximations = points_of(self.problem), self._approximations.values()
         rows = [np.asarray(term.interpolate(identity)).reshape(-1, unknowns) for term in points]

@@ -14,10 +14,10 @@ log p(y) = −½ (log det S + log det Hᵀ S⁻¹ H + yᵀ S⁻¹ (y − H b)) +
 With P = S⁻¹ − S⁻¹ H (Hᵀ S⁻¹ H)⁻¹ Hᵀ S⁻¹ and its 3 × 3 blocks P_kk, the other points alone predict point k with the
 residual P_kk⁻¹ (P y)_k, whose covariance is P_kk⁻¹.
 
-A surface is not linear in u. It depends on few unknowns, those that it touches. A Gaussian factor stands for it: rows of
-B and y with errors of variance one. The difference between both is a function of v, which are the touched unknowns up
-to a micrometre. Further rows of B, which are not observed, select them: v given y is Gaussian, too, and then y without
-the factor and v determine the Gaussian of u.
+A surface is not linear in u. It depends on few unknowns, those that it touches. A Gaussian factor stands for it: rows
+of B and y with errors of variance one. The difference between both is a function of v, which are the touched unknowns
+up to a micrometre. Further rows of B, which are not observed, select them. v given y is Gaussian, too; and given v and
+the shifts of points, without the factor, so is u.
 
 A Gaussian prior of the rigid motion, c ~ N(0, Λ⁻¹), adds Λ to Hᵀ S⁻¹ H; a flat one is its limit. S has three rows for
 each point and none for the nodes, and only the stiffness changes Gᵀ M G and Gᵀ A G

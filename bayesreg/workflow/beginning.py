@@ -119,6 +119,19 @@ def temper(config: Config, inputs: Inputs, posterior: Posterior, deadline: Deadl
     return tempered
 
 
+def tempered_as_before(
+    config: Config, inputs: Inputs, posterior: Posterior, provenance: Mapping[str, Any]
+) -> Posterior:
+    """Return the posterior as it was tempered when its run began.
+
+    A surface needs the mode again, from which the same search counts the same points.
+    """
+    if posterior.target.prepare_marginal is not None:
+        return temper(config, inputs, posterior)
+    counts = provenance.get("independent_points")
+    return posterior.with_independent_points(counts) if counts else posterior
+
+
 def _programs(config: Config, posterior: Posterior) -> Iterator[None]:
     options, length = config.sampler, draws_per_block(config, posterior)
     return compile_programs(posterior.target, options.name, options.chains, length, options.thin, **options.settings)

@@ -32,7 +32,7 @@ from bayesreg.model.posterior import Posterior
 from bayesreg.results.result import REPORT, Result, load_result
 from bayesreg.types import InputError
 from bayesreg.workflow.assembly import posterior_of, with_initial
-from bayesreg.workflow.beginning import CUT, begin
+from bayesreg.workflow.beginning import CUT, begin, tempered_as_before
 from bayesreg.workflow.budget import BLOCK, draws_per_block, max_seconds, require_memory
 from bayesreg.workflow.fingerprint import fingerprint, require_same_observations
 from bayesreg.workflow.finish import finish
@@ -143,8 +143,9 @@ def _resume(config: Config, folder: RunFolder, progress: Showing, observations: 
     # A run without a state has not come to its chains. It begins again, so that its draws are those of a run that was
     # not interrupted.
     has_state = folder.is_listed(checkpoints.STATE)
-    independent_points = provenance.get("independent_points") if has_state else None
-    posterior = posterior_of(config, inputs, observations, independent_points)
+    posterior = posterior_of(config, inputs, observations)
+    if has_state:
+        posterior = tempered_as_before(config, inputs, posterior, provenance)
     require_same_observations(folder.path, provenance, posterior, observations)
     if finished:
         checkpoints.reopen(folder, to_blocks(posterior.target, load_result(folder.path).idata, BLOCK))

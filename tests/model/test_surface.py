@@ -18,9 +18,9 @@ from bayesreg.model.observations.surface import Surface, count_independent
 from bayesreg.model.observations.surface_report import describe_far_surface, height_figure, surface_table
 from bayesreg.model.state import state_of
 from bayesreg.report import style
-from tests.phantoms import ball_mesh, box_mesh
+from tests.phantoms import ball_mesh, box_mesh, of_one_tissue
 
-MESH = box_mesh(4)
+MESH = of_one_tissue(box_mesh(4))
 TOP = MESH.points[:, 2].max()
 CENTRE = np.array([5.0, -3.0, 8.0])
 
@@ -98,6 +98,28 @@ def test_the_distance_from_labels_is_that_from_a_ball():
         error = np.asarray(distance(jnp.asarray(CENTRE + (40 + height) * directions))) - height
         assert abs(error.mean()) < 0.05 + 0.1 * abs(height)
         assert error.std() < 0.1
+
+
+def test_narrow_folds_are_bridged_and_holes_filled():
+    """A ball of 4 mm sinks 0.5 mm into a fold of 4 mm of a slab with its top at 29.5 mm, and to the ground of 14 mm."""
+    mask = np.zeros((60, 40, 50), np.uint8)
+    mask[:, :, :30] = 1
+    mask[14:18, :, 15:30] = mask[36:50, :, 15:30] = mask[25:29, 18:22, 5:9] = 0
+    distance = distance_from_mask(br.Image(mask, np.eye(4)))
+    over_fold, over_valley, in_hole = np.array([[15.5, 20.0, 29.5], [42.5, 20.0, 29.5], [26.5, 19.5, 6.5]])
+    assert 0 < float(distance(over_fold)) < 1.0
+    assert float(distance(over_valley)) > 5.0
+    assert float(distance(in_hole)) < -3.0
+
+
+def test_the_surface_of_the_organ_is_that_of_its_solid_tissues():
+    layers = (MESH.points[MESH.cells].mean(axis=1)[:, 2] > 0.6 * TOP).astype(int)
+    mesh = br.TetMesh.from_arrays(MESH.points, MESH.cells, layers, ("gm", "csf"))
+    points = points_above(0.0)
+    whole, solid = (Surface(points, of=of, sd=0.4).on(mesh).term for of in (("gm", "csf"), "boundary"))
+    rest = jnp.zeros(mesh.points.shape)
+    np.testing.assert_allclose(whole.height(rest), 0.0, atol=0.05)
+    assert (np.asarray(solid.height(rest)) > 0.2 * TOP).all()
 
 
 def test_the_gradient_is_that_of_differences():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import edt
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from bayesreg.distance import forbidden, signed_distance
 from bayesreg.fem.location import locate, nearest_on_surface
@@ -15,6 +17,8 @@ from bayesreg.model.observations.measured_surface import CellTable
 
 # The distance of a mask goes on for so far beyond its grid, mm.
 MARGIN = 20.0
+# Folds narrower than twice this are bridged, mm: those of a cortex are, and light and pointers do not enter them.
+FOLD = 4.0
 # The number of voxels along an edge of the mesh, in the grid of cells and that of the distance from a mesh.
 VOXELS_PER_EDGE = 8
 # The grid reaches beyond the points by this multiple of the length of an edge: a point may have moved so far.
@@ -44,8 +48,11 @@ def cell_table(mesh: TetMesh, grid: Image) -> CellTable:
 
 
 def distance_from_mask(mask: Image) -> Interpolator:
-    """Compute the signed distance from the surface of a mask, mm, positive outside, without the steps of its voxels."""
-    inward = signed_distance(forbidden(mask), MARGIN)
+    """Compute the signed distance from the surface of a mask, mm, positive outside, without the steps of its voxels.
+
+    The surface bridges folds, as what a camera or a pointer sees does.
+    """
+    inward = signed_distance(forbidden(_bridge_folds(mask)), MARGIN)
     return inward.with_voxels(-np.asarray(inward.voxels)).interpolator("cubic")
 
 
@@ -57,6 +64,17 @@ def distance_from_mesh(mesh: TetMesh, chosen: Bool[np.ndarray, "cells"], grid: I
     inside = locate(mesh.points, mesh.cells[chosen], centres)[0] >= 0
     distance = np.where(inside, -1, 1) * np.linalg.norm(centres - places, axis=1)
     return grid.with_voxels(distance.reshape(grid.shape)).interpolator("cubic")
+
+
+def _bridge_folds(mask: Image) -> Image:
+    """Fill what no ball of the radius `FOLD` outside the mask can reach: a closing by this ball, and holes."""
+    width = [(int(np.ceil(FOLD / size)) + 1,) * 2 for size in mask.voxel_sizes]
+    outside, sizes = np.pad(np.asarray(mask.voxels) == 0, width, constant_values=True), tuple(mask.voxel_sizes)
+    within_reach = edt.edt(outside, anisotropy=sizes) <= FOLD
+    closed = edt.edt(within_reach, anisotropy=sizes) > FOLD
+    inner = tuple(slice(low, -high) for low, high in width)
+    filled = ndimage.binary_fill_holes(closed[inner] | ~outside[inner])
+    return mask.with_voxels(np.asarray(filled, np.uint8))
 
 
 def _cells_behind(mesh: TetMesh) -> Int[np.ndarray, "faces"]:

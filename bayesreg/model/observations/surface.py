@@ -31,6 +31,7 @@ from bayesreg.model.observations.surface_report import describe_far_surface, hei
 from bayesreg.model.state import State
 from bayesreg.model.term import Label
 from bayesreg.settings import FoundFile, KnownOrInferred, ScalePrior
+from bayesreg.tissues import is_fluid
 from bayesreg.types import InputError
 
 BOUNDARY = "boundary"
@@ -54,7 +55,8 @@ class Surface:
     points : (k, 3) array
         World RAS mm, in the space of the moving image; at least `FEWEST`.
     of : str or sequence of str, default "boundary"
-        The names of tissues whose common surface is meant; "boundary" is the surface of the whole organ.
+        The names of tissues whose common surface is meant; "boundary" is that of the whole organ without the fluid
+        around it. Folds are bridged (`bayesreg.model.observations.level_set`).
     sd : float or ScalePrior
         Standard deviation of the error along the normal, mm, the inexactness of the surface at rest included; or its
         prior, to infer it as "<name>_sd".
@@ -128,7 +130,8 @@ class Surface:
 
     def _tissues(self, mesh: TetMesh) -> Bool[np.ndarray, "tissues"]:
         if self.of == (BOUNDARY,):
-            return np.ones(len(mesh.names), bool)
+            solid = np.array([not is_fluid(name) for name in mesh.names])
+            return solid if solid.any() else ~solid
         chosen = np.isin(mesh.names, self.of)
         if unknown := [name for name in self.of if name not in mesh.names]:
             raise InputError(
