@@ -169,6 +169,7 @@ def test_lam_has_the_posterior_of_a_quadrature():
     assert stats.kstest(position[::5], "uniform").pvalue > 0.001
 
 
+@pytest.mark.long
 def test_it_agrees_with_hamiltonian_trajectories_before_a_barrier():
     """With few hyperparameters; where loads are inferred, trajectories need many more draws."""
     own, moments = posterior(least_volume=0.95, known_loads=True, known_lam=3.0), []
