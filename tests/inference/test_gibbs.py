@@ -143,6 +143,20 @@ def test_weighted_draws_have_not_seen_the_landmark():
         np.testing.assert_allclose(weighted[:, k] / weighted[:, k].sum(), expected, atol=1e-6)
 
 
+def test_a_surface_that_tells_nothing_leaves_the_predictions_of_points_as_they_are():
+    model = br.ModelConfig(preset="registration", least_volume=0.0, fixed={"mu": {"organ": 1.0}})
+    points = br.Landmarks(FIXED, MOVING, br.ScalePrior(median=1.0), noise=NormalNoise())
+    top = np.c_[np.random.default_rng(3).uniform(5, 15, (30, 2)), np.full(30, 20.0)]
+    surface = br.Surface(top, sd=1e4, noise=NormalNoise())
+    draws = {name: np.asarray(value)[None] for name, value in estimands().items()} | {"mu": np.ones((1, 1))}
+    alone, beside = (
+        predict_at_draws(marginal_of(own), own.data.terms["landmarks"], draws)
+        for own in (posterior(NormalNoise()), br.build_posterior(MESH, [points, surface], model))
+    )
+    for expected, predicted in zip(alone, beside, strict=True):
+        np.testing.assert_allclose(predicted, expected, rtol=1e-4, atol=1e-5)
+
+
 def test_weights_of_the_others_stay_when_a_point_is_left_out():
     own, weights = posterior(), np.linspace(0.1, 2.0, len(FIXED))
     marginal, shift = marginal_of(own), np.asarray(own.data.terms["landmarks"].shift)
