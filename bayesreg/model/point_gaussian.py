@@ -73,8 +73,7 @@ class GivenShifts(NamedTuple):
 
     def factorised(self) -> Factorised:
         """Compute S of the observed coordinates, factorise it, and solve with it for H."""
-        observed = len(self.noise)
-        return self._factorise(self.covariance()[:observed, :observed], self.rigid[:observed], self.noise)
+        return self._factorise_observed(self.covariance())
 
     def factorised_with_touched(self, points: int) -> Factorised:
         """Do the same for v and the coordinates of points, the first of the observed ones, in their place."""
@@ -89,7 +88,7 @@ class GivenShifts(NamedTuple):
     def touched(self, shift: Float[np.ndarray, "observed"]) -> TouchedGaussian:
         """Compute the Gaussian of v given y: the observed coordinates correct a mean of zero."""
         observed, covariance = len(self.noise), self.covariance()
-        factorised = self._factorise(covariance[:observed, :observed], self.rigid[:observed], self.noise)
+        factorised = self._factorise_observed(covariance)
         across, upper = covariance[:observed, observed:], covariance[observed:, observed:]
         weights, motion = factorised.solve(shift)
         rigid = self.rigid[observed:] - across.T @ factorised.whitened
@@ -99,6 +98,10 @@ class GivenShifts(NamedTuple):
         root, failure = dpotrf(upper.T, lower=1)
         log = np.nan if failure else factorised.log_density(shift)
         return TouchedGaussian(log, across.T @ weights + self.rigid[observed:] @ motion, root)
+
+    def _factorise_observed(self, upper: Float[np.ndarray, "m m"]) -> Factorised:
+        observed = len(self.noise)
+        return self._factorise(upper[:observed, :observed], self.rigid[:observed], self.noise)
 
     def _factorise(
         self, upper: Float[np.ndarray, "o o"], rigid: Float[np.ndarray, "o 6"], noise: Float[np.ndarray, "o"]

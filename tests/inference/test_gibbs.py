@@ -83,7 +83,8 @@ def test_the_marginal_density_is_the_joint_one_with_u_integrated_out():
 def test_displacements_are_drawn_from_their_conditional():
     own, weights = posterior(NormalNoise()), np.linspace(0.3, 2.0, len(FIXED))
     precision, mean = dense_conditional(own, estimands(), weights)
-    draw = jax.jit(jax.vmap(lambda key: marginal_of(own).draw_displacements(key, estimands(), jnp.asarray(weights))))
+    marginal = marginal_of(own)
+    draw = jax.jit(jax.vmap(lambda key: marginal.draw_displacements(key, estimands(), jnp.asarray(weights))))
     draws = np.asarray(draw(jax.random.split(jax.random.key(1), 4000))).reshape(4000, -1)
     whitened = (draws - mean) @ np.linalg.cholesky(precision)
     assert np.abs(whitened.mean(axis=0)).max() < 5 / np.sqrt(4000)

@@ -92,18 +92,19 @@ def _step(
 
     Where some factors are functions of the touched unknowns v, this happens once, with a trajectory of v.
     """
-    key_first, key_second = jax.random.split(key)
-    walk = partial(_walk, target, marginal, setup)
+    walk, densities = partial(_walk, target, marginal, setup), 1 + STEPS
     if not len(marginal.touched_nodes):
+        key_first, key_second = jax.random.split(key)
         drawn, first_rate = _sweep(marginal, _stay, key_first, estimands, is_tested)
         drawn, second_rate = _sweep(marginal, walk, key_second, drawn, is_tested)
         rate = (first_rate + second_rate) / 2
     elif is_tested:
         drawn, rate = _move_with_touched(target, marginal, setup, key, estimands)
+        densities = 1 + 2 * HALF_STEPS
     else:
         drawn, rate = _sweep(marginal, walk, key, estimands, is_tested)
     nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
-    return drawn, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), 1 + STEPS))
+    return drawn, Info(rate, no, no, nothing, no, gradients=nothing, densities=jnp.full((), densities))
 
 
 def _stay(_key: AnyArray, estimands: Estimands, _weights: AnyArray) -> dict[str, AnyArray]:

@@ -68,7 +68,7 @@ class Smc(Tuned):
 
 
 class Gibbs(Settings):
-    """Gibbs sampling of pairs of points on one tissue with random loads: displacements are integrated out."""
+    """Gibbs sampling of points and surfaces alone with random loads: displacements are integrated out."""
 
     warm_up: Count = 80
     """Transitions that are not kept, from which the steps of stiffness and scales are tuned."""

@@ -225,14 +225,13 @@ class MeasuredSurface(NamedTuple):
 
         y has the same barycentric coordinates in the moved cell as x in the cell at rest.
         """
-        # Points along the last axis: the operations on three coordinates are then those of long vectors.
-        nodes = self.cells.T[:, cells]
-        at_rest, moved = self.rest.T[:, nodes], (self.rest + u).T[:, nodes]
+        nodes = self.cells[cells]
+        at_rest, moved = self.rest[nodes], (self.rest + u)[nodes]
         a, b, c = (moved[:, corner] - moved[:, 0] for corner in (1, 2, 3))
-        away = points.T - moved[:, 0]
+        away = points - moved[:, 0]
         # Cramer's rule: the volumes of the tetrahedra in which the point takes the place of a corner.
-        faces = [jnp.cross(*edges, axis=0) for edges in ((b, c), (c, a), (a, b))]
-        volume = (a * faces[0]).sum(axis=0)
-        last_three = jnp.stack([(away * face).sum(axis=0) / volume for face in faces])
-        weights = jnp.concatenate([1 - last_three.sum(axis=0, keepdims=True), last_three])
-        return (at_rest * weights).sum(axis=1).T, weights.T
+        faces = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
+        volume = (a * faces[0]).sum(axis=1)
+        last_three = jnp.stack([(away * face).sum(axis=1) / volume for face in faces], axis=1)
+        weights = jnp.concatenate([1 - last_three.sum(axis=1, keepdims=True), last_three], axis=1)
+        return jnp.einsum("ka,kai->ki", weights, at_rest), weights
