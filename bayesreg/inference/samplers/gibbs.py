@@ -7,7 +7,8 @@ Park 2008).
 
 What is not Gaussian in u, such as the barrier, is left out of these conditionals. The moves of θ are reversible, and u
 is independent of its last value. The proposal of both is therefore reversible with respect to the posterior without
-these terms, and Metropolis' rule for them alone makes it exact.
+these terms, and Metropolis' rule for them alone makes it exact. Surfaces would seldom pass this test: the few unknowns
+that they touch have a trajectory of their own (`_move_with_touched`).
 """
 
 from __future__ import annotations
