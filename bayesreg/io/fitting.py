@@ -1,10 +1,12 @@
-"""Displacement of boundary nodes to a distance from the skull without inverting a tetrahedron."""
+"""Displacement of boundary nodes, to the surface of a region and away from the skull, without inverting tetrahedra."""
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from bayesreg.image import Image
@@ -15,6 +17,68 @@ from bayesreg.mesh import TetMesh
 LEAST_MEAN_RATIO = 0.1
 # Nodes move this much further than the gap, mm, so that rounding does not undo it.
 MARGIN = 0.01
+# The number of steps of Gauss–Newton to the surface of a region, the damping of their matrix over its mean diagonal,
+# and the greatest displacement of a node by one of them, in edges of the boundary.
+FITS, DAMPING, GREATEST_STEP = 2, 0.05, 0.25
+# The greatest number of rounds in which nodes and what lies around them move in turn: to the surface of a region, as
+# far as they come; and away from the skull, where they must.
+FITTING_ROUNDS, PULLING_ROUNDS = 5, 30
+# The barycentric coordinates of the points of a triangle at which its distance from the surface is taken.
+_POINTS_OF_FACE = np.array([(i + 1 / 3, j + 1 / 3, 3 - i - j + 1 / 3) for i in range(4) for j in range(4 - i)]) / 4
+
+
+def fit_to_surface(mesh: TetMesh, depth: Image) -> TetMesh:
+    """Move the boundary nodes of a mesh so that its faces lie on the surface of a region, in least squares.
+
+    Smoothing, and chords in the place of arcs, leave a mesh within the region that it is made for: convex parts lose
+    their rims.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Its faces lie near the surface.
+    depth : Image
+        Signed distance from the outside of the region, mm, positive in the region, from `signed_distance`.
+
+    Notes
+    -----
+    With the depth φ, points x_q of the faces, and the nodes k displaced along their normals n_k by a_k, a step of
+    Gauss–Newton minimises Σ_q w_q (φ(x_q) + Σ_k N_k(x_q) a_k n_k · ∇φ(x_q))² with the area w_q of each point. Nodes
+    whose tetrahedra would become flat stay behind.
+    """
+    points, boundary = mesh.points.copy(), mesh.boundary
+    faces, greatest = np.searchsorted(boundary, mesh.boundary_faces), GREATEST_STEP * mesh.boundary_edge
+    for _ in range(FITS):
+        step = np.clip(_step_to_surface(points[boundary], faces, depth), -greatest, greatest)
+        goal = points[boundary] + step[:, None] * _normals(points[boundary], faces)
+        _move(points, mesh, boundary, goal, FITTING_ROUNDS)
+    return TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
+
+
+def _step_to_surface(
+    points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"], depth: Image
+) -> Float[np.ndarray, "nodes"]:
+    """Compute a_k, mm, for one step of Gauss–Newton."""
+    corners, weights = points[faces], np.tile(_POINTS_OF_FACE, (len(faces), 1))
+    places = np.einsum("qk,fki->fqi", _POINTS_OF_FACE, corners).reshape(-1, 3)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    node = np.repeat(faces, len(_POINTS_OF_FACE), axis=0)
+    slope = np.einsum("qki,qi->qk", _normals(points, faces)[node], _gradient(depth, places))
+    root = np.sqrt(np.repeat(areas, len(_POINTS_OF_FACE)))
+    place = np.repeat(np.arange(len(places)), 3)
+    entries = (root[:, None] * weights * slope).ravel()
+    jacobian = scipy.sparse.csr_array((entries, (place, node.ravel())), (len(places), len(points)))
+    matrix = jacobian.T @ jacobian
+    matrix += DAMPING * matrix.diagonal().mean() * scipy.sparse.eye_array(len(points))
+    return spsolve(matrix.tocsc(), -(jacobian.T @ (root * _sample(depth, places))))
+
+
+def _normals(points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"]) -> Float[np.ndarray, "nodes 3"]:
+    """Compute the unit normals of nodes, the means of their faces' weighted by area."""
+    corners, normals = points[faces], np.zeros_like(points)
+    for corner in faces.T:
+        np.add.at(normals, corner, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
@@ -42,11 +106,8 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
     if len(moving) == 0:
         return mesh
     goal = _allowed_places(distance, points[moving], gap)
-    for _ in range(30):
-        _advance(points, mesh.cells, moving, goal)
-        if np.array_equal(points[moving], goal):
-            return TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
-        _smooth(points, mesh.cells, _interior_near(mesh, moving))
+    if _move(points, mesh, moving, goal, PULLING_ROUNDS):
+        return TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
     left = np.linalg.norm(points[moving] - goal, axis=1)
     raise MeshError(
         f"{np.count_nonzero(left)} boundary nodes cannot be moved to {gap:g} mm inside the intracranial mask without "
@@ -88,6 +149,22 @@ def _gradient(distance: Image, points: Float[np.ndarray, "n 3"]) -> Float[np.nda
     step = distance.voxel_sizes.max() * np.eye(3)
     ahead, behind = (np.stack([_sample(distance, points + sign * e) for e in step], axis=1) for sign in (1, -1))
     return (ahead - behind) / (2 * step[0, 0])
+
+
+def _move(
+    points: Float[np.ndarray, "nodes 3"],
+    mesh: TetMesh,
+    moving: Int[np.ndarray, "n"],
+    goal: Float[np.ndarray, "n 3"],
+    rounds: int,
+) -> bool:
+    """Move nodes towards their goals, in place, and smooth the interior around them; return whether all arrive."""
+    for _ in range(rounds):
+        _advance(points, mesh.cells, moving, goal)
+        if np.array_equal(points[moving], goal):
+            return True
+        _smooth(points, mesh.cells, _interior_near(mesh, moving))
+    return False
 
 
 def _advance(

@@ -15,7 +15,7 @@ from bayesreg.distance import forbidden, signed_distance
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
 from bayesreg.io.domain import MeshError, domain_labels, labels_everywhere, mesh_domain
-from bayesreg.io.fitting import pull_inside
+from bayesreg.io.fitting import fit_to_surface, pull_inside
 from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surface_files import read_dataset, save_dataset
@@ -132,10 +132,11 @@ def build_mesh(
     labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing, names), names)
     surfaces = tissue_surfaces(labels, options.edge_length, names)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
-    distance = None if intracranial is None else signed_distance(forbidden(intracranial))
+    depth = signed_distance(forbidden(labels), options.edge_length)
+    skull_distance = None if intracranial is None else signed_distance(forbidden(intracranial))
     for attempt in range(1, options.attempts + 1):
         try:
-            mesh = _attempt(labels, names, surfaces, sizing, distance, options)
+            mesh = _attempt(labels, names, surfaces, sizing, depth, skull_distance, options)
             _log.debug("mesh made: %s", check_mesh(mesh, labels))
             return mesh
         except ValueError as error:
@@ -273,7 +274,8 @@ def _attempt(
     names: Sequence[str],
     surfaces: list[Surface],
     sizing: Sizing,
-    distance: Image | None,
+    depth: Image,
+    skull_distance: Image | None,
     options: MeshOptions,
 ) -> TetMesh:
     points, cells = tetrahedralize(
@@ -285,9 +287,9 @@ def _attempt(
         quiet=options.quiet,
     )
     points, cells = without_loose_nodes(points, cells)
-    mesh = TetMesh.from_arrays(points, cells, np.zeros(len(cells), int), names)
-    if distance is not None:
-        mesh = pull_inside(mesh, distance, options.skull_gap)
+    mesh = fit_to_surface(TetMesh.from_arrays(points, cells, np.zeros(len(cells), int), names), depth)
+    if skull_distance is not None:
+        mesh = pull_inside(mesh, skull_distance, options.skull_gap)
     tissue = tissue_of_cells(mesh.points, cells, labels_everywhere(labels, names))
     return TetMesh.from_arrays(mesh.points, cells, tissue, names)
 

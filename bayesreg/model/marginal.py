@@ -42,6 +42,8 @@ from bayesreg.types import AnyArray, Scalar
 
 # The matrices of more unknowns take minutes, and those of more coordinates of points a gigabyte.
 MOST_UNKNOWNS, MOST_COORDINATES = 5000, 1500
+# A draw with more coordinates than this takes a part of a second.
+MANY_COORDINATES = 600
 # The number of displacements about the mode over which a surface's slope and curvature are averaged.
 PLACES = 16
 # The terms that are Gaussian in the displacements, and those that may stand beside them.
@@ -200,8 +202,9 @@ class Marginalisation:
 
     @property
     def has_costly_draws(self) -> bool:
-        """Whether a draw takes a part of a second: with surfaces, or where each stiffness is factorised."""
-        return self.is_costly or bool(surfaces_of(self.problem))
+        """Whether a draw takes a part of a second: many points, surfaces, or a factorisation for each stiffness."""
+        has_many_points = 3 * _count_points(self.problem) > MANY_COORDINATES
+        return self.is_costly or has_many_points or bool(surfaces_of(self.problem))
 
     def __call__(self) -> Marginal:
         """Return the marginal; several threads may ask for it."""

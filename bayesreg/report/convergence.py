@@ -30,6 +30,7 @@ def key_table(studies: dict[str, Study]) -> Table:
     """Make a table of the key numbers of runs, with a column for each run."""
     columns = [key_facts(study.manifest, study.entries, study.posterior) for study in studies.values()]
     rows = [[label, *(facts[label] for facts in columns)] for label in columns[0]]
+    rows = [row for row in rows if set(row[1:]) != {NONE}]
     return Table("Key numbers", "", ["", *studies], [("", rows)])
 
 
@@ -105,7 +106,8 @@ def _choose_traces(study: Study) -> list[Trace]:
         note = f"R̂ {rhat_text(entry.rhat)} · ESS {number(entry.ess_bulk, 2)}"
         chosen.append(Trace(_symbolic(entry.name), note, draws_of(study.posterior, entry, SHOWN_DRAWS)))
     for name, title in STATISTICS.items():
-        if name in study.sample_stats:
+        # Without images E_s is zero.
+        if name in study.sample_stats and study.sample_stats[name].any():
             draws = study.sample_stats[name].transpose("chain", "draw").to_numpy()
             chosen.append(Trace(title, "", draws[:, :: max(1, draws.shape[1] // SHOWN_DRAWS)]))
     return chosen

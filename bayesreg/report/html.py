@@ -74,7 +74,7 @@ def write_first_report(run: Run, reach: Float[np.ndarray, "nodes"], path: str | 
 def _opening(study: Study) -> Opening:
     return Opening(
         kicker=KICKER,
-        title=study.name,
+        title=str(study.manifest.get("name") or "Registration"),
         lead=_describe(study),
         verdicts=[("", study.verdict)],
         answers=answers(study),

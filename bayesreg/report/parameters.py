@@ -22,8 +22,9 @@ IDENTIFIED = 10.0
 REACHES_ZERO = 20.0
 # … and the bound is within this factor of the median.
 BOUND = 5.0
-# An interval of at least this share of the prior’s is described as equally wide.
-PRIOR_SHARE = 0.8
+# A parameter whose interval is wider than the first share of the prior’s has it mostly from there, and is weakly
+# identified at best; above the second it is not identified.
+PRIOR_SHARES = 0.5, 0.8
 LAME = ("lam", "mu")
 HEADER = ["", "Median", "95 % interval", "Prior, 95 %", "Data say", "R̂", "Least ESS"]
 CAPTION = (
@@ -68,13 +69,14 @@ def describe_bounds(draws: np.ndarray, prior: Interval | None = None) -> str:
     if np.ptp(finite) == 0:
         return "fixed"
     first, q01, low, median, high, q99, last = np.quantile(finite, (0.025, 0.01, 0.05, 0.5, 0.95, 0.99, 0.975))
-    if prior is not None and last - first > PRIOR_SHARE * (prior.high - prior.low):
+    share = 0.0 if prior is None else (last - first) / (prior.high - prior.low)
+    if share > PRIOR_SHARES[1]:
         return "not identified"
     if median > REACHES_ZERO * q01:
         return "only an upper bound" if high < BOUND * median else "not identified"
     if q99 > REACHES_ZERO * median:
         return "only a lower bound" if median < BOUND * low else "not identified"
-    return "identified" if high < IDENTIFIED * low else "weakly identified"
+    return "identified" if high < IDENTIFIED * low and share <= PRIOR_SHARES[0] else "weakly identified"
 
 
 def prior_of_scale(prior: Mapping[str, float]) -> Interval:
@@ -124,11 +126,17 @@ def parameter_table(study: Study) -> Table:
 def _group_rows(study: Study, index: int, group: Group) -> list[list[str]]:
     model = nested_entry(study.manifest, "model") or {}
     entry = None if group.lam.shape[-1] > 1 else index
-    rows = [_row(study, SYMBOLS["ratio"], group.ratio, ("ratio", entry), None, describe_bounds(group.ratio))]
-    for name in LAME:
-        draws, prior = getattr(group, name), prior_of(model, name, group.name)
+    priors = {name: prior_of(model, name, group.name) for name in LAME}
+    # The ratio has a prior of its own only if μ is known.
+    is_mu_known, prior = np.ptp(group.mu) == 0, priors["lam"]
+    mu = float(np.ravel(group.mu)[0])
+    ratio_prior = Interval(prior.low / mu, prior.high / mu) if is_mu_known and mu and prior else None
+    rows = []
+    for name, prior in {"ratio": ratio_prior, **priors}.items():
+        draws = getattr(group, name)
         rows.append(_row(study, SYMBOLS[name], draws, (name, entry), prior, describe_bounds(draws, prior)))
-    rows[0][3] = NONE
+    if ratio_prior is None:
+        rows[0][3] = NONE
     return rows
 
 

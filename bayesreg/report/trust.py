@@ -32,7 +32,7 @@ def _correlated(manifest: Mapping[str, Any]) -> list[str]:
         sentences.append(
             f"Neighbouring residuals are alike. Their correlation leaves {number(count)} of the {points:,} points that "
             f"are compared independent, by which the intervals are {number(wider, 2)} times as wide as if all were. "
-            "What the model does not explain in the images has its share in that."
+            "What the model does not explain has its share in that."
         )
     return sentences
 

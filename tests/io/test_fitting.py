@@ -1,13 +1,47 @@
-"""Boundary nodes pulled clear of the skull."""
+"""Boundary nodes moved to a surface, and pulled clear of the skull."""
 
 import numpy as np
 import pytest
 
 from bayesreg.distance import signed_distance
+from bayesreg.image import Image
 from bayesreg.io.domain import MeshError
-from bayesreg.io.fitting import pull_inside
+from bayesreg.io.fitting import fit_to_surface, pull_inside
 from bayesreg.io.quality import mean_ratio
-from tests.phantoms import ball_mesh, flat_skull
+from bayesreg.mesh import TetMesh
+from tests.phantoms import ball_mesh, box_mesh, flat_skull
+
+
+def depth_of(radius: float, order: float) -> Image:
+    """The depth below the surface of a ball (order 2) or a cube (order ∞), from voxels of 1.5 mm."""
+    axis = np.arange(-40.0, 41.0, 1.5)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    outside = np.linalg.norm(points, ord=order, axis=-1) > radius
+    affine = np.diag([1.5, 1.5, 1.5, 1.0])
+    affine[:3, 3] = axis[0]
+    return signed_distance(Image(outside.astype(np.uint8), affine), 16.0)
+
+
+class TestFitToSurface:
+    def test_a_ball_gets_its_volume(self):
+        mesh = ball_mesh(spacing=13.0)
+        centre, radius = mesh.points.mean(axis=0), np.linalg.norm(mesh.points - mesh.points.mean(axis=0), axis=1).max()
+        mesh = TetMesh.from_arrays((mesh.points - centre) * 29 / radius, mesh.cells, mesh.tissue, mesh.names)
+        fitted = fit_to_surface(mesh, depth_of(30.0, 2))
+        ball = 4 / 3 * np.pi * 30**3
+        assert mesh.volumes.sum() < 0.93 * ball
+        assert fitted.volumes.sum() == pytest.approx(ball, rel=0.015)
+        assert mean_ratio(fitted.points, fitted.cells).min() > 0.1
+
+    def test_a_cube_gets_its_rim(self):
+        """Edges and corners were cut off by a quarter of an edge length, as smoothing does."""
+        mesh = box_mesh(5, size=60.0)
+        points = mesh.points - 30.0
+        points *= 1 - 0.06 * (np.abs(points) > 29).sum(axis=1, keepdims=True).clip(1) + 0.06
+        cut = TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
+        fitted = fit_to_surface(cut, depth_of(30.0, np.inf))
+        assert cut.volumes.sum() < 0.97 * 60**3
+        assert fitted.volumes.sum() == pytest.approx(60**3, rel=0.01)
 
 
 class TestPullInside:

@@ -61,12 +61,12 @@ class TestBuildMesh:
         assert (mesh.volumes > 0).all()
         centre = np.average(mesh.points[mesh.cells].mean(axis=1), weights=mesh.volumes, axis=0)
         np.testing.assert_allclose(centre, CENTRE, atol=1.0)
-        assert mesh.volumes.sum() == pytest.approx(4 / 3 * np.pi * 36**3, rel=0.2)
+        assert mesh.volumes.sum() == pytest.approx(4 / 3 * np.pi * 36**3, rel=0.03)
 
     def test_works_where_the_labels_touch_the_edge_of_the_grid(self):
         tissue, _ = balls(grid(extent=60.0))
         mesh = build_mesh(tissue, None, OPTIONS)
-        assert mesh.volumes.sum() == pytest.approx(np.count_nonzero(tissue.voxels) * tissue.voxel_volume, rel=0.2)
+        assert mesh.volumes.sum() == pytest.approx(np.count_nonzero(tissue.voxels) * tissue.voxel_volume, rel=0.05)
         assert tissue.contains(mesh.points).mean() > 0.5
 
     def test_tries_again_where_a_mesh_is_not_sound(self, phantom, mesh, monkeypatch, caplog):
@@ -80,14 +80,15 @@ class TestBuildMesh:
 
         monkeypatch.setattr(meshing, "tetrahedralize", sometimes)
         again = build_mesh(*phantom, OPTIONS)
-        np.testing.assert_array_equal(again.points, mesh.points)
+        np.testing.assert_array_equal(again.cells, mesh.cells)
         assert "mesh 1 of at most 3 failed its check: no luck" in caplog.text
 
     def test_takes_a_region_made_already(self, phantom, mesh, monkeypatch):
         domain = mesh_domain(*phantom)
-        monkeypatch.setattr(meshing, "mesh_domain", None)
         monkeypatch.setattr(meshing, "tetrahedralize", lambda *args, **kwargs: (mesh.points, mesh.cells))
-        assert build_mesh(*phantom, OPTIONS, domain).digest == mesh.digest
+        expected = build_mesh(*phantom, OPTIONS)
+        monkeypatch.setattr(meshing, "mesh_domain", None)
+        assert build_mesh(*phantom, OPTIONS, domain).digest == expected.digest
 
     def test_gives_up_after_the_last_attempt(self, phantom, monkeypatch):
         monkeypatch.setattr(tetwild, "_PROGRAM", "import sys; sys.exit('out of luck')")

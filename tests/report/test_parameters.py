@@ -72,6 +72,7 @@ def test_a_posterior_like_its_prior_is_not_identified():
     draws = np.linspace(0, 30, 1001)
     assert describe_bounds(draws, Interval(0.75, 29.25)) == "not identified"
     assert describe_bounds(np.linspace(10, 12, 1001), Interval(0.75, 29.25)) == "identified"
+    assert describe_bounds(np.linspace(12, 30, 1001), Interval(0.75, 29.25)) == "weakly identified"
     assert describe_bounds(np.ones(9)) == "fixed"
     assert describe_bounds(np.full(3, np.nan)) == "undefined"
 

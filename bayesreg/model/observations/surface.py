@@ -236,7 +236,7 @@ class SurfaceSection(ObservationSection):
         """Return a sentence that explains the term."""
         return (
             f"{name}: the place of the organ that has moved to a measured point lies on the surface at rest, up to an "
-            "error along the normal; no partner is told."
+            "error along the normal; no partner is told"
         )
 
     @classmethod
