@@ -211,6 +211,12 @@ def test_a_surface_needs_no_images(register, tmp_path):
     both = understand(labels=Path(register.path("labels")), surface=points, landmarks=points).config
     assert [section.kind for section in both.observations] == ["landmarks", "surface"]
     assert both.model.rigid_sd is None
+    lost = understand(labels=Path(register.path("labels")), surface=points, overrides=["data.pose=unknown"])
+    assert lost.config.model.rigid_sd == 10.0
+    assert "pose        looked for by the surface, each rigid motion to 10 mm (model.rigid_sd)" in lost.lines
+    images = [Path(register.path(name)) for name in ("fixed", "moving")]
+    with pytest.raises(ValueError, match="unknown is for a surface without images"):
+        understand(*images, surface=points, overrides=["data.pose=unknown"])
 
 
 def test_points_need_no_images(register):

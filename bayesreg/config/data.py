@@ -64,9 +64,10 @@ class FilesData(Section):
     """Mask of the ignored part of the fixed image, such as a tumour; not zero = ignored. On any grid, in its world."""
     moving_ignore: FoundImage | None = None
     """Mask of the ignored part of the moving image, such as a cavity; not zero = ignored. On any grid, in its world."""
-    pose: Literal["auto", "fixed"] = "auto"
+    pose: Literal["auto", "fixed", "unknown"] = "auto"
     """auto: if the headers do not align the images, a rigid motion is found first; fixed: the headers are used as they
-    are. The rigid part of the displacement is sampled in both cases."""
+    are; unknown: without images, a surface is aligned from starts in all directions. The rigid part of the displacement
+    is sampled in all cases."""
     same_contrast: StrictBool | None = None
     """true: both images have one contrast and one scale of intensities; false: the fixed image is compared through a
     map of its intensities; null: the program decides from the images."""
@@ -102,6 +103,13 @@ class FilesData(Section):
         if ignore is not None and "fixed" in info.data and info.data["fixed"] is None:
             raise ValueError("there is no image of which a part could be ignored; expected null")
         return ignore
+
+    @field_validator("pose")
+    @classmethod
+    def _has_no_image(cls, pose: str, info: ValidationInfo) -> str:
+        if pose == "unknown" and info.data.get("fixed") is not None:
+            raise ValueError("unknown is for a surface without images; expected auto, which looks for that of images")
+        return pose
 
     @field_validator("label_table")
     @classmethod

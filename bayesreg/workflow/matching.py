@@ -1,11 +1,12 @@
-"""Match the moving image to the fixed image before the registration, in pose, contrast and scale of intensities."""
+"""Match the moving image, or a measured surface, to the fixed image before the registration: pose and intensities."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from bayesreg.config.data import FilesData
 from bayesreg.ignored import ignored_voxels
@@ -14,6 +15,8 @@ from bayesreg.io.alignment import find_pose
 from bayesreg.io.grids import check_same_space
 from bayesreg.io.records import Channel, Matching
 from bayesreg.model.observations.images.similarity import AnySimilarity
+from bayesreg.model.observations.surface import Surface, SurfaceSection
+from bayesreg.model.observations.surface_pose import find_pose as find_surface_pose
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Likeness, compare_images
@@ -22,6 +25,8 @@ from bayesreg.workflow.appraisal import Likeness, compare_images
 GAIN = 1.05
 # The user is warned if a mask ignores a greater share of the organ: zero and nonzero may be interchanged in it.
 MOST_IGNORED = 0.5
+# The user is warned if the pose of a surface has no greater lead than this, in log evidence.
+CLEAR = 5.0
 
 
 class MatchedImages(NamedTuple):
@@ -50,6 +55,21 @@ class MatchedImages(NamedTuple):
     likeness: Likeness
     notes: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+
+
+class MatchedSurface(NamedTuple):
+    """The pose of a measured surface.
+
+    Attributes
+    ----------
+    matching : Matching
+    notes, warnings : tuple of str
+        One sentence each.
+    """
+
+    matching: Matching
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def match_images(
@@ -182,6 +202,33 @@ def _describe_ignored(domain: Image, masks: Mapping[str, Image | None]) -> tuple
 def _scaled(name: str, image: Image, domain: Image) -> Image:
     check_same_space(domain, image, ("fixed", name))
     return _scale_of(name, image, within(domain, image))(image)
+
+
+def match_surface(
+    section: SurfaceSection, points: Float[np.ndarray, "k 3"], tissue: Image, names: Sequence[str]
+) -> MatchedSurface:
+    """Find the pose of a measured surface from starts in all directions; its points are world RAS, mm.
+
+    Parameters
+    ----------
+    section : SurfaceSection
+    points : (k, 3) array
+    tissue : Image
+        0 outside the organ, 1 + index into the names inside.
+    names : sequence of str
+    """
+    found = find_surface_pose(Surface(points, section.of, name=section.name), tissue, names)
+    motion = found.pose.inverse.about(points.mean(axis=0))
+    note = (
+        f"Pose: the organ lies {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the coordinates of "
+        f"{section.name}, as the best of {found.starts} starts says (data.pose: fixed keeps them)."
+    )
+    doubt = (
+        f"{section.name}: another pose explains the points nearly as well (its log evidence is lower by "
+        f"{found.lead:.1f}): a part of a surface hardly tells the pose. Points with partners (--landmarks) would, or "
+        "navigated coordinates (data.pose: fixed)."
+    )
+    return MatchedSurface(Matching(found.pose), (note,), (doubt,) if found.lead < CLEAR else ())
 
 
 def _find_pose(

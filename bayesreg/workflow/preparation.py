@@ -26,18 +26,19 @@ from bayesreg.io.intensities import in_levels
 from bayesreg.io.meshing import domain_labels, load_mesh, mesh_domain
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.points import read_point_pairs
-from bayesreg.io.records import Channel, Inputs, Truth
+from bayesreg.io.records import Channel, Inputs, Matching, Truth
 from bayesreg.io.run_folder import RunFolder
 from bayesreg.io.volumes import load_ignored, load_image, load_mask
 from bayesreg.mesh import TetMesh
 from bayesreg.model.observations.section import Arrays
+from bayesreg.model.observations.surface import SurfaceSection
 from bayesreg.model.warp import tissue_on_grid
 from bayesreg.pose import Pose
 from bayesreg.tissues import BRAIN_CLOSING
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.evaluation import NAME, require_unseen
-from bayesreg.workflow.matching import MatchedImages, match_channel, match_images
+from bayesreg.workflow.matching import MatchedImages, MatchedSurface, match_channel, match_images, match_surface
 from bayesreg.workflow.meshing import complete_lengths, mesh_of, size_of_organ
 from bayesreg.workflow.prediction import require_inside
 from bayesreg.workflow.simulated_pair import describe_pair, simulate_pair
@@ -79,6 +80,8 @@ def prepare(config: Config) -> Prepared:
     observed = with_held_out({section.name: section.read() for section in config.observations}, config)
     if isinstance(config.data, FilesData) and config.data.labels is None and config.data.fixed is None:
         assert config.mesh.file is not None
+        if config.data.pose == "unknown":
+            raise InputError("data.pose: unknown needs labels (data.labels), to whose surface the points are aligned")
         mesh = load_mesh(config.mesh.file)
         _require_start(config, mesh)
         clock.lap("mesh")
@@ -97,7 +100,8 @@ def prepare(config: Config) -> Prepared:
     settings = complete_lengths(config.mesh, size)
     with ahead(starmap(mesh_of, [(anatomy, domain, settings)])) as meshing:
         matched = _match(config, anatomy, domain, fixed_ignore)
-        appraisal = _appraise(config, anatomy, domain, matched)
+        matched_surface = _match_surface(config, observed, tissue, anatomy.names)
+        appraisal = _appraise(config, anatomy, domain, matched or matched_surface)
         clock.lap("images")
     mesh = meshing.result()
     if settings.file is not None:
@@ -106,11 +110,11 @@ def prepare(config: Config) -> Prepared:
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     if isinstance(config.data, FilesData):
-        pose = IDENTITY if matched is None else matched.matching.pose
-        boundary = _known_boundary(config, mesh, pose=pose)
+        matching = Matching() if (found := matched or matched_surface) is None else found.matching
+        boundary = _known_boundary(config, mesh, pose=matching.pose)
         inputs = Inputs(
             resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, observed=observed,
-            fixed_ignore=fixed_ignore,
+            fixed_ignore=fixed_ignore, matching=matching,
         )  # fmt: skip
         if matched is not None:
             ignored = matched.moving_ignore
@@ -118,7 +122,6 @@ def prepare(config: Config) -> Prepared:
                 fixed=_as_stored(matched.fixed),
                 moving=_as_stored(matched.moving),
                 moving_ignore=None if ignored is None else _as_stored(ignored),
-                matching=matched.matching,
                 channels=_channels(config, domain, matched, fixed_ignore),
             )
         return Prepared(inputs, clock.laps, {}, appraisal)
@@ -169,6 +172,18 @@ def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image 
     return match_images(data, config.image_options.similarity, domain, fixed, moving, fixed_ignore, moving_ignore)
 
 
+def _match_surface(
+    config: Config, observed: Mapping[str, Arrays], tissue: Image, names: Sequence[str]
+) -> MatchedSurface | None:
+    """Find the pose of the first measured surface; None unless data.pose asks for it."""
+    if not (isinstance(config.data, FilesData) and config.data.pose == "unknown"):
+        return None
+    for section in config.observations:
+        if isinstance(section, SurfaceSection):
+            return match_surface(section, observed[section.name]["points"], tissue, names)
+    raise InputError("data.pose: unknown needs a surface, which tells the pose (observations: {kind: surface})")
+
+
 def _skull(intracranial: Path | None) -> Image | None:
     """Compute the region that sampled nodes may not enter, from a mask of where the organ may go."""
     if intracranial is None:
@@ -191,15 +206,22 @@ def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, A
     return observations | {NAME: held_out.as_arrays()}
 
 
-def _appraise(config: Config, anatomy: Anatomy, domain: Image, matched: MatchedImages | None) -> Appraisal:
+def _appraise(
+    config: Config, anatomy: Anatomy, domain: Image, matched: MatchedImages | MatchedSurface | None
+) -> Appraisal:
     """Appraise labels and images before the mesh is built."""
-    if matched is None or not isinstance(config.data, FilesData):
-        return appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
+    if not (isinstance(matched, MatchedImages) and isinstance(config.data, FilesData)):
+        appraisal = appraise(anatomy.tissue, domain, anatomy.names, intracranial=anatomy.intracranial)
+        return appraisal if matched is None else _with_remarks(appraisal, matched)
     one_contrast = matched.matching.one_contrast and not config.image_options.similarity.serves_any_contrast
     one_scale = one_contrast and config.data.same_contrast is True
     appraisal = appraise(
         anatomy.tissue, domain, anatomy.names, matched.likeness, one_contrast, one_scale, anatomy.intracranial
     )
+    return _with_remarks(appraisal, matched)
+
+
+def _with_remarks(appraisal: Appraisal, matched: MatchedImages | MatchedSurface) -> Appraisal:
     return appraisal._replace(notes=matched.notes, warnings=(*appraisal.warnings, *matched.warnings))
 
 

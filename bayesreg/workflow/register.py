@@ -21,10 +21,9 @@ from bayesreg.types import InputError
 
 # These draws are independent, so that few are enough.
 QUICK = {"sampler": {"name": "laplace"}, "stop": {"rhat": None, "ess": None, "max_steps": 100}}
-
-
-# The sd of each rigid motion, mm, where points on a surface are all that is observed: that of a navigated scan.
-RIGID_SD = 1.0
+# The sd of each rigid motion, mm, where points on a surface are all that is observed: that of a navigated scan, and
+# that of a pose which the points themselves tell.
+RIGID_SD, RIGID_SD_OF_FOUND = 1.0, 10.0
 
 
 class Understood(NamedTuple):
@@ -81,7 +80,8 @@ def understand(
         Pairs of points that show the same places.
     surface : path, optional
         Points on the moved surface of the organ, without partners. Where nothing else is observed, the rigid motion
-        has a prior of sd `RIGID_SD`, since a part of a surface says little about it.
+        has a prior of sd `RIGID_SD`, since a part of a surface says little about it; of `RIGID_SD_OF_FOUND` with
+        data.pose=unknown.
 
     Raises
     ------
@@ -117,6 +117,9 @@ def understand(
     if quick:
         sections |= QUICK
     config = make_config(sections, overrides)
+    if isinstance(config.data, FilesData) and config.data.pose == "unknown" and landmarks is None:
+        sections["model"]["rigid_sd"] = RIGID_SD_OF_FOUND
+        config = make_config(sections, overrides)
     if any(override.startswith("data.label_table") for override in overrides):
         how = "as set"
     return Understood(config, tuple(_describe(config, how)))
@@ -153,7 +156,8 @@ def _describe(config: Config, how: str) -> Iterator[str]:
     if config.model.elasticity == "uniform" and len(getattr(data, "label_table", None) or ()) > 1:
         yield f"{'stiffness':<12}one for all tissues; each its own: --set model.elasticity=tissue"
     if config.model.rigid_sd is not None:
-        yield f"{'pose':<12}as the headers say, each rigid motion to {config.model.rigid_sd:g} mm (model.rigid_sd)"
+        pose = "looked for by the surface" if data.pose == "unknown" else "as the headers say"
+        yield f"{'pose':<12}{pose}, each rigid motion to {config.model.rigid_sd:g} mm (model.rigid_sd)"
     if config.sampler.name == "laplace":
         yield f"{'sampler':<12}laplace, approximate: independent draws of the Gaussian about the mode"
 

@@ -1,6 +1,6 @@
 """`make calibrate`: simulation-based calibration and Geweke's test, with figures and a JSON file.
 
-python -m studies.calibration -o DIR [--parts sbc geweke pairs same_mesh mesh_share external carried]
+python -m studies.calibration -o DIR [--parts sbc geweke surfaces pairs same_mesh mesh_share external carried]
 
 The program ends with status 1 if an experiment fails.
 """
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import bayesreg as br
-from studies.calibration import carried, external, figures, geweke, mesh_share, pairs, sbc
+from studies.calibration import carried, external, figures, geweke, mesh_share, pairs, sbc, surfaces
 from studies.calibration.simulator import T_SIMILARITY, VARIANTS, Simulator, Variant, calibrated, treated_as_it_says
 
 # Errors on purpose, which the tests must detect: T_s fixed at 1.5 times its true value, the elastic prior without its
@@ -35,6 +35,9 @@ LOADS = {"step_size": 0.1, "steps": 20}
 
 # The other experiments take up to an hour each; --parts names them.
 DEFAULT = ["sbc", "geweke"]
+
+# Each compiles programs of its own, a minute.
+SURFACES = 40
 
 BEGAN = time.perf_counter()
 
@@ -83,6 +86,15 @@ def _summary(ranks: sbc.Ranks, planted: bool) -> dict[str, Any]:
         "rhat_99": float(np.quantile(ranks.rhat, 0.99)),
         "acceptance": dict(zip(("least", "median"), np.quantile(ranks.acceptance, [0, 0.5]).tolist(), strict=True)),
     }
+
+
+def calibrate_surfaces(out: Path) -> dict[str, Any]:
+    """Test the ranks and the coverage of `gibbs` with a surface."""
+    ranks = surfaces.calibrate(SURFACES, report_progress)
+    figures.rank_histograms(ranks, out / "ranks_surface.png")
+    summary = _summary(ranks, planted=False)
+    report_progress(f"surface: {summary['verdict']}; least p {summary['least_p']:.2g}")
+    return {"surface": summary}
 
 
 def compare_simulators(out: Path) -> dict[str, Any]:
@@ -161,6 +173,7 @@ def carry(out: Path) -> dict[str, Any]:
 EXPERIMENTS = {
     "sbc": calibrate_by_simulation,
     "geweke": compare_simulators,
+    "surfaces": calibrate_surfaces,
     "pairs": register_pairs,
     "same_mesh": register_on_one_mesh,
     "mesh_share": share_of_the_mesh,

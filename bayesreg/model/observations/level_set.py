@@ -47,13 +47,18 @@ def cell_table(mesh: TetMesh, grid: Image) -> CellTable:
     return CellTable(jnp.asarray(cells.reshape(grid.shape)), jnp.asarray(grid.to_voxel))
 
 
-def distance_from_mask(mask: Image) -> Interpolator:
-    """Compute the signed distance from the surface of a mask, mm, positive outside, without the steps of its voxels.
+def depth_in_mask(mask: Image, margin: float = MARGIN) -> Image:
+    """Compute the depth below the surface of a mask, mm, negative outside, without the steps of its voxels.
 
-    The surface bridges folds, as what a camera or a pointer sees does.
+    The surface bridges folds, as what a camera or a pointer sees does. The grid reaches beyond the mask by the margin.
     """
-    inward = signed_distance(forbidden(_bridge_folds(mask)), MARGIN)
-    return inward.with_voxels(-np.asarray(inward.voxels)).interpolator("cubic")
+    return signed_distance(forbidden(_bridge_folds(mask)), margin)
+
+
+def distance_from_mask(mask: Image) -> Interpolator:
+    """Compute the signed distance from the surface of a mask, mm, positive outside."""
+    depth = depth_in_mask(mask)
+    return depth.with_voxels(-np.asarray(depth.voxels)).interpolator("cubic")
 
 
 def distance_from_mesh(mesh: TetMesh, chosen: Bool[np.ndarray, "cells"], grid: Image) -> Interpolator:

@@ -105,13 +105,12 @@ class Surface:
         InputError
             If the mesh has no such tissue, or no point lies near it.
         """
-        chosen = self._tissues(mesh)
+        chosen = self._tissues(mesh.names)
         grid = grid_around(mesh, self.points)
         if self.tissue is None:
             distance = distance_from_mesh(mesh, chosen[mesh.tissue], grid)
         else:
-            labels = np.append(False, chosen)
-            distance = distance_from_mask(self.tissue.with_voxels(labels[np.asarray(self.tissue.voxels, int)]))
+            distance = distance_from_mask(self.mask(self.tissue, mesh.names))
         scale = f"{self.name}_sd"
         term = MeasuredSurface(
             label=Label(self.name),
@@ -128,17 +127,20 @@ class Surface:
         )
         return Placed(self, term, {} if self.prior is None else {scale: scale_block(self.prior)})
 
-    def _tissues(self, mesh: TetMesh) -> Bool[np.ndarray, "tissues"]:
+    def mask(self, tissue: Image, names: Sequence[str]) -> Image:
+        """Mark the tissues whose surface is meant, in labels that are 0 outside and 1 + index into the names inside."""
+        return tissue.with_voxels(np.append(False, self._tissues(names))[np.asarray(tissue.voxels, int)])
+
+    def _tissues(self, names: Sequence[str]) -> Bool[np.ndarray, "tissues"]:
         if self.of == (BOUNDARY,):
-            solid = np.array([not is_fluid(name) for name in mesh.names])
+            solid = np.array([not is_fluid(name) for name in names])
             return solid if solid.any() else ~solid
-        chosen = np.isin(mesh.names, self.of)
-        if unknown := [name for name in self.of if name not in mesh.names]:
+        if unknown := [name for name in self.of if name not in names]:
             raise InputError(
                 f"{self.name}: of: the mesh has no tissue {unknown[0]}; expected {BOUNDARY} or some of "
-                f"{', '.join(mesh.names)}"
+                f"{', '.join(names)}"
             )
-        return chosen
+        return np.isin(names, self.of)
 
     def smoothed_term(self, term: MeasuredSurface, sd: float) -> MeasuredSurface:
         """Return the term with a wider error: the points draw the surface from further off."""
