@@ -69,7 +69,9 @@ def is_fluid(name: str) -> bool:
 
 
 def label_of(name: str) -> str:
-    """Return the name of a tissue in reports."""
+    """Return the name of a tissue in reports, or of all of them together where they have one stiffness ("uniform")."""
+    if name == "uniform":
+        return "the whole organ"
     preset = PRESETS.get(name.lower())
     return preset.label if preset else name
 

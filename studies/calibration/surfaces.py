@@ -48,11 +48,9 @@ def calibrate(replications: int, report_progress: Callable[[str], None]) -> Rank
             mesh=MESH, observations=[br.Surface(points, sd=SD)], model=MODEL
         ).with_independent_points({"surface": float(POINTS)})
         drawn = br.sample(posterior, "gibbs", CHAINS, DRAWS, seed=replication, progress=False).idata.posterior
-        values = np.concatenate(
-            [np.stack([drawn[name].values.reshape(CHAINS, -1) for name in ("lam", *SCALES)], axis=-1)]
-            + [drawn.u_boundary.sel(node=node).values.reshape(CHAINS, -1, 3 * len(node))],
-            axis=-1,
-        )
+        parameters = np.stack([drawn[name].values.reshape(CHAINS, -1) for name in ("lam", *SCALES)], axis=-1)
+        displacements = drawn.u_boundary.sel(node=node).values.reshape(CHAINS, -1, 3 * len(node))
+        values = np.concatenate([parameters, displacements], axis=-1)
         true = np.r_[[truth[name] for name in ("lam", *SCALES)], truth["u"][node].ravel()]
         ess, rhat = effective_sample_size(values), split_gelman_rubin(values)
         rows.append((_place(values, true, ess, rng), ess, rhat))

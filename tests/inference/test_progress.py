@@ -19,13 +19,13 @@ def test_draws_until_convergence_follow_the_excess_of_rhat():
     assert draws_until([*history, (400, 1.0001)], 1.01) == pytest.approx(400)
 
 
-def test_time_left_tells_both():
-    assert time_left(300.0, 72.0) == "about 1.2 min to convergence, 5.0 min to the budget"
-    assert time_left(300.0, None) == "5.0 min to the budget"
-    assert time_left(300.0, 900.0) == "5.0 min to the budget"
+def test_time_left_is_that_to_convergence_or_of_the_budget():
+    assert time_left(300.0, 72.0) == "about 1.2 min left"
+    assert time_left(300.0, None) == "at most 5.0 min left"
+    assert time_left(300.0, 900.0) == "at most 5.0 min left"
     # R̂ is low enough, and something else is not.
-    assert time_left(60.0, -1.0) == "1.0 min to the budget"
-    assert time_left(-1.0, 5.0) == "0.0 min to the budget"
+    assert time_left(60.0, -1.0) == "at most 1.0 min left"
+    assert time_left(-1.0, 5.0) == "at most 0.0 min left"
 
 
 @pytest.mark.parametrize("cache", ["new", "a file/in its place"])

@@ -47,14 +47,14 @@ class NoProgress:
 
 
 class SamplingProgress(NoProgress):
-    """A line with draws, acceptance, steps per second, greatest running R̂ and time left."""
+    """A line with draws, acceptance, greatest running R̂ and time left, in 80 columns."""
 
     def __init__(self, draws: int, max_seconds: float | None, threshold: float | None) -> None:
         self._draws, self._max_seconds, self._threshold = draws, max_seconds, threshold
         self._first: tuple[float, float] | None = None
         self._worst: list[tuple[int, float]] = []
         self._bar = RichProgress(
-            TextColumn("sampling"), BarColumn(bar_width=24), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
+            TextColumn("sampling"), BarColumn(bar_width=10), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
             TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
         )  # fmt: skip
         self._task = self._bar.add_task("sampling", total=draws, figures="compiling", left="")
@@ -67,23 +67,24 @@ class SamplingProgress(NoProgress):
         self._bar.stop()
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
-        """Show acceptance inside the support and overall, steps per second of a chain, greatest R̂ and time left."""
+        """Show the acceptance, inside the support, too, if it differs, the greatest R̂ and the time left."""
         draws, seconds, tally = int(checkpoint.draws), float(checkpoint.seconds), checkpoint.tally
         if draws == 0:
             return
         steps = float(np.sum(tally.steps))
         inside = max(steps - float(np.sum(tally.outside_support)), 1.0)
-        accepted = float(np.sum(tally.acceptance))
+        accepted = f"{float(np.sum(tally.acceptance)) / steps:.0%}"
+        accepted_inside = f"{float(np.sum(tally.acceptance)) / inside:.0%}"
         target = "" if self._threshold is None else f"/{self._threshold:g}"
         worst = greatest_rhat(rhat["estimands"])
         # The first block includes the compilation, so rates count from its end.
         self._first = self._first or (draws, seconds)
-        figures = f"accepted {accepted / steps:.0%} (in support {accepted / inside:.0%})  R̂ {worst:.2f}{target}"
+        of_support = "" if accepted_inside == accepted else f" ({accepted_inside} in support)"
+        figures = f"accepted {accepted}{of_support}  R̂ {worst:.3f}{target}"
         left = ""
         self._worst.append((draws, worst))
         if draws > self._first[0]:
             rate = (draws - self._first[0]) / max(seconds - self._first[1], 1e-9)
-            figures += f"  {rate * steps / draws / len(tally.steps):.0f} steps/s"
             budget = (self._draws - draws) / rate
             if self._max_seconds is not None:
                 budget = min(budget, self._max_seconds - seconds)
@@ -111,12 +112,11 @@ def draws_until(checks: Sequence[tuple[int, float]], threshold: float | None) ->
 
 
 def time_left(budget: float, convergence: float | None) -> str:
-    """Describe the time left in the budget, and the time until convergence if it is known and shorter.
+    """Describe the time until convergence, or that in the budget if the former is not known or longer.
 
     If R̂ is already low enough and the chains continue, the effective sample size is still too small. The text says
     nothing about that.
     """
-    of_budget = f"{max(budget, 0) / 60:.1f} min to the budget"
     if convergence is None or not 0 < convergence <= budget:
-        return of_budget
-    return f"about {convergence / 60:.1f} min to convergence, {of_budget}"
+        return f"at most {max(budget, 0) / 60:.1f} min left"
+    return f"about {convergence / 60:.1f} min left"
