@@ -34,9 +34,9 @@ from bayesreg.types import AnyArray, InputError
 # The number of steps of θ in one transition. Some go along one direction of its unit by a random multiple, spread
 # evenly on a logarithmic axis, so that also tails and narrow parts of its posterior are visited.
 STEPS, NARROWEST, WIDEST = 6, 0.5, 4.0
-# The number of turns of the trajectory of touched unknowns, each by an angle: a quarter of a circle in all leads to a
-# place that is nearly independent.
-TURNS, ANGLE = 5, 0.35
+# The same in each half of a transition with touched unknowns, and the number of turns of their trajectory, each by an
+# angle: a quarter of a circle in all leads to a place that is nearly independent.
+HALF_STEPS, TURNS, ANGLE = 2, 5, 0.35
 # The share of the other steps, which propose θ independently of where it is, and the degrees of freedom of Student's t,
 # from which every component of both kinds is drawn.
 INDEPENDENT, FREEDOM = 0.6, 5.0
@@ -101,7 +101,7 @@ def _step(
         rate = (first_rate + second_rate) / 2
     elif is_tested:
         drawn, rate = _move_with_touched(target, marginal, setup, key, estimands)
-        densities = 3
+        densities = 1 + 2 * HALF_STEPS
     else:
         drawn, rate = _sweep(marginal, walk, key, estimands, is_tested)
     nothing, no = jnp.zeros((), int), jnp.zeros((), bool)
@@ -136,7 +136,7 @@ def _move_with_touched(
     """Draw the weights, move θ and v with the other unknowns integrated out, and draw the displacements given both.
 
     v = m + L ζ with the mean and the Cholesky factor of its Gaussian, which θ determines. θ moves at a fixed ζ, so that
-    v stays where its Gaussian is (Murray and Adams 2010), and ζ moves at a fixed θ. The steps of θ before and after the
+    v stays where its Gaussian is (Murray and Adams 2010), and ζ moves at a fixed θ. The walks before and after the
     trajectory of ζ make the whole reversible. v has all factors of the posterior but the barrier, and the micrometre by
     which it differs from the displacements: Metropolis' rule for these makes it exact.
     """
@@ -155,20 +155,27 @@ def _move_with_touched(
         gaussian = marginal.touched(estimands, weights)
         return gaussian._replace(log=gaussian.log + log_jacobian)
 
-    def step(key: AnyArray, flat: AnyArray, gaussian: Any, zeta: AnyArray) -> tuple[AnyArray, Any]:
+    def walk(key: AnyArray, flat: AnyArray, gaussian: Any, zeta: AnyArray) -> tuple[AnyArray, Any]:
         if not flat.size:
             return flat, gaussian
-        key_move, key_accept = jax.random.split(key)
-        candidate, balance = _propose(setup, key_move, flat, 0)
-        new = touched(candidate)
-        gain = new.log + log_factors(new, zeta) - gaussian.log - log_factors(gaussian, zeta) + balance
-        return _accept(key_accept, gain, (candidate, new), (flat, gaussian))[0]
+
+        def step(now: tuple[AnyArray, Any, AnyArray], key: AnyArray) -> tuple[Any, None]:
+            flat, gaussian, factors = now
+            key_move, key_accept = jax.random.split(key)
+            candidate, balance = _propose(setup, key_move, flat, 0)
+            new = touched(candidate)
+            new_factors = log_factors(new, zeta)
+            gain = new.log + new_factors - gaussian.log - factors + balance
+            return _accept(key_accept, gain, (candidate, new, new_factors), now)[0], None
+
+        start = flat, gaussian, log_factors(gaussian, zeta)
+        return jax.lax.scan(step, start, jax.random.split(key, HALF_STEPS))[0][:2]
 
     gaussian = touched(flat)
     zeta = solve_triangular(gaussian.root, v - gaussian.mean, lower=True)
-    flat, gaussian = step(keys[2], flat, gaussian, zeta)
+    flat, gaussian = walk(keys[2], flat, gaussian, zeta)
     zeta, rate = _rotate(partial(log_factors, gaussian), keys[3], zeta)
-    flat, gaussian = step(keys[4], flat, gaussian, zeta)
+    flat, gaussian = walk(keys[4], flat, gaussian, zeta)
     moved, new_v = estimands_of(flat)[0], gaussian.mean + gaussian.root @ zeta
     proposal = {**moved, "u_boundary": marginal.draw_displacements(keys[5], moved, weights, new_v)}
     gain = marginal.log_others(proposal) - marginal.log_surfaces(present, new_v)
