@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import edt
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
@@ -20,6 +21,8 @@ MARGIN = 0.01
 # The number of steps of Gauss–Newton to the surface of a region, the damping of their matrix over its mean diagonal,
 # and the greatest displacement of a node by one of them, in edges of the boundary.
 FITS, DAMPING, GREATEST_STEP = 2, 0.05, 0.25
+# The grid of depths: cubes per edge of the mesh at least, and the greatest number of them.
+CUBES_PER_EDGE, MOST_CUBES = 8, 3e7
 # The greatest number of rounds in which nodes and what lies around them move in turn: to the surface of a region, as
 # far as they come; and away from the skull, where they must.
 FITTING_ROUNDS, PULLING_ROUNDS = 5, 30
@@ -27,18 +30,50 @@ FITTING_ROUNDS, PULLING_ROUNDS = 5, 30
 _POINTS_OF_FACE = np.array([(i + 1 / 3, j + 1 / 3, 3 - i - j + 1 / 3) for i in range(4) for j in range(4 - i)]) / 4
 
 
+def depth_of_region(region: Image, edge_length: float) -> Image:
+    """Compute the signed distance to the surface of the voxels of a region, mm, positive inside.
+
+    Parameters
+    ----------
+    region : Image
+        Nonzero in the region.
+    edge_length : float
+        That of the mesh, mm.
+
+    Returns
+    -------
+    Image
+        On a grid of cubes around the region, at least as fine as its voxels if these are not too many, so that the
+        distance to a voxel is that to its surface up to half a cube. It is not smoothed, which would shrink what is
+        thin or curved.
+    """
+    inside = (np.asarray(region.voxels) != 0).astype(np.uint8)
+    box = ndimage.find_objects(inside)[0]
+    before = np.ceil(edge_length / region.voxel_sizes).astype(int)
+    around = np.pad(inside[box], np.stack([before, before], axis=1))
+    affine = region.affine.copy()
+    affine[:3, 3] = region.voxel_to_world(np.array([span.start for span in box]) - before.astype(float))
+    size = max(
+        min(region.voxel_sizes.min(), edge_length / CUBES_PER_EDGE),
+        np.cbrt(around.size * region.voxel_volume / MOST_CUBES),
+    )
+    cubes = Image(around, affine).on_orthogonal_grid(np.full(3, size), order=0)
+    distance = edt.sdf(np.asarray(cubes.voxels) != 0, anisotropy=tuple(cubes.voxel_sizes))
+    return cubes.with_voxels(distance - np.copysign(size / 2, distance, dtype=distance.dtype))
+
+
 def fit_to_surface(mesh: TetMesh, depth: Image) -> TetMesh:
     """Move the boundary nodes of a mesh so that its faces lie on the surface of a region, in least squares.
 
     Smoothing, and chords in the place of arcs, leave a mesh within the region that it is made for: convex parts lose
-    their rims.
+    their rims. A step that leads away from the surface is not taken.
 
     Parameters
     ----------
     mesh : TetMesh
         Its faces lie near the surface.
     depth : Image
-        Signed distance from the outside of the region, mm, positive in the region, from `signed_distance`.
+        Of the region, from `depth_of_region`.
 
     Notes
     -----
@@ -46,25 +81,43 @@ def fit_to_surface(mesh: TetMesh, depth: Image) -> TetMesh:
     Gauss–Newton minimises Σ_q w_q (φ(x_q) + Σ_k N_k(x_q) a_k n_k · ∇φ(x_q))² with the area w_q of each point. Nodes
     whose tetrahedra would become flat stay behind.
     """
-    points, boundary = mesh.points.copy(), mesh.boundary
-    faces, greatest = np.searchsorted(boundary, mesh.boundary_faces), GREATEST_STEP * mesh.boundary_edge
+    boundary, greatest = mesh.boundary, GREATEST_STEP * mesh.boundary_edge
+    faces = np.searchsorted(boundary, mesh.boundary_faces)
     for _ in range(FITS):
+        points, before = mesh.points.copy(), _misfit(mesh.points[boundary], faces, depth)
         step = np.clip(_step_to_surface(points[boundary], faces, depth), -greatest, greatest)
         goal = points[boundary] + step[:, None] * _normals(points[boundary], faces)
         _move(points, mesh, boundary, goal, FITTING_ROUNDS)
-    return TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
+        if _misfit(points[boundary], faces, depth) > before:
+            break
+        mesh = TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
+    return mesh
+
+
+def _misfit(points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"], depth: Image) -> float:
+    """Compute the mean square depth of faces, mm²."""
+    places, areas = _places_of_faces(points, faces)
+    return float(np.average(_sample(depth, places) ** 2, weights=areas))
+
+
+def _places_of_faces(
+    points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"]
+) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, "q"]]:
+    """Return points of all faces, and the area for which each stands, up to a factor."""
+    corners = points[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    places = np.einsum("qk,fki->fqi", _POINTS_OF_FACE, corners).reshape(-1, 3)
+    return places, np.repeat(areas, len(_POINTS_OF_FACE))
 
 
 def _step_to_surface(
     points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"], depth: Image
 ) -> Float[np.ndarray, "nodes"]:
     """Compute a_k, mm, for one step of Gauss–Newton."""
-    corners, weights = points[faces], np.tile(_POINTS_OF_FACE, (len(faces), 1))
-    places = np.einsum("qk,fki->fqi", _POINTS_OF_FACE, corners).reshape(-1, 3)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    places, areas = _places_of_faces(points, faces)
+    weights, root = np.tile(_POINTS_OF_FACE, (len(faces), 1)), np.sqrt(areas)
     node = np.repeat(faces, len(_POINTS_OF_FACE), axis=0)
     slope = np.einsum("qki,qi->qk", _normals(points, faces)[node], _gradient(depth, places))
-    root = np.sqrt(np.repeat(areas, len(_POINTS_OF_FACE)))
     place = np.repeat(np.arange(len(places)), 3)
     entries = (root[:, None] * weights * slope).ravel()
     jacobian = scipy.sparse.csr_array((entries, (place, node.ravel())), (len(places), len(points)))

@@ -15,7 +15,7 @@ from bayesreg.distance import forbidden, signed_distance
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
 from bayesreg.io.domain import MeshError, domain_labels, labels_everywhere, mesh_domain
-from bayesreg.io.fitting import fit_to_surface, pull_inside
+from bayesreg.io.fitting import depth_of_region, fit_to_surface, pull_inside
 from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surface_files import read_dataset, save_dataset
@@ -132,7 +132,7 @@ def build_mesh(
     labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing, names), names)
     surfaces = tissue_surfaces(labels, options.edge_length, names)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
-    depth = signed_distance(forbidden(labels), options.edge_length)
+    depth = depth_of_region(labels, options.edge_length)
     skull_distance = None if intracranial is None else signed_distance(forbidden(intracranial))
     for attempt in range(1, options.attempts + 1):
         try:

@@ -6,6 +6,7 @@ from scipy.spatial import Delaunay
 
 from bayesreg.io import meshing
 from bayesreg.io.domain import MeshError
+from bayesreg.io.fitting import depth_of_region
 from bayesreg.io.loose_nodes import FEWEST, may_be_contracted, without_loose_nodes
 from bayesreg.io.quality import EDGES, check_topology
 from bayesreg.io.surfaces import depth_sizing
@@ -132,5 +133,6 @@ def test_no_mesh_of_a_brain_has_any(monkeypatch):
     monkeypatch.setattr(meshing, "tetrahedralize", lambda *_, **__: with_ears(BALL.points, BALL.cells))
     monkeypatch.setattr(meshing, "tissue_of_cells", lambda points, cells, labels: np.zeros(len(cells), int))
     labels, _ = balls(grid())
-    mesh = meshing._attempt(labels, BRAIN, [], depth_sizing(labels, 15.0, 30.0), None, meshing.MeshOptions())
+    sizing, depth = depth_sizing(labels, 15.0, 30.0), depth_of_region(labels, 15.0)
+    mesh = meshing._attempt(labels, BRAIN, [], sizing, depth, None, meshing.MeshOptions())
     assert (held_by(mesh) >= FEWEST).all()
