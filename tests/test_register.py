@@ -215,7 +215,7 @@ def test_a_surface_needs_no_images(register, tmp_path):
     assert lost.config.model.rigid_sd == 10.0
     assert "pose        looked for by the surface, each rigid motion to 10 mm (model.rigid_sd)" in lost.lines
     images = [Path(register.path(name)) for name in ("fixed", "moving")]
-    with pytest.raises(ValueError, match="unknown is for a surface without images"):
+    with pytest.raises(ValueError, match="unknown is for points and surfaces without images"):
         understand(*images, surface=points, overrides=["data.pose=unknown"])
 
 

@@ -66,8 +66,8 @@ class FilesData(Section):
     """Mask of the ignored part of the moving image, such as a cavity; not zero = ignored. On any grid, in its world."""
     pose: Literal["auto", "fixed", "unknown"] = "auto"
     """auto: if the headers do not align the images, a rigid motion is found first; fixed: the headers are used as they
-    are; unknown: without images, a surface is aligned from starts in all directions. The rigid part of the displacement
-    is sampled in all cases."""
+    are; unknown: without images, pairs of points are aligned, or a surface from starts in all directions. The rigid
+    part of the displacement is sampled in all cases."""
     same_contrast: StrictBool | None = None
     """true: both images have one contrast and one scale of intensities; false: the fixed image is compared through a
     map of its intensities; null: the program decides from the images."""
@@ -108,7 +108,7 @@ class FilesData(Section):
     @classmethod
     def _has_no_image(cls, pose: str, info: ValidationInfo) -> str:
         if pose == "unknown" and info.data.get("fixed") is not None:
-            raise ValueError("unknown is for a surface without images; expected auto, which looks for that of images")
+            raise ValueError("unknown is for points and surfaces without images; expected auto, which looks for a pose")
         return pose
 
     @field_validator("label_table")

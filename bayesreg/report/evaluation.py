@@ -35,7 +35,7 @@ def evaluation_table(study: Study) -> Table | None:
     rows = [
         [name, *(decimal_text(float(value)) for value in (x.mean(), np.median(x), np.quantile(x, 0.95), x.max()))]
         for name, x in {
-            "By the headers": np.asarray(predicted.evaluation_before)[inside],
+            "By the coordinates as given": np.asarray(predicted.evaluation_before)[inside],
             "By the pose alone": np.asarray(predicted.evaluation_posed)[inside],
             "By the posterior mean": after[inside],
         }.items()

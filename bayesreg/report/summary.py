@@ -67,9 +67,13 @@ def _pose(study: Study) -> str:
     if pose.is_identity:
         return "The organ deformed; before and after share one coordinate system."
     motion = pose.about(study.mesh.points.mean(axis=0))
+    if study.run.moving is None:
+        source = "from its coordinates at rest in those of the points"
+    else:
+        source = "from where the header of the moving image has it"
     return (
-        f"The organ lies {decimal_text(motion.millimetres, 1)} mm and {decimal_text(motion.degrees, 1)}° from where "
-        "the header of the moving image has it; it deformed besides."
+        f"The organ lies {decimal_text(motion.millimetres, 1)} mm and {decimal_text(motion.degrees, 1)}° {source}; it "
+        "deformed besides."
     )
 
 

@@ -13,6 +13,7 @@ import xarray as xr
 from bayesreg.mesh import TetMesh
 from bayesreg.printable import NONE, number
 from bayesreg.report.estimands import Estimand, above, parameter_groups, worst
+from bayesreg.tissues import label_of
 
 DEFAULT_THRESHOLD = 1.01
 LEAST_ESS = 100.0
@@ -265,7 +266,7 @@ def _locking(mesh: TetMesh, posterior: xr.Dataset) -> list[str]:
         nu = lam / (2 * (lam + mu)) if mu > 0 else 0.0
         if nu > NU_LOCKING:
             warnings.append(
-                f"Poisson’s ratio of {group.name} is {nu:.3f} at the medians (λ/μ = {number(lam / mu)}), above "
-                f"{NU_LOCKING}: linear tetrahedra lock near incompressibility, and the tissue moves too stiffly."
+                f"Poisson’s ratio of {label_of(group.name)} is {nu:.3f} at the medians (λ/μ = {number(lam / mu)}), "
+                f"above {NU_LOCKING}: linear tetrahedra lock near incompressibility, and the tissue moves too stiffly."
             )
     return warnings

@@ -1,4 +1,4 @@
-"""Match the moving image, or a measured surface, to the fixed image before the registration: pose and intensities."""
+"""Match the moving image, or measured points, to the fixed image before the registration: pose and intensities."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from bayesreg.config.data import FilesData
 from bayesreg.ignored import ignored_voxels
@@ -57,8 +58,8 @@ class MatchedImages(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
-class MatchedSurface(NamedTuple):
-    """The pose of a measured surface.
+class MatchedPoints(NamedTuple):
+    """The pose of pairs of points or of a measured surface.
 
     Attributes
     ----------
@@ -69,7 +70,7 @@ class MatchedSurface(NamedTuple):
 
     matching: Matching
     notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def match_images(
@@ -206,7 +207,7 @@ def _scaled(name: str, image: Image, domain: Image) -> Image:
 
 def match_surface(
     section: SurfaceSection, points: Float[np.ndarray, "k 3"], tissue: Image, names: Sequence[str]
-) -> MatchedSurface:
+) -> MatchedPoints:
     """Find the pose of a measured surface from starts in all directions; its points are world RAS, mm.
 
     Parameters
@@ -218,17 +219,41 @@ def match_surface(
     names : sequence of str
     """
     found = find_surface_pose(Surface(points, section.of, name=section.name), tissue, names)
-    motion = found.pose.inverse.about(points.mean(axis=0))
-    note = (
-        f"Pose: the organ lies {motion.millimetres:.1f} mm and {motion.degrees:.1f}° off the coordinates of "
-        f"{section.name}, as the best of {found.starts} starts says (data.pose: fixed keeps them)."
-    )
+    note = _describe_pose(found.pose, tissue, section.name, f"the best of {found.starts} starts of a rigid alignment")
     doubt = (
         f"{section.name}: another pose explains the points nearly as well (its log evidence is lower by "
-        f"{found.lead:.1f}): a part of a surface hardly tells the pose. Points with partners (--landmarks) would, or "
+        f"{found.lead:.1f}): a part of a surface hardly tells the pose. Pairs of points would (--landmarks), or "
         "navigated coordinates (data.pose: fixed)."
     )
-    return MatchedSurface(Matching(found.pose), (note,), (doubt,) if found.lead < CLEAR else ())
+    return MatchedPoints(Matching(found.pose), (note,), (doubt,) if found.lead < CLEAR else ())
+
+
+def match_pairs(
+    name: str, fixed: Float[np.ndarray, "k 3"], moving: Float[np.ndarray, "k 3"], tissue: Image
+) -> MatchedPoints:
+    """Find the pose of pairs of points by least squares, without start; they are world RAS, mm.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than three.
+    """
+    if len(fixed) < 3:
+        raise InputError(f"{name}: data.pose: unknown needs three pairs of points or more, got {len(fixed)}")
+    centres = fixed.mean(axis=0), moving.mean(axis=0)
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.align_vectors(moving - centres[1], fixed - centres[0])[0].as_matrix()
+    matrix[:3, 3] = centres[1] - matrix[:3, :3] @ centres[0]
+    pose = Pose(matrix)
+    return MatchedPoints(Matching(pose), (_describe_pose(pose, tissue, name, "least squares"),))
+
+
+def _describe_pose(pose: Pose, tissue: Image, name: str, source: str) -> str:
+    motion = pose.about(tissue.voxel_to_world(np.argwhere(np.asarray(tissue.voxels) != 0)).mean(axis=0))
+    return (
+        f"Pose: the coordinates of {name} are {motion.millimetres:.1f} mm and {motion.degrees:.1f}° from those of the "
+        f"organ, by {source} (data.pose: fixed takes them as they are)."
+    )
 
 
 def _find_pose(

@@ -38,7 +38,14 @@ from bayesreg.tissues import BRAIN_CLOSING
 from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.evaluation import NAME, require_unseen
-from bayesreg.workflow.matching import MatchedImages, MatchedSurface, match_channel, match_images, match_surface
+from bayesreg.workflow.matching import (
+    MatchedImages,
+    MatchedPoints,
+    match_channel,
+    match_images,
+    match_pairs,
+    match_surface,
+)
 from bayesreg.workflow.meshing import complete_lengths, mesh_of, size_of_organ
 from bayesreg.workflow.prediction import require_inside
 from bayesreg.workflow.simulated_pair import describe_pair, simulate_pair
@@ -100,8 +107,8 @@ def prepare(config: Config) -> Prepared:
     settings = complete_lengths(config.mesh, size)
     with ahead(starmap(mesh_of, [(anatomy, domain, settings)])) as meshing:
         matched = _match(config, anatomy, domain, fixed_ignore)
-        matched_surface = _match_surface(config, observed, tissue, anatomy.names)
-        appraisal = _appraise(config, anatomy, domain, matched or matched_surface)
+        matched_points = _match_points(config, observed, tissue, anatomy.names)
+        appraisal = _appraise(config, anatomy, domain, matched or matched_points)
         clock.lap("images")
     mesh = meshing.result()
     if settings.file is not None:
@@ -110,7 +117,7 @@ def prepare(config: Config) -> Prepared:
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
     if isinstance(config.data, FilesData):
-        matching = Matching() if (found := matched or matched_surface) is None else found.matching
+        matching = Matching() if (found := matched or matched_points) is None else found.matching
         boundary = _known_boundary(config, mesh, pose=matching.pose)
         inputs = Inputs(
             resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, observed=observed,
@@ -172,16 +179,19 @@ def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image 
     return match_images(data, config.image_options.similarity, domain, fixed, moving, fixed_ignore, moving_ignore)
 
 
-def _match_surface(
+def _match_points(
     config: Config, observed: Mapping[str, Arrays], tissue: Image, names: Sequence[str]
-) -> MatchedSurface | None:
-    """Find the pose of the first measured surface; None unless data.pose asks for it."""
+) -> MatchedPoints | None:
+    """Find the pose of the first pairs of points or, without them, of a surface; None unless data.pose asks for it."""
     if not (isinstance(config.data, FilesData) and config.data.pose == "unknown"):
         return None
     for section in config.observations:
+        if {"fixed", "moving"} <= set(arrays := observed.get(section.name, {})):
+            return match_pairs(section.name, np.asarray(arrays["fixed"]), np.asarray(arrays["moving"]), tissue)
+    for section in config.observations:
         if isinstance(section, SurfaceSection):
             return match_surface(section, observed[section.name]["points"], tissue, names)
-    raise InputError("data.pose: unknown needs a surface, which tells the pose (observations: {kind: surface})")
+    raise InputError("data.pose: unknown needs pairs of points or a surface, which tell the pose")
 
 
 def _skull(intracranial: Path | None) -> Image | None:
@@ -207,7 +217,7 @@ def with_held_out(observed: Mapping[str, Arrays], config: Config) -> dict[str, A
 
 
 def _appraise(
-    config: Config, anatomy: Anatomy, domain: Image, matched: MatchedImages | MatchedSurface | None
+    config: Config, anatomy: Anatomy, domain: Image, matched: MatchedImages | MatchedPoints | None
 ) -> Appraisal:
     """Appraise labels and images before the mesh is built."""
     if not (isinstance(matched, MatchedImages) and isinstance(config.data, FilesData)):
@@ -221,7 +231,7 @@ def _appraise(
     return _with_remarks(appraisal, matched)
 
 
-def _with_remarks(appraisal: Appraisal, matched: MatchedImages | MatchedSurface) -> Appraisal:
+def _with_remarks(appraisal: Appraisal, matched: MatchedImages | MatchedPoints) -> Appraisal:
     return appraisal._replace(notes=matched.notes, warnings=(*appraisal.warnings, *matched.warnings))
 
 

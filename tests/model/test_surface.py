@@ -173,7 +173,7 @@ def test_points_that_share_their_errors_count_as_few():
         ({"points": np.zeros((0, 3))}, "shape"),
         ({"points": np.zeros((3, 3))}, "10 points or more"),
         ({"points": [[1.0, 2.0, np.inf]] * 12}, "finite"),
-        ({"points": [[1.0, 2.0, 3.0]] * 12, "sd": -1.0}, "sd must be positive"),
+        ({"points": np.arange(36.0).reshape(12, 3), "sd": -1.0}, "sd must be positive"),
     ],
 )
 def test_wrong_surfaces_are_told(arguments, message):

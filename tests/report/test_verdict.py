@@ -144,8 +144,8 @@ def test_a_residual_that_fits_is_not():
 
 def test_locking_names_the_tissue_and_poissons_ratio():
     (text,) = warnings_of({}, box_mesh(), elastic([1.0, 10.0, 30.0], [1.0] * 3))
-    assert "Poisson’s ratio of wm is 0.484" in text
-    assert warnings_of({}, box_mesh(), elastic([30.0], [1.0]))[0].startswith("Poisson’s ratio of uniform")
+    assert "Poisson’s ratio of WM is 0.484" in text
+    assert warnings_of({}, box_mesh(), elastic([30.0], [1.0]))[0].startswith("Poisson’s ratio of the whole organ")
 
 
 def test_failed_solves_are_warned_of():

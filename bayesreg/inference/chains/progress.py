@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichProgress
+from rich.progress import TextColumn, TimeElapsedColumn
 
 from bayesreg.inference.draws.moments import greatest_rhat
 
@@ -54,7 +54,7 @@ class SamplingProgress(NoProgress):
         self._first: tuple[float, float] | None = None
         self._worst: list[tuple[int, float]] = []
         self._bar = RichProgress(
-            TextColumn("sampling"), BarColumn(bar_width=10), MofNCompleteColumn(), TextColumn("{task.fields[figures]}"),
+            TextColumn("{task.completed:.0f} draws"), TextColumn("{task.fields[figures]}"),
             TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
         )  # fmt: skip
         self._task = self._bar.add_task("sampling", total=draws, figures="compiling", left="")
@@ -67,7 +67,7 @@ class SamplingProgress(NoProgress):
         self._bar.stop()
 
     def show(self, checkpoint: Any, rhat: dict[str, Any]) -> None:
-        """Show the acceptance, inside the support, too, if it differs, the greatest R̂ and the time left."""
+        """Show the greatest R̂, the time left, and the acceptance: that inside the support, too, if both differ."""
         draws, seconds, tally = int(checkpoint.draws), float(checkpoint.seconds), checkpoint.tally
         if draws == 0:
             return

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
 from bayesreg.image import Image
@@ -90,6 +91,8 @@ class Surface:
             raise InputError(f"{name}: expected {FEWEST} points or more of shape (k, 3), got {self.points.shape}")
         if not np.isfinite(self.points).all():
             raise InputError(f"{name}: every coordinate must be a finite number")
+        if (distinct := len(np.unique(self.points, axis=0))) < FEWEST:
+            raise InputError(f"{name}: expected {FEWEST} different points or more, got {distinct}")
         self.prior = sd if isinstance(sd, ScalePrior) else None
         self.sd = sd.median if isinstance(sd, ScalePrior) else float(sd)
         if not (np.isfinite(self.sd) and self.sd > 0):
@@ -106,6 +109,7 @@ class Surface:
             If the mesh has no such tissue, or no point lies near it.
         """
         chosen = self._tissues(mesh.names)
+        self._require_near(mesh)
         grid = grid_around(mesh, self.points)
         if self.tissue is None:
             distance = distance_from_mesh(mesh, chosen[mesh.tissue], grid)
@@ -126,6 +130,15 @@ class Surface:
             independent_points=jnp.asarray(float(len(self.points))),
         )
         return Placed(self, term, {} if self.prior is None else {scale: scale_block(self.prior)})
+
+    def _require_near(self, mesh: TetMesh) -> None:
+        """Raise InputError if most points lie further from the organ than half of its size."""
+        away = float(np.median(cKDTree(mesh.points).query(self.points)[0]))
+        if away > np.ptp(mesh.points, axis=0).max() / 2:
+            raise InputError(
+                f"{self.name}: half of its points lie more than {away:.0f} mm away from the organ; are they in mm, and "
+                "in the coordinates of its image? data.pose: unknown aligns a surface of other coordinates"
+            )
 
     def mask(self, tissue: Image, names: Sequence[str]) -> Image:
         """Mark the tissues whose surface is meant, in labels that are 0 outside and 1 + index into the names inside."""

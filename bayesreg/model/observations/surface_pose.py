@@ -2,8 +2,8 @@
 
 A rigid motion takes the measured points y_k back to x_k = R (y_k − c) + c + t, about their centre c. These lie on the
 surface at rest up to errors of Student's t of scale s, which hold what the organ deforms, too. With the depth φ below
-the surface, the share κ of points that are independent, and a wide Normal prior of precision Λ for p = (t, rotation
-vector), iteratively reweighted least squares leads from each start to a mode of
+the surface, the share κ of points that are independent, and a wide Normal prior of precision Λ for p, the rotation
+vector and t less the shift that aligns the centres, reweighted least squares leads from each start to a mode of
 
 log p = κ Σ_k (log t_ν(φ(x_k) / s) − log s) − ½ pᵀ Λ p,
 
@@ -27,8 +27,8 @@ from bayesreg.pose import Pose
 
 # Degrees of freedom of the errors.
 FREEDOM = 4.0
-# Each start has one of 24 turns by right angles or one of so many others at random, the points where they are or their
-# centre at that of the organ, and at most so many points.
+# The number of random turns besides the 24 by right angles; each is tried with the points where they are, and with
+# their centre at that of the organ. And the greatest number of points that are used.
 TURNS, POINTS = 96, 200
 # The sd of the prior of the six motions: mm and radians.
 WIDE = np.repeat([100.0, 1.5], 3)
@@ -50,15 +50,12 @@ class SurfacePose(NamedTuple):
     ----------
     pose : Pose
         From the world of the fixed image to that of the points.
-    gain : float
-        Its log evidence less that of the pose to which the points lead from where they are; zero if it is this.
     lead : float
         Its log evidence less that of the next pose; infinite if there is no other.
     starts : int
     """
 
     pose: Pose
-    gain: float
     lead: float
     starts: int
 
@@ -81,23 +78,23 @@ def find_pose(surface: Surface, tissue: Image, names: Sequence[str]) -> SurfaceP
     depth = depth_in_mask(mask.with_voxels(np.asarray(mask.voxels, np.uint8)).on_orthogonal_grid(edges, 0), size / 2)
     inside = depth.voxel_to_world(np.argwhere(np.asarray(depth.voxels) > 0))
     turns = Rotation.concatenate([Rotation.create_group("O"), Rotation.random(TURNS, rng=np.random.default_rng(0))])
-    shifts = np.stack([np.zeros(3), inside.mean(axis=0) - centre])
-    # The group begins with no turn: the first start has the points as they are.
+    to_centre = inside.mean(axis=0) - centre
+    shifts = np.stack([np.zeros(3), to_centre])
     R, t = np.tile(turns.as_matrix(), (2, 1, 1)), np.repeat(shifts, len(turns), axis=0)
     scale = np.full((len(t), 1), np.ptp(y, axis=0).max())
-    modes = _improve(y - centre, centre, R, t, scale, depth, FIRST_SHARE, STEPS)
+    cloud = _Cloud(y - centre, centre, to_centre)
+    modes = _improve(cloud, R, t, scale, depth, FIRST_SHARE, STEPS)
     best = int(modes.evidence.argmax())
     # Neighbours share what the organ deforms.
     share = count_independent(modes.scores[best], modes.places[best]) / len(y)
-    modes = _improve(y - centre, centre, modes.R, modes.t, modes.scale, depth, share, LAST_STEPS)
+    modes = _improve(cloud, modes.R, modes.t, modes.scale, depth, share, LAST_STEPS)
     best = int(modes.evidence.argmax())
     distances = np.linalg.norm(modes.places - modes.places[best], axis=2).mean(axis=1)
     is_apart = distances > APART * np.ptp(y, axis=0).max()
-    gain = modes.evidence[best] - modes.evidence[0] if is_apart[0] else 0.0
     lead = modes.evidence[best] - modes.evidence[is_apart].max() if is_apart.any() else np.inf
     backward = np.eye(4)
     backward[:3, :3], backward[:3, 3] = modes.R[best], centre + modes.t[best] - modes.R[best] @ centre
-    return SurfacePose(Pose(backward).inverse, float(gain), float(lead), len(t))
+    return SurfacePose(Pose(backward).inverse, float(lead), len(t))
 
 
 class _Modes(NamedTuple):
@@ -125,9 +122,16 @@ class _Modes(NamedTuple):
     evidence: Float[np.ndarray, "starts"]
 
 
+class _Cloud(NamedTuple):
+    """Measured points relative to their centre, this centre, and the shift from it to that of the organ, all mm."""
+
+    away: Float[np.ndarray, "k 3"]
+    centre: Float[np.ndarray, "3"]
+    to_organ: Float[np.ndarray, "3"]
+
+
 def _improve(
-    away: Float[np.ndarray, "k 3"],
-    centre: Float[np.ndarray, "3"],
+    cloud: _Cloud,
     R: Float[np.ndarray, "starts 3 3"],
     t: Float[np.ndarray, "starts 3"],
     scale: Float[np.ndarray, "starts 1"],
@@ -135,15 +139,15 @@ def _improve(
     share: float,
     steps: int,
 ) -> _Modes:
-    """Take steps of iteratively reweighted least squares from poses of points, given relative to their centre."""
+    """Take steps of iteratively reweighted least squares from poses."""
     precision = np.diag(WIDE**-2.0)
     for _ in range(steps):
-        turned = np.einsum("sij,kj->ski", R, away)
-        places = turned + (centre + t)[:, None]
+        turned = np.einsum("sij,kj->ski", R, cloud.away)
+        places = turned + (cloud.centre + t)[:, None]
         phi, slope = _depth_and_slope(depth, places)
         weights = (FREEDOM + 1) / (FREEDOM + (phi / scale) ** 2) / scale**2
         J = np.concatenate([slope, np.cross(turned, slope)], axis=2)
-        p = np.concatenate([t, Rotation.from_matrix(R).as_rotvec()], axis=1)
+        p = np.concatenate([t - cloud.to_organ, Rotation.from_matrix(R).as_rotvec()], axis=1)
         H = share * np.einsum("ska,sk,skb->sab", J, weights, J, optimize=True) + precision
         pull = share * np.einsum("ska,sk->sa", J, weights * phi) + p @ precision
         log = -(FREEDOM + 1) / 2 * np.log1p((phi / scale) ** 2 / FREEDOM) - np.log(scale)
