@@ -68,6 +68,7 @@ def test_draws_are_of_the_exact_density(bend):
         assert error < 0.02
 
 
+@pytest.mark.long
 def test_a_chain_knows_the_exact_density_where_it_stands(monkeypatch):
     """With random loads, whose normaliser depends on hyperparameters that move alone, on few nodes treated as many."""
     monkeypatch.setattr("bayesreg.model.target.CHEAP_NODES", 0)

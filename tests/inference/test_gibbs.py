@@ -171,6 +171,7 @@ def test_weights_of_the_others_stay_when_a_point_is_left_out():
         np.testing.assert_allclose(np.linalg.inv(information[k]), expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.long
 def test_lam_has_the_posterior_of_a_quadrature():
     own, ones = posterior(NormalNoise(), sd=0.5, known_loads=True), jnp.ones(len(FIXED))
     marginal, u = marginal_of(own), estimands()["u_boundary"]

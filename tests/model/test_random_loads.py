@@ -98,6 +98,7 @@ def test_the_variance_of_a_point_keeps_its_size_where_the_mesh_is_refined(prior,
     assert growth[0] < variances[1] / variances[0] < growth[1]
 
 
+@pytest.mark.long
 def test_the_size_of_loads_and_stiffness_lie_where_their_evidence_is_greatest():
     """Points at all nodes make all else Gaussian: the evidence by dense linear algebra, rigid motions projected out."""
     sd, count = 0.2, 3 * len(MESH.points)

@@ -16,7 +16,7 @@ def test_every_sampler_has_a_section_whose_settings_it_takes():
         assert sampler_section(name).name == name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_comparison_from_a_file(folder, tmp_path, monkeypatch, capsys):  # noqa: F811
     out = tmp_path / "compared"
     options = ("--samplers", "rwmh", "--minutes", "0.2", "--set", "stop.max_steps=60")
