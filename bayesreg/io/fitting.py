@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from bayesreg.distance import distance_at, slope_at
 from bayesreg.image import Image
 from bayesreg.io.domain import MeshError
 from bayesreg.io.quality import mean_ratio
@@ -85,8 +86,7 @@ def fit_to_surface(mesh: TetMesh, depth: Image) -> TetMesh:
     faces = np.searchsorted(boundary, mesh.boundary_faces)
     for _ in range(FITS):
         points, before = mesh.points.copy(), _misfit(mesh.points[boundary], faces, depth)
-        step = np.clip(_step_to_surface(points[boundary], faces, depth), -greatest, greatest)
-        goal = points[boundary] + step[:, None] * _normals(points[boundary], faces)
+        goal = points[boundary] + _step_to_surface(points[boundary], faces, depth, greatest)
         _move(points, mesh, boundary, goal, FITTING_ROUNDS)
         if _misfit(points[boundary], faces, depth) > before:
             break
@@ -97,7 +97,7 @@ def fit_to_surface(mesh: TetMesh, depth: Image) -> TetMesh:
 def _misfit(points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"], depth: Image) -> float:
     """Compute the mean square depth of faces, mm²."""
     places, areas = _places_of_faces(points, faces)
-    return float(np.average(_sample(depth, places) ** 2, weights=areas))
+    return float(np.average(distance_at(depth, places) ** 2, weights=areas))
 
 
 def _places_of_faces(
@@ -111,19 +111,21 @@ def _places_of_faces(
 
 
 def _step_to_surface(
-    points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"], depth: Image
-) -> Float[np.ndarray, "nodes"]:
-    """Compute a_k, mm, for one step of Gauss–Newton."""
+    points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"], depth: Image, greatest: float
+) -> Float[np.ndarray, "nodes 3"]:
+    """Compute a_k n_k, mm, for one step of Gauss–Newton; each no longer than `greatest`."""
+    normals = _normals(points, faces)
     places, areas = _places_of_faces(points, faces)
     weights, root = np.tile(_POINTS_OF_FACE, (len(faces), 1)), np.sqrt(areas)
     node = np.repeat(faces, len(_POINTS_OF_FACE), axis=0)
-    slope = np.einsum("qki,qi->qk", _normals(points, faces)[node], _gradient(depth, places))
+    slope = np.einsum("qki,qi->qk", normals[node], slope_at(depth, places))
     place = np.repeat(np.arange(len(places)), 3)
     entries = (root[:, None] * weights * slope).ravel()
     jacobian = scipy.sparse.csr_array((entries, (place, node.ravel())), (len(places), len(points)))
     matrix = jacobian.T @ jacobian
     matrix += DAMPING * matrix.diagonal().mean() * scipy.sparse.eye_array(len(points))
-    return spsolve(matrix.tocsc(), -(jacobian.T @ (root * _sample(depth, places))))
+    a = spsolve(matrix.tocsc(), -(jacobian.T @ (root * distance_at(depth, places))))
+    return np.clip(a, -greatest, greatest)[:, None] * normals
 
 
 def _normals(points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces 3"]) -> Float[np.ndarray, "nodes 3"]:
@@ -155,7 +157,7 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
         If there is no allowed point, or a node cannot reach one.
     """
     points = mesh.points.copy()
-    moving = mesh.boundary[_sample(distance, points[mesh.boundary]) < gap]
+    moving = mesh.boundary[distance_at(distance, points[mesh.boundary]) < gap]
     if len(moving) == 0:
         return mesh
     goal = _allowed_places(distance, points[moving], gap)
@@ -172,11 +174,11 @@ def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: floa
     """Move points along the gradient of the distance until they are far enough from the skull."""
     start, points = points, points.copy()
     for _ in range(20):
-        value = _sample(distance, points)
+        value = distance_at(distance, points)
         near = value < gap
         if not near.any():
             return points
-        slope = _gradient(distance, points[near])
+        slope = slope_at(distance, points[near])
         steep = np.maximum((slope**2).sum(axis=1), 0.25)
         points[near] += slope * ((gap + MARGIN - value[near]) / steep)[:, None]
     # In a narrow gap of the skull the gradient leads from one side to the other and back.
@@ -191,17 +193,6 @@ def _nearest_allowed(distance: Image, points: Float[np.ndarray, "n 3"], gap: flo
         raise MeshError(f"the intracranial mask is nowhere thick enough for a gap of {gap:g} mm to the skull")
     centres = distance.voxel_to_world(np.argwhere(shell))
     return centres[cKDTree(centres).query(points)[1]]
-
-
-def _sample(distance: Image, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    return ndimage.map_coordinates(distance.voxels, distance.world_to_voxel(points).T, order=1, mode="nearest")
-
-
-def _gradient(distance: Image, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Compute the gradient by central differences over two voxels, which smooths the kinks of a voxelwise distance."""
-    step = distance.voxel_sizes.max() * np.eye(3)
-    ahead, behind = (np.stack([_sample(distance, points + sign * e) for e in step], axis=1) for sign in (1, -1))
-    return (ahead - behind) / (2 * step[0, 0])
 
 
 def _move(

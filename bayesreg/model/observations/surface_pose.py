@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from bayesreg.distance import distance_at, slope_at
 from bayesreg.image import Image
 from bayesreg.model.observations.level_set import depth_in_mask
 from bayesreg.model.observations.surface import Surface, count_independent
@@ -144,7 +144,7 @@ def _improve(
     for _ in range(steps):
         turned = np.einsum("sij,kj->ski", R, cloud.away)
         places = turned + (cloud.centre + t)[:, None]
-        phi, slope = _depth_and_slope(depth, places)
+        phi, slope = distance_at(depth, places), slope_at(depth, places)
         weights = (FREEDOM + 1) / (FREEDOM + (phi / scale) ** 2) / scale**2
         J = np.concatenate([slope, np.cross(turned, slope)], axis=2)
         p = np.concatenate([t - cloud.to_organ, Rotation.from_matrix(R).as_rotvec()], axis=1)
@@ -159,14 +159,3 @@ def _improve(
         # The scale of greatest likelihood, but for the weights.
         scale = np.sqrt((weights * scale**2 * phi**2).mean(axis=1, keepdims=True)) + LEAST_SCALE
     return modes
-
-
-def _depth_and_slope(
-    depth: Image, points: Float[np.ndarray, "starts k 3"]
-) -> tuple[Float[np.ndarray, "starts k"], Float[np.ndarray, "starts k 3"]]:
-    """Interpolate a depth, mm, and its gradient by central differences over two voxels."""
-    step = depth.voxel_sizes.max() * np.eye(3)
-    moved = np.stack([points, *(points + sign * each for each in step for sign in (1, -1))])
-    index = np.moveaxis(depth.world_to_voxel(moved), -1, 0)
-    values = ndimage.map_coordinates(np.asarray(depth.voxels), index, order=1, mode="nearest")
-    return values[0], np.moveaxis(values[1::2] - values[2::2], 0, -1) / (2 * step[0, 0])
