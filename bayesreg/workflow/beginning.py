@@ -74,7 +74,7 @@ def begin(
     searching = time.perf_counter()
     deadline = Deadline.after(max_seconds(config))
     if posterior.target.prepare_marginal is not None:
-        # The programs have the shapes of the Gaussian about the mode.
+        # The programs have the shapes of the Gaussian about the mode. The next call returns at once.
         posterior = temper(config, inputs, posterior)
     with ahead(_programs(config, posterior)):
         posterior = temper(config, inputs, posterior, deadline)
