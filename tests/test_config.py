@@ -237,7 +237,7 @@ def similar(settings):
         (SMALL + similar("temperature: hot"), 'similarity.temperature = "hot": expected a number or keys with values'),
         (SMALL + similar("temperature: {median: 0}"), "similarity.temperature.median = 0: expected greater than 0"),
         (SMALL + similar("kind: student_t, degrees_of_freedom: 2"), "degrees_of_freedom = 2: expected greater than 2"),
-        (SMALL + similar("kind: correlation"), "expected one of 'ssd', 'student_t', 'lncc', 'mi', 'mind'"),
+        (SMALL + similar("kind: correlation"), "expected one of 'ssd', 'student_t', 'lc2', 'lncc', 'mi', 'mind'"),
         (SMALL + similar("kind: mi, temperature: {median: 1}"), "expected a number"),
         (SMALL + similar("window_mm: 3"), "window_mm = 3: unknown key"),
         (SMALL + "observations: [{kind: images, similarity: lncc, intensity_map: 1}]", "which has maps of its own"),

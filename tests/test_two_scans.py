@@ -28,7 +28,7 @@ from bayesreg.report.slices import planes_through
 from bayesreg.results.slicer import slicer
 from bayesreg.tissues import BRAIN_EDGE, BRAIN_VOLUME
 from bayesreg.workflow.preparation import prepare
-from tests.io.test_alignment import FIXED, MASK, motion
+from tests.model.test_image_pose import FIXED, MASK, motion
 from tests.phantoms import ball_mesh
 
 POSE = motion(8.0, 8.0, seed=6)

@@ -66,8 +66,11 @@ class FilesData(Section):
     """Mask of the ignored part of the moving image, such as a cavity; not zero = ignored. On any grid, in its world."""
     pose: Literal["auto", "fixed", "unknown"] = "auto"
     """auto: if the headers do not align the images, a rigid motion is found first; fixed: the headers are used as they
-    are; unknown: without images, pairs of points are aligned, or a surface from starts in all directions. The rigid
-    part of the displacement is sampled in all cases."""
+    are; unknown: the headers say nothing, so that images, pairs of points or a surface are aligned from starts in all
+    directions. The rigid part of the displacement is sampled in all cases."""
+    pose_sd: tuple[Positive, Positive] = (10.0, 10.0)
+    """With pose auto, the sd of the prior of the motion between the headers of two images: mm along each axis for the
+    centre of the organ, and degrees about each axis."""
     same_contrast: StrictBool | None = None
     """true: both images have one contrast and one scale of intensities; false: the fixed image is compared through a
     map of its intensities; null: the program decides from the images."""
@@ -103,13 +106,6 @@ class FilesData(Section):
         if ignore is not None and "fixed" in info.data and info.data["fixed"] is None:
             raise ValueError("there is no image of which a part could be ignored; expected null")
         return ignore
-
-    @field_validator("pose")
-    @classmethod
-    def _has_no_image(cls, pose: str, info: ValidationInfo) -> str:
-        if pose == "unknown" and info.data.get("fixed") is not None:
-            raise ValueError("unknown is for points and surfaces without images; expected auto, which looks for a pose")
-        return pose
 
     @field_validator("label_table")
     @classmethod

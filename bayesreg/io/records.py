@@ -149,22 +149,31 @@ class Matching(NamedTuple):
         Whether both images have the same contrast.
     scale : IntensityScale or None
         The scale that maps the moving image's intensities to those of the model; None if no scale was applied.
+    in_patches : bool
+        Whether the contrasts are related patch by patch only, as those of MRI and ultrasound.
     """
 
     pose: Pose = Pose.identity()
     one_contrast: bool = True
     scale: IntensityScale | None = None
+    in_patches: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Convert the record to mappings and lists, for files."""
         pose = np.asarray(self.pose.matrix).tolist()
-        return {"pose": pose, "one_contrast": self.one_contrast, "scale": self.scale and list(self.scale)}
+        return {
+            "pose": pose,
+            "one_contrast": self.one_contrast,
+            "scale": self.scale and list(self.scale),
+            "in_patches": self.in_patches,
+        }
 
     @classmethod
     def of_json(cls, mapping: Mapping[str, Any]) -> Matching:
         """Create the record from the mapping of `as_json`."""
         scale = None if mapping["scale"] is None else IntensityScale(*mapping["scale"])
-        return cls(Pose(np.array(mapping["pose"])), bool(mapping["one_contrast"]), scale)
+        pose = Pose(np.array(mapping["pose"]))
+        return cls(pose, bool(mapping["one_contrast"]), scale, bool(mapping.get("in_patches", False)))
 
 
 class Channel(NamedTuple):

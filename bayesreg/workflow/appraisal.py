@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from bayesreg.image import Image
-from bayesreg.model.observations.images.contrast import explained_shares
+from bayesreg.model.observations.images.contrast import explained_shares, map_residual
+from bayesreg.model.observations.images.linear_combination import regression_at
+from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.tissues import is_fluid, label_of
 
 # The largest number of voxels that are compared, and the number of bins of each image in the joint histogram.
@@ -24,6 +27,11 @@ OFFSET = 0.5
 STRAIGHT = 0.8
 # A map that explains a smaller share of the variance does not show whether the contrasts are the same.
 UNLIKE = 0.02
+# Patches have maps of their own if one map explains a smaller share of the variance within them than the first, and
+# their own explain more than so many times as much.
+LITTLE, MUCH = 0.2, 1.5
+# The longest side of a patch within which the contrast may be one of its own, mm.
+PATCH = 10.0
 # Greater shares are reported: the share of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
 # Labels that fill a smaller share of the mask seem to show only a part of the organ.
@@ -76,6 +84,9 @@ class Likeness(NamedTuple):
     line_share, map_share : float
         The shares of the variance of the moving image that functions of the fixed image's intensities explain: a
         straight line (a negative share if the line falls), and the best map.
+    map_share_within, patch_share_within : float
+        The shares of the variance within patches of the moving image that the best map explains, and that the linear
+        combination of f and |∇f| of each patch explains.
     """
 
     correlation: float
@@ -85,11 +96,18 @@ class Likeness(NamedTuple):
     on_grid: float
     line_share: float = 0.0
     map_share: float = 0.0
+    map_share_within: float = 0.0
+    patch_share_within: float = 0.0
 
     @property
     def is_one_contrast(self) -> bool:
         """Whether a rising line explains nearly as much as any map does, or no map explains anything."""
         return self.map_share < UNLIKE or self.line_share >= STRAIGHT * self.map_share
+
+    @property
+    def is_related_in_patches(self) -> bool:
+        """Whether one map explains little of the variance within patches, and maps of their own explain more."""
+        return self.map_share_within < LITTLE and self.patch_share_within > MUCH * self.map_share_within
 
     @property
     def is_one_scale(self) -> bool:
@@ -185,13 +203,35 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
         return Likeness(0.0, 0.0, 1.0, 0.0, float(on_grid.mean()))
     correlation = float(np.corrcoef(fixed_values, moving_values)[0, 1])
     offset = (np.median(moving_values) - np.median(fixed_values)) / ranges[0]
-    information, shares = (
-        _mutual_information(fixed_values, moving_values),
-        explained_shares(fixed_values, moving_values),
-    )
     return Likeness(
-        correlation, information, float(ranges[1] / ranges[0]), float(offset), float(on_grid.mean()), *shares
+        correlation,
+        _mutual_information(fixed_values, moving_values),
+        float(ranges[1] / ranges[0]),
+        float(offset),
+        float(on_grid.mean()),
+        *explained_shares(fixed_values, moving_values),
+        *_shares_within_patches(fixed, places[on_grid], moving_values, map_residual(fixed_values, moving_values)),
     )
+
+
+def _shares_within_patches(
+    fixed: Image,
+    places: Float[np.ndarray, "points 3"],
+    moving_values: Float[np.ndarray, "points"],
+    left: Float[np.ndarray, "points"],
+) -> tuple[float, float]:
+    """Return the shares of the variance of m within patches that one map explains, and that f and |∇f| explain there.
+
+    A patch has its own coefficients, whose number is taken into account.
+    """
+    variance = moving_values.var()
+    regression = regression_at(places, fixed.interpolator("linear"), PATCH, variance)
+    weights = np.ones(len(places))
+    of_m, of_left = (regression.fit(Intensities(weights, jnp.asarray(m), weights)) for m in (moving_values, left))
+    spare = np.maximum(np.asarray(of_m.count) - 3, 1) / np.asarray(of_m.count)
+    whole, after_map = float(of_m.whole @ (1 / of_m.count)), float(of_left.whole @ (1 / of_left.count))
+    after_patches = float((of_m.left / of_m.count / spare) @ np.ones(len(places)))
+    return max(1 - after_map / whole, 0.0), max(1 - after_patches / whole, 0.0)
 
 
 def measure_tissues(tissue: Image, domain: Image, names: tuple[str, ...]) -> dict[str, tuple[float, float]]:

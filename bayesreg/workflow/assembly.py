@@ -13,7 +13,7 @@ from jaxtyping import Float
 from bayesreg.config import Config
 from bayesreg.image import Image
 from bayesreg.inference.chains.initialise import Start
-from bayesreg.io.alignment import find_demons
+from bayesreg.io.demons import find_demons
 from bayesreg.io.displacements import read_start
 from bayesreg.io.records import Inputs
 from bayesreg.mesh import TetMesh

@@ -10,12 +10,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
 
 from bayesreg.ahead import ahead
 from bayesreg.config import Config, resolved_yaml
 from bayesreg.config.data import BrainWebData, FilesData
 from bayesreg.distance import forbidden
 from bayesreg.fem.location import transfer
+from bayesreg.ignored import find_filling
 from bayesreg.image import Image, robust_scale
 from bayesreg.io import store
 from bayesreg.io.agreement import require_agreement
@@ -39,8 +41,10 @@ from bayesreg.types import InputError
 from bayesreg.workflow.appraisal import Appraisal, appraise
 from bayesreg.workflow.evaluation import NAME, require_unseen
 from bayesreg.workflow.matching import (
+    FoundPose,
     MatchedImages,
     MatchedPoints,
+    find_image_pose,
     match_channel,
     match_images,
     match_pairs,
@@ -100,13 +104,15 @@ def prepare(config: Config) -> Prepared:
     if anatomy.intracranial is not None:
         anatomy = anatomy._replace(intracranial=without_ridges(anatomy.intracranial))
     clock.lap("anatomy")
+    scans = _read_scans(config, anatomy)
+    if scans is not None and scans.found is not None:
+        anatomy = _within_view(anatomy, scans)
     size = size_of_organ(config, anatomy)
     domain = mesh_domain(anatomy.tissue, anatomy.intracranial, size * BRAIN_CLOSING, anatomy.names)
     tissue = _as_stored(domain_labels(anatomy.tissue, domain, anatomy.names))
-    fixed_ignore = None if anatomy.image is None else _ignored(config, "fixed", anatomy.image)
     settings = complete_lengths(config.mesh, size)
     with ahead(starmap(mesh_of, [(anatomy, domain, settings)])) as meshing:
-        matched = _match(config, anatomy, domain, fixed_ignore)
+        matched = None if scans is None else _match(config, scans, domain)
         matched_points = _match_points(config, observed, tissue, anatomy.names)
         appraisal = _appraise(config, anatomy, domain, matched or matched_points)
         clock.lap("images")
@@ -121,15 +127,15 @@ def prepare(config: Config) -> Prepared:
         boundary = _known_boundary(config, mesh, pose=matching.pose)
         inputs = Inputs(
             resolved_yaml(config), mesh, None, None, tissue, skull, boundary=boundary, observed=observed,
-            fixed_ignore=fixed_ignore, matching=matching,
+            matching=matching,
         )  # fmt: skip
         if matched is not None:
-            ignored = matched.moving_ignore
             inputs = inputs._replace(
                 fixed=_as_stored(matched.fixed),
                 moving=_as_stored(matched.moving),
-                moving_ignore=None if ignored is None else _as_stored(ignored),
-                channels=_channels(config, domain, matched, fixed_ignore),
+                channels=_channels(config, domain, matched),
+                fixed_ignore=_mask_as_stored(matched.fixed_ignore),
+                moving_ignore=_mask_as_stored(matched.moving_ignore),
             )
         return Prepared(inputs, clock.laps, {}, appraisal)
     assert anatomy.image is not None
@@ -144,14 +150,14 @@ def prepare(config: Config) -> Prepared:
     return Prepared(inputs, clock.laps, describe_pair(config, pair), appraisal)
 
 
-def _channels(config: Config, domain: Image, matched: MatchedImages, fixed_ignore: Image | None) -> dict[str, Channel]:
+def _channels(config: Config, domain: Image, matched: MatchedImages) -> dict[str, Channel]:
     """Match the pairs of images after the first, by their names."""
     assert isinstance(config.data, FilesData)
     channels = {}
     for section in config.pairs_of_images:
         if section.fixed is not None and section.moving is not None:
             images = load_image(section.fixed), load_image(section.moving)
-            channel = match_channel(config.data, domain, matched, section.name, *images, fixed_ignore)
+            channel = match_channel(config.data, domain, matched, section.name, *images)
             fixed, moving = _as_stored(channel.fixed), _as_stored(channel.moving)
             channels[section.name] = channel._replace(fixed=fixed, moving=moving)
     return channels
@@ -169,21 +175,70 @@ def _ignored(config: Config, which: Literal["fixed", "moving"], image: Image) ->
     return _as_stored(mask)
 
 
-def _match(config: Config, anatomy: Anatomy, domain: Image, fixed_ignore: Image | None) -> MatchedImages | None:
-    """Match the moving image of a pair from files to the fixed image; None without such a pair."""
+class _Scans(NamedTuple):
+    """A pair of images from files, with the masks of their ignored voxels, each in its own world.
+
+    Attributes
+    ----------
+    fixed, moving : Image
+    fixed_ignore, moving_ignore : Image or None
+    found : FoundPose or None
+        The pose, if the organ is what both images show: it is then needed before all else.
+    """
+
+    fixed: Image
+    moving: Image
+    fixed_ignore: Image | None
+    moving_ignore: Image | None
+    found: FoundPose | None = None
+
+
+def _read_scans(config: Config, anatomy: Anatomy) -> _Scans | None:
+    """Read the pair of images from files; None without such a pair."""
     data = config.data
     if not isinstance(data, FilesData) or data.moving is None or anatomy.image is None:
         return None
     fixed, moving = anatomy.image, load_image(data.moving)
-    moving_ignore = _ignored(config, "moving", moving)
-    return match_images(data, config.image_options.similarity, domain, fixed, moving, fixed_ignore, moving_ignore)
+    scans = _Scans(fixed, moving, _ignored(config, "fixed", fixed), _ignored(config, "moving", moving))
+    if data.labels is not None or data.intracranial is not None or config.mesh.file is not None:
+        return scans
+    view = _within_view(anatomy, scans).tissue
+    return scans._replace(found=find_image_pose(data, view, *scans[:4]))
+
+
+def _within_view(anatomy: Anatomy, scans: _Scans) -> Anatomy:
+    """Return the part of an organ that the moving image shows, by the pose that was found, or else by the headers.
+
+    Raises
+    ------
+    InputError
+        If it shows nothing of it.
+    """
+    pose = Pose.identity() if scans.found is None else scans.found.pose
+    shown = ~find_filling(scans.moving)
+    view = pose.aligned(scans.moving.with_voxels(shown.astype(np.uint8)))
+    voxels = np.asarray(anatomy.tissue.voxels)
+    parts, count = ndimage.label((voxels != 0) & (view.nearest(anatomy.tissue.grid_points()) != 0))
+    if not count:
+        raise InputError(
+            "the moving image shows nothing of the organ, where the headers place both; check that they show the same "
+            "place, or give a mask of the organ (labels) and data.pose: unknown"
+        )
+    largest = np.bincount(parts.ravel())[1:].argmax() + 1
+    return anatomy._replace(tissue=anatomy.tissue.with_voxels(np.where(parts == largest, voxels, 0)))
+
+
+def _match(config: Config, scans: _Scans, domain: Image) -> MatchedImages:
+    """Match the moving image of a pair from files to the fixed image."""
+    assert isinstance(config.data, FilesData)
+    return match_images(config.data, config.image_options.similarity, domain, *scans)
 
 
 def _match_points(
     config: Config, observed: Mapping[str, Arrays], tissue: Image, names: Sequence[str]
 ) -> MatchedPoints | None:
     """Find the pose of the first pairs of points or, without them, of a surface; None unless data.pose asks for it."""
-    if not (isinstance(config.data, FilesData) and config.data.pose == "unknown"):
+    if not (isinstance(config.data, FilesData) and config.data.pose == "unknown") or config.data.moving is not None:
         return None
     for section in config.observations:
         if {"fixed", "moving"} <= set(arrays := observed.get(section.name, {})):
@@ -323,6 +378,10 @@ def _anatomy(config: Config) -> Anatomy:
     if isinstance(data, BrainWebData):
         return brainweb(data.labels, data.t1, data.intracranial_labels)
     return mni152()
+
+
+def _mask_as_stored(mask: Image | None) -> Image | None:
+    return None if mask is None else _as_stored(mask)
 
 
 def _as_stored(image: Image) -> Image:

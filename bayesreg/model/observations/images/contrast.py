@@ -89,9 +89,14 @@ def explained_shares(
         sign if the line falls, and the share that splines of `predictor` explain.
     """
     correlation = float(np.corrcoef(predictor, response)[0, 1])
-    functions = np.stack([spline(predictor) for spline in _splines(predictor)], axis=1)
-    left = response - functions @ _fit(functions, response)
+    left = map_residual(predictor, response)
     return correlation * abs(correlation), float(max(1 - left.var() / response.var(), 0.0))
+
+
+def map_residual(predictor: Float[np.ndarray, "points"], response: Float[np.ndarray, "points"]) -> np.ndarray:
+    """Return what the best map by splines of the intensities `predictor` leaves of the intensities `response`."""
+    functions = np.stack([spline(predictor) for spline in _splines(predictor)], axis=1)
+    return response - functions @ _fit(functions, response)
 
 
 def _function_images(fixed: Image, positions: Float[np.ndarray, "points 3"], tissue: Image | None) -> Iterator[Image]:

@@ -167,6 +167,16 @@ class ComparedImages(NamedTuple):
         """Return −∂E_s/∂x at every point x_q + u(x_q): the force of the images there."""
         return _scores(self, u, dict(values))
 
+    def information_share(self, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
+        """Return the expected curvature over the mean square of the scores; one if m has no noise of its own.
+
+        The gradient of the noise of m adds to the variance of the scores, and tells nothing about the displacement.
+        """
+        if self.similarity.expected_slope(self.compared(self.places(u), values)) is None:
+            return 1.0
+        curvature = self.gauss_newton(u, values).matrices.trace(axis1=1, axis2=2).sum() / self.independent_share
+        return float(curvature * self.temperature(values) ** 2 / (self.scores(u, values) ** 2).sum())
+
     def with_independent_points(self, count: float) -> ComparedImages:
         """Return the term with the likelihood tempered to this number of independent points."""
         return self._replace(independent_share=jnp.asarray(count / len(self.positions)))
@@ -264,7 +274,7 @@ def _gauss_newton(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: V
     displaced_points = term.places(u)
     pair = term.compared(displaced_points, values)
     convexity = term.similarity.convexity(pair, term.temperature(values))
-    return _chain(term, convexity, _slope(term, displaced_points), term.temperature(values))
+    return _chain(term, convexity, _expected_slope(term, displaced_points, pair), term.temperature(values))
 
 
 @jax.jit
@@ -277,8 +287,9 @@ def _remainder(term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Valu
     ]
     pair = term.compared(displaced_points, values)
     first = jax.grad(similarity.energy)(pair, t_similarity).moving
-    second = _subtract(similarity.curvature(pair, t_similarity), similarity.convexity(pair, t_similarity))
-    curvature = _chain(term, second, slope(displaced_points), t_similarity)
+    exact = _chain(term, similarity.curvature(pair, t_similarity), slope(displaced_points), t_similarity)
+    expected_slope = _expected_slope(term, displaced_points, pair)
+    curvature = _subtract(exact, _chain(term, similarity.convexity(pair, t_similarity), expected_slope, t_similarity))
     bent = first[:, None, None] * jnp.stack(columns, axis=-1)
     return curvature._replace(matrices=curvature.matrices + term.independent_share / t_similarity * bent)
 
@@ -295,14 +306,20 @@ def _chain(
     return PointCurvature(term.nodes, term.quadrature.barycentric, matrices, shared)
 
 
-def _subtract(minuend: ValueCurvature, subtrahend: ValueCurvature) -> ValueCurvature:
+def _subtract(minuend: PointCurvature, subtrahend: PointCurvature) -> PointCurvature:
     """Subtract one curvature from another; both have the same groups, or neither has groups."""
-    diagonal = minuend.diagonal - subtrahend.diagonal
+    matrices = minuend.matrices - subtrahend.matrices
     if minuend.shared is None or subtrahend.shared is None:
-        return ValueCurvature(diagonal)
+        return minuend._replace(matrices=matrices)
     vectors = jnp.concatenate([minuend.shared.vectors, subtrahend.shared.vectors])
     signs = jnp.concatenate([minuend.shared.signs, -subtrahend.shared.signs])
-    return ValueCurvature(diagonal, SharedCurvature(minuend.shared.groups, vectors, signs))
+    return minuend._replace(matrices=matrices, shared=SharedCurvature(minuend.shared.groups, vectors, signs))
+
+
+def _expected_slope(term: ComparedImages, places: AnyArray, pair: Intensities) -> AnyArray:
+    """Return the gradient of m without its noise, as f predicts it; else ∇m, as if m had none."""
+    expected_slope = term.similarity.expected_slope(pair)
+    return _slope(term, places) if expected_slope is None else expected_slope
 
 
 def _slope(term: ComparedImages, places: AnyArray) -> AnyArray:

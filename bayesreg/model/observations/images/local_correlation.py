@@ -28,6 +28,7 @@ import scipy.sparse
 from jaxtyping import Float, Int
 
 from bayesreg.fem.operators import SparseOperator, sparse_operator
+from bayesreg.interpolation import Interpolator
 from bayesreg.model.observations.images.pointwise import (
     Intensities,
     SimilaritySettings,
@@ -165,6 +166,10 @@ class WindowCorrelation(NamedTuple):
         noise = jax.random.normal(key, scale.shape) / scale
         return scale * self.residuals(pair._replace(fixed=noise, share=None))
 
+    def expected_slope(self, pair: Intensities) -> None:
+        """Return None; see `Similarity`."""
+        return
+
     def of_one_point(self) -> SumOfSquaredDifferences:
         """Return Gaussian noise, the noise of one point."""
         return SumOfSquaredDifferences()
@@ -225,7 +230,7 @@ class LocalCorrelation(SimilaritySettings):
     """Longest side of a window, mm, within which one affine map should relate the contrasts. Where the quadrature has
     few points, windows are as much larger as to hold 16."""
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> WindowCorrelation:
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> WindowCorrelation:
         """Make the similarity at these points; see `AnySimilarity`.
 
         Raises

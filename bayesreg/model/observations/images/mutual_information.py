@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from bayesreg.interpolation import Interpolator
 from bayesreg.model.observations.images.pointwise import (
     Intensities,
     SimilaritySettings,
@@ -128,6 +129,10 @@ class JointInformation(NamedTuple):
         scale = jnp.sqrt(self.temperature / (2 * pair.weights))
         return (drawn - conditional @ centres / conditional.sum(axis=1)) / scale
 
+    def expected_slope(self, pair: Intensities) -> None:
+        """Return None; see `Similarity`."""
+        return
+
     def of_one_point(self) -> SumOfSquaredDifferences:
         """Return Gaussian noise, the noise of one point."""
         return SumOfSquaredDifferences()
@@ -162,7 +167,7 @@ class MutualInformation(SimilaritySettings):
     temperature: Positive = 0.05
     """Temperature of the likelihood, a number: there is no noise of which it could be inferred."""
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> JointInformation:
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> JointInformation:
         """Make the similarity at these points; see `AnySimilarity`.
 
         Raises

@@ -35,7 +35,7 @@ class ImageOptions(Section):
 
     similarity: Annotated[AnySimilarity, Field(discriminator="kind"), BeforeValidator(by_kind)] = SquaredDifferences()
     """The similarity, and with it the noise and its temperature T_s: ssd, student_t, or for images of unlike contrast
-    lncc, mi or mind."""
+    lc2 (ultrasound), lncc, mi or mind."""
     interpolation: Interpolation = "linear"
     """Interpolation of the images; cubic where gradients are used."""
     quadrature: Literal["gauss4", "gauss32", "gauss256", "voxels"] = "gauss4"
@@ -79,7 +79,7 @@ def with_preset(preset: str, options: Mapping[str, Any]) -> dict[str, Any]:
             kind = similarity.get("kind", usual["kind"])
             if kind in OF_ANY_CONTRAST:
                 chosen.pop("intensity_map", None)
-            # Mutual information has no noise to infer.
-            temperature = {} if kind == "mi" else {key: usual[key] for key in ("temperature",) if key in usual}
+            # These have no noise to infer from all points together.
+            temperature = {} if kind in ("mi", "lc2") else {key: usual[key] for key in ("temperature",) if key in usual}
             options = {**options, "similarity": {"kind": kind, **temperature, **similarity}}
     return {**chosen, **options}

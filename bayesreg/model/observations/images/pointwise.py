@@ -13,6 +13,7 @@ from jaxtyping import Float
 from pydantic import Field
 from scipy import stats
 
+from bayesreg.interpolation import Interpolator
 from bayesreg.model.term import SharedCurvature
 from bayesreg.settings import KnownOrInferred, Section
 from bayesreg.types import AnyArray, Scalar
@@ -107,6 +108,10 @@ class Pointwise(ABC):
     @abstractmethod
     def draw(self, key: AnyArray, pair: Intensities) -> Float[AnyArray, "points"]:
         """Draw residuals from the model, in units of their scales."""
+
+    def expected_slope(self, pair: Intensities) -> None:
+        """Return None; see `Similarity`."""
+        return
 
     def of_one_point(self: Same) -> Same:
         """Return the similarity itself: its points are independent."""
@@ -206,6 +211,8 @@ class SimilaritySettings(Section):
 
     serves_any_contrast: ClassVar[bool] = False
     compares_descriptors: ClassVar[bool] = False
+    # Whether the gradient of m is mostly that of its noise.
+    has_noisy_slopes: ClassVar[bool] = False
     # E_s in the report, and the description of its residual if that is not f − m(x + u).
     formula: ClassVar[str]
     residual: ClassVar[str] = ""
@@ -223,7 +230,9 @@ class SquaredDifferences(SimilaritySettings):
 
     kind: Literal["ssd"] = "ssd"
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> SumOfSquaredDifferences:
+    def on(
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator
+    ) -> SumOfSquaredDifferences:
         """Make the similarity at these points; see `AnySimilarity`."""
         return SumOfSquaredDifferences()
 
@@ -247,6 +256,6 @@ class StudentT(SimilaritySettings):
         """Return Student's t, see `SimilaritySettings.noise`."""
         return f"Student’s t with ν = {self.degrees_of_freedom:g}", stats.t(self.degrees_of_freedom)
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> StudentTNoise:
+    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> StudentTNoise:
         """Make the similarity at these points; see `AnySimilarity`."""
         return StudentTNoise(jnp.asarray(self.degrees_of_freedom))

@@ -74,6 +74,16 @@ class PreparedPair:
         """Return functions, besides a shading, whose amounts may differ between m and f, smoothed by sd, mm."""
         return np.zeros((len(positions), 0))
 
+    def compared_at(
+        self, positions: Float[np.ndarray, "points 3"], weights: Float[AnyArray, "points"]
+    ) -> dict[str, Any]:
+        """Return the images at all quadrature points and their similarity, by their names in `ComparedImages`."""
+        moving, fixed_values = self.moving_function(), self.fixed_at(positions)
+        rest = Intensities(fixed_values, moving(jnp.asarray(positions)), weights)
+        fixed = self.fixed.interpolator(self.options.interpolation)
+        similarity = self.options.similarity.on(positions, rest, fixed)
+        return {"moving": moving, "fixed_values": fixed_values, "similarity": similarity}
+
     def compared_points(self, mesh: TetMesh) -> Any:
         """Return the quadrature points that are compared.
 
@@ -92,22 +102,24 @@ class PreparedPair:
         """Place the pair on a mesh; see `ImagePair.on`."""
         quadrature, options = self.compared_points(mesh), self.options
         positions = quadrature.positions(mesh)
-        smooth = self._smoothed_by_options()
-        moving, fixed_values = smooth.moving_function(), smooth.fixed_at(positions)
-        rest = Intensities(fixed_values, moving(jnp.asarray(positions)), quadrature.weights)
+        compared = self._smoothed_by_options().compared_at(positions, quadrature.weights)
         term = ComparedImages(
             comparison=Comparison(self.name, is_inferred(options.similarity.temperature), self.temperature_name),
-            similarity=options.similarity.on(positions, rest),
-            fixed_values=fixed_values,
-            moving=moving,
+            **compared,
             quadrature=quadrature,
             nodes=jnp.asarray(mesh.cells[np.asarray(quadrature.cells)]),
             positions=jnp.asarray(positions),
             independent_share=jnp.asarray(_independent_share(self.name, options, len(positions))),
-            shading=self._shading(np.asarray(fixed_values), positions),
+            shading=self._shading(np.asarray(compared["fixed_values"]), positions),
             visible=None if self.moving_ignore is None else visibility(self.moving, self.moving_ignore),
         )
-        return Placed(self, term, self._blocks(term))
+        blocks = self._blocks(term)
+        if self.is_tempered_by_residuals and options.similarity.has_noisy_slopes:
+            # A search without tempering would follow the noise.
+            values = {self.temperature_name: blocks[self.temperature_name].reference()}
+            count = self.count_independent_points(term, jnp.zeros(mesh.points.shape), values)
+            term = term.with_independent_points(count)
+        return Placed(self, term, blocks)
 
     @property
     def temperature_name(self) -> str:
@@ -191,7 +203,7 @@ class PreparedPair:
     def smoothed_term(self, term: ComparedImages, sd: float) -> ComparedImages:
         """Return the term with further smoothed images, sd in mm."""
         smooth = self._smoothed_by_options().smoothed(sd)
-        return term._replace(moving=smooth.moving_function(), fixed_values=smooth.fixed_at(np.asarray(term.positions)))
+        return term._replace(**smooth.compared_at(np.asarray(term.positions), term.quadrature.weights))
 
     @property
     def is_tempered_by_residuals(self) -> bool:
@@ -201,7 +213,8 @@ class PreparedPair:
     def count_independent_points(self, term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
         """Count the independent quadrature points, from the residuals at these values (see `independent_scores`)."""
         voxels = np.rint(self.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
-        return independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
+        count = independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
+        return max(count * term.information_share(u, values), 1.0)
 
 
 @dataclass(frozen=True, eq=False)

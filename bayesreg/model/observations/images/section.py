@@ -16,6 +16,9 @@ from bayesreg.model.observations.section import Arrays, Name, ObservationSection
 from bayesreg.settings import FoundImage
 from bayesreg.types import InputError
 
+# The options of images whose contrasts are related patch by patch only.
+IN_PATCHES: Mapping[str, Any] = {"similarity": {"kind": "lc2"}, "intensity_map": None}
+
 
 class ImagesSection(ObservationSection, ImageOptions):
     """The pair of images of the section data, or, with a name and files, another pair of the same two visits, such as
@@ -50,7 +53,8 @@ class ImagesSection(ObservationSection, ImageOptions):
             raise InputError("the run compares images, and its folder holds none: inputs/fixed.nii.gz is missing")
         images = inputs.fixed, inputs.moving, self.name, inputs.fixed_ignore, inputs.moving_ignore
         if self.name == "images":
-            return [ImagePair(*images, inputs.matching.one_contrast, inputs.tissue, **self.options)]
+            options = {**self.options, **(IN_PATCHES if inputs.matching.in_patches else {})}
+            return [ImagePair(*images, inputs.matching.one_contrast, inputs.tissue, **options)]
         channel = inputs.channels[self.name]
         tissue = channel.fixed.with_voxels(inputs.tissue.nearest(channel.fixed.grid_points()))
         return [ImagePair(channel.fixed, channel.moving, *images[2:], channel.one_contrast, tissue, **self.options)]

@@ -111,6 +111,8 @@ class SelfSimilarity(SimilaritySettings):
 
     kind: Literal["mind"] = "mind"
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities) -> SumOfSquaredDifferences:
+    def on(
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator
+    ) -> SumOfSquaredDifferences:
         """Make the similarity at these points; see `AnySimilarity`."""
         return SumOfSquaredDifferences()

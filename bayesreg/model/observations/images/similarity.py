@@ -6,6 +6,7 @@ from typing import Protocol, get_args
 
 from jaxtyping import Float
 
+from bayesreg.model.observations.images.linear_combination import LinearCombination
 from bayesreg.model.observations.images.local_correlation import LocalCorrelation
 from bayesreg.model.observations.images.mutual_information import MutualInformation
 from bayesreg.model.observations.images.pointwise import (
@@ -40,6 +41,9 @@ class Similarity(Protocol):
     def curvature(self, pair: Intensities, temperature: Scalar) -> ValueCurvature:
         """Return the curvature of E_s in the values m_q."""
 
+    def expected_slope(self, pair: Intensities) -> Float[AnyArray, "points 3"] | None:
+        """Return the gradient of m that f predicts, without that of the noise of m; None where it predicts none."""
+
     def variance(self) -> Scalar:
         """Return the mean of the residuals' variances in units of their squared scales."""
 
@@ -50,8 +54,10 @@ class Similarity(Protocol):
         """Return the noise of a single point."""
 
 
-AnySimilarity = SquaredDifferences | StudentT | LocalCorrelation | MutualInformation | SelfSimilarity
-"""The settings of a similarity. Its method `on(positions, rest)` makes the `Similarity` at some points (q, 3), mm, of
-images with the `Intensities` `rest` there where nothing has moved."""
+AnySimilarity = (
+    SquaredDifferences | StudentT | LinearCombination | LocalCorrelation | MutualInformation | SelfSimilarity
+)
+"""The settings of a similarity. Its method `on(positions, rest, fixed)` makes the `Similarity` at some points (q, 3),
+mm, of images with the `Intensities` `rest` there where nothing has moved; f is the function `fixed`."""
 
 SIMILARITIES = {settings.model_fields["kind"].default: settings for settings in get_args(AnySimilarity)}
