@@ -77,7 +77,7 @@ FoundImage = Annotated[Path, BeforeValidator(_find_image)]
 
 
 class ScalePrior(Section):
-    """Log-normal prior of a positive number, such as a temperature or the standard deviation of an error.
+    """Log-normal prior of a positive number, such as a temperature, the sd of an error, λ or μ.
 
     Attributes
     ----------

@@ -20,8 +20,8 @@ class Tissue(NamedTuple):
     colour : str
         The colour of the tissue in figures.
     is_fluid : bool
-        Whether the tissue has almost no stiffness. A fluid starts at λ = μ = 0.01 and fills the space that other
-        tissues leave; its stiffness is not of interest.
+        Whether the tissue has almost no stiffness. A fluid fills the space that other tissues leave; its stiffness is
+        not of interest.
     has_unit_mu : bool
         Whether the default fixes the μ of this tissue at 1.
     """
@@ -30,6 +30,21 @@ class Tissue(NamedTuple):
     colour: str
     is_fluid: bool = False
     has_unit_mu: bool = False
+
+
+class Stiffness(NamedTuple):
+    """The usual stiffness of a tissue. The medians of its default priors follow from it.
+
+    Attributes
+    ----------
+    mu : float
+        μ relative to that of most solid tissue.
+    ratio : float
+        λ/μ, which is 2ν / (1 − 2ν) for a Poisson's ratio ν.
+    """
+
+    mu: float = 1.0
+    ratio: float = 12.0
 
 
 # The presets by name, in small letters. The colours differ in hue and in lightness, so that colour-blind readers and
@@ -54,9 +69,23 @@ BRAIN_EDGE, BRAIN_CLOSING, BRAIN_GAP = 15.5, 8.0, 0.5
 # The volume of solid tissue in Colin27, mm³. The lengths for other organs are proportional to their size.
 BRAIN_VOLUME = 1.583e6
 
-# The default λ and μ of a solid (the literature's λ/μ is about 24), and the default value of both for a fluid.
+# The λ and μ of a solid at the start (the literature's λ/μ is about 24), and the value of both for a fluid, if their
+# priors have no median.
 SOLID = {"lam": 10.0, "mu": 1.0}
 FLUID = 0.01
+
+# The usual stiffness by a word in the name of the tissue; all other tissues have that of a solid. The literature for
+# each is in docs/model.md, "Priors of stiffness". A fluid stands for what leaves its place, and so does the air of a
+# lung: both change their volume easily.
+STIFFNESS: Mapping[str, Stiffness] = {
+    **dict.fromkeys(("csf", "fluid"), Stiffness(mu=0.05, ratio=1.0)),
+    **dict.fromkeys(("lung", "lungs"), Stiffness(ratio=1.0)),
+    **dict.fromkeys(("tumour", "tumor", "lesion", "enhancing"), Stiffness(mu=1.5)),
+}
+# The standard deviations of log μ and of log(λ/μ) in the default priors. A solid has its Poisson's ratio in
+# [0.3, 0.495] with a probability of 98 %.
+MU_LOG_SD, RATIO_LOG_SD = 0.7, 0.9
+
 # The name in a label table of everything outside the organ.
 BACKGROUND = "background"
 # The name of the only tissue of an organ without labels.
@@ -88,8 +117,13 @@ def tissue_of_unit_mu(names: Sequence[str]) -> str:
     return next(preset, next((name for name in names if not is_fluid(name)), names[0]))
 
 
+def usual_stiffness(name: str) -> Stiffness:
+    """Return the usual stiffness of a tissue by the first word of its name that tells it; else that of a solid."""
+    return next((STIFFNESS[word] for word in name.lower().split("_") if word in STIFFNESS), Stiffness())
+
+
 def usual_value(parameter: str, name: str) -> float:
-    """Return the default λ ("lam") or μ ("mu") of a tissue."""
+    """Return the λ ("lam") or μ ("mu") of a tissue at the start, if its prior has no median."""
     return FLUID if is_fluid(name) else SOLID[parameter]
 
 

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from bayesreg.config import Config, ConfigError, load_config, model_of, resolved_yaml, schema
 from bayesreg.model.observations.images.options import ImageOptions, with_preset
 from bayesreg.model.options import ModelConfig
+from bayesreg.settings import ScalePrior
 from bayesreg.types import InputError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -103,7 +104,7 @@ data: {source: mni152}
 simulate: {kind: calibrated, direction: [1, 2, 3], lam: {csf: 1e-6, gm: 10, wm: 3e1}}
 model:
   elastic_prior: {held: {12: [0, 0, -1.5]}, nodes: [1, 2, 3]}
-  priors: {lam: {gm: {alpha: 2, beta: 3, low: 0, high: 60}}, mu: {high: .inf}}
+  priors: {lam: {gm: {alpha: 2, beta: 3, low: 0, high: 60}, wm: {median: 9, log_sd: 0.5}}, mu: {high: .inf}}
 start: {field: truth, fraction: 0.5, lam: {csf: 1, gm: 10, wm: 20}}
 stop: {rhat: null, max_minutes: 1}
 report: {places: {left ventricle: [-12, 3.5, 20]}}
@@ -113,6 +114,7 @@ report: {places: {left ventricle: [-12, 3.5, 20]}}
     assert load_config(write(resolved_yaml(config), "resolved.yaml")) == config
     assert config.start.fraction == (0.5, 0.5)
     assert config.model.priors["mu"].high == math.inf
+    assert config.model.priors["lam"]["wm"] == ScalePrior(median=9.0, log_sd=0.5)
     assert math.hypot(*config.simulate.direction) == pytest.approx(1)
     assert "max_minutes: 1.0" in resolved_yaml(config)
     assert "rhat: null" in resolved_yaml(config)
@@ -231,6 +233,9 @@ def similar(settings):
             "model.elastic_prior.normalised = true: expected false with known_boundary",
         ),
         (SMALL + "model: {priors: {lam: {low: 3, high: 2}}}", 'model.priors.lam = {"low": 3, "high": 2}: a prior'),
+        (SMALL + "model: {priors: {lam: {medain: 3, log_sd: 1}}}", "lam.medain = 3: unknown key; did you mean median?"),
+        (SMALL + "model: {priors: {lam: {gm: {median: 3, low: 1}}}}", ": a prior is log-normal (median, log_sd) or"),
+        (SMALL + "model: {priors: {lam: {gm: {median: -3}}}}", "priors.lam.gm.median = -3: expected greater than 0"),
         (SMALL.replace("paper", "paper, direction: [0, 0, 0]"), "simulate.direction = [0, 0, 0]: expected a direction"),
         (SMALL.replace("paper", "paper, making_edge_length: 9"), "simulate.making_edge_length = 9: unknown key"),
         (SMALL.replace("paper", "calibrated, making_edge_length: 20"), "expected less than mesh.edge_length, 15.5 mm"),

@@ -38,11 +38,11 @@ class StartConfig(Section):
     fraction: Range = (0.0, 1.0)
     """The chains start at fractions of the field that are evenly spaced from the first to the second value."""
     lam: Positive | ByTissue | None = None
-    """First Lamé parameter, for all tissues or by tissue; null is 10, in a fluid 0.01. Fixed parameters keep their
-    value."""
+    """First Lamé parameter, for all tissues or by tissue; null is the median of a log-normal prior, else 10, in a fluid
+    0.01. Fixed parameters keep their value."""
     mu: Positive | ByTissue | None = None
-    """Second Lamé parameter, for all tissues or by tissue; null is 1, in a fluid 0.01. Fixed parameters keep their
-    value."""
+    """Second Lamé parameter, for all tissues or by tissue; null is the median of a log-normal prior, else 1, in a fluid
+    0.01. Fixed parameters keep their value."""
     spread: NotNegative = 0.1
     """Standard deviation, between chains, of the logarithm of the Lamé parameters at the start."""
 

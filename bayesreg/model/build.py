@@ -47,8 +47,9 @@ def build_posterior(
         Nonzero voxels, and points off its grid, are forbidden. None: no constraint.
     reference : mapping, optional
         "lam" and "mu" (all entries) where the interior solve is preconditioned and chains start. They are also the
-        scales of the coordinates of parameters without an upper bound. Values near the posterior save time. Default:
-        `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01 for a fluid.
+        scales of the coordinates of parameters with a flat prior without an upper bound. Values near the posterior save
+        time. Default: the median of a log-normal prior, else `bayesreg.tissues.usual_value`: λ = 10, μ = 1, and 0.01
+        for a fluid.
 
     Returns
     -------

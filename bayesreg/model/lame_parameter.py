@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from bayesreg.model.priors import RangeTransform, ScaledBeta
+from bayesreg.model.priors import Entries, MixedPrior, RangeTransform, ScaledBeta
 from bayesreg.types import AnyArray, Scalar
 
-
-@jax.tree_util.register_static
-class FreeEntries:
-    """The sampled entries of a block. They are static because shapes depend on them.
-
-    Parameters
-    ----------
-    is_free : (entries,) bool array
-    """
-
-    def __init__(self, is_free: Bool[np.ndarray, "entries"]) -> None:
-        self.is_free = np.asarray(is_free, bool)
-        self.index: Int[np.ndarray, "free"] = np.flatnonzero(self.is_free)
-        self._key = self.is_free.tobytes()
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, FreeEntries) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
+# All but 1e-9 of a log-normal prior lies below the value of this Normal score.
+GREATEST_SCORE = 6.0
 
 
 class LameParameter(NamedTuple):
@@ -42,14 +24,19 @@ class LameParameter(NamedTuple):
     Attributes
     ----------
     alpha, beta, low, high : (entries,) arrays
-        Parameters of the scaled Beta prior of each entry.
+        Parameters of the scaled Beta prior of each entry; of a log-normal entry those of the flat prior of all positive
+        numbers.
     log_beta : (entries,) array
         log B(α, β).
-    free : FreeEntries
+    median, log_sd : (entries,) arrays
+        Parameters of the log-normal prior of each entry; 1 for the other entries.
+    log_normal : Entries
+        The entries with a log-normal prior.
+    free : Entries
         The entries that are sampled.
     at_rest : (entries,) array
-        The known value, or the value at which the interior solve is preconditioned and chains may start. Without an
-        upper bound, it is also the scale of the coordinate.
+        The known value, or the value at which the interior solve is preconditioned and chains may start. For a flat
+        prior without an upper bound, it is also the scale of the coordinate.
     """
 
     alpha: Float[AnyArray, "entries"]
@@ -57,18 +44,23 @@ class LameParameter(NamedTuple):
     low: Float[AnyArray, "entries"]
     high: Float[AnyArray, "entries"]
     log_beta: Float[AnyArray, "entries"]
-    free: FreeEntries
+    median: Float[AnyArray, "entries"]
+    log_sd: Float[AnyArray, "entries"]
+    log_normal: Entries
+    free: Entries
     at_rest: Float[AnyArray, "entries"]
 
     @property
     def is_sampled(self) -> bool:
         """Whether any entry is unknown; see `Block`."""
-        return bool(self.free.is_free.any())
+        return bool(self.free.is_in.any())
 
     def prior(self) -> dist.Distribution:
         """Return the prior p(λ) or p(μ) of the sampled entries; known entries have no density."""
-        beta = ScaledBeta(self.alpha, self.beta, self.low, self.high, self.log_beta)
-        return beta.mask(self.free.is_free).to_event(1)
+        prior: dist.Distribution = ScaledBeta(self.alpha, self.beta, self.low, self.high, self.log_beta)
+        if self.log_normal.is_in.any():
+            prior = MixedPrior(prior, self.median, self.log_sd, self.log_normal)
+        return prior.mask(self.free.is_in).to_event(1)
 
     def draw(self, name: str) -> AnyArray:
         """Draw the parameter in a NumPyro program; see `Block`."""
@@ -78,6 +70,14 @@ class LameParameter(NamedTuple):
         """Return the reference values, `at_rest`."""
         return jnp.asarray(self.at_rest)
 
+    def bounds(self) -> tuple[float, float]:
+        """Return the least value of any entry and the greatest: of the prior, or the known ones if none is sampled."""
+        if not self.is_sampled:
+            return float(np.min(self.at_rest)), float(np.max(self.at_rest))
+        likely = np.asarray(self.median) * np.exp(GREATEST_SCORE * np.asarray(self.log_sd))
+        high = np.where(self.log_normal.is_in, likely, self.high)
+        return float(np.min(self.low)), float(high.max())
+
     def complete(self, estimand: AnyArray) -> AnyArray:
         """Return all entries, including the known ones."""
         return jnp.asarray(self.at_rest).at[self.free.index].set(estimand)
@@ -86,34 +86,61 @@ class LameParameter(NamedTuple):
         """Return the sampled entries of a value."""
         return jnp.asarray(value, float)[..., self.free.index]
 
-    @property
-    def transform(self) -> RangeTransform:
-        """The map from the real line to the sampled entries."""
-        index = self.free.index
-        low, high, scale = (jnp.asarray(x)[index] for x in (self.low, self.high, self.at_rest))
-        return RangeTransform(low, high, scale)
-
     def constrain(self, position: AnyArray) -> tuple[AnyArray, Scalar]:
         """Map Normal scores to λ or μ."""
-        to_range = self.transform
-        estimand = to_range(position)
-        return estimand, to_range.log_abs_det_jacobian(position, estimand).sum()
+        to_range, (median, log_sd) = self._to_range, self._of_log_normal
+        estimand = self._by_kind(lambda: median * jnp.exp(log_sd * position), lambda: to_range(position))
+        log_jacobian = self._by_kind(
+            lambda: jnp.log(median * log_sd) + log_sd * position,
+            lambda: to_range.log_abs_det_jacobian(position, estimand),
+        )
+        return estimand, log_jacobian.sum()
 
     def unconstrain(self, estimand: AnyArray) -> AnyArray:
         """Map λ or μ to Normal scores."""
-        return self.transform.inv(estimand)
+        to_range, (median, log_sd) = self._to_range, self._of_log_normal
+        # A branch that is not taken must still have a finite gradient.
+        positive = jnp.where(self._is_log_normal, estimand, 1.0)
+        return self._by_kind(lambda: jnp.log(positive / median) / log_sd, lambda: to_range.inv(estimand))
 
     def least_curvature(self, position: AnyArray) -> AnyArray:
         """Return one, the curvature of a Normal score, or less for a large score without an upper bound.
 
-        Without an upper bound, λ and μ grow as scale · z²/2 for large scores z. The curvature in log λ or log μ does
-        not depend on the scale, and is one.
+        With a flat prior without an upper bound, λ and μ grow as scale · z²/2 for large scores z. The curvature in
+        log λ or log μ does not depend on the scale, and is one.
         """
-        to_range = self.transform
-        x = to_range(position)
-        growth = jnp.exp(to_range.log_abs_det_jacobian(position, x)) / (x - to_range.low)
-        return jnp.where(jnp.isinf(to_range.high), jnp.minimum(growth, 1.0) ** 2, 1.0)
+        to_range = self._to_range
+
+        def of_range() -> AnyArray:
+            x = to_range(position)
+            growth = jnp.exp(to_range.log_abs_det_jacobian(position, x)) / (x - to_range.low)
+            return jnp.where(jnp.isinf(to_range.high), jnp.minimum(growth, 1.0) ** 2, 1.0)
+
+        return self._by_kind(lambda: jnp.ones_like(position), of_range)
 
     def allows(self, value: AnyArray) -> Bool[AnyArray, ""]:
         """Check whether the sampled entries lie in [low, high]."""
-        return (~self.free.is_free | ((value >= self.low) & (value <= self.high))).all()
+        return (~self.free.is_in | ((value >= self.low) & (value <= self.high))).all()
+
+    @property
+    def _to_range(self) -> RangeTransform:
+        """The map from the real line to the sampled entries with a scaled Beta prior."""
+        index = self.free.index
+        low, high, scale = (jnp.asarray(x)[index] for x in (self.low, self.high, self.at_rest))
+        return RangeTransform(low, high, scale)
+
+    @property
+    def _of_log_normal(self) -> tuple[Float[AnyArray, "free"], Float[AnyArray, "free"]]:
+        """The medians and log-sds of the sampled entries."""
+        return jnp.asarray(self.median)[self.free.index], jnp.asarray(self.log_sd)[self.free.index]
+
+    @property
+    def _is_log_normal(self) -> Bool[np.ndarray, "free"]:
+        return self.log_normal.is_in[self.free.index]
+
+    def _by_kind(self, log_normal: Callable[[], AnyArray], others: Callable[[], AnyArray]) -> AnyArray:
+        """Choose between two arrays by the prior of every sampled entry; an array that no entry takes is not made."""
+        chosen = self._is_log_normal
+        if not chosen.any():
+            return others()
+        return log_normal() if chosen.all() else jnp.where(chosen, log_normal(), others())

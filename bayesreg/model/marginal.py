@@ -192,7 +192,7 @@ class Marginalisation:
             return None
         is_small = 3 * len(mesh.points) <= MOST_UNKNOWNS
         is_small &= 3 * _count_points(problem) <= MOST_COORDINATES
-        is_bounded = all(np.isfinite(_range(problem, name)).all() for name in LAME)
+        is_bounded = all(np.isfinite(problem.blocks[name].bounds()).all() for name in LAME)
         return cls(problem, mesh, start) if is_small and is_bounded else None
 
     @property
@@ -272,7 +272,7 @@ class Marginalisation:
             entries = np.asarray(self.problem.body.cell_entry)
             return FactorisedResponse(self.mesh, entries, rigid, masses, interpolation, point_algebra.side_by_side)
         mu = float(np.asarray(self.problem.blocks["mu"].reference())[0])
-        return SpectralResponse(self.mesh, rigid, masses, interpolation, mu, _range(self.problem, "lam"))
+        return SpectralResponse(self.mesh, rigid, masses, interpolation, mu, self.problem.blocks["lam"].bounds())
 
 
 def has_one_tissue(problem: Problem) -> bool:
@@ -297,10 +297,3 @@ def unknowns_of(nodes: Int[np.ndarray, "n"]) -> Int[np.ndarray, "unknowns"]:
 
 def _count_points(problem: Problem) -> int:
     return sum(len(term.shift) for term in points_of(problem))
-
-
-def _range(problem: Problem, name: str) -> tuple[float, float]:
-    """Return the least λ or μ, and the greatest, that the priors allow; both are the known one if none is sampled."""
-    block = problem.blocks[name]
-    low, high = (block.low, block.high) if block.is_sampled else (block.reference(),) * 2
-    return float(np.asarray(low).min()), float(np.asarray(high).max())

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from bayesreg.model.elastic.boltzmann import Boltzmann
 from bayesreg.model.elastic.loads import RandomLoads
 from bayesreg.model.field import FieldConfig
-from bayesreg.settings import NotNegative, Positive, Section, by_kind, is_inferred, wrong
-from bayesreg.tissues import tissue_of_unit_mu
+from bayesreg.settings import NotNegative, Positive, ScalePrior, Section, by_kind, is_inferred, wrong
+from bayesreg.tissues import MU_LOG_SD, RATIO_LOG_SD, is_fluid, tissue_of_unit_mu, usual_stiffness
 
 # Names of blocks and other sites of the program. No observation may use them.
 TAKEN = (
@@ -53,14 +53,38 @@ class PriorConfig(Section):
         return self
 
 
+# The prior of λ or μ: log-normal, or a scaled Beta.
+LamePrior = PriorConfig | ScalePrior
+
+
+def _require_one_kind(prior: Any) -> Any:
+    if isinstance(prior, Mapping) and {"median", "log_sd"} & set(prior) and set(PriorConfig.model_fields) & set(prior):
+        raise ValueError(
+            "a prior is log-normal (median, log_sd) or a Beta prior of a range (alpha, beta, low, high), not both"
+        )
+    return prior
+
+
+def _kind_of_prior(prior: Any) -> str:
+    """Tell which kind of prior is meant, so that errors are those of this kind alone."""
+    if isinstance(prior, ScalePrior) or (isinstance(prior, Mapping) and {"median", "log_sd"} & set(prior)):
+        return "log_normal"
+    is_range = isinstance(prior, Mapping) and set(PriorConfig.model_fields) & set(prior)
+    is_tissues = isinstance(prior, Mapping) and not is_range
+    return "by_tissue" if is_tissues else "scaled_beta"
+
+
+_OneKind = BeforeValidator(_require_one_kind)
+_ScaledBeta = Annotated[PriorConfig, Tag("scaled_beta")]
+_LogNormal = Annotated[ScalePrior, Tag("log_normal")]
+_PriorOfTissue = Annotated[_ScaledBeta | _LogNormal, Discriminator(_kind_of_prior), _OneKind]
+_ByTissue = Annotated[dict[str, _PriorOfTissue], Tag("by_tissue")]
+_PriorOfAll = Annotated[_ScaledBeta | _LogNormal | _ByTissue, Discriminator(_kind_of_prior), _OneKind]
+
 # The options of each preset by its name. Options that the user gives replace them.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
-    "registration": {
-        "elastic_prior": {"kind": "loads"},
-        "priors": {"lam": {"high": 100.0}, "mu": {"high": 20.0}},
-        "least_volume": 0.1,
-    },
+    "registration": {"elastic_prior": {"kind": "loads"}, "least_volume": 0.1},
 }
 
 
@@ -87,8 +111,10 @@ class ModelConfig(Section):
         element of that tissue), or ``{"mu": 1.0}`` for all entries of μ. The default fixes μ of one tissue
         (`bayesreg.tissues.tissue_of_unit_mu`) at 1, uniform: μ at 1; the scale of λ, μ is not identified otherwise.
     priors : mapping
-        A prior for each of "lam", "mu", or one for each tissue: ``{"lam": {"liver": PriorConfig(high=60)}}``;
-        what is not named has the flat prior on [0, ∞).
+        A prior for each of "lam", "mu", or one for each tissue, log-normal or a scaled Beta:
+        ``{"mu": {"tumour": ScalePrior(median=3, log_sd=0.5)}, "lam": PriorConfig(high=60)}``. What is not named has,
+        with preset "paper", the flat prior on [0, ∞); with "registration" a log-normal one about the usual stiffness
+        of its tissue (`with_default_priors`).
     elastic_prior : Boltzmann or RandomLoads
         The prior of the displacements: exp(−E_r / T_r), eq. (12), of the nodes that it names; or equilibrium with
         random loads, K u = q in place of eq. (7), of all nodes, which depends much less on the mesh.
@@ -108,7 +134,7 @@ class ModelConfig(Section):
     elasticity: Literal["tissue", "uniform", "element", "field"] = "tissue"
     field: FieldConfig | None = None
     fixed: dict[Lame, Positive | dict[str, Positive]] | None = None
-    priors: dict[Lame, PriorConfig | dict[str, PriorConfig]] = Field(default={})
+    priors: dict[Lame, _PriorOfAll] = Field(default={})
     elastic_prior: Annotated[Boltzmann | RandomLoads, Field(discriminator="kind"), BeforeValidator(_require_tagged)] = (
         Boltzmann()
     )
@@ -166,14 +192,50 @@ class ModelConfig(Section):
         elastic = self.elastic_prior
         case = "a given boundary" if elastic.samples_no_node else f"elastic_prior: {elastic.kind}, normalised,"
         needed = elastic.normalised or elastic.samples_no_node
+        priors = self.with_default_priors(tissues).priors
         for name, tissue in product(get_args(Lame), tissues if needed else ()):
-            prior = of_tissue(self, self.priors.get(name), tissue) or PriorConfig()
-            if math.isinf(prior.high) and of_tissue(self, fixed.get(name), tissue) is None:
+            prior = of_tissue(self, priors.get(name), tissue) or PriorConfig()
+            is_flat = isinstance(prior, PriorConfig) and math.isinf(prior.high)
+            if is_flat and of_tissue(self, fixed.get(name), tissue) is None:
                 raise wrong(
                     f"priors.{name}",
-                    f"{case} needs a prior with a finite high (r2) for every free parameter, and {name} of "
-                    f"{tissue} has none: the posterior would be improper",
+                    f"{case} needs a prior with a finite high (r2), or a log-normal one, for every free parameter, and "
+                    f"{name} of {tissue} has none: the posterior would be improper",
                 )
+
+    def with_default_priors(self, tissues: Sequence[str]) -> ModelConfig:
+        """Return the model with a prior for λ and μ of all of these tissues; a given prior stays.
+
+        With preset "registration", μ of a tissue is log-normal about its usual value, relative to a tissue whose μ is
+        known, and λ about its usual multiple of μ (`bayesreg.tissues.STIFFNESS`). With "paper" nothing is added: what
+        has no prior is flat.
+        """
+        if self.preset == "paper":
+            return self
+        priors: dict[Lame, Any] = {**self.priors}
+        for name in get_args(Lame):
+            given = priors.get(name) or {}
+            if self.elasticity == "uniform":
+                priors[name] = given or self._default_prior(name, tissue_of_unit_mu(tissues), tissues)
+            elif isinstance(given, Mapping):
+                defaults = {tissue: self._default_prior(name, tissue, tissues) for tissue in tissues}
+                priors[name] = {**defaults, **given}
+        return self.model_copy(update={"priors": priors})
+
+    def _default_prior(self, name: Lame, tissue: str, tissues: Sequence[str]) -> ScalePrior:
+        usual, known = usual_stiffness(tissue), self.known(tissues).get("mu")
+        # Usual values are relative: one known μ tells the unit of all, preferably that of a solid.
+        known_by_tissue = {other: of_tissue(self, known, other) for other in sorted(tissues, key=is_fluid)}
+        unit = next((mu / usual_stiffness(other).mu for other, mu in known_by_tissue.items() if mu is not None), 1.0)
+        given = of_tissue(self, self.priors.get("mu"), tissue)
+        of_mu = given if isinstance(given, ScalePrior) else ScalePrior(median=unit * usual.mu, log_sd=MU_LOG_SD)
+        if name == "mu":
+            return of_mu
+        mu = known_by_tissue[tissue]
+        median, log_sd = (of_mu.median, of_mu.log_sd) if mu is None else (mu, 0.0)
+        # λ and μ are independent, and λ/μ varies as much where μ is known as where it is not.
+        log_sd = math.sqrt(RATIO_LOG_SD**2 - min(log_sd, MU_LOG_SD) ** 2)
+        return ScalePrior(median=usual.ratio * median, log_sd=log_sd)
 
     def known(self, tissues: Sequence[str]) -> Mapping[Lame, Any]:
         """Return `fixed`, or its default for these tissues."""

@@ -1,4 +1,4 @@
-"""Priors of the Lamé parameters: Beta distributions scaled to [r1, r2] (section 3.1 of the paper)."""
+"""Priors of the Lamé parameters: Beta distributions scaled to [r1, r2] (section 3.1 of the paper), or log-normal."""
 
 from __future__ import annotations
 
@@ -8,11 +8,32 @@ import numpy as np
 import numpyro.distributions as dist
 from jax.scipy.special import betaln, erfc, ndtri, xlog1py, xlogy
 from jax.scipy.stats import norm
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpyro.distributions import constraints
 from numpyro.distributions.transforms import Transform, biject_to
 
 from bayesreg.types import AnyArray
+
+
+@jax.tree_util.register_static
+class Entries:
+    """Some entries of a block. They are static because shapes and programs depend on them.
+
+    Parameters
+    ----------
+    is_in : (entries,) bool array
+    """
+
+    def __init__(self, is_in: Bool[np.ndarray, "entries"]) -> None:
+        self.is_in = np.asarray(is_in, bool)
+        self.index: Int[np.ndarray, "chosen"] = np.flatnonzero(self.is_in)
+        self._key = self.is_in.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Entries) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
 
 class _Range(constraints.Constraint):
@@ -199,3 +220,50 @@ class ScaledBeta(dist.Distribution):
         if np.any(np.isinf(self.high)):
             raise NotImplementedError("a flat prior on [low, inf) cannot be sampled; give a finite high")
         return self.low + (self.high - self.low) * dist.Beta(self.alpha, self.beta).sample(key, sample_shape)
+
+
+class MixedPrior(dist.Distribution):
+    """Log-normal priors of some entries, scaled Beta priors of the others.
+
+    Parameters
+    ----------
+    beta : ScaledBeta
+        The scaled Beta priors; that of a log-normal entry is the flat one of positive numbers.
+    median, log_sd : arrays
+        The medians of log-normal numbers, in the unit of the parameter, and the standard deviations of their
+        logarithms; any positive numbers for the other entries.
+    log_normal : Entries
+        The entries with a log-normal prior.
+    """
+
+    arg_constraints = {"median": constraints.positive, "log_sd": constraints.positive}  # noqa: RUF012
+    pytree_data_fields = ("beta", "median", "log_sd")
+    pytree_aux_fields = ("log_normal",)
+
+    def __init__(self, beta: ScaledBeta, median: AnyArray, log_sd: AnyArray, log_normal: Entries) -> None:
+        self.beta, self.median, self.log_sd, self.log_normal = beta, median, log_sd, log_normal
+        super().__init__(batch_shape=jnp.shape(median), validate_args=False)
+
+    @constraints.dependent_property(is_discrete=False, event_dim=0)
+    def support(self) -> _Range:
+        """The support: all positive numbers for a log-normal entry."""
+        return self.beta.support
+
+    def log_prob(self, value: Float[AnyArray, "*entries"]) -> Float[AnyArray, "*entries"]:
+        """Return log p(value) of every entry; −∞ outside the range."""
+        chosen = self.log_normal.is_in
+        # A branch that is not taken must still have a finite gradient.
+        log = jnp.log(jnp.where(chosen & (value > 0), value, 1.0))
+        log_normal = norm.logpdf(log, jnp.log(self.median), self.log_sd) - log
+        return self.beta.log_prob(value) + jnp.where(chosen, log_normal, 0.0)
+
+    def sample(self, key: AnyArray, sample_shape: tuple[int, ...] = ()) -> AnyArray:
+        """Draw from a proper prior."""
+        chosen, (key_beta, key_normal) = self.log_normal.is_in, jax.random.split(key)
+        positive = self.median * jnp.exp(
+            self.log_sd * jax.random.normal(key_normal, (*sample_shape, *self.batch_shape))
+        )
+        if chosen.all():
+            return positive
+        bounded = ScaledBeta(self.beta.alpha, self.beta.beta, self.beta.low, jnp.where(chosen, 1.0, self.beta.high))
+        return jnp.where(chosen, positive, bounded.sample(key_beta, sample_shape))

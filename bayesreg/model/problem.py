@@ -32,24 +32,30 @@ from bayesreg.model.elastic.barrier import Barrier
 from bayesreg.model.elastic.rigid import RigidPrior
 from bayesreg.model.elastic.skull import Skull, SoftSkull, is_allowed
 from bayesreg.model.field import StiffnessField, stiffness_field
-from bayesreg.model.lame_parameter import FreeEntries, LameParameter
+from bayesreg.model.lame_parameter import LameParameter
 from bayesreg.model.observations.observation import Placed, place
 from bayesreg.model.options import (
     FieldConfig,
     Lame,
+    LamePrior,
     ModelConfig,
     PriorConfig,
     is_reserved_name,
     of_tissue,
 )
+from bayesreg.model.priors import Entries
 from bayesreg.model.program import Problem
 from bayesreg.model.state import Body, StaticMesh
 from bayesreg.model.term import Terms
+from bayesreg.settings import ScalePrior
 from bayesreg.tissues import SOLID, usual_value
 from bayesreg.types import AnyArray, InputError
 
 # The elastic solve affects E_s to first order, so its tolerance is smaller than the solver's default.
 TOLERANCE = 1e-10
+
+# In place of the other kind of prior, an entry has a flat one of positive numbers, or a log-normal one without effect.
+POSITIVE, UNUSED = PriorConfig(low=float(np.finfo(float).tiny)), ScalePrior(median=1.0)
 
 
 def problem_of(
@@ -268,24 +274,30 @@ def lame_parameter(
         different values, or the reference has the wrong shape or sign.
     """
     entries = {"uniform": 1, "element": len(mesh.cells)}.get(model.elasticity, len(mesh.names))
-    prior = _by_entry(f"priors.{name}", model.priors.get(name, PriorConfig()), PriorConfig(), mesh, model, entries)
+    given = model.with_default_priors(mesh.names).priors.get(name, PriorConfig())
+    priors = _by_entry(f"priors.{name}", given, PriorConfig(), mesh, model, entries)
     fixed = model.known(mesh.names)
     fixed_values = _by_entry(f"fixed.{name}", fixed.get(name), None, mesh, model, entries)
     if reference is None:
-        start = _within(prior, _default_reference(name, mesh, model, entries))
+        start = _within(priors, _default_reference(name, mesh, model, entries))
     else:
         start = np.asarray(reference[name], float)
     if start.shape != (entries,) or not (np.isfinite(start) & (start > 0)).all():
         raise InputError(f"reference[{name!r}] must be {entries} positive numbers, got {start.tolist()}")
     values = np.array([s if k is None else float(k) for s, k in zip(start, fixed_values, strict=True)])
-    alpha, beta = (np.array([float(getattr(p, name)) for p in prior]) for name in ("alpha", "beta"))
+    ranges = [prior if isinstance(prior, PriorConfig) else POSITIVE for prior in priors]
+    log_normal = [prior if isinstance(prior, ScalePrior) else UNUSED for prior in priors]
+    alpha, beta = (np.array([float(getattr(p, name)) for p in ranges]) for name in ("alpha", "beta"))
     return LameParameter(
         alpha=jnp.asarray(alpha),
         beta=jnp.asarray(beta),
-        low=jnp.array([float(p.low) for p in prior]),
-        high=jnp.array([float(p.high) for p in prior]),
+        low=jnp.array([float(p.low) for p in ranges]),
+        high=jnp.array([float(p.high) for p in ranges]),
         log_beta=jnp.asarray(betaln(alpha, beta)),
-        free=FreeEntries(np.array([k is None for k in fixed_values])),
+        median=jnp.array([p.median for p in log_normal]),
+        log_sd=jnp.array([p.log_sd for p in log_normal]),
+        log_normal=Entries(np.array([isinstance(prior, ScalePrior) for prior in priors])),
+        free=Entries(np.array([k is None for k in fixed_values])),
         at_rest=jnp.asarray(values),
     )
 
@@ -295,11 +307,17 @@ def _default_reference(name: Lame, mesh: TetMesh, model: ModelConfig, entries: i
     return {"uniform": np.full(1, SOLID[name]), "element": by_tissue[mesh.tissue]}.get(model.elasticity, by_tissue)
 
 
-def _within(prior: list[PriorConfig], values: Float[np.ndarray, "entries"]) -> Float[np.ndarray, "entries"]:
-    """Replace values outside the range of their prior by a value inside."""
-    low, high = np.array([(p.low, p.high) for p in prior]).T
-    inside = np.where(np.isinf(high), low + values, (low + high) / 2)
-    return np.where((values > low) & (values < high), values, inside)
+def _within(priors: list[LamePrior], values: Float[np.ndarray, "entries"]) -> Float[np.ndarray, "entries"]:
+    """Replace values by the median of a log-normal prior, and values outside the range of another by a value inside."""
+    return np.array([_value_within(prior, float(value)) for prior, value in zip(priors, values, strict=True)])
+
+
+def _value_within(prior: LamePrior, value: float) -> float:
+    if isinstance(prior, ScalePrior):
+        return prior.median
+    if prior.low < value < prior.high:
+        return value
+    return prior.low + value if np.isinf(prior.high) else (prior.low + prior.high) / 2
 
 
 def _by_entry(where: str, option: object, default: object, mesh: TetMesh, model: ModelConfig, entries: int) -> list:
