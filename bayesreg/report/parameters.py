@@ -12,7 +12,7 @@ from scipy import stats
 from bayesreg.report.estimands import SYMBOLS, Group, sampled_scales, symbol_of
 from bayesreg.report.study import Study
 from bayesreg.report.tables import Table
-from bayesreg.report.verdict import NONE, nested_entry, number, rhat_text, threshold_of
+from bayesreg.report.verdict import NONE, decimal_text, nested_entry, number, rhat_text, threshold_of
 from bayesreg.tissues import label_of
 
 # A parameter is identified if its central 90 % interval spans less than a factor of ten.
@@ -25,11 +25,14 @@ BOUND = 5.0
 # A parameter whose interval is wider than the first share of the prior’s has it mostly from there, and is weakly
 # identified at best; above the second it is not identified.
 PRIOR_SHARES = 0.5, 0.8
+LEVELS = 0.025, 0.975
 LAME = ("lam", "mu")
-HEADER = ["", "Median", "95 % interval", "Prior, 95 %", "Data say", "R̂", "Least ESS"]
+HEADER = ["", "Median", "95 % interval", "Prior, 95 %", "Width", "Data say", "R̂", "Least ESS"]
 CAPTION = (
     "Only ratios shape the deformation where no force acts inside; the scale of λ and μ is set by the parameter that "
-    "is fixed and by the elastic temperature. λ/μ has no mean where μ may be 0. A flat prior on [0, ∞) is improper."
+    "is fixed and by the elastic temperature. λ/μ has no mean where μ may be 0. A flat prior on [0, ∞) is improper. "
+    "Width: that of the interval over that of the prior’s, of logarithms where the prior is log-normal. Near 1 the "
+    "data say nothing beyond the prior."
 )
 
 
@@ -43,6 +46,31 @@ class Interval(NamedTuple):
     def text(self) -> str:
         """The interval as text."""
         return f"{number(self.low)} to {number(self.high)}"
+
+    def share_of(self, draws: np.ndarray) -> float:
+        """Return the width of the draws' central 95 % interval, as a share of the width of this one."""
+        low, high = np.quantile(draws, LEVELS)
+        return float((high - low) / (self.high - self.low))
+
+
+class LogInterval(Interval):
+    """The central 95 % interval of a log-normal number, whose width is that of logarithms."""
+
+    @classmethod
+    def of(cls, median: float, log_sd: float) -> LogInterval:
+        """Return the interval of a log-normal number."""
+        factor = math.exp(stats.norm.ppf(LEVELS[1]) * log_sd)
+        return cls(median / factor, median * factor)
+
+    @property
+    def log_width(self) -> float:
+        """The logarithm of the factor between the ends."""
+        return math.log(self.high / self.low)
+
+    def share_of(self, draws: np.ndarray) -> float:
+        """Return the width of the draws' interval as a share of the width of this one, of logarithms."""
+        low, high = np.quantile(draws, LEVELS)
+        return math.log(high / low) / self.log_width if low > 0 else math.inf
 
 
 def describe_bounds(draws: np.ndarray, prior: Interval | None = None) -> str:
@@ -68,8 +96,8 @@ def describe_bounds(draws: np.ndarray, prior: Interval | None = None) -> str:
         return "undefined"
     if np.ptp(finite) == 0:
         return "fixed"
-    first, q01, low, median, high, q99, last = np.quantile(finite, (0.025, 0.01, 0.05, 0.5, 0.95, 0.99, 0.975))
-    share = 0.0 if prior is None else (last - first) / (prior.high - prior.low)
+    q01, low, median, high, q99 = np.quantile(finite, (0.01, 0.05, 0.5, 0.95, 0.99))
+    share = 0.0 if prior is None else prior.share_of(finite)
     if share > PRIOR_SHARES[1]:
         return "not identified"
     if median > REACHES_ZERO * q01:
@@ -77,12 +105,6 @@ def describe_bounds(draws: np.ndarray, prior: Interval | None = None) -> str:
     if q99 > REACHES_ZERO * median:
         return "only a lower bound" if median < BOUND * low else "not identified"
     return "identified" if high < IDENTIFIED * low and share <= PRIOR_SHARES[0] else "weakly identified"
-
-
-def prior_of_scale(prior: Mapping[str, float]) -> Interval:
-    """Return the central 95 % interval of the log-normal prior of a scale, given by its median and log_sd."""
-    factor = math.exp(stats.norm.ppf(0.975) * float(prior["log_sd"]))
-    return Interval(float(prior["median"]) / factor, float(prior["median"]) * factor)
 
 
 def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> Interval | None:
@@ -96,13 +118,27 @@ def prior_of(model: Mapping[str, Any], name: str, tissue: str | None = None) -> 
     tissue : str, optional
     """
     prior = (model.get("priors") or {}).get(name) or {}
-    if "alpha" not in prior:
+    if not {"alpha", "median"} & set(prior):
         prior = prior.get(tissue) or (next(iter(prior.values()), {}) if tissue == "uniform" else {})
+    if "median" in prior:
+        return LogInterval.of(**prior)
     high = prior.get("high")
     if high is None or math.isinf(high):
         return None
     low, alpha, beta = (float(prior.get(key, default)) for key, default in (("low", 0), ("alpha", 1), ("beta", 1)))
-    return Interval(*(float(x) for x in stats.beta(alpha, beta, low, high - low).ppf((0.025, 0.975))))
+    return Interval(*(float(x) for x in stats.beta(alpha, beta, low, high - low).ppf(LEVELS)))
+
+
+def prior_of_ratio(lam: Interval | None, mu: Interval | None, known_mu: float | None) -> Interval | None:
+    """Return the central 95 % interval of the prior of λ/μ; None if it has none of its own."""
+    if known_mu and lam:
+        return type(lam)(lam.low / known_mu, lam.high / known_mu)
+    if not (isinstance(lam, LogInterval) and isinstance(mu, LogInterval)):
+        return None
+    # The logarithms of independent numbers have variances that add.
+    width = math.hypot(lam.log_width, mu.log_width)
+    median = math.sqrt(lam.low * lam.high / (mu.low * mu.high))
+    return LogInterval(median * math.exp(-width / 2), median * math.exp(width / 2))
 
 
 def parameter_table(study: Study) -> Table:
@@ -111,7 +147,7 @@ def parameter_table(study: Study) -> Table:
     rows = []
     for name in sampled_scales(study.posterior):
         scale_prior = nested_entry(study.manifest, "scales", name)
-        draws, prior = study.posterior[name].to_numpy(), prior_of_scale(scale_prior) if scale_prior else None
+        draws, prior = study.posterior[name].to_numpy(), LogInterval.of(**scale_prior) if scale_prior else None
         rows.append(_row(study, symbol_of(name), draws, (name, 0), prior, describe_bounds(draws, prior)))
     groups += [("Scales", rows)] if rows else []
     header, caption = list(HEADER), CAPTION
@@ -127,10 +163,8 @@ def _group_rows(study: Study, index: int, group: Group) -> list[list[str]]:
     model = nested_entry(study.manifest, "model") or {}
     entry = None if group.lam.shape[-1] > 1 else index
     priors = {name: prior_of(model, name, group.name) for name in LAME}
-    # The ratio has a prior of its own only if μ is known.
-    is_mu_known, prior = np.ptp(group.mu) == 0, priors["lam"]
-    mu = float(np.ravel(group.mu)[0])
-    ratio_prior = Interval(prior.low / mu, prior.high / mu) if is_mu_known and mu and prior else None
+    known_mu = float(np.ravel(group.mu)[0]) if np.ptp(group.mu) == 0 else None
+    ratio_prior = prior_of_ratio(priors["lam"], priors["mu"], known_mu)
     rows = []
     for name, prior in {"ratio": ratio_prior, **priors}.items():
         draws = getattr(group, name)
@@ -151,13 +185,13 @@ def _row(
     finite = draws[np.isfinite(draws)]
     if description in ("fixed", "undefined"):
         value = number(float(finite[0])) if finite.size else NONE
-        return [symbol, value, description, *[NONE] * 4]
-    low, median, high = (float(x) for x in np.quantile(finite, (0.025, 0.5, 0.975)))
+        return [symbol, value, description, *[NONE] * 5]
+    low, median, high = (float(x) for x in np.quantile(finite, (LEVELS[0], 0.5, LEVELS[1])))
     rhat, bulk, tail = _figures(study, *entry)
     description = "the chains disagree" if rhat >= threshold_of(study.manifest) else description
-    prior_text = "improper" if prior is None else prior.text
+    prior_text, width = ("improper", NONE) if prior is None else (prior.text, decimal_text(prior.share_of(finite)))
     least = number(float(np.fmin(bulk, tail)))
-    return [symbol, number(median), Interval(low, high).text, prior_text, description, _rhat(rhat), least]
+    return [symbol, number(median), Interval(low, high).text, prior_text, width, description, _rhat(rhat), least]
 
 
 def _rhat(rhat: float) -> str:

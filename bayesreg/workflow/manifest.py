@@ -89,7 +89,7 @@ def manifest(
         "pair": provenance["pair"],
         "appraisal": provenance.get("appraisal", {}),
         "sampler": _describe_sampler(config, posterior),
-        "model": config.model.model_dump(mode="json"),
+        "model": config.model.with_default_priors(inputs.mesh.names).model_dump(mode="json"),
         "observations": observations,
         "scales": {
             name: {"median": float(block.median), "log_sd": float(block.log_sd)}

@@ -5,7 +5,14 @@ from scipy import stats
 
 from bayesreg.image import Image
 from bayesreg.io.records import Run
-from bayesreg.report.parameters import Interval, describe_bounds, parameter_table, prior_of, prior_of_scale
+from bayesreg.report.parameters import (
+    Interval,
+    LogInterval,
+    describe_bounds,
+    parameter_table,
+    prior_of,
+    prior_of_ratio,
+)
 from bayesreg.report.study import Study
 from tests.phantoms import box_mesh
 from tests.report.conftest import Draws
@@ -77,6 +84,28 @@ def test_a_posterior_like_its_prior_is_not_identified():
     assert describe_bounds(np.full(3, np.nan)) == "undefined"
 
 
+def test_the_width_of_a_log_normal_prior_is_that_of_logarithms():
+    """A stiffness that is twice as well known, in logarithms, as before."""
+    prior, level = LogInterval.of(1.5, 0.8), (np.arange(DRAWS) + 0.5) / DRAWS
+    for log_sd, reading in ((0.8, "not identified"), (0.5, "weakly identified"), (0.3, "identified")):
+        # The median moves, which is no change of width.
+        draws = stats.lognorm.ppf(level, log_sd, scale=4.0)
+        assert prior.share_of(draws) == pytest.approx(log_sd / 0.8, rel=2e-3)
+        assert describe_bounds(draws, prior) == reading
+        assert prior.share_of(1 / draws) == pytest.approx(log_sd / 0.8, rel=2e-3)
+    assert prior.share_of(np.r_[np.zeros(100), np.linspace(1, 2, 900)]) == np.inf
+
+
+def test_the_ratio_of_log_normal_numbers_is_log_normal():
+    lam, mu = LogInterval.of(18.0, 0.6), LogInterval.of(1.5, 0.7)
+    rng = np.random.default_rng(0)
+    drawn = 12 * np.exp(0.6 * rng.normal(size=400_000) - 0.7 * rng.normal(size=400_000))
+    np.testing.assert_allclose(prior_of_ratio(lam, mu, None), np.quantile(drawn, (0.025, 0.975)), rtol=0.01)
+    np.testing.assert_allclose(prior_of_ratio(lam, mu, 2.0), np.array(lam) / 2)
+    assert isinstance(prior_of_ratio(lam, mu, 2.0), LogInterval)
+    assert prior_of_ratio(Interval(1.0, 2.0), mu, None) is prior_of_ratio(None, mu, 1.0) is None
+
+
 def test_priors_are_read_from_the_manifest():
     beta = {"alpha": 2.0, "beta": 3.0, "low": 1.0, "high": 11.0}
     flat = {"alpha": 1.0, "beta": 1.0, "low": 0.0, "high": None}
@@ -85,7 +114,9 @@ def test_priors_are_read_from_the_manifest():
     np.testing.assert_allclose(prior_of(model, "lam", "gm"), np.quantile(draws, (0.025, 0.975)), rtol=0.01)
     assert prior_of(model, "lam", "wm") is prior_of(model, "lam", "csf") is prior_of({}, "mu", "gm") is None
     assert prior_of(model, "mu", "csf") == pytest.approx((1.0, 39.0))
-    scale = prior_of_scale({"median": 0.05, "log_sd": 1.0})
+    scale = LogInterval.of(0.05, 1.0)
+    model = {"priors": {"lam": {"median": 0.05, "log_sd": 1.0}, "mu": {"gm": {"median": 0.05, "log_sd": 1.0}}}}
+    assert prior_of(model, "lam", "wm") == prior_of(model, "mu", "gm") == prior_of(model, "mu", "uniform") == scale
     assert scale == pytest.approx((0.05 * np.exp(-1.96), 0.05 * np.exp(1.96)), rel=1e-3)
 
 
@@ -100,9 +131,9 @@ def test_a_row_for_all_that_is_known(posterior):
     assert float(cells["WM", "λ/μ"][0]) == pytest.approx(24, rel=0.02)
     low, high = (float(edge) for edge in cells["WM", "λ/μ"][1].split(" to "))
     assert (low, high) == pytest.approx((24 * np.exp(-0.196), 24 * np.exp(0.196)), rel=0.03)
-    assert cells["GM", "λ"][2:4] == ["0.500 to 19.5", "identified"]
-    assert cells["GM", "μ"] == ["1.00", "fixed", "–", "–", "–", "–"]
-    assert cells["CSF", "λ"][2:4] == ["improper", "only an upper bound"]
-    assert cells["CSF", "λ/μ"][3] == "not identified"
-    assert cells["WM", "μ"][3:] == ["the chains disagree", "1.500", "150"]
-    assert cells["Scales", "T_s"][3] == "identified"
+    assert cells["GM", "λ"][2:5] == ["0.500 to 19.5", "0.10", "identified"]
+    assert cells["GM", "μ"] == ["1.00", "fixed", "–", "–", "–", "–", "–"]
+    assert cells["CSF", "λ"][2:5] == ["improper", "–", "only an upper bound"]
+    assert cells["CSF", "λ/μ"][4] == "not identified"
+    assert cells["WM", "μ"][4:] == ["the chains disagree", "1.500", "150"]
+    assert cells["Scales", "T_s"][3:5] == ["0.10", "identified"]
