@@ -125,7 +125,7 @@ def brainweb(
     tissue = tissues_of(labels, TABLES["brainweb"], labels_path)
     check_same_grid(t1, tissue, ("T1", "label"))
     inside = tissues_of(labels, {"intracranial": tuple(intracranial_labels)}, labels_path)
-    mask = main_part(np.asarray(inside.voxels) != 0, "intracranial mask")
+    mask = main_part(inside, "intracranial mask")
     return Anatomy(t1, tissue.with_voxels(tissue.voxels * mask), tissue.with_voxels(mask.astype(np.uint8)))
 
 

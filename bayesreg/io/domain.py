@@ -15,7 +15,8 @@ from bayesreg.io.grids import check_same_grid
 from bayesreg.tissues import BRAIN, BRAIN_CLOSING, BRAIN_VOLUME, is_fluid, label_of
 from bayesreg.types import InputError
 
-SPECK = 0.01
+# The largest part of a mask is its only one if it has this share of it. What is filled is told beyond the second share.
+MAIN, TOLD = 0.9, 0.002
 _log = logging.getLogger(__name__)
 
 
@@ -66,7 +67,8 @@ def mesh_domain(
     ------
     MeshError
         If a solid tissue has no voxel, the intracranial mask is empty or excludes more than half of the solid tissues,
-        or a mask has several large parts. Parts below 1 % of a mask are removed, and the log reports them.
+        or a mask has several large parts. If its largest part has 90 % of a mask, the others are left out. The log
+        tells them in ml, and holes that are filled with a solid tissue.
     """
     voxels = np.asarray(tissue.voxels)
     solid_names = {index: name for index, name in enumerate(names, start=1) if not is_fluid(name)}
@@ -76,7 +78,8 @@ def mesh_domain(
     solid = np.isin(voxels, list(solid_names))
     if not solid.any():
         raise MeshError(f"there is no solid tissue to mesh among {', '.join(names)}")
-    hull = _fill(_close(solid, tissue.voxel_sizes, closing) if len(solid_names) < len(names) else solid)
+    has_fluid = len(solid_names) < len(names)
+    hull = fill_holes(_close(solid, tissue.voxel_sizes, closing) if has_fluid else solid)
     if intracranial is not None:
         hull &= _intracranial_part(tissue, intracranial)
         if (hull & solid).sum() < 0.5 * solid.sum():
@@ -85,7 +88,10 @@ def mesh_domain(
                 "mask; do the two belong together?"
             )
     # The intracranial mask may cut the hull and so leave separate parts and holes.
-    return tissue.with_voxels(_fill(main_part(hull, "region to mesh")).astype(np.uint8))
+    region = fill_holes(main_part(tissue.with_voxels(hull), "region to mesh"))
+    if not has_fluid and np.count_nonzero(holes := region & ~solid) > TOLD * np.count_nonzero(region):
+        _log.warning("%s of holes in the region to mesh filled, %s", millilitres(tissue, holes), place(tissue, holes))
+    return tissue.with_voxels(region.astype(np.uint8))
 
 
 def domain_labels(tissue: Image, domain: Image, names: Sequence[str] = BRAIN) -> Image:
@@ -116,24 +122,48 @@ def labels_everywhere(tissue: Image, names: Sequence[str]) -> Image:
     return tissue.with_voxels(voxels[tuple(nearest)])
 
 
-def main_part(mask: Bool[np.ndarray, "X Y Z"], name: str) -> Bool[np.ndarray, "X Y Z"]:
-    """Return the main connected part of a mask; remove parts below 1 % of the mask.
+def main_part(mask: Image, name: str) -> Bool[np.ndarray, "X Y Z"]:
+    """Return the largest connected part of a mask, nonzero inside; the log tells the others in ml.
 
-    Raise MeshError if the mask is empty or has several large parts.
+    Raise MeshError if the mask is empty, or its largest part has less than 90 % of it.
     """
-    components, count = ndimage.label(mask)
+    inside = np.asarray(mask.voxels) != 0
+    components, count = ndimage.label(inside)
     if count == 0:
         raise MeshError(f"the {name} is empty")
     if count == 1:
-        return mask
+        return inside
     sizes = np.bincount(components.ravel())[1:]
-    large = np.flatnonzero(sizes >= SPECK * sizes.sum())
-    if len(large) > 1:
-        shares = ", ".join(f"{sizes[i] / sizes.sum():.0%}" for i in large[np.argsort(-sizes[large])])
-        raise MeshError(f"the {name} has {len(large)} separate parts ({shares} of its volume); expected one")
-    dropped = int(sizes.sum() - sizes.max())
-    _log.warning("%d specks of the %s left out, %d voxels together", count - 1, name, dropped)
-    return components == sizes.argmax() + 1
+    main = components == sizes.argmax() + 1
+    others = inside & ~main
+    if sizes.max() < MAIN * sizes.sum():
+        shares = ", ".join(f"{share:.0%}" for share in np.sort(sizes)[::-1] / sizes.sum() if share >= 0.01)
+        raise MeshError(
+            f"the {name} has {count} separate parts ({shares} of its volume), the second {place(mask, others)}, and a "
+            "mesh has one; give labels of one part, or join the parts"
+        )
+    _log.warning(
+        "%d separate parts of the %s left out, %s together, %s",
+        count - 1, name, millilitres(mask, others), place(mask, others),
+    )  # fmt: skip
+    return main
+
+
+def largest_part(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
+    """Return the largest connected part of a mask that is not empty."""
+    components, _ = ndimage.label(mask)
+    return components == np.bincount(components.ravel())[1:].argmax() + 1
+
+
+def millilitres(image: Image, part: Bool[np.ndarray, "X Y Z"]) -> str:
+    """Write the volume of a part of an image."""
+    return f"{np.count_nonzero(part) * image.voxel_volume / 1e3:.3g} ml"
+
+
+def place(image: Image, part: Bool[np.ndarray, "X Y Z"]) -> str:
+    """Write where the centre of the largest piece of a part of an image lies, in world RAS, mm."""
+    centre = image.voxel_to_world(np.argwhere(largest_part(part)).mean(axis=0))
+    return f"about ({', '.join(f'{x:.0f}' for x in centre)}) mm"
 
 
 def without_ridges(intracranial: Image) -> Image:
@@ -143,12 +173,12 @@ def without_ridges(intracranial: Image) -> Image:
     is weighted by a Gaussian of one voxel. Parts of the mask thinner than two voxels vanish, too.
     """
     inside = ndimage.gaussian_filter((np.asarray(intracranial.voxels) != 0).astype(float), 1.0) > 0.5
-    return intracranial.with_voxels(main_part(inside, "intracranial mask").astype(np.uint8))
+    return intracranial.with_voxels(main_part(intracranial.with_voxels(inside), "intracranial mask").astype(np.uint8))
 
 
 def _intracranial_part(tissue: Image, intracranial: Image) -> Bool[np.ndarray, "X Y Z"]:
     check_same_grid(tissue, intracranial, ("tissue", "intracranial"))
-    return main_part(np.asarray(intracranial.voxels) != 0, "intracranial mask")
+    return main_part(intracranial, "intracranial mask")
 
 
 def _close(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: float) -> Bool[np.ndarray, "X Y Z"]:
@@ -163,7 +193,7 @@ def _close(mask: Bool[np.ndarray, "X Y Z"], voxel_sizes: np.ndarray, radius: flo
     return result
 
 
-def _fill(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
+def fill_holes(mask: Bool[np.ndarray, "X Y Z"]) -> Bool[np.ndarray, "X Y Z"]:
     """Fill the holes of a mask, which are the empty voxels that have no connection to the outside of the grid."""
     components, _ = ndimage.label(~np.pad(mask, 1))
     return (components != components[0, 0, 0])[1:-1, 1:-1, 1:-1]

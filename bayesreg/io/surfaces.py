@@ -89,8 +89,7 @@ def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BR
     Returns
     -------
     list of Surface
-        The surfaces, the outer one first. All normals point outwards, since fTetWild uses winding numbers and would
-        treat an inner surface of opposite orientation as the boundary of a cavity.
+        The surfaces, the outer one first. All normals point outwards.
 
     Raises
     ------
@@ -100,7 +99,8 @@ def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BR
     grid = _CoarseGrid.around(labels, STRIDE * edge_length, margin=edge_length)
     smallest = (edge_length / 2) ** 3 / grid.voxel_volume
     outer = grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length)
-    inside = main_part(outer > 0.5, f"region to mesh, smoothed for an edge length of {edge_length:g} mm,")
+    name = f"region to mesh, smoothed for an edge length of {edge_length:.3g} mm,"
+    inside = main_part(grid.image(outer > 0.5), name)
     deep = edt.edt(inside, anisotropy=tuple(grid.spacing)) > edge_length / 2
     outer[(outer > 0.5) & ~inside] = 0
     solids, fluids = _from_outside_in(np.asarray(labels.voxels), names)
@@ -113,6 +113,12 @@ def tissue_surfaces(labels: Image, edge_length: float, names: Sequence[str] = BR
         inner.append(deep * grid.smoothed(np.isin(labels.voxels, fluids), FLUID_SMOOTHING * edge_length))
     fields = [outer, *(_without_specks(field, smallest) for field in inner)]
     return [_surface(field, grid) for field in fields if field.max() > 0.5]
+
+
+def smoothed_region(labels: Image, edge_length: float) -> Image:
+    """Smooth the region Ω, where labels are not zero; the first of its `tissue_surfaces` lies where it is 0.5."""
+    grid = _CoarseGrid.around(labels, STRIDE * edge_length, margin=edge_length)
+    return grid.image(grid.smoothed(labels.voxels != 0, SMOOTHING * edge_length))
 
 
 def _from_outside_in(labels: Int[np.ndarray, "X Y Z"], names: Sequence[str]) -> tuple[list[int], list[int]]:
@@ -178,7 +184,13 @@ class _CoarseGrid(NamedTuple):
         # The stride may skip the last plane, and marching cubes closes a surface only inside its grid.
         return np.pad(coarse, [(0, 1)] * 3)
 
-    def to_world(self, indices: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    def image(self, values: np.ndarray) -> Image:
+        affine = self.affine.copy()
+        affine[:3, :3] *= self.stride
+        affine[:3, 3] = self.to_world(np.zeros(3))
+        return Image(values, affine)
+
+    def to_world(self, indices: np.ndarray) -> Float[np.ndarray, "*n 3"]:
         voxels = indices * np.array(self.stride) - self.padding
         return voxels @ self.affine[:3, :3].T + self.affine[:3, 3]
 

@@ -39,7 +39,7 @@ class TestDomain:
         with caplog.at_level(logging.INFO):
             domain = mesh_domain(tissue, inside.with_voxels(speckled))
         np.testing.assert_array_equal(domain.voxels, tissue.voxels > 0)
-        assert "2 specks of the intracranial mask left out, 9 voxels together" in caplog.text
+        assert "2 separate parts of the intracranial mask left out, 0.072 ml together, about (-35" in caplog.text
 
     def test_refuses_a_mask_in_large_parts(self, phantom):
         tissue, inside = phantom
