@@ -5,22 +5,22 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from bayesreg.distance import forbidden, signed_distance
 from bayesreg.image import Image
 from bayesreg.io.atomic import replacing
+from bayesreg.io.cells import tissue_of_cells
 from bayesreg.io.domain import MeshError, domain_labels, labels_everywhere, mesh_domain
 from bayesreg.io.fitting import depth_of_region, fit_to_surface, pull_inside
 from bayesreg.io.loose_nodes import without_loose_nodes
 from bayesreg.io.quality import MeshQuality, check_mesh
 from bayesreg.io.surface_files import read_dataset, save_dataset
-from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, tissue_surfaces
+from bayesreg.io.surfaces import Sizing, Surface, depth_sizing, smoothed_region, tissue_surfaces
 from bayesreg.io.tetwild import tetrahedralize
+from bayesreg.io.thickness import resolved
 from bayesreg.mesh import FACES, TetMesh
 from bayesreg.tissues import BRAIN, BRAIN_CLOSING, BRAIN_EDGE, BRAIN_GAP
 from bayesreg.types import AnyArray, InputError
@@ -39,6 +39,8 @@ __all__ = [
 ]
 
 NAMES_FIELD = "tissue_names"
+# The default envelope in units of the edge length.
+ENVELOPE = 0.32
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +57,8 @@ class MeshOptions:
         Largest length of an edge deep inside, mm; the default is 1.9 edge lengths. Tissue boundaries may make edges
         shorter.
     envelope : float, optional
-        Largest distance of faces from the surfaces of the labels, mm; the default is 0.32 edge lengths.
+        Largest distance of faces from the surfaces of the labels, mm; the default is 0.32 edge lengths. Every
+        further attempt halves it.
     skull_gap : float
         Least distance of the boundary nodes from the outside of the intracranial mask, mm.
     closing : float
@@ -129,43 +132,26 @@ def build_mesh(
         If the labels or the mask cannot be meshed (see `mesh_domain`), or no attempt gave a mesh that passes
         `check_mesh`.
     """
-    labels = domain_labels(tissue, domain or mesh_domain(tissue, intracranial, options.closing, names), names)
+    domain = domain or mesh_domain(tissue, intracranial, options.closing, names)
+    labels = domain_labels(tissue, resolved(domain, options.edge_length), names)
     surfaces = tissue_surfaces(labels, options.edge_length, names)
+    field = smoothed_region(labels, options.edge_length)
     sizing = depth_sizing(labels, options.edge_length, options.inner_edge_length or 1.9 * options.edge_length)
     depth = depth_of_region(labels, options.edge_length)
     skull_distance = None if intracranial is None else signed_distance(forbidden(intracranial))
     for attempt in range(1, options.attempts + 1):
         try:
-            mesh = _attempt(labels, names, surfaces, sizing, depth, skull_distance, options)
+            # Within a smaller envelope the mesh has more nodes, and follows the surfaces more closely.
+            envelope = (options.envelope or ENVELOPE * options.edge_length) / 2 ** (attempt - 1)
+            mesh = _attempt(labels, names, surfaces, field, sizing, depth, skull_distance, envelope, options)
             _log.debug("mesh made: %s", check_mesh(mesh, labels))
             return mesh
         except ValueError as error:
             _log.warning("mesh %d of at most %d failed its check: %s", attempt, options.attempts, error)
             last = error
     raise MeshError(
-        f"none of {options.attempts} meshes is sound; the last one: {last}; try a smaller mesh.edge_length"
+        f"none of {options.attempts} meshes is sound, the last one because {last}; choose a shorter mesh.edge_length"
     ) from last
-
-
-def tissue_of_cells(
-    points: Float[np.ndarray, "nodes 3"], cells: Int[np.ndarray, "cells 4"], labels: Image, samples: int = 6
-) -> Int[np.ndarray, "cells"]:
-    """Find the tissue that fills most of each tetrahedron, as an index into the names.
-
-    Parameters
-    ----------
-    points, cells : (n, 3), (m, 4) array
-    labels : Image
-        1 + tissue, without zeros (`labels_everywhere`).
-    samples : int
-        Points per edge of the lattice inside each tetrahedron; 6 makes 56 points.
-    """
-    votes = np.zeros((len(cells), int(labels.voxels.max())), int)
-    corner = points[cells]
-    row = np.arange(len(cells))
-    for weights in _inner_lattice(samples):
-        votes[row, _nearest(labels, weights @ corner) - 1] += 1
-    return votes.argmax(axis=1)
 
 
 def save_mesh(
@@ -273,15 +259,18 @@ def _attempt(
     labels: Image,
     names: Sequence[str],
     surfaces: list[Surface],
+    field: Image,
     sizing: Sizing,
     depth: Image,
     skull_distance: Image | None,
+    envelope: float,
     options: MeshOptions,
 ) -> TetMesh:
     points, cells = tetrahedralize(
         surfaces,
+        field,
         sizing,
-        envelope=options.envelope or 0.32 * options.edge_length,
+        envelope=envelope,
         stop_energy=options.stop_energy,
         threads=options.threads,
         quiet=options.quiet,
@@ -292,16 +281,3 @@ def _attempt(
         mesh = pull_inside(mesh, skull_distance, options.skull_gap)
     tissue = tissue_of_cells(mesh.points, cells, labels_everywhere(labels, names))
     return TetMesh.from_arrays(mesh.points, cells, tissue, names)
-
-
-def _inner_lattice(samples: int) -> Float[np.ndarray, "points 4"]:
-    """Compute the barycentric coordinates of a regular lattice strictly inside a tetrahedron."""
-    steps = np.array([s for s in product(range(samples), repeat=3) if sum(s) < samples])
-    steps = np.column_stack([steps, samples - 1 - steps.sum(axis=1)])
-    return (steps + 0.25) / samples
-
-
-def _nearest(labels: Image, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """Look up the label of the voxel nearest to each point."""
-    index = np.clip(np.rint(labels.world_to_voxel(points)).astype(int), 0, np.array(labels.shape) - 1)
-    return np.asarray(labels.voxels)[tuple(index.T)].astype(int)

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from bayesreg.image import Image
-from bayesreg.io.domain import MeshError
+from bayesreg.io.domain import MeshError, millilitres, place
 from bayesreg.mesh import TetMesh, signed_volumes
 
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
@@ -85,7 +85,7 @@ def check_mesh(mesh: TetMesh, labels: Image) -> MeshQuality:
             f"tetrahedron {ratio.argmin()} is nearly flat: mean ratio {ratio.min():.3g}, least {LEAST_MEAN_RATIO}"
         )
     quality = _measure(mesh, labels, ratio, genus)
-    _check_tissues(quality)
+    _check_tissues(quality, labels)
     return quality
 
 
@@ -140,13 +140,11 @@ def _check_connected(mesh: TetMesh) -> None:
 def _check_boundary(mesh: TetMesh) -> int:
     """Check that the boundary is one closed manifold surface, and return its genus."""
     faces = mesh.boundary_faces
-    half_edges = faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2)
-    edges, count = np.unique(np.sort(half_edges, axis=1), axis=0, return_counts=True)
-    if (count != 2).any():
-        raise MeshError(
-            f"{(count != 2).sum()} edges of the boundary belong to more than two of its faces; it is no manifold"
-        )
-    _check_fans(faces)
+    for places, kind in ((crowded_edges(faces), "edges"), (pinched_nodes(faces)[:, None], "nodes")):
+        if len(places):
+            where = ", ".join(f"{x:.0f}" for x in mesh.points[places[0]].mean(axis=0))
+            raise MeshError(f"the boundary touches itself at {len(places)} {kind}, the first at ({where}) mm")
+    edges = np.unique(_edges(faces), axis=0)
     nodes, index = np.unique(edges, return_inverse=True)
     components = _count_parts(len(nodes), index.reshape(-1, 2))
     if components > 1:
@@ -154,11 +152,24 @@ def _check_boundary(mesh: TetMesh) -> int:
     return (2 - (len(nodes) - len(edges) + len(faces))) // 2
 
 
-def _check_fans(faces: Int[np.ndarray, "faces 3"]) -> None:
-    """Check that the faces around each boundary node form one ring, as on a manifold.
+def crowded_edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
+    """Find the edges of a closed surface that belong to more than two of its faces."""
+    edges, count = np.unique(_edges(faces), axis=0, return_counts=True)
+    return edges[count != 2]
 
-    Corners of faces are linked across shared edges; the linked corners of a node must be one part.
+
+def pinched_nodes(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "nodes"]:
+    """Find the nodes of a closed surface around which its faces form more than one ring; none if an edge is crowded.
+
+    Corners of faces are linked across shared edges; the linked corners of a node are one part on a manifold.
+
+    Parameters
+    ----------
+    faces : (m, 3) array
+        Consistently oriented.
     """
+    if len(crowded_edges(faces)):
+        return np.zeros(0, int)
     number = np.arange(faces.size).reshape(-1, 3)
     # Each half-edge (a → b) of one face meets (b → a) of another, so that their corners at a and at b are neighbours.
     half = np.concatenate(
@@ -168,14 +179,24 @@ def _check_fans(faces: Int[np.ndarray, "faces 3"]) -> None:
     backward = half[half[:, 0] > half[:, 1]][:, (1, 0, 3, 2)]
     forward, backward = (half_edge[np.lexsort((half_edge[:, 1], half_edge[:, 0]))] for half_edge in (forward, backward))
     links = np.concatenate([np.stack([forward[:, k], backward[:, k]], axis=1) for k in (2, 3)])
-    pinched = _count_parts(faces.size, links) - len(np.unique(faces))
-    if pinched:
-        raise MeshError(f"the boundary touches itself at {pinched} nodes; it is no manifold")
+    rings = np.unique(np.column_stack([faces.ravel(), _parts(faces.size, links)]), axis=0)
+    nodes, count = np.unique(rings[:, 0], return_counts=True)
+    return nodes[count > 1]
+
+
+def _edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
+    """List the edges of faces, each once for every face."""
+    return np.sort(faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2), axis=1)
+
+
+def _parts(nodes: int, links: Int[np.ndarray, "links 2"]) -> Int[np.ndarray, "nodes"]:
+    """Number the connected parts of a graph, and return the number for each node."""
+    graph = sparse.coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), (nodes, nodes))
+    return connected_components(graph, directed=False)[1]
 
 
 def _count_parts(nodes: int, links: Int[np.ndarray, "links 2"]) -> int:
-    graph = sparse.coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), (nodes, nodes))
-    return int(connected_components(graph, directed=False)[0])
+    return int(_parts(nodes, links).max()) + 1
 
 
 def _measure(mesh: TetMesh, labels: Image, ratio: Float[np.ndarray, "cells"], genus: int) -> MeshQuality:
@@ -201,12 +222,12 @@ def _measure(mesh: TetMesh, labels: Image, ratio: Float[np.ndarray, "cells"], ge
     )
 
 
-def _check_tissues(quality: MeshQuality) -> None:
-    absent = [name for name, count in quality.tissue_cells.items() if count == 0]
-    if absent:
-        raise MeshError(
-            f"no tetrahedron is {' or '.join(absent)}: the tissue is too thin for this edge length, or is not there"
-        )
+def _check_tissues(quality: MeshQuality, labels: Image) -> None:
+    for label, (name, count) in enumerate(quality.tissue_cells.items(), start=1):
+        if count == 0:
+            voxels = np.asarray(labels.voxels) == label
+            where = f", its {millilitres(labels, voxels)} {place(labels, voxels)}," if voxels.any() else ""
+            raise MeshError(f"no tetrahedron is {name}: the tissue{where} is too thin for this edge length")
     volumes = {**quality.tissue_volumes, "all": sum(quality.tissue_volumes.values())}
     expected = {**quality.label_volumes, "all": sum(quality.label_volumes.values())}
     for name, volume in volumes.items():

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bayesreg.io.cavities import without_cavities
+from bayesreg.image import Image
+from bayesreg.io.cells import cells_inside
 from bayesreg.io.domain import MeshError
 from bayesreg.io.surfaces import Sizing, Surface
 
@@ -24,13 +25,15 @@ import sys
 import numpy as np
 import pytetwild
 given = {name: value[()] for name, value in np.load("in.npz").items()}
-points, cells = pytetwild.tetrahedralize(**given, coarsen=True, vtk_ordering=True, quiet=sys.argv[1] == "quiet")
+points, cells = pytetwild.tetrahedralize(**given, coarsen=True, vtk_ordering=True, disable_filtering=True,
+                                        quiet=sys.argv[1] == "quiet")
 np.savez("out.npz", points=points, cells=cells)
 """
 
 
 def tetrahedralize(
     surfaces: list[Surface],
+    field: Image,
     sizing: Sizing,
     *,
     envelope: float,
@@ -40,6 +43,9 @@ def tetrahedralize(
 ) -> tuple[Float[np.ndarray, "nodes 3"], Int[np.ndarray, "cells 4"]]:
     """Mesh the inside of surfaces by fTetWild; return points and positively oriented cells.
 
+    fTetWild takes for outside where its surfaces wind in total less than once, which holds in a few tetrahedra where it
+    joined an inner surface with the outer one. So it returns its whole box, and `cells_inside` chooses.
+
     fTetWild (Hu, Schneider, Wang, Zorin, Panozzo, "Fast Tetrahedral Meshing in the Wild", 2020) is not deterministic,
     even with one thread.
 
@@ -47,6 +53,8 @@ def tetrahedralize(
     ----------
     surfaces : list of Surface
         The mesh fills the first surface and has faces along all surfaces.
+    field : Image
+        Above 0.5 inside the first surface.
     sizing : Sizing
         Target edge length.
     envelope : float
@@ -77,7 +85,8 @@ def tetrahedralize(
         "bg_tets": sizing.cells.astype(np.int32),
         "bg_values": sizing.values,
     }
-    return without_cavities(*_run(arguments, quiet))
+    points, cells = _run(arguments, quiet)
+    return _renumbered(points, cells[cells_inside(points, cells, field)])
 
 
 def _run(arguments: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +99,11 @@ def _run(arguments: dict[str, Any], quiet: bool) -> tuple[np.ndarray, np.ndarray
             raise MeshError(f"fTetWild failed (exit {done.returncode}: {words}); try another edge_length or envelope")
         with np.load(Path(folder) / "out.npz") as result:
             points, cells = result["points"], result["cells"].astype(np.int64)
+    return _renumbered(points.astype(float), cells)
+
+
+def _renumbered(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(cells) == 0:
-        raise MeshError("fTetWild returned an empty mesh; try a shorter edge_length or a smaller envelope")
+        raise MeshError("fTetWild returned an empty mesh; choose a shorter edge_length or a smaller envelope")
     used, index = np.unique(cells, return_inverse=True)
-    return points[used].astype(float), index.reshape(-1, 4)
+    return points[used], index.reshape(-1, 4)

@@ -134,5 +134,5 @@ def test_no_mesh_of_a_brain_has_any(monkeypatch):
     monkeypatch.setattr(meshing, "tissue_of_cells", lambda points, cells, labels: np.zeros(len(cells), int))
     labels, _ = balls(grid())
     sizing, depth = depth_sizing(labels, 15.0, 30.0), depth_of_region(labels, 15.0)
-    mesh = meshing._attempt(labels, BRAIN, [], sizing, depth, None, meshing.MeshOptions())
+    mesh = meshing._attempt(labels, BRAIN, [], labels, sizing, depth, None, 4.8, meshing.MeshOptions())
     assert (held_by(mesh) >= FEWEST).all()

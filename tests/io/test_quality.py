@@ -75,7 +75,10 @@ class TestCheckMesh:
                 [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]],
                 "touches itself at 1 nodes",
             ),
-            ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]], "1 edges of the boundary"),
+            (
+                [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, -1]],
+                r"touches itself at 1 edges, the first at \(0, 0, 0\) mm",
+            ),
         ],
         ids=["at a node", "along an edge"],
     )

@@ -5,7 +5,7 @@ import pytest
 
 from bayesreg.io import tetwild
 from bayesreg.io.domain import MeshError
-from bayesreg.io.surfaces import depth_sizing, tissue_surfaces
+from bayesreg.io.surfaces import depth_sizing, smoothed_region, tissue_surfaces
 from bayesreg.mesh import TetMesh
 from tests.io.balls import balls, grid
 
@@ -13,7 +13,7 @@ from tests.io.balls import balls, grid
 @pytest.fixture(scope="module")
 def task():
     labels, _ = balls(grid((3.0, 3.0, 3.0)))
-    return tissue_surfaces(labels, 20.0), depth_sizing(labels, 20.0, 30.0)
+    return tissue_surfaces(labels, 20.0), smoothed_region(labels, 20.0), depth_sizing(labels, 20.0, 30.0)
 
 
 class TestTetrahedralize:
