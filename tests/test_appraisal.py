@@ -5,7 +5,9 @@ import pytest
 from scipy import ndimage
 
 from bayesreg.image import Image
-from bayesreg.workflow.appraisal import appraise, compare_images
+from bayesreg.mesh import TetMesh
+from bayesreg.workflow.appraisal import appraise, compare_images, explain_mesh
+from tests.phantoms import box_mesh
 
 AFFINE = np.diag([2.0, 2.0, 2.0, 1.0])
 SHAPE = (60, 50, 40)
@@ -77,3 +79,15 @@ def test_tissue_outside_the_region_is_told_in_millilitres():
     assert appraisal.warnings == (
         f"{outside:.3g} of {inside + outside:.3g} ml of GM lie outside the region to mesh, which leaves them out.",
     )
+
+
+@pytest.mark.parametrize(("names", "warned"), [(("gm", "wm"), 1), (("gm", "csf"), 0)])
+def test_a_mesh_with_other_volumes_than_its_labels_is_told_unless_it_fills_folds(names, warned):
+    box = box_mesh(2)
+    tissue = (box.points[box.cells].mean(axis=1)[:, 0] > np.ptp(box.points[:, 0]) * 0.7).astype(int)
+    mesh = TetMesh.from_arrays(box.points, box.cells, tissue, names)
+    volumes = np.bincount(tissue, mesh.volumes)
+    labels = np.repeat([1, 2], np.rint([volumes[0] * 0.85, volumes[1] + volumes[0] * 0.15]).astype(int))[None, None]
+    told = explain_mesh(mesh, Image(labels, np.eye(4)))
+    assert sum("ml of GM, and the labels" in sentence for sentence in told) == warned
+    assert not any("CSF" in sentence for sentence in told)

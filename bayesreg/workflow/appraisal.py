@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bayesreg.image import Image
+from bayesreg.mesh import TetMesh
 from bayesreg.model.observations.images.contrast import explained_shares, map_residual
 from bayesreg.model.observations.images.linear_combination import regression_at
 from bayesreg.model.observations.images.pointwise import Intensities
@@ -34,6 +35,8 @@ LITTLE, MUCH = 0.2, 1.5
 PATCH = 10.0
 # Greater shares are reported: the share of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
+# So are greater differences of the volumes of a solid tissue in the mesh and in the labels, as a share of the latter.
+MESHED = 0.1
 # Labels that fill a smaller share of the mask seem to show only a part of the organ.
 FILLED = 0.4
 
@@ -252,6 +255,23 @@ def explain_left_out(millilitres: Mapping[str, tuple[float, float]]) -> list[str
         "them out."
         for name, (inside, outside) in millilitres.items()
         if not is_fluid(name) and outside > LEFT_OUT * (inside + outside)
+    ]
+
+
+def explain_mesh(mesh: TetMesh, tissue: Image) -> list[str]:
+    """Warn of every solid tissue whose volume in the mesh differs by more than `MESHED` from that of its labels.
+
+    A mesh gives to solid tissues the fluid in their folds, which is allowed for.
+    """
+    meshed = np.bincount(mesh.tissue, mesh.volumes, len(mesh.names)) / 1e3
+    voxels = np.bincount(np.asarray(tissue.voxels).ravel(), minlength=len(mesh.names) + 1)[1:]
+    labelled, fluid = voxels * tissue.voxel_volume / 1e3, np.array([is_fluid(name) for name in mesh.names])
+    in_folds = max(float((labelled - meshed)[fluid].sum()), 0.0)
+    return [
+        f"The mesh holds {in_mesh:.4g} ml of {label_of(name)}, and the labels {in_labels:.4g} ml: it fills holes and "
+        "narrow gaps, and does not show what is thinner than a third of its edges (mesh.edge_length)."
+        for name, in_mesh, in_labels in zip(mesh.names, meshed, labelled, strict=True)
+        if not is_fluid(name) and abs(in_mesh - in_labels) > MESHED * in_labels + in_folds
     ]
 
 

@@ -38,7 +38,7 @@ from bayesreg.model.warp import tissue_on_grid
 from bayesreg.pose import Pose
 from bayesreg.tissues import BRAIN_CLOSING
 from bayesreg.types import InputError
-from bayesreg.workflow.appraisal import Appraisal, appraise
+from bayesreg.workflow.appraisal import Appraisal, appraise, explain_mesh
 from bayesreg.workflow.evaluation import NAME, require_unseen
 from bayesreg.workflow.matching import (
     FoundPose,
@@ -119,6 +119,7 @@ def prepare(config: Config) -> Prepared:
     mesh = meshing.result()
     if settings.file is not None:
         require_agreement(mesh, tissue, settings.file)
+    appraisal = appraisal._replace(warnings=(*appraisal.warnings, *explain_mesh(mesh, anatomy.tissue)))
     clock.lap("mesh")
     _require_start(config, mesh)
     skull = None if anatomy.intracranial is None else _as_stored(forbidden(anatomy.intracranial))
