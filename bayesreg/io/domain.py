@@ -105,9 +105,11 @@ def domain_labels(tissue: Image, domain: Image, names: Sequence[str] = BRAIN) ->
         If a tissue has no voxel in Ω.
     """
     labels = np.where(np.asarray(domain.voxels) != 0, labels_everywhere(tissue, names).voxels, 0).astype(np.int8)
-    missing = [name for index, name in enumerate(names, start=1) if not (labels == index).any()]
-    if missing:
-        raise MeshError(f"the region to mesh holds no {' and no '.join(missing)}")
+    for index, name in enumerate(names, start=1):
+        if not (labels == index).any():
+            outside = np.asarray(tissue.voxels) == index
+            where = f" (its voxels lie {place(tissue, outside)})" if outside.any() else ""
+            raise MeshError(f"the region to mesh holds no {name}{where}; choose a table of labels without it")
     return tissue.with_voxels(labels)
 
 
