@@ -97,7 +97,16 @@ def test_images_alone_are_enough(register):
     result = register.call()
     assert result.exit_code == 0, result.output
     assert register.calls[0][0].data.tissues == ("organ",)
-    assert "labels      none: the organ is what is bright in the fixed image, of one tissue" in result.output
+    assert (
+        "labels      none: the organ is what is bright in the fixed image and in view of the moving one, of one tissue"
+        in result.output
+    )
+
+
+def test_an_unknown_pose_of_images_needs_no_prior_of_rigid_motions(register):
+    result = register.call("--labels", register.path("labels"), "--set", "data.pose=unknown")
+    assert result.exit_code == 0, result.output
+    assert register.calls[0][0].model.rigid_sd is None
 
 
 def test_a_mask_is_the_organ_where_there_are_no_labels(register):

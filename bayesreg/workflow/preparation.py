@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from itertools import starmap
@@ -55,6 +56,8 @@ from bayesreg.workflow.prediction import require_inside
 from bayesreg.workflow.simulated_pair import describe_pair, simulate_pair
 
 PROVENANCE = "inputs/provenance.json"
+
+_log = logging.getLogger(__name__)
 
 
 class Prepared(NamedTuple):
@@ -226,6 +229,9 @@ def _within_view(anatomy: Anatomy, scans: _Scans) -> Anatomy:
             "place, or give a mask of the organ (labels) and data.pose: unknown"
         )
     largest = np.bincount(parts.ravel())[1:].argmax() + 1
+    if scans.found is not None:
+        millilitres = np.count_nonzero(parts == largest) * anatomy.tissue.voxel_volume / 1e3
+        _log.warning("the moving image shows %.4g ml of it, which are the organ here", millilitres)
     return anatomy._replace(tissue=anatomy.tissue.with_voxels(np.where(parts == largest, voxels, 0)))
 
 

@@ -61,8 +61,8 @@ def understand(
     fixed, moving : path, optional
         Two images; none where points or a surface are all that is observed.
     labels : path, optional
-        Tissue labels of the fixed image, or a mask of the organ. Without them, the organ is `intracranial`, or the
-        bright part of the fixed image.
+        Tissue labels of the fixed image, or a mask of the organ. Without them, the organ is `intracranial`, or what
+        both images show of the bright part of the fixed one.
     table : str, optional
         The name of a label table (`bayesreg.label_tables`), or a YAML file with labels by tissue. The default is
         recognised from the values of the labels.
@@ -117,7 +117,7 @@ def understand(
     if quick:
         sections |= QUICK
     config = make_config(sections, overrides)
-    if isinstance(config.data, FilesData) and config.data.pose == "unknown" and landmarks is None:
+    if fixed is None and isinstance(config.data, FilesData) and config.data.pose == "unknown" and landmarks is None:
         sections["model"]["rigid_sd"] = RIGID_SD_OF_FOUND
         config = make_config(sections, overrides)
     if any(override.startswith("data.label_table") for override in overrides):
@@ -174,7 +174,9 @@ def _channel(number: int, pair: str) -> dict[str, str]:
 
 
 def _describe_organ(data: FilesData) -> str:
-    return "what is bright in the fixed image" if data.intracranial is None else f"all of {data.intracranial}"
+    if data.intracranial is not None:
+        return f"all of {data.intracranial}"
+    return "what is bright in the fixed image and in view of the moving one"
 
 
 def _choose_table(labels: Path, table: str | None) -> tuple[Mapping[str, Any], str]:
