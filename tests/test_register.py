@@ -224,8 +224,7 @@ def test_a_surface_needs_no_images(register, tmp_path):
     assert lost.config.model.rigid_sd == 10.0
     assert "pose        looked for by the surface, each rigid motion to 10 mm (model.rigid_sd)" in lost.lines
     images = [Path(register.path(name)) for name in ("fixed", "moving")]
-    with pytest.raises(ValueError, match="unknown is for points and surfaces without images"):
-        understand(*images, surface=points, overrides=["data.pose=unknown"])
+    assert understand(*images, surface=points, overrides=["data.pose=unknown"]).config.model.rigid_sd is None
 
 
 def test_points_need_no_images(register):

@@ -136,6 +136,10 @@ class ModeSearch(Protocol):
     def tempering(self) -> Callable[[Estimands], Target] | None:
         """The map from estimands near the mode to the tempered target; None if the target needs no tempering."""
 
+    @property
+    def loosening(self) -> Mapping[str, float]:
+        """The factors, by name, on the scales with which the search begins."""
+
     def continuation(self) -> Iterable[Any]:
         """Yield the data of problems of increasing difficulty that lead to the target's own problem.
 

@@ -81,6 +81,10 @@ def approach(
     flat = np.asarray(start)
     if target.mode_search.search_start is not None:
         flat = np.asarray(flat_position(target, target.data, target.mode_search.search_start))
+    elif loosening := target.mode_search.loosening:
+        estimands = estimands_at(target, target.data, jnp.asarray(flat))
+        loose = {name: factor * estimands[name] for name, factor in loosening.items()}
+        flat = np.asarray(flat_position(target, target.data, {**estimands, **loose}))
     for data in target.mode_search.continuation():
         if deadline.has_passed:
             break

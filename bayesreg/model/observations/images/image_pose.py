@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from bayesreg.ignored import fill_ignored, find_filling, ignored_voxels
 from bayesreg.image import Image
 from bayesreg.interpolation import Interpolator
-from bayesreg.model.observations.images.linear_combination import PatchRegression, regression_at
+from bayesreg.model.observations.images.linear_combination import PATCH, PatchRegression, regression_at
 from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.pose import Motion, Pose
 from bayesreg.types import AnyArray, InputError, Scalar
@@ -37,13 +37,11 @@ SURROUNDINGS = 15.0
 TURNS, DRAWS = (-25.0, 25.0), 300
 # For each level: the edge of the voxels and the number of candidates from which it searches.
 LEVELS: tuple[tuple[float, int], ...] = ((8.0, 16), (4.0, 4), (2.0, 2))
-# The longest side of a patch, in edges of voxels.
-PATCH = 5.0
 # The share of the points of one level that are independent: noise and what f does not explain is smoother than a voxel.
 INDEPENDENT = 0.1
 ITERATIONS = 60
 # The greatest number of points of one level.
-POINTS = 10_000
+POINTS = 20_000
 
 
 class PosePrior(NamedTuple):
@@ -161,8 +159,9 @@ def find_poses(
     centre = centre_of(organ)
     headers = Motion(np.zeros(3), np.zeros(3))
     near, others = headers, list(_starts(fixed, moving, prior, in_all_directions))
+    finest = fixed.voxel_volume ** (1 / 3)
     for edge, most in LEVELS:
-        level = _Level.of(fixed, filled, region, ~hidden, centre, edge * size)
+        level = _Level.of(fixed, filled, region, ~hidden, centre, max(edge * size, finest))
         others.sort(key=lambda motion: level.judge(motion, prior).evidence, reverse=True)
         near, *others = (level.improve(start, prior) for start in (near, *others[:most]))
     candidates = [level.judge(motion, prior) for motion in (near, *others)]
@@ -239,7 +238,7 @@ class _Level(NamedTuple):
         positions = coarse.voxel_to_world(voxels.astype(float))
         smooth = moving.smoothed(edge / 2)
         regression = regression_at(
-            positions, fixed.smoothed(edge / 2).interpolator("cubic"), PATCH * edge, smooth.voxels[shown].var()
+            positions, fixed.smoothed(edge / 2).interpolator("cubic"), PATCH * edge / 2, smooth.voxels[shown].var()
         )
         # Nothing is seen beyond the grid.
         affine = np.array(moving.affine, float)

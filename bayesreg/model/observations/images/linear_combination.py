@@ -48,6 +48,8 @@ FREEDOM = 4.0
 RIDGE = 0.01
 # The smallest number of points of a patch, where it is not compared: its sums are zero.
 NEARLY_NONE = 1e-3
+# The side of a patch in sds of the smoothing of the images: in less, three coefficients explain any smooth image.
+PATCH = 10.0
 # s² as a share of the variance of m: less than the noise of ultrasound.
 FLOOR = 0.05
 
@@ -245,7 +247,9 @@ class LinearCombination(SimilaritySettings):
     window_mm: Positive = 10.0
     """Longest side of a patch, mm, within which the echoes should be one linear combination."""
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> PatchRegression:
+    def on(
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator, blur: float = 0.0
+    ) -> PatchRegression:
         """Make the similarity at these points; see `AnySimilarity`.
 
         Raises
@@ -256,7 +260,8 @@ class LinearCombination(SimilaritySettings):
         for name, values in (("fixed", rest.fixed), ("moving", rest.moving)):
             if jnp.ptp(values) <= 1e-9 * abs(values).max():
                 raise InputError(f"the {name} image is constant in the mesh: similarity 'lc2' has nothing to compare")
-        return regression_at(positions, fixed, self.window_mm, rest.moving.var(), self.temperature)
+        window = max(self.window_mm, PATCH * blur)
+        return regression_at(positions, fixed, window, rest.moving.var(), self.temperature)
 
 
 def regression_at(

@@ -230,7 +230,9 @@ class LocalCorrelation(SimilaritySettings):
     """Longest side of a window, mm, within which one affine map should relate the contrasts. Where the quadrature has
     few points, windows are as much larger as to hold 16."""
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> WindowCorrelation:
+    def on(
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator, blur: float = 0.0
+    ) -> WindowCorrelation:
         """Make the similarity at these points; see `AnySimilarity`.
 
         Raises

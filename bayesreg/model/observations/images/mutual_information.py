@@ -167,7 +167,9 @@ class MutualInformation(SimilaritySettings):
     temperature: Positive = 0.05
     """Temperature of the likelihood, a number: there is no noise of which it could be inferred."""
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> JointInformation:
+    def on(
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator, blur: float = 0.0
+    ) -> JointInformation:
         """Make the similarity at these points; see `AnySimilarity`.
 
         Raises

@@ -231,7 +231,7 @@ class SquaredDifferences(SimilaritySettings):
     kind: Literal["ssd"] = "ssd"
 
     def on(
-        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator, blur: float = 0.0
     ) -> SumOfSquaredDifferences:
         """Make the similarity at these points; see `AnySimilarity`."""
         return SumOfSquaredDifferences()
@@ -256,6 +256,8 @@ class StudentT(SimilaritySettings):
         """Return Student's t, see `SimilaritySettings.noise`."""
         return f"Student’s t with ν = {self.degrees_of_freedom:g}", stats.t(self.degrees_of_freedom)
 
-    def on(self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator) -> StudentTNoise:
+    def on(
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator, blur: float = 0.0
+    ) -> StudentTNoise:
         """Make the similarity at these points; see `AnySimilarity`."""
         return StudentTNoise(jnp.asarray(self.degrees_of_freedom))

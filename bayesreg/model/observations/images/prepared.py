@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -75,13 +76,16 @@ class PreparedPair:
         return np.zeros((len(positions), 0))
 
     def compared_at(
-        self, positions: Float[np.ndarray, "points 3"], weights: Float[AnyArray, "points"]
+        self, positions: Float[np.ndarray, "points 3"], weights: Float[AnyArray, "points"], blur: float
     ) -> dict[str, Any]:
-        """Return the images at all quadrature points and their similarity, by their names in `ComparedImages`."""
+        """Return the images at all quadrature points and their similarity, by their names in `ComparedImages`.
+
+        `blur` is the sd of the smoothing that the images have, mm.
+        """
         moving, fixed_values = self.moving_function(), self.fixed_at(positions)
         rest = Intensities(fixed_values, moving(jnp.asarray(positions)), weights)
         fixed = self.fixed.interpolator(self.options.interpolation)
-        similarity = self.options.similarity.on(positions, rest, fixed)
+        similarity = self.options.similarity.on(positions, rest, fixed, blur)
         return {"moving": moving, "fixed_values": fixed_values, "similarity": similarity}
 
     def compared_points(self, mesh: TetMesh) -> Any:
@@ -102,7 +106,7 @@ class PreparedPair:
         """Place the pair on a mesh; see `ImagePair.on`."""
         quadrature, options = self.compared_points(mesh), self.options
         positions = quadrature.positions(mesh)
-        compared = self._smoothed_by_options().compared_at(positions, quadrature.weights)
+        compared = self._smoothed_by_options().compared_at(positions, quadrature.weights, self._smoothing_sd)
         term = ComparedImages(
             comparison=Comparison(self.name, is_inferred(options.similarity.temperature), self.temperature_name),
             **compared,
@@ -203,7 +207,16 @@ class PreparedPair:
     def smoothed_term(self, term: ComparedImages, sd: float) -> ComparedImages:
         """Return the term with further smoothed images, sd in mm."""
         smooth = self._smoothed_by_options().smoothed(sd)
-        return term._replace(**smooth.compared_at(np.asarray(term.positions), term.quadrature.weights))
+        return term._replace(
+            **smooth.compared_at(
+                np.asarray(term.positions), term.quadrature.weights, math.hypot(sd, self._smoothing_sd)
+            )
+        )
+
+    @property
+    def is_weak(self) -> bool:
+        """Whether the images say little about each place, so that the search must not begin with a stiff prior."""
+        return self.options.similarity.has_noisy_slopes
 
     @property
     def is_tempered_by_residuals(self) -> bool:

@@ -112,7 +112,7 @@ class SelfSimilarity(SimilaritySettings):
     kind: Literal["mind"] = "mind"
 
     def on(
-        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator
+        self, positions: Float[np.ndarray, "points 3"], rest: Intensities, fixed: Interpolator, blur: float = 0.0
     ) -> SumOfSquaredDifferences:
         """Make the similarity at these points; see `AnySimilarity`."""
         return SumOfSquaredDifferences()

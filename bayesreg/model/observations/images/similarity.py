@@ -57,7 +57,8 @@ class Similarity(Protocol):
 AnySimilarity = (
     SquaredDifferences | StudentT | LinearCombination | LocalCorrelation | MutualInformation | SelfSimilarity
 )
-"""The settings of a similarity. Its method `on(positions, rest, fixed)` makes the `Similarity` at some points (q, 3),
-mm, of images with the `Intensities` `rest` there where nothing has moved; f is the function `fixed`."""
+"""The settings of a similarity. Its method `on(positions, rest, fixed, blur)` makes the `Similarity` at some points
+(q, 3), mm, of images with the `Intensities` `rest` there where nothing has moved. f is the function `fixed`, and `blur`
+is the sd of the smoothing of the images, mm."""
 
 SIMILARITIES = {settings.model_fields["kind"].default: settings for settings in get_args(AnySimilarity)}
