@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -67,6 +68,7 @@ class ModeSearch:
     hyperparameters = ()
     separable = ()
     search_start = tempering = None
+    loosening = MappingProxyType({})
 
     def continuation(self):
         yield self.data

@@ -52,7 +52,8 @@ def off(estimate, pose):
 
 
 @pytest.mark.parametrize(
-    ("millimetres", "degrees"), [(8.0, 8.0), pytest.param(20.0, 15.0, marks=pytest.mark.long), (300.0, 20.0)]
+    ("millimetres", "degrees"),
+    [(8.0, 8.0), pytest.param(20.0, 15.0, marks=pytest.mark.long), pytest.param(300.0, 20.0, marks=pytest.mark.long)],
 )
 def test_a_rigid_motion_is_found(millimetres, degrees):
     pose = motion(millimetres, degrees)
@@ -61,6 +62,7 @@ def test_a_rigid_motion_is_found(millimetres, degrees):
     assert poses.best.evidence > poses.headers.evidence + 10
 
 
+@pytest.mark.long
 def test_it_is_found_where_bright_and_dark_change_places():
     pose = motion(8.0, 8.0, seed=2)
     inverted = moved(pose, lambda v: np.where(v > 0, 2 - v, 0.0))
@@ -110,6 +112,7 @@ def test_the_same_images_give_the_same_pose():
     np.testing.assert_array_equal(first_matrix, second_matrix)
 
 
+@pytest.mark.long
 def test_a_turned_header_is_found_where_the_pose_is_unknown():
     """By 180° about one axis, as where the axes of a header are mistaken."""
     pose = Motion(np.array([5.0, -8.0, 3.0]), np.array([0.0, 0.0, 180.0])).pose(np.zeros(3))
@@ -117,6 +120,7 @@ def test_a_turned_header_is_found_where_the_pose_is_unknown():
     assert off(poses.best.pose, pose) < 0.3
 
 
+@pytest.mark.long
 def test_no_pose_gains_by_leaving_the_view():
     """A wedge of the phantom, with a constant filling around it, and noise elsewhere in common with nothing."""
     moving = moved(motion(6.0, 6.0, seed=4))
