@@ -158,7 +158,7 @@ def find_poses(
     fixed, filled = fill_ignored(fixed, fixed_ignore), fill_ignored(moving, hidden_mask)
     centre = centre_of(organ)
     headers = Motion(np.zeros(3), np.zeros(3))
-    near, others = headers, list(_starts(fixed, moving, prior, in_all_directions))
+    near, others = headers, list(_starts(fixed, filled, prior, in_all_directions))
     finest = fixed.voxel_volume ** (1 / 3)
     for edge, most in LEVELS:
         level = _Level.of(fixed, filled, region, ~hidden, centre, max(edge * size, finest))
