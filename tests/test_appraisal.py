@@ -91,3 +91,28 @@ def test_a_mesh_with_other_volumes_than_its_labels_is_told_unless_it_fills_folds
     told = explain_mesh(mesh, Image(labels, np.eye(4)))
     assert sum("ml of GM, and the labels" in sentence for sentence in told) == warned
     assert not any("CSF" in sentence for sentence in told)
+
+
+def fine_structures(seed):
+    """A brain's mixture of fine and coarse structures, on a grid of 2 mm."""
+    rng = np.random.default_rng(seed)
+    fine, coarse = (ndimage.gaussian_filter(rng.normal(size=SHAPE), sd) for sd in (1.0, 6.0))
+    return Image(fine / fine.std() + coarse / coarse.std(), AFFINE)
+
+
+@pytest.mark.parametrize("contrast", [1.0, -1.0], ids=["one contrast", "inverted"])
+def test_fine_structures_that_moved_are_not_of_another_contrast_from_place_to_place(contrast):
+    fixed, rng = fine_structures(0), np.random.default_rng(1)
+    bend = np.stack([ndimage.gaussian_filter(rng.normal(size=SHAPE), 8) for _ in range(3)])
+    # 2.5 voxels, or 5 mm, in each direction.
+    places = np.indices(SHAPE) + 2.5 * bend / bend.std()
+    moved = ndimage.map_coordinates(fixed.voxels, places, order=1, mode="nearest") + 0.1 * rng.normal(size=SHAPE)
+    likeness = compare_images(fixed, fixed.with_voxels(contrast * moved), DOMAIN)
+    assert not likeness.is_related_in_patches
+
+
+def test_a_contrast_of_each_place_is_found():
+    fixed, rng = fine_structures(0), np.random.default_rng(2)
+    gain = np.sign(ndimage.gaussian_filter(rng.normal(size=SHAPE), 5))
+    moving = fixed.with_voxels(gain * fixed.voxels + 2 * rng.normal(size=SHAPE))
+    assert compare_images(fixed, moving, DOMAIN).is_related_in_patches

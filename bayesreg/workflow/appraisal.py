@@ -33,6 +33,9 @@ UNLIKE = 0.02
 LITTLE, MUCH = 0.2, 1.5
 # The longest side of a patch within which the contrast may be one of its own, mm.
 PATCH = 10.0
+# Images are smoothed by this sd, mm, before their patches are compared: a displacement of some mm makes fine structures
+# of one contrast look unrelated within a patch, and leaves coarser ones alike.
+COARSE = 4.0
 # Greater shares are reported: the share of Ω beyond the grid of the moving image, and of a solid tissue outside Ω.
 BEYOND, LEFT_OUT = 0.01, 0.05
 # So are greater differences of the volumes of a solid tissue in the mesh and in the labels, as a share of the latter.
@@ -89,7 +92,7 @@ class Likeness(NamedTuple):
         straight line (a negative share if the line falls), and the best map.
     map_share_within, patch_share_within : float
         The shares of the variance within patches of the moving image that the best map explains, and that the linear
-        combination of f and |∇f| of each patch explains.
+        combination of f and |∇f| of each patch explains; both images are smoothed by `COARSE`.
     """
 
     correlation: float
@@ -213,21 +216,17 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
         float(offset),
         float(on_grid.mean()),
         *explained_shares(fixed_values, moving_values),
-        *_shares_within_patches(fixed, places[on_grid], moving_values, map_residual(fixed_values, moving_values)),
+        *_shares_within_patches(fixed.smoothed(COARSE), moving.smoothed(COARSE), places[on_grid]),
     )
 
 
-def _shares_within_patches(
-    fixed: Image,
-    places: Float[np.ndarray, "points 3"],
-    moving_values: Float[np.ndarray, "points"],
-    left: Float[np.ndarray, "points"],
-) -> tuple[float, float]:
+def _shares_within_patches(fixed: Image, moving: Image, places: Float[np.ndarray, "points 3"]) -> tuple[float, float]:
     """Return the shares of the variance of m within patches that one map explains, and that f and |∇f| explain there.
 
     A patch has its own coefficients, whose number is taken into account.
     """
-    variance = moving_values.var()
+    fixed_values, moving_values = (np.asarray(image.interpolate(places)) for image in (fixed, moving))
+    left, variance = map_residual(fixed_values, moving_values), moving_values.var()
     regression = regression_at(places, fixed.interpolator("linear"), PATCH, variance)
     weights = np.ones(len(places))
     of_m, of_left = (regression.fit(Intensities(weights, jnp.asarray(m), weights)) for m in (moving_values, left))
