@@ -26,7 +26,9 @@ FITS, DAMPING, GREATEST_STEP = 2, 0.05, 0.25
 CUBES_PER_EDGE, MOST_CUBES = 8, 3e7
 # The greatest number of rounds in which nodes and what lies around them move in turn: to the surface of a region, as
 # far as they come; and away from the skull, where they must.
-FITTING_ROUNDS, PULLING_ROUNDS = 5, 30
+FITTING_ROUNDS, PULLING_ROUNDS = 5, 10
+# The greatest number of times that nodes which are stopped drag their neighbours along.
+PULLS = 3
 # The barycentric coordinates of the points of a triangle at which its distance from the surface is taken.
 _POINTS_OF_FACE = np.array([(i + 1 / 3, j + 1 / 3, 3 - i - j + 1 / 3) for i in range(4) for j in range(4 - i)]) / 4
 
@@ -137,11 +139,11 @@ def _normals(points: Float[np.ndarray, "nodes 3"], faces: Int[np.ndarray, "faces
 
 
 def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
-    """Move the boundary nodes of a mesh to a distance of at least `gap` from the forbidden region.
+    """Move the boundary nodes of a mesh to a distance of at least `gap` from the forbidden region, where they can.
 
     Nodes that are too near move along the gradient of the distance. If a full step would give a tetrahedron a mean
     ratio below 0.1, or below its present one, the node moves part of the way. Then the interior nodes around it are
-    smoothed, and the node moves on.
+    smoothed, and the node moves on. A node that is stopped on its way may stay nearer, outside the forbidden region.
 
     Parameters
     ----------
@@ -154,20 +156,39 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
     Raises
     ------
     MeshError
-        If there is no allowed point, or a node cannot reach one.
+        If there is no allowed point, or a node cannot leave the forbidden region.
     """
     points = mesh.points.copy()
-    moving = mesh.boundary[distance_at(distance, points[mesh.boundary]) < gap]
-    if len(moving) == 0:
+    for _ in range(PULLS):
+        moving = mesh.boundary[distance_at(distance, points[mesh.boundary]) < gap]
+        goal = _allowed_places(distance, points[moving], gap)
+        if not _move(points, mesh, moving, goal, PULLING_ROUNDS):
+            _drag(points, mesh, moving, goal - points[moving])
+    room = distance_at(distance, points[mesh.boundary])
+    if (room <= 0).any():
+        raise MeshError(
+            f"{np.count_nonzero(room <= 0)} boundary nodes cannot be moved into the intracranial mask without "
+            f"inverting tetrahedra (up to {-room.min():.2f} mm are missing); choose a smaller envelope or edge_length"
+        )
+    if np.array_equal(points, mesh.points):
         return mesh
-    goal = _allowed_places(distance, points[moving], gap)
-    if _move(points, mesh, moving, goal, PULLING_ROUNDS):
-        return TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
-    left = np.linalg.norm(points[moving] - goal, axis=1)
-    raise MeshError(
-        f"{np.count_nonzero(left)} boundary nodes cannot be moved to {gap:g} mm inside the intracranial mask without "
-        f"inverting tetrahedra (up to {left.max():.2f} mm are missing); choose a smaller envelope or edge_length"
-    )
+    return TetMesh.from_arrays(points, mesh.cells, mesh.tissue, mesh.names)
+
+
+def _drag(
+    points: Float[np.ndarray, "nodes 3"],
+    mesh: TetMesh,
+    moving: Int[np.ndarray, "n"],
+    rest: Float[np.ndarray, "n 3"],
+) -> None:
+    """Move the boundary nodes around each node that has not arrived by the rest of its way, in place.
+
+    A tetrahedron with four boundary nodes stops one of them that moves through the plane of the others.
+    """
+    for node, way in zip(moving, rest, strict=True):
+        if way.any():
+            around = np.setdiff1d(np.intersect1d(_neighbours(mesh.cells, np.array([node])), mesh.boundary), moving)
+            _advance(points, mesh.cells, around, points[around] + way)
 
 
 def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: float) -> Float[np.ndarray, "n 3"]:

@@ -58,6 +58,17 @@ class TestPullInside:
         untouched = np.intersect1d(mesh.boundary, np.flatnonzero(before >= 0.5))
         np.testing.assert_array_equal(pulled.points[untouched], mesh.points[untouched])
 
+    def test_a_node_drags_along_those_that_stop_it(self):
+        """The top of a flat tetrahedron, whose base is inside already, would have to pass through it."""
+        angle = np.radians([90, 210, 330])
+        base = np.stack([12 * np.cos(angle), 12 * np.sin(angle), np.full(3, -1.0)], axis=1)
+        points = np.array([[0.0, 0.0, 3.0], *base, [0.0, 0.0, -20.0]])
+        mesh = TetMesh.from_arrays(points, np.array([[0, 1, 3, 2], [4, 1, 2, 3]]), np.zeros(2, int), ("gm",))
+        distance = signed_distance(flat_skull(mesh.points, axis=2, wall=0.0))
+        pulled = pull_inside(mesh, distance, 0.5)
+        assert np.asarray(distance.interpolate(pulled.points)).min() >= 0.5
+        assert (pulled.volumes > 0).all()
+
     def test_leaves_a_mesh_that_is_clear_alone(self):
         mesh = ball_mesh()
         distance = signed_distance(flat_skull(mesh.points, axis=0, wall=mesh.points[:, 0].max() + 2))
@@ -66,7 +77,7 @@ class TestPullInside:
     def test_refuses_the_impossible(self):
         mesh = ball_mesh()
         distance = signed_distance(flat_skull(mesh.points, axis=0, wall=mesh.points[:, 0].min() + 8))
-        with pytest.raises(MeshError, match=r"boundary nodes cannot be moved to 0\.5 mm inside the intracranial mask"):
+        with pytest.raises(MeshError, match=r"boundary nodes cannot be moved into the intracranial mask"):
             pull_inside(mesh, distance, 0.5)
 
     def test_refuses_a_mask_that_is_too_thin(self):
