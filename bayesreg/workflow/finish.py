@@ -17,9 +17,11 @@ from bayesreg.io import checkpoints, store
 from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.records import Inputs, Predicted, Run
 from bayesreg.io.run_folder import RunFolder
-from bayesreg.model.observations.observation import Doubtful, Noted
+from bayesreg.io.volumes import save_image
+from bayesreg.model.observations.observation import Doubtful, Mapped, Noted
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import warp_image
+from bayesreg.pose import Pose
 from bayesreg.report.metrics import compute_metrics
 from bayesreg.results.bids import FOLDER, write_bids
 from bayesreg.results.displacement_fields import ENSEMBLE, moments_on, write_transforms
@@ -85,6 +87,8 @@ def finish(
     with folder.writing() as place:
         write_transforms(place, transform(config.results.draws), grid)
         store.write_results(place, finished, *moments.rounded)
+        for name, image in _maps(posterior, predicted, pose).items():
+            save_image(image, place(name))
     with folder.writing("finished") as place:
         if config.results.bids is not None:
             write_bids(folder.path, config.results.bids, place)
@@ -109,6 +113,16 @@ def _with_findings(provenance: dict[str, Any], posterior: Posterior, predicted: 
     appraisal = provenance.get("appraisal", {})
     added = {"warnings": warnings, "notes": notes}
     return provenance | {"appraisal": appraisal | {key: [*appraisal.get(key, ()), *added[key]] for key in added}}
+
+
+def _maps(posterior: Posterior, predicted: Predicted, pose: Pose) -> dict[str, Image]:
+    """Collect the maps of the observations by the names of their files, each in the world of its image's file."""
+    images: dict[str, Image] = {}
+    for name, observation in posterior.observations.items():
+        if isinstance(observation, Mapped):
+            maps = observation.maps(predicted.of_observation(name))
+            images |= maps.of_fixed | {file: pose.inverse.aligned(image) for file, image in maps.of_moving.items()}
+    return images
 
 
 def _store_draws(posterior: Posterior, samples: Samples, folder: RunFolder, seed: int) -> Any:

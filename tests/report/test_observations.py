@@ -75,6 +75,17 @@ def test_each_pair_of_images_says_what_it_compares():
     assert all("affine map" in text for text in texts)
 
 
+def test_what_is_no_density_of_images_is_called_a_pseudo_likelihood():
+    paper, usual = ImageOptions().model_dump(mode="json"), ImageOptions(intensity_map=2).model_dump(mode="json")
+    of_paper, of_usual, of_windows = (
+        explanations({"observations": {"images": {**IMAGES, "options": options}}})[0]
+        for options in (paper, usual, OPTIONS)
+    )
+    assert "pseudo-likelihood" not in of_paper
+    assert "pseudo-likelihood" in of_usual
+    assert "pseudo-likelihood" in of_windows
+
+
 def test_observations_without_residuals_leave_their_cells_empty():
     table = observation_table({"observations": {"points": POINTS, "own": OWN}})
     assert table.groups[0][1] == [

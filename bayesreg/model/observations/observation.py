@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
+from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Blocks, Values
 from bayesreg.model.state import State
@@ -110,6 +111,27 @@ class Noted(Protocol):
 
     def notes(self, summary: Mapping[str, np.ndarray]) -> list[str]:
         """Return these sentences, from the arrays of `summarise`."""
+
+
+class Maps(NamedTuple):
+    """Images that an observation adds to the folder of a run, by the names of their files.
+
+    Attributes
+    ----------
+    of_fixed, of_moving : dict
+        Images in the world of the fixed image, and in that of the aligned moving image.
+    """
+
+    of_fixed: dict[str, Image]
+    of_moving: dict[str, Image]
+
+
+@runtime_checkable
+class Mapped(Protocol):
+    """An observation that makes maps."""
+
+    def maps(self, summary: Mapping[str, np.ndarray]) -> Maps:
+        """Return the maps, from the arrays of `summarise`."""
 
 
 @runtime_checkable

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 from scipy import ndimage
 
 from bayesreg.fem.elements import GAUSS_SUBDIVISIONS, Quadrature, gauss_quadrature, quadrature_at
@@ -69,27 +70,36 @@ def _voxels_of(mesh: TetMesh, fixed: Image, most: int | None) -> Quadrature:
     return quadrature_at(mesh, cells[chosen], barycentric[chosen], np.full(len(chosen), volume / len(chosen)))
 
 
+def is_seen(
+    mesh: TetMesh, quadrature: Quadrature, moving: Image, visible: Interpolator | None = None
+) -> Bool[np.ndarray, "points"]:
+    """Return which points are visible and lie on the grid of the moving image at rest; elsewhere nothing was observed.
+
+    The choice of points must not depend on the displacement: the posterior could then exclude points that do not fit.
+    """
+    positions = quadrature.positions(mesh)
+    seen = moving.contains(positions)
+    if visible is not None:
+        seen &= np.asarray(visible(jnp.asarray(positions))) > 0.5
+    return seen
+
+
 def seen_points(
     mesh: TetMesh, quadrature: Quadrature, moving: Image, visible: Interpolator | None = None
 ) -> Quadrature:
-    """Return the visible points that lie on the grid of the moving image at rest; nothing was observed elsewhere.
-
-    The choice of points must not depend on the displacement: the posterior could then exclude points that do not fit.
+    """Return the points of `is_seen`.
 
     Raises
     ------
     InputError
         If none is left.
     """
-    positions = quadrature.positions(mesh)
-    mask = moving.contains(positions)
-    if visible is not None:
-        mask &= np.asarray(visible(jnp.asarray(positions))) > 0.5
-    if not mask.any():
+    seen = is_seen(mesh, quadrature, moving, visible)
+    if not seen.any():
         raise InputError("nothing is left to compare: all of the mesh lies in fixed_ignore, or beyond the moving image")
-    if mask.all():
+    if seen.all():
         return quadrature
     visible_arrays = (
-        np.asarray(array)[mask] for array in (quadrature.cells, quadrature.barycentric, quadrature.weights)
+        np.asarray(array)[seen] for array in (quadrature.cells, quadrature.barycentric, quadrature.weights)
     )
     return quadrature_at(mesh, *visible_arrays)

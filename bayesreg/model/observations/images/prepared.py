@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -23,10 +24,26 @@ from bayesreg.model.observations.images.independence import independent_scores
 from bayesreg.model.observations.images.intensity_map import SHARE, shading_basis
 from bayesreg.model.observations.images.likelihood import ComparedImages, Comparison, shading_name
 from bayesreg.model.observations.images.options import ImageOptions
-from bayesreg.model.observations.images.points import quadrature_of, require_overlap, seen_points, visibility
+from bayesreg.model.observations.images.points import (
+    is_seen,
+    quadrature_of,
+    require_overlap,
+    seen_points,
+    visibility,
+)
 from bayesreg.model.observations.images.pointwise import Intensities
 from bayesreg.model.observations.images.self_similarity import AlternatingImages, describe_self_similarity
-from bayesreg.model.observations.observation import Placed, Recorded
+from bayesreg.model.observations.images.unsupported import (
+    NOT_COMPARED,
+    Points,
+    explain_unsupported,
+    find_unsupported,
+    mark_places,
+    misfit_file,
+    support_at,
+    support_file,
+)
+from bayesreg.model.observations.observation import Maps, Placed, Recorded
 from bayesreg.model.state import State
 from bayesreg.settings import is_inferred
 from bayesreg.types import AnyArray, InputError
@@ -99,8 +116,11 @@ class PreparedPair:
         pair_suffix = "" if self.name == "images" else f" of {self.name!r}"
         require_overlap(mesh, self.fixed, f"fixed image{pair_suffix}")
         require_overlap(mesh, self.moving, f"moving image{pair_suffix}")
-        visible = None if self.fixed_ignore is None else visibility(self.fixed, self.fixed_ignore)
-        return seen_points(mesh, quadrature_of(mesh, self.fixed, self.options), self.moving, visible)
+        return seen_points(mesh, quadrature_of(mesh, self.fixed, self.options), self.moving, self._visible_of_fixed)
+
+    @property
+    def _visible_of_fixed(self) -> Interpolator | None:
+        return None if self.fixed_ignore is None else visibility(self.fixed, self.fixed_ignore)
 
     def on(self, mesh: TetMesh) -> Placed:
         """Place the pair on a mesh; see `ImagePair.on`."""
@@ -185,11 +205,36 @@ class PreparedPair:
         }
 
     def summarise(self, posterior: Any, state: State, draws: Values) -> dict[str, np.ndarray]:
-        """Return the residual at a state, in units of the noise, and the tissue of each of its points."""
-        term = posterior.data.terms[self.name]
-        residual = term.scaled_residual(state.u, state.values)
-        tissue = posterior.mesh.tissue[np.asarray(term.quadrature.cells)]
-        return {"residual": np.asarray(residual, np.float32), "residual_tissue": tissue.astype(np.int8)}
+        """Return the residual at a state, in units of the noise, the tissue of each of its points, and their support.
+
+        For the support see `find_unsupported`; `misfit_places` (k, 3) are the displaced points of the regions of
+        misfit, mm.
+        """
+        mesh, term = posterior.mesh, posterior.data.terms[self.name]
+        residual = np.asarray(term.scaled_residual(state.u, state.values))
+        places = np.asarray(term.places(state.u))
+        share = np.ones(len(places)) if term.visible is None else np.asarray(term.visible(places))
+        quadrature = quadrature_of(mesh, self.fixed, self.options)
+        seen = is_seen(mesh, quadrature, self.moving, self._visible_of_fixed)
+        positions = np.asarray(quadrature.positions(mesh))
+        support = find_unsupported(Points.where(seen, positions, residual, share, np.asarray(quadrature.weights)))
+        return {
+            "residual": residual.astype(np.float32),
+            "residual_tissue": mesh.tissue[np.asarray(term.quadrature.cells)].astype(np.int8),
+            "misfit_places": places[support_at(support, positions[seen]) > NOT_COMPARED].astype(np.float32),
+            **support,
+        }
+
+    def doubts(self, summary: Mapping[str, np.ndarray]) -> list[str]:
+        """Return sentences on places that the images do not support; see `explain_unsupported`."""
+        return explain_unsupported(summary, self.name)
+
+    def maps(self, summary: Mapping[str, np.ndarray]) -> Maps:
+        """Return the map of the support, and the mask of the regions of misfit in the moving image if there are any."""
+        support = Image(summary["support"], summary["support_affine"])
+        places = np.asarray(summary["misfit_places"], float)
+        marked = {misfit_file(self.name): mark_places(places, self.moving)} if len(places) else {}
+        return Maps({support_file(self.name): support}, marked)
 
     def recorded(self, term: ComparedImages) -> Recorded:
         """Return the compared intensities of f at up to 1,000 evenly spaced quadrature points."""

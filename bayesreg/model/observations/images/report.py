@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesreg.model.observations.images.discrepancies import DISCREPANCIES
 from bayesreg.model.observations.images.similarity import SIMILARITIES
+from bayesreg.model.observations.images.unsupported import BEYOND, LEAST_MISFIT, NOT_COMPARED, support_file
 from bayesreg.model.observations.section import Arrays, ReportFigure, ReportTable
 from bayesreg.printable import number
 from bayesreg.tissues import colours_of, label_of
@@ -75,6 +76,26 @@ def residual_figure(
     return ReportFigure(f"residual-{name}", f"The residual{pair_suffix(name)}", caption, alt, 2.6, draw)
 
 
+def support_figure(name: str, summary: Arrays) -> ReportFigure:
+    """Make the figure of the places that the images do not support; see `find_unsupported`."""
+    unseen, misfits = float(summary["unseen"]), summary["regions"][1:]
+    caption = (
+        "The organ from three sides. Grey: the images support the displacement. Striped: they are not compared, for "
+        f"they are ignored there or one of them ends ({unseen:.1%} of the organ). Red: regions of at least "
+        f"{LEAST_MISFIT:g} ml where the residual has one sign ({misfits[:, 0].sum():.3g} ml in {len(misfits)}). "
+        f"{support_file(name)} holds the map."
+    )
+    alt = f"{len(misfits)} regions of misfit; {unseen:.1%} of the organ is not compared."
+    return ReportFigure(
+        f"support-{name}",
+        f"What the images support{pair_suffix(name)}",
+        caption,
+        alt,
+        2.6,
+        partial(_draw_support, summary),
+    )
+
+
 def pair_suffix(name: str) -> str:
     """Return the part of a title that names the pair; empty for the main pair."""
     return "" if name == "images" else f" of {name}"
@@ -102,6 +123,24 @@ def _draw_residual(summary: Arrays, tissues: Sequence[str], expected: ExpectedNo
             axes, NAMES[DISCREPANCIES[k]], summary["observed"][..., k], summary["replicated"][..., k], style
         )
     others[0].legend(loc="upper left", bbox_to_anchor=(0, 1.04), ncols=2, handlelength=1.0, columnspacing=1.0)
+
+
+def _draw_support(summary: Arrays, figure: Any, style: Any) -> None:
+    support = np.asarray(summary["support"])
+    affine = np.asarray(summary["support_affine"])
+    places = [affine[k, 3] + affine[k, k] * np.arange(n) for k, n in enumerate(support.shape)]
+    names = ("x", "y", "z")
+    for axis, axes in enumerate(np.ravel(figure.subplots(1, 3))):
+        across = [k for k in range(3) if k != axis]
+        x, y = (places[k] for k in across)
+        for mask, draw in (
+            (support != BEYOND, partial(axes.contourf, colors=[style.FAINT])),
+            (support == NOT_COMPARED, partial(axes.contourf, colors=["none"], hatches=["////"])),
+            (support > NOT_COMPARED, partial(axes.contourf, colors=[style.ACCENT], alpha=0.8)),
+        ):
+            if mask.any():
+                draw(x, y, mask.any(axis=axis).T.astype(float), levels=[0.5, 1.5])
+        axes.set(aspect="equal", xlabel=f"{names[across[0]]}, mm", ylabel=f"{names[across[1]]}, mm")
 
 
 def _draw_discrepancy(axes: Any, name: str, observed: np.ndarray, replicated: np.ndarray, style: Any) -> None:

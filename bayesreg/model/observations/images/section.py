@@ -10,7 +10,7 @@ from pydantic import model_validator
 from bayesreg.io.records import Inputs
 from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.model.observations.images.pair import ImagePair
-from bayesreg.model.observations.images.report import check_table, residual_figure
+from bayesreg.model.observations.images.report import check_table, residual_figure, support_figure
 from bayesreg.model.observations.images.similarity import SIMILARITIES
 from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
 from bayesreg.settings import FoundImage
@@ -18,6 +18,11 @@ from bayesreg.types import InputError
 
 # The options of images whose contrasts are related patch by patch only.
 IN_PATCHES: Mapping[str, Any] = {"similarity": {"kind": "lc2"}, "intensity_map": None}
+
+PSEUDO_LIKELIHOOD = (
+    "With this the images have a pseudo-likelihood: it is not the density of images that a model draws, and the width "
+    "of its intervals rests on the number of independent points, which is estimated from the residuals"
+)
 
 
 class ImagesSection(ObservationSection, ImageOptions):
@@ -67,9 +72,12 @@ class ImagesSection(ObservationSection, ImageOptions):
 
     @classmethod
     def explain(cls, name: str, described: Mapping[str, Any]) -> str:
-        """Return the formula of E_s of the similarity."""
-        similarity = SIMILARITIES[described["options"]["similarity"]["kind"]]
-        return f"<var>E</var><sub>s</sub>{'' if name == 'images' else f'({name})'} = {similarity.formula}"
+        """Return the formula of E_s of the similarity, and what its likelihood is where it is not a density of f."""
+        options = described["options"]
+        similarity = SIMILARITIES[options["similarity"]["kind"]]
+        formula = f"<var>E</var><sub>s</sub>{'' if name == 'images' else f'({name})'} = {similarity.formula}"
+        is_density = options["similarity"]["kind"] in ("ssd", "student_t") and options["intensity_map"] is None
+        return formula if is_density and options["independent_points"] is None else f"{formula}. {PSEUDO_LIKELIHOOD}"
 
     @classmethod
     def tables(cls, name: str, summary: Arrays) -> list[ReportTable]:
@@ -80,9 +88,10 @@ class ImagesSection(ObservationSection, ImageOptions):
     def figures(
         cls, name: str, summary: Arrays, tissues: Sequence[str], described: Mapping[str, Any]
     ) -> list[ReportFigure]:
-        """Return the figure of the residual and its expected distribution."""
+        """Return the figures of the residual, with its expected distribution, and of the places without support."""
         if "residual" not in summary:
             return []
         similarity = described["options"]["similarity"]
         residual = SIMILARITIES[similarity["kind"]].residual
-        return [residual_figure(name, summary, tissues, similarity, residual)]
+        figures = [residual_figure(name, summary, tissues, similarity, residual)]
+        return [*figures, support_figure(name, summary)] if "support" in summary else figures
