@@ -50,6 +50,7 @@ def _answers(port):
         return trial.connect_ex((serve.LOOPBACK, port)) == 0
 
 
+@pytest.mark.long
 def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
     assert umbridge.supported_models(address) == ["log_posterior", "forward", "start"]
     log_posterior, forward, start = (
@@ -85,6 +86,7 @@ def test_the_client_finds_value_gradient_and_forward_model(posterior, address):
     assert step @ np.array(pulled) == pytest.approx(difference, rel=1e-5)
 
 
+@pytest.mark.long
 def test_what_is_impossible_is_a_number(address):
     log_posterior, start = (umbridge.HTTPModel(address, name) for name in ("log_posterior", "start"))
     position = [np.full(len(block), 1e200).tolist() for block in start([])]
