@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
@@ -216,8 +216,20 @@ def compare_images(fixed: Image, moving: Image, domain: Image) -> Likeness:
         float(offset),
         float(on_grid.mean()),
         *explained_shares(fixed_values, moving_values),
-        *_shares_within_patches(fixed.smoothed(COARSE), moving.smoothed(COARSE), places[on_grid]),
+        *_shares_within_patches(_smoothed_within(domain, fixed), _smoothed_within(domain, moving), places[on_grid]),
     )
+
+
+def within(domain: Image, image: Image) -> Bool[np.ndarray, "X Y Z"]:
+    """Mark the voxels of an image that lie in the domain; the two grids may differ."""
+    return np.asarray(domain.interpolate(image.grid_points())) > 0.5
+
+
+def _smoothed_within(domain: Image, image: Image) -> Image:
+    """Smooth an image by `COARSE` from its voxels in the domain alone: what is ignored, such as metal, stays out."""
+    inside = within(domain, image).astype(float)
+    of_values, of_mask = (image.with_voxels(x).smoothed(COARSE).voxels for x in (inside * image.voxels, inside))
+    return image.with_voxels(of_values / np.maximum(of_mask, 1e-6))
 
 
 def _shares_within_patches(fixed: Image, moving: Image, places: Float[np.ndarray, "points 3"]) -> tuple[float, float]:

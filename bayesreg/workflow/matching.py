@@ -21,7 +21,7 @@ from bayesreg.model.observations.surface import Surface, SurfaceSection
 from bayesreg.model.observations.surface_pose import find_pose as find_surface_pose
 from bayesreg.pose import Pose
 from bayesreg.types import InputError
-from bayesreg.workflow.appraisal import Likeness, compare_images
+from bayesreg.workflow.appraisal import Likeness, compare_images, within
 
 # A pose turned by more degrees than this is not taken by itself: an axis may be mistaken.
 MOST_DEGREES = 45.0
@@ -404,8 +404,3 @@ def _scale_of(name: str, image: Image, mask: np.ndarray) -> IntensityScale:
         return robust_scale(image, mask)
     except InputError as error:
         raise InputError(f"the {name} image within the organ: {error}") from error
-
-
-def within(domain: Image, image: Image) -> np.ndarray:
-    """Mark the voxels of an image that lie in the domain; the two grids may differ."""
-    return np.asarray(domain.interpolate(image.grid_points())) > 0.5
