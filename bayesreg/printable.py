@@ -49,3 +49,9 @@ def number(value: float | int | None, digits: int = 3) -> str:
         return f"{value:,.0f}".replace("-", "−")
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def place_text(place: Iterable[float]) -> str:
+    """Format world coordinates, mm."""
+    # Adding zero turns −0 into 0.
+    return ("(" + ", ".join(f"{round(coordinate) + 0:d}" for coordinate in place) + ") mm").replace("-", "−")

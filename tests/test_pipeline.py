@@ -118,6 +118,7 @@ def test_the_run_folder_is_that_of_the_contract(finished, folder):
     read = store.read_run(RunFolder(out)).predicted
     np.testing.assert_allclose(read.chain_mean.mean(axis=0), finished.u_mean, atol=1e-6)
     assert "Posterior predictive checks" in (out / "report.html").read_text()
+    assert (out / "maps" / "support.nii.gz").is_file()
     assert not finished.converged
 
 

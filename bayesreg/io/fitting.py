@@ -143,7 +143,8 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
 
     Nodes that are too near move along the gradient of the distance. If a full step would give a tetrahedron a mean
     ratio below 0.1, or below its present one, the node moves part of the way. Then the interior nodes around it are
-    smoothed, and the node moves on. A node that is stopped on its way may stay nearer, outside the forbidden region.
+    smoothed, and the node moves on. A node that is stopped drags its neighbours on the
+    boundary along. One that is stopped for good may stay nearer, outside the forbidden region.
 
     Parameters
     ----------

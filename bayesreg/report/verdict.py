@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from bayesreg.mesh import TetMesh
-from bayesreg.printable import NONE, number
+from bayesreg.printable import NONE, number, place_text
 from bayesreg.report.estimands import Estimand, above, parameter_groups, worst
 from bayesreg.tissues import label_of
 
@@ -126,12 +126,6 @@ def rhat_text(rhat: float) -> str:
 
 def _at(entry: Estimand) -> str:
     return f" at {place_text(entry.place)}" + (f", {entry.region}" if entry.region else "") if entry.place else ""
-
-
-def place_text(place: Iterable[float]) -> str:
-    """Format world coordinates, mm."""
-    # Adding zero turns −0 into 0.
-    return ("(" + ", ".join(f"{round(coordinate) + 0:d}" for coordinate in place) + ") mm").replace("-", "−")
 
 
 def _few_draws(entries: Sequence[Estimand]) -> str:

@@ -18,7 +18,7 @@ from bayesreg.io.point_formats import PointPairs
 from bayesreg.io.records import Inputs, Predicted, Run
 from bayesreg.io.run_folder import RunFolder
 from bayesreg.io.volumes import save_image
-from bayesreg.model.observations.observation import Doubtful, Mapped, Noted
+from bayesreg.model.observations.observation import MAPS, Doubtful, Mapped, Noted
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.warp import warp_image
 from bayesreg.pose import Pose
@@ -82,7 +82,7 @@ def finish(
         **inputs._asdict(),
     )
     # The run may have finished before, with other files in these folders.
-    for subfolder in (ENSEMBLE, FOLDER):
+    for subfolder in (ENSEMBLE, FOLDER, MAPS):
         folder.drop(subfolder)
     with folder.writing() as place:
         write_transforms(place, transform(config.results.draws), grid)

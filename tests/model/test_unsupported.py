@@ -54,7 +54,7 @@ def test_a_cavity_is_found_with_its_place_and_volume(ball, sign):
     marked = support_at(support, points.positions) == NOT_COMPARED + 1
     assert (marked & gone).sum() > 0.8 * gone.sum()
     [sentence] = explain_unsupported(support)
-    assert "--moving-ignore misfit.nii.gz" in sentence
+    assert "--moving-ignore maps/misfit.nii.gz" in sentence
     assert f"{volume:.2g} ml about ({place[0]:.0f}, −15, {place[2]:.0f}) mm" in sentence
 
 
@@ -108,11 +108,11 @@ def test_a_pair_finds_what_is_gone_and_what_is_ignored():
     summary = observation.summarise(posterior, state, {})
     unseen, misfit = observation.doubts(summary)
     assert "is ignored or lies beyond the moving image" in unseen
-    assert "misfit.nii.gz" in misfit
+    assert "maps/misfit.nii.gz" in misfit
     assert len(summary["regions"]) == 2
     maps = observation.maps(summary)
-    marked = np.asarray(maps.of_moving["misfit.nii.gz"].voxels) > 0
+    marked = np.asarray(maps.of_moving["maps/misfit.nii.gz"].voxels) > 0
     assert (marked & gone).sum() > 0.9 * gone.sum()
     assert marked.sum() < 1.6 * gone.sum()
-    support = maps.of_fixed["support.nii.gz"]
+    support = maps.of_fixed["maps/support.nii.gz"]
     assert set(np.unique(support.voxels)) == {BEYOND, SUPPORTED, NOT_COMPARED, NOT_COMPARED + 1}

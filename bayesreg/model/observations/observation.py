@@ -113,6 +113,10 @@ class Noted(Protocol):
         """Return these sentences, from the arrays of `summarise`."""
 
 
+# The subfolder of a run with the maps of its observations.
+MAPS = "maps"
+
+
 class Maps(NamedTuple):
     """Images that an observation adds to the folder of a run, by the names of their files.
 

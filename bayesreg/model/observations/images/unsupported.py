@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from bayesreg.image import Image
+from bayesreg.model.observations.observation import MAPS
+from bayesreg.printable import place_text
 
 # The map has voxels of this side, mm, and is smoothed by a Gaussian of this sd, mm.
 STEP, SMOOTHING = 3.0, 3.0
@@ -123,11 +125,11 @@ def explain_unsupported(summary: Mapping[str, np.ndarray], name: str = "images")
     (_, *centre, _), *misfits = summary["regions"]
     if (unseen := float(summary["unseen"])) > LEAST_UNSEEN:
         sentences.append(
-            f"{unseen:.0%} of the organ, most of it about {_place(centre)}, is ignored or lies beyond the moving "
+            f"{unseen:.0%} of the organ, most of it about {place_text(centre)}, is ignored or lies beyond the moving "
             f"image{_of(name)}: only the prior and other data say how it moved."
         )
     if misfits:
-        regions = ", ".join(f"{volume:.2g} ml about {_place(centre)}" for volume, *centre, _ in misfits[:3])
+        regions = ", ".join(f"{volume:.2g} ml about {place_text(centre)}" for volume, *centre, _ in misfits[:3])
         more = f" and {len(misfits) - 3} smaller ones" if len(misfits) > 3 else ""
         sentences.append(
             f"The images{_of(name)} do not match at {regions}{more}: is tissue gone there, or new? If so, the "
@@ -139,12 +141,12 @@ def explain_unsupported(summary: Mapping[str, np.ndarray], name: str = "images")
 
 def misfit_file(name: str) -> str:
     """Return the name of the file with the mask of misfit of a pair of images."""
-    return f"misfit{'' if name == 'images' else '_' + name}.nii.gz"
+    return f"{MAPS}/misfit{'' if name == 'images' else '_' + name}.nii.gz"
 
 
 def support_file(name: str) -> str:
     """Return the name of the file with the map of the support of a pair of images."""
-    return f"support{'' if name == 'images' else '_' + name}.nii.gz"
+    return f"{MAPS}/support{'' if name == 'images' else '_' + name}.nii.gz"
 
 
 def mark_places(places: Float[np.ndarray, "points 3"], grid: Image) -> Image:
@@ -180,10 +182,6 @@ def _smoothed_sum(voxels: tuple[np.ndarray, ...], values: np.ndarray, shape: tup
 def _connected(mask: np.ndarray) -> list[np.ndarray]:
     labels, count = ndimage.label(mask)
     return [labels == number for number in range(1, count + 1)]
-
-
-def _place(centre: Any) -> str:
-    return "(" + ", ".join(f"{round(float(x)) + 0:d}" for x in centre).replace("-", "−") + ") mm"
 
 
 def _of(name: str) -> str:
