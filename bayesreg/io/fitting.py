@@ -143,8 +143,8 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
 
     Nodes that are too near move along the gradient of the distance. If a full step would give a tetrahedron a mean
     ratio below 0.1, or below its present one, the node moves part of the way. Then the interior nodes around it are
-    smoothed, and the node moves on. A node that is stopped drags its neighbours on the
-    boundary along. One that is stopped for good may stay nearer, outside the forbidden region.
+    smoothed, and the node moves on. One that is stopped may stay nearer than `gap`, outside the forbidden region. A
+    node that is stopped within the forbidden region drags its neighbours on the boundary along.
 
     Parameters
     ----------
@@ -163,8 +163,11 @@ def pull_inside(mesh: TetMesh, distance: Image, gap: float) -> TetMesh:
     for _ in range(PULLS):
         moving = mesh.boundary[distance_at(distance, points[mesh.boundary]) < gap]
         goal = _allowed_places(distance, points[moving], gap)
-        if not _move(points, mesh, moving, goal, PULLING_ROUNDS):
-            _drag(points, mesh, moving, goal - points[moving])
+        _move(points, mesh, moving, goal, PULLING_ROUNDS)
+        stopped = distance_at(distance, points[moving]) <= 0
+        if not stopped.any():
+            break
+        _drag(points, mesh, moving[stopped], (goal - points[moving])[stopped])
     room = distance_at(distance, points[mesh.boundary])
     if (room <= 0).any():
         raise MeshError(
@@ -182,14 +185,13 @@ def _drag(
     moving: Int[np.ndarray, "n"],
     rest: Float[np.ndarray, "n 3"],
 ) -> None:
-    """Move the boundary nodes around each node that has not arrived by the rest of its way, in place.
+    """Move the boundary nodes around each node by the rest of its way, in place.
 
     A tetrahedron with four boundary nodes stops one of them that moves through the plane of the others.
     """
     for node, way in zip(moving, rest, strict=True):
-        if way.any():
-            around = np.setdiff1d(np.intersect1d(_neighbours(mesh.cells, np.array([node])), mesh.boundary), moving)
-            _advance(points, mesh.cells, around, points[around] + way)
+        around = np.setdiff1d(np.intersect1d(_neighbours(mesh.cells, np.array([node])), mesh.boundary), moving)
+        _advance(points, mesh.cells, around, points[around] + way)
 
 
 def _allowed_places(distance: Image, points: Float[np.ndarray, "n 3"], gap: float) -> Float[np.ndarray, "n 3"]:
@@ -223,14 +225,13 @@ def _move(
     moving: Int[np.ndarray, "n"],
     goal: Float[np.ndarray, "n 3"],
     rounds: int,
-) -> bool:
-    """Move nodes towards their goals, in place, and smooth the interior around them; return whether all arrive."""
+) -> None:
+    """Move nodes towards their goals, in place, and smooth the interior around them."""
     for _ in range(rounds):
         _advance(points, mesh.cells, moving, goal)
         if np.array_equal(points[moving], goal):
-            return True
+            return
         _smooth(points, mesh.cells, _interior_near(mesh, moving))
-    return False
 
 
 def _advance(
