@@ -45,11 +45,9 @@ class Predicted(NamedTuple):
     far_mm : scalar
         A distance, mm, for `far`.
     far : (n,) array
-        P(|u − ū| > far_mm) at every node, with ū the posterior mean. The variance that the mesh cannot resolve is
-        included.
+        P(|u − ū| > far_mm) at every node, with ū the posterior mean.
     reach : (n,) array
-        Radius of the ball around the mean that holds each displaced node with 95 % probability, mm. The variance that
-        the mesh cannot resolve is included.
+        Radius of the ball around the mean that holds each displaced node with 95 % probability, mm.
     place_names : (L,) array of str
         Names of the points that the report shows.
     place_points : (L, 3) array
@@ -61,9 +59,6 @@ class Predicted(NamedTuple):
         centre, mm, and the rotation vector about the centre, degrees.
     centre : (3,) array
         The mesh's centre in the fixed image's world, mm.
-    total_sd : (n, 3) array or None
-        Standard deviation of the displacement of every node along the axes of the moving image's world, mm; None
-        without a pose, when these axes are those of the fixed image.
     observations : mapping
         The arrays of each observation for the report, by "<observation>/<array>".
     evaluation_names, evaluation_points : (k,), (k, 3) arrays or None
@@ -93,7 +88,6 @@ class Predicted(NamedTuple):
     place_draws: AnyArray
     motion: AnyArray
     centre: AnyArray
-    total_sd: AnyArray | None = None
     observations: Mapping[str, AnyArray] = MappingProxyType({})
     evaluation_names: np.ndarray | None = None
     evaluation_points: AnyArray | None = None

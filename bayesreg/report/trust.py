@@ -67,8 +67,8 @@ def _mesh(manifest: Mapping[str, Any]) -> list[str]:
     if nodes is None or mesh is None:
         return []
     return [
-        f"Within a tetrahedron the displacement is linear. What a smooth one departs from that, {number(mesh, 2)} mm "
-        f"(root mean square over voxels and axes) by how the gradient changes between nodes, is part of the sd of each "
-        f"voxel in displacement_sd.nii.gz, beside the posterior’s own, {number(nodes, 2)} mm; figures show the latter "
-        "alone."
+        f"Within a tetrahedron the displacement is linear. What the mesh cannot resolve, {number(mesh, 2)} mm (root "
+        "mean square over voxels and axes) by the loads and the stiffness that were inferred, is part of the sd of "
+        f"each voxel in displacement_sd.nii.gz, beside the posterior’s own, {number(nodes, 2)} mm; figures show the "
+        "latter alone."
     ]

@@ -97,7 +97,7 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
     distance, box = _distance_to_others(numbers), _box(numbers)
     reach = _reach(inverse)
     certain, unsure = (np.empty(int(np.prod(grid.shape)), kind) for kind in (np.int16, bool))
-    nearby, unresolved = [], []
+    nearby = []
     for block, places in grid.blocks():
         source, near = inverse.place(places)
         certain[block] = numbers.nearest(source)
@@ -107,8 +107,7 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
         clearance = np.where(numbers.contains(source), distance.nearest(source), _distance_to_box(numbers, box, source))
         unsure[block] = (clearance <= reach[near.cell] + FURTHEST * sd.max(axis=1)) & (certain[block] >= 0)
         nearby.append(Location(near.cell[unsure[block]], near.barycentric[unsure[block]]))
-        unresolved.append(sd[unsure[block]].astype(np.float32))
-    open_voxels, unresolved_sd = np.flatnonzero(unsure), np.concatenate(unresolved)
+    open_voxels = np.flatnonzero(unsure)
     cell, barycentric = (np.concatenate(pieces) for pieces in zip(*nearby, strict=True))
     counts = np.zeros((len(values), len(open_voxels)), np.uint16)
     for block in slices(len(open_voxels), max(MOST_COUNTS // len(values), 1)):
@@ -118,7 +117,6 @@ def carry_labels(transform: Transform, labels: Image, grid: Image, keep_around: 
             numbers,
             grid.centres(open_voxels[block]),
             Location(cell[block], barycentric[block]),
-            unresolved_sd[block],
             block_counts,
         )
     return CarriedLabels(grid, values[order], certain, open_voxels, counts, len(transform.draws))
@@ -129,13 +127,12 @@ def _count(
     numbers: Image,
     places: Float[np.ndarray, "k 3"],
     near: Location,
-    unresolved_sd: Float[np.ndarray, "k 3"],
     counts: UInt[np.ndarray, "L k"],
 ) -> None:
     """Count the labels that every draw gives to points, in place."""
 
     def labels_of(draw: int) -> Int[np.ndarray, "k"]:
-        sources = inverse.place_by(draw, places, near, unresolved_sd)
+        sources = inverse.place_by(draw, places, near)
         return numbers.nearest(sources)
 
     columns = np.arange(len(places))

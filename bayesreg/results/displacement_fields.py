@@ -14,7 +14,6 @@ from bayesreg.io.fields import save_displacement
 from bayesreg.io.run_folder import Place
 from bayesreg.io.transforms import save_transform
 from bayesreg.mesh import TetMesh
-from bayesreg.model.submesh import discretisation_variance
 from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Pose
 from bayesreg.results.transform import Transform
@@ -40,8 +39,8 @@ class Moments(NamedTuple):
     mean : (X, Y, Z, 3) array
         Posterior mean in the mesh and around it, mm, including the pose.
     sd : (X, Y, Z, 3) array
-        Standard deviation, mm. Its square is the sum of two variances: that of the nodes, interpolated as a standard
-        deviation, and that of a smooth displacement which the mesh cannot resolve (`bayesreg.model.submesh`). Zero
+        Standard deviation, mm, along the axes of the moving image's world. Its square is the sum of two variances:
+        that of the draws, and that of the displacement which the mesh cannot resolve (`bayesreg.model.submesh`). Zero
         around the mesh.
     rms_sd : dict
         Root mean squares of the two parts over the axes and the voxels in the mesh, mm: "nodes", "mesh".
@@ -60,15 +59,13 @@ class Moments(NamedTuple):
         return np.rint(self.mean / step) * step, sd
 
 
-def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], grid: Image) -> Moments:
+def moments_on(transform: Transform, grid: Image) -> Moments:
     """Compute the posterior mean and standard deviation of the displacement at the voxel centres of an image.
 
     Parameters
     ----------
     transform : Transform
         The transform from the fixed image's world.
-    nodal_sd : (n, 3) array
-        Posterior standard deviation at the nodes, mm, along the axes of the moving image's world.
     grid : Image
     """
     mesh, pose = transform.mesh, transform.pose
@@ -81,11 +78,10 @@ def moments_on(transform: Transform, nodal_sd: Float[np.ndarray, "nodes 3"], gri
     mean[covered_index] = np.einsum("ka,kai->ki", covered.barycentric, transform.u_mean[corners])
     for block, points in grid.blocks():
         mean[block] = pose.displacement(points, mean[block])
-    nodal = np.einsum("ka,kai->ki", covered.barycentric, nodal_sd[corners]) ** 2
-    beyond = discretisation_variance(mesh, pose.displacement(mesh.points, transform.u_mean))[covered.cell]
+    drawn, unresolved = transform.variances(covered.cell, covered.barycentric)
     sd = np.zeros_like(mean)
-    sd[covered_index] = np.sqrt(nodal + beyond)
-    shape, variances = (*grid.shape, 3), {"nodes": nodal, "mesh": beyond}
+    sd[covered_index] = np.sqrt(drawn + unresolved)
+    shape, variances = (*grid.shape, 3), {"nodes": drawn, "mesh": unresolved}
     rms = {name: float(np.sqrt(variance.mean())) for name, variance in variances.items()}
     return Moments(mean.reshape(shape), sd.reshape(shape), rms)
 

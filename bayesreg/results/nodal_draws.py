@@ -17,6 +17,7 @@ from bayesreg.model.elastic.boltzmann import Boltzmann
 from bayesreg.model.options import ModelConfig
 from bayesreg.model.problem import body_of
 from bayesreg.model.state import Body, state_of
+from bayesreg.model.submesh import Unresolved, unresolved_in
 from bayesreg.results.result import Result
 from bayesreg.results.transform import Transform
 from bayesreg.types import AnyArray
@@ -29,8 +30,20 @@ def transform_of(result: Result, draws: int = POINT_DRAWS) -> Transform:
     """Build the transform of a run from the fixed image's world to the moving one's, with at most `draws` draws."""
     run = result.run
     # `model_of` does not open the files that the configuration names, since they may no longer exist.
-    u = nodal_draws(model_of(run.config), run, dataset(result.idata, "posterior"), draws)
-    return Transform(Deformer(run.mesh), run.matching.pose, run.u_mean, u, seed=int(run.manifest["seed"]))
+    model, sampled = model_of(run.config), dataset(result.idata, "posterior")
+    u = nodal_draws(model, run, sampled, draws)
+    unresolved = unresolved_by(model, run, sampled, u)
+    return Transform(Deformer(run.mesh), run.matching.pose, run.u_mean, u, unresolved, seed=int(run.manifest["seed"]))
+
+
+def unresolved_by(
+    model: ModelConfig, inputs: Inputs | Run, draws: xr.Dataset, u: Float[np.ndarray, "draws nodes 3"]
+) -> Unresolved:
+    """Make the distribution of what the mesh cannot resolve, from draws and the displacements u of some of them, mm."""
+    body, blocks = body_of(inputs.mesh, with_known_boundary(model, inputs))
+    names = [name for name in blocks if name in draws and name != "u_boundary"]
+    values = fill(blocks, {name: draws[name].mean(("chain", "draw")).to_numpy() for name in names})
+    return unresolved_in(body, values, u)
 
 
 def nodal_draws(

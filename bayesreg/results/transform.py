@@ -11,7 +11,7 @@ from itertools import combinations_with_replacement, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 from scipy.stats.qmc import MultivariateNormalQMC
 
@@ -19,7 +19,7 @@ from bayesreg.fem.deformation import Deformer, Displaced
 from bayesreg.fem.location import Location
 from bayesreg.image import slices
 from bayesreg.mesh import TetMesh
-from bayesreg.model.submesh import discretisation_variance
+from bayesreg.model.submesh import Unresolved
 from bayesreg.pose import Pose
 
 
@@ -37,27 +37,26 @@ class Transform:
         Posterior mean of u at the nodes, mm.
     draws : (S, n, 3) array
         Draws of u at the nodes, mm.
+    unresolved : Unresolved
+        The distribution of the displacement that the mesh cannot resolve.
     turned : bool
         Whether the map leads from the moving image's world to the fixed image's world.
     seed : int
-        Seed of the Normal numbers for the part of u that the mesh cannot resolve.
+        Seed of the draws of the displacement that the mesh cannot resolve.
 
     Notes
     -----
-    A draw of u is linear between the nodes, which averages independent errors of the nodes: in the middle of a
-    tetrahedron the standard deviation of u is half of that at the corners. The true displacement is not linear, and is
-    no better known in the middle than at the corners. Therefore a draw at a point is the draw of the mesh plus a Normal
-    number. The variance of their sum is the variance of the nodes, interpolated as a standard deviation, plus the
-    variance of a smooth displacement that the mesh cannot resolve (`bayesreg.model.submesh`). A run writes the same
-    standard deviation on the grid of its image. All points share the same Normal numbers, three for each draw, so that
-    the result for a point does not depend on the other points. The draws do not show how the displacements of several
-    points vary together.
+    A draw at a point is the draw of the mesh, which is linear in every tetrahedron, plus a draw of the displacement
+    that the mesh cannot resolve (`bayesreg.model.submesh`). The latter has no jumps and is common to all points, so
+    that the draws show how the displacements of several points vary together. Of every two draws, the second has the
+    opposite sign, so that their mean is zero. A run writes the standard deviation of the sum on the grid of its image.
     """
 
     deformer: Deformer
     pose: Pose
     u_mean: Float[np.ndarray, "nodes 3"]
     draws: Float[np.ndarray, "draws nodes 3"]
+    unresolved: Unresolved
     turned: bool = False
     seed: int = 0
 
@@ -77,13 +76,6 @@ class Transform:
         return self.deformer.displaced(self.u_mean)
 
     @cached_property
-    def _normal_numbers(self) -> Float[np.ndarray, "draws 3"]:
-        """Normal numbers for each draw and axis, with mean zero and variance one over the draws."""
-        numbers = np.random.default_rng(self.seed).standard_normal((len(self.draws), 3))
-        numbers -= numbers.mean(axis=0)
-        return numbers / np.maximum(numbers.std(axis=0, ddof=1), 1e-12) if len(numbers) > 1 else numbers
-
-    @cached_property
     def folded(self) -> float:
         """The share of the draws that invert a tetrahedron of the mesh."""
         return float(np.mean([self.deformer.displaced(u).folded > 0 for u in self.draws]))
@@ -95,9 +87,7 @@ class Transform:
         location = self.deformer.locate(points)
         return self.pose.place(points + self.mean.displacement(points, location)), location
 
-    def place_by(
-        self, draw: int, points: Float[np.ndarray, "k 3"], near: Location, unresolved_sd: Float[np.ndarray, "k 3"]
-    ) -> Float[np.ndarray, "k 3"]:
+    def place_by(self, draw: int, points: Float[np.ndarray, "k 3"], near: Location) -> Float[np.ndarray, "k 3"]:
         """Map points by one of the draws, mm.
 
         Parameters
@@ -108,11 +98,9 @@ class Transform:
             The points before the map, mm.
         near : Location
             The locations of the points from `place`.
-        unresolved_sd : (k, 3) array
-            The standard deviations at these locations from `Transform.unresolved_sd`, mm.
         """
         displaced = self.deformer.displaced(self.draws[draw])
-        beside = unresolved_sd * self._normal_numbers[draw]
+        beside = self._unresolved_by(draw, near)
         if self.turned:
             return displaced.sources(self.pose.inverse.place(points), near)[0] - beside
         return self.pose.place(points + displaced.displacement(points, near) + beside)
@@ -124,71 +112,52 @@ class Transform:
             for first in range(0, len(self.draws), side_by_side):
                 yield from pool.map(function, range(first, min(first + side_by_side, len(self.draws))))
 
-    def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
-        """Compute the standard deviation of the Normal number that is added to draws of u at points, mm.
+    def _unresolved_by(self, draw: int, near: Location) -> Float[np.ndarray, "k 3"]:
+        """Compute the displacement that the mesh cannot resolve at points in one of the draws, mm; zero around it."""
+        pair, turn = divmod(draw, 2)
+        amplitudes = (1 - 2 * turn) * self.unresolved.draw((self.seed, pair))
+        displacement, inside = np.zeros((len(near.cell), 3)), self.deformer.is_inside(near)
+        displacement[inside] = self.unresolved.displacement(amplitudes, near.cell[inside], near.barycentric[inside])
+        return displacement
 
-        The notes of `Transform` define it. It is zero around the mesh.
-        """
-        return np.sqrt(self._unresolved_variance(near, self._drawn_covariance(near)))
+    def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
+        """Compute the standard deviation of what the mesh cannot resolve at points, mm; zero around the mesh."""
+        sd, inside = np.zeros((len(near.cell), 3)), self.deformer.is_inside(near)
+        covariance = self.unresolved.covariance_at(near.cell[inside], near.barycentric[inside])
+        sd[inside] = np.sqrt(np.einsum("kii->ki", covariance))
+        return sd
 
     def covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
         """Compute the posterior covariance of u at points, mm², along the axes of the fixed image's world.
 
-        The notes of `Transform` define it. It is NaN around the mesh, where nothing is observed.
+        It is that of the draws plus that of what the mesh cannot resolve. It is NaN around the mesh, where nothing is
+        observed.
         """
-        drawn = self._drawn_covariance(near)
-        covariance = drawn + self._unresolved_variance(near, drawn)[:, :, None] * np.eye(3)
-        covariance[~self.deformer.is_inside(near)] = np.nan
-        return covariance
-
-    def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
-        """Compute the posterior covariance of u at the nodes, mm², plus the variance that the mesh cannot resolve.
-
-        The latter is the mean over the tetrahedra at a node, weighted by their volumes.
-        """
-        away = self.draws - self.draws.mean(axis=0)
-        covariance = np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
-        total, volume = np.zeros((len(covariance), 3)), np.zeros(len(covariance))
-        for corner in self.mesh.cells.T:
-            np.add.at(total, corner, self.mesh.volumes[:, None] * self._discretisation_variance)
-            np.add.at(volume, corner, self.mesh.volumes)
-        return covariance + (total / volume[:, None])[:, :, None] * np.eye(3)
-
-    def _drawn_covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
-        """Compute the covariance of the draws at points, mm²; zero around the mesh.
-
-        The draws are linear in every tetrahedron.
-        """
-        covariance = np.zeros((len(near.cell), 3, 3))
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
-        total = np.zeros((len(cell), 3, 3))
+        total = self.unresolved.covariance_at(cell, share)
         for a, b in product(range(4), repeat=2):
             total += (share[:, a] * share[:, b])[:, None, None] * self._cell_covariance[cell, a, b]
+        covariance = np.full((len(near.cell), 3, 3), np.nan)
         covariance[inside] = total
         return covariance
 
-    def _unresolved_variance(self, near: Location, drawn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "k 3"]:
-        """Compute the variance of u minus the variance of the draws at points, mm²; zero around the mesh.
+    def variances(self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "2 k 3"]:
+        """Compute the variances of u at points in tetrahedra, mm², along the axes of the moving image's world.
 
-        The variance of u is that of the nodes, interpolated, plus the variance that the mesh cannot resolve.
+        The first is that of the draws, and the second that of what the mesh cannot resolve.
         """
-        variance = np.zeros((len(near.cell), 3))
-        inside = self.deformer.is_inside(near)
-        cell, share = near.cell[inside], near.barycentric[inside]
-        nodal = np.einsum("ka,kai->ki", share, self._corner_sd[cell]) ** 2
-        variance[inside] = np.maximum(
-            nodal + self._discretisation_variance[cell] - np.einsum("kii->ki", drawn[inside]), 0
-        )
-        return variance
+        along = np.einsum("ij,mabjk,ik->mabi", self.pose.rotation, self._cell_covariance, self.pose.rotation)
+        drawn = np.zeros((len(cell), 3))
+        for a, b in combinations_with_replacement(range(4), 2):
+            times = 1 if a == b else 2
+            drawn += (times * share[:, a] * share[:, b])[:, None] * along[cell, a, b]
+        return np.stack([np.maximum(drawn, 0), self.unresolved.turned(self.pose.rotation).variance_at(cell, share)])
 
-    @cached_property
-    def _corner_sd(self) -> Float[np.ndarray, "cells 4 3"]:
-        return np.sqrt(np.einsum("maaii->mai", self._cell_covariance))
-
-    @cached_property
-    def _discretisation_variance(self) -> Float[np.ndarray, "cells 3"]:
-        return discretisation_variance(self.mesh, self.u_mean)
+    def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
+        """Compute the posterior covariance of u at the nodes, mm²."""
+        away = self.draws - self.draws.mean(axis=0)
+        return np.einsum("sni,snj->nij", away, away) / max(len(away) - 1, 1)
 
     @cached_property
     def _cell_covariance(self) -> Float[np.ndarray, "cells 4 4 3 3"]:
@@ -260,10 +229,7 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
     inside_index = np.flatnonzero(inside)
     location = Location(near.cell[inside_index], near.barycentric[inside_index])
     square, beyond_far = np.zeros((len(inside_index), 3, 3)), np.zeros((len(far), len(inside_index)))
-    sd = transform.unresolved_sd(location)
-    for drawn_places in transform.for_each_draw(
-        lambda draw: transform.place_by(draw, points[inside_index], location, sd)
-    ):
+    for drawn_places in transform.for_each_draw(lambda draw: transform.place_by(draw, points[inside_index], location)):
         away = drawn_places - places[inside_index]
         square += away[:, :, None] * away[:, None]
         distance = np.linalg.norm(away, axis=1)

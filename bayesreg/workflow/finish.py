@@ -20,6 +20,7 @@ from bayesreg.io.run_folder import RunFolder
 from bayesreg.io.volumes import save_image
 from bayesreg.model.observations.observation import MAPS, Doubtful, Mapped, Noted
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.submesh import unresolved_in
 from bayesreg.model.warp import warp_image
 from bayesreg.pose import Pose
 from bayesreg.report.metrics import compute_metrics
@@ -60,7 +61,8 @@ def finish(
 
     def transform(most: int) -> Transform:
         u = nodal_draws(config.model, inputs, draws, most)
-        return Transform(deformer, pose, samples.u_mean, u, seed=config.seed)
+        unresolved = unresolved_in(posterior.data.body, mean, u)
+        return Transform(deformer, pose, samples.u_mean, u, unresolved, seed=config.seed)
 
     sampled_transform = transform(POINT_DRAWS)
     predicted = with_unresolved(predicted, sampled_transform)
@@ -69,8 +71,7 @@ def finish(
             PointPairs.of_arrays(inputs.observed[NAME]), sampled_transform, config.evaluation.sd
         )
         predicted = predicted._replace(**held_out)
-    total_sd = samples.u_sd if predicted.total_sd is None else predicted.total_sd
-    moments = moments_on(sampled_transform, total_sd, grid)
+    moments = moments_on(sampled_transform, grid)
     finished = Run(
         manifest=manifest(config, inputs, posterior, samples, sampled_transform.draws, mean, judged, provenance, began)
         | {"displacement_sd": moments.rms_sd},

@@ -14,7 +14,9 @@ from bayesreg.fem.deformation import Deformer
 from bayesreg.io import store
 from bayesreg.io.records import Inputs, Run
 from bayesreg.io.run_folder import RunFolder
+from bayesreg.model import coordinates
 from bayesreg.model.posterior import Posterior
+from bayesreg.model.submesh import unresolved_in
 from bayesreg.results.displacement_fields import moments_on, write_transforms
 from bayesreg.results.nodal_draws import POINT_DRAWS, nodal_draws
 from bayesreg.results.result import REPORT
@@ -49,8 +51,10 @@ def write_first_answer(
 
     grid, pose = inputs.fixed or inputs.tissue, inputs.matching.pose
     u = nodal_draws(config.model, inputs, _labelled(posterior, estimands), POINT_DRAWS)
-    transform = Transform(Deformer(inputs.mesh), pose, u.mean(axis=0), u, seed=config.seed)
-    moments = moments_on(transform, (u @ pose.rotation.T).std(axis=0), grid)
+    mean = {name: np.mean(draws, axis=0) for name, draws in estimands.items()}
+    unresolved = unresolved_in(posterior.data.body, coordinates.complete(posterior.data.blocks, mean), u)
+    transform = Transform(Deformer(inputs.mesh), pose, u.mean(axis=0), u, unresolved, seed=config.seed)
+    moments = moments_on(transform, grid)
     run = Run(
         manifest={"name": config.description, "appraisal": appraisal},
         u_mean=transform.u_mean,

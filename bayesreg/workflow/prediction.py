@@ -22,7 +22,7 @@ from bayesreg.model.observations.observation import Checked, Summarised
 from bayesreg.model.posterior import Posterior
 from bayesreg.model.state import state_of
 from bayesreg.pose import Pose, compose, rigid_projection
-from bayesreg.results.transform import Transform, distances_of
+from bayesreg.results.transform import Transform
 from bayesreg.tissues import label_of
 from bayesreg.types import AnyArray
 
@@ -81,19 +81,19 @@ def predict(
     places = places or default_places(mesh, u_mean, u_sd)
     nodes, weights = _interpolation(mesh, places)
     centre, projection = rigid_projection(mesh.points, mesh.nodal_volumes)
-    arrays = (u_mean, nodes, weights, projection, pose.rotation)
+    arrays = (u_mean, nodes, weights, projection)
     shared = posterior.data, *(jnp.asarray(array) for array in arrays)
     key = jax.random.key(seed)
 
     def forward(draw: dict[str, AnyArray], arguments: Any) -> dict[str, AnyArray]:
-        data, u_mean, nodes, weights, projection, rotation = arguments
+        data, u_mean, nodes, weights, projection = arguments
         number = draw.pop("number")
         state = state_of(data.body, data.blocks, coordinates.fill(data.blocks, draw))
         u = state.u
         distance, stiffness = jnp.linalg.norm(u - u_mean, axis=1), data.body.stiffness_factor(draw)
         predictions = {"u": u, "distance": distance, "far": (distance > FAR).astype(float),
                        "places": jnp.einsum("la,lai->li", weights, u[nodes]),
-                       "motion": jnp.einsum("aki,ki->a", projection, u), "turned": u @ rotation.T,
+                       "motion": jnp.einsum("aki,ki->a", projection, u),
                        "stiffness": stiffness, "stiffer": (stiffness > STIFFER).astype(float)}  # fmt: skip
         of_draw = jax.random.fold_in(key, number.astype(int))
         for name, observation in checked.items():
@@ -119,7 +119,6 @@ def predict(
         place_draws=kept_arrays.pop("places"),
         motion=np.concatenate(compose(pose, centre, kept_arrays.pop("motion")), axis=-1),
         centre=centre,
-        total_sd=None if pose.is_identity else summary.sd["turned"],
         observations=kept_arrays | _summaries(posterior, mean, thinned),
         **(_stiffness(summary) if posterior.data.body.field is not None else {}),
     )
@@ -148,10 +147,7 @@ def with_unresolved(predicted: Predicted, transform: Transform) -> Predicted:
     draws = np.asarray(predicted.place_draws)
     # The stream number len(draws) is free: the draws use the numbers below it.
     rng = np.random.default_rng((transform.seed, len(transform.draws)))
-    about = distances_of(transform.nodal_covariance(), (float(predicted.far_mm),), REACH)
-    return predicted._replace(
-        place_draws=draws + sd * rng.standard_normal(draws.shape), reach=about.radius, far=about.far[0]
-    )
+    return predicted._replace(place_draws=draws + sd * rng.standard_normal(draws.shape))
 
 
 def _stiffness(summary: Summary) -> dict[str, np.ndarray]:

@@ -13,15 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import bayesreg as br
 from bayesreg.fem.deformation import Deformer, Displaced
 from bayesreg.image import Image
+from bayesreg.model import coordinates
 from bayesreg.model.observations.landmarks_report import region_probability
-from bayesreg.model.submesh import discretisation_variance
+from bayesreg.model.submesh import Unresolved, unresolved_in
 from bayesreg.pose import Pose
 from bayesreg.results.carried_labels import carry_labels
 from bayesreg.results.transform import Transform, spread
 from studies.calibration import sbc
-from studies.calibration.chains import simulated
+from studies.calibration.chains import PARAMETERS, simulated
 from studies.calibration.simulator import DEGREES_OF_FREEDOM, MESH, VARIANTS, Simulator
 from tests.phantoms import box_mesh, smooth_image
 
@@ -32,9 +34,8 @@ FORWARD_RANGE, INVERSE_RANGE = (0.5, 19.5), (4.0, 16.0)
 LABELS = 4
 
 
-# The ellipsoids of points.csv, and of their components: the draws alone, which are linear in each tetrahedron, and the
-# draws with one of the two variances that `Transform` adds to them.
-COVARIANCES = ("as written", "the draws", "the draws and what the mesh cannot follow", "the nodes, interpolated")
+# The ellipsoids of points.csv, and those of the draws alone, which are linear in each tetrahedron.
+COVARIANCES = ("as written", "the draws")
 
 
 class Case(NamedTuple):
@@ -42,7 +43,7 @@ class Case(NamedTuple):
 
     Attributes
     ----------
-    forward, inverse : (4,) arrays
+    forward, inverse : (2,) arrays
         The probability for a point that is mapped forward, and by the inverse, with each of `COVARIANCES`.
     label : float
         The probability for the label of a voxel; it includes a random share of the probability of the true label.
@@ -56,24 +57,37 @@ class Case(NamedTuple):
 def measure(
     finer: bool, seed: int = 0, settings: sbc.Settings = SETTINGS, report_progress: sbc.Progress = lambda text: None
 ) -> np.ndarray:
-    """Return all cases as an array (r, 9), in the order of `Case`."""
+    """Return all cases as an array (r, 5), in the order of `Case`."""
     mesh = box_mesh(4) if finer else MESH
     simulator = Simulator(VARIANTS["loads"], mesh)
+    posterior = simulator.posterior
     rng = np.random.default_rng(seed)
     truths = simulator.draw_prior(rng, settings.replications)
     key_data, key_chains = jax.random.split(jax.random.key(seed))
     observed = _observed_images(simulator, truths, key_data)
     starts = Simulator(VARIANTS["loads"]).draw_prior(rng, settings.replications)
-    sampled = sbc.sample(simulator.posterior, observed, starts, key_chains, settings, report_progress=report_progress)
+    sampled = sbc.sample(posterior, observed, starts, key_chains, settings, report_progress=report_progress)
     report_progress(f"acceptance {sampled.acceptance.min():.0%} to {sampled.acceptance.max():.0%}")
     registered, true = Deformer(MESH), Deformer(mesh)
     labels = _labels()
     cases = []
     for case, u in enumerate(truths["u_boundary"]):
         draws = sampled.u[:, case]
-        transform = Transform(registered, Pose.identity(), draws.mean(axis=0), draws, seed=case)
+        unresolved = _unresolved(posterior, sampled.quantities[:, case].mean(axis=0), draws)
+        transform = Transform(registered, Pose.identity(), draws.mean(axis=0), draws, unresolved, seed=case)
         cases.append(_case(transform, true.displaced(u), labels, rng))
     return np.array([np.hstack(case) for case in cases])
+
+
+def _unresolved(posterior: br.Posterior, quantities: np.ndarray, draws: np.ndarray) -> Unresolved:
+    """Make the distribution of what the mesh cannot resolve, at the loads and the stiffness among test quantities."""
+    estimands = posterior.estimands(posterior.reference())
+    first = 0
+    for name in [name for name in PARAMETERS if name in estimands]:
+        end = first + np.size(estimands[name])
+        estimands[name] = quantities[first:end].reshape(np.shape(estimands[name]))
+        first = end
+    return unresolved_in(posterior.data.body, coordinates.complete(posterior.data.blocks, estimands), draws)
 
 
 def _observed_images(simulator: Simulator, truths: dict[str, np.ndarray], key: Any) -> Any:
@@ -121,11 +135,9 @@ def _improbable(transform: Transform, points: np.ndarray, true_places: np.ndarra
     """Return the probability of the region that contains the true place, for each of `COVARIANCES`."""
     predicted = spread(transform, points)
     _, location = transform.place(points)
-    drawn = transform.covariance(location) - np.eye(3) * transform.unresolved_sd(location)[:, :, None] ** 2
-    submesh = discretisation_variance(transform.mesh, transform.u_mean)[location.cell]
-    nodes = transform.covariance(location) - np.eye(3) * submesh[:, :, None]
-    every = (predicted.covariance, drawn, drawn + np.eye(3) * submesh[:, :, None], nodes)
-    return np.concatenate([region_probability(true_places - predicted.places, covariance) for covariance in every])
+    drawn = transform.covariance(location) - transform.unresolved.covariance_at(location.cell, location.barycentric)
+    away = true_places - predicted.places
+    return np.concatenate([region_probability(away, covariance) for covariance in (predicted.covariance, drawn)])
 
 
 def _improbable_label(probabilities: dict[int, float], true: int, rng: np.random.Generator) -> float:

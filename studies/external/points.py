@@ -14,7 +14,6 @@ import numpy as np
 
 from bayesreg.io.points import read_point_pairs
 from bayesreg.model.observations.landmarks_report import region_probability
-from bayesreg.model.submesh import discretisation_variance
 from bayesreg.results.nodal_draws import transform_of
 from bayesreg.results.result import load_result
 
@@ -28,8 +27,7 @@ def main() -> None:
     # The errors are along the axes of the world of the fixed image, as the covariance of u.
     away = (points.moving - places) @ transform.pose.rotation
     covariance = transform.covariance(near)
-    submesh = discretisation_variance(transform.mesh, transform.u_mean)[near.cell]
-    drawn = covariance + (submesh - transform.unresolved_sd(near) ** 2)[:, :, None] * np.eye(3)
+    drawn = covariance - transform.unresolved.covariance_at(near.cell, near.barycentric)
     print(f"{len(places)} points, mean error {np.linalg.norm(away, axis=1).mean():.3f} mm")
     for name, matrix in {"ellipsoids of points.csv": covariance, "of the draws alone": drawn}.items():
         inside = region_probability(away, matrix)

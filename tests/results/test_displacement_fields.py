@@ -1,5 +1,7 @@
 """The transforms that a run leaves, in the hands of other programs: SimpleITK, ANTs, nitransforms and nibabel."""
 
+from dataclasses import replace
+
 import ants
 import nibabel as nib
 import nitransforms
@@ -13,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.io.fields import load_displacement
-from bayesreg.model.submesh import discretisation_variance
+from bayesreg.model.submesh import unresolved_displacement
 from bayesreg.model.warp import covered_voxels
 from bayesreg.pose import Motion, Pose
 from bayesreg.results.displacement_fields import MEAN_STEP, SD_STEP, STEP_AROUND, moments_on, write_transforms
@@ -47,7 +49,9 @@ def _transform(pose: Pose = POSE, draws: int = 2) -> Transform:
     mesh, rng = ball_mesh(radius=38, spacing=18.0), np.random.default_rng(0)
     x, y, z = (mesh.points - CENTRE).T / 25
     u = 3.0 * np.stack([np.sin(y), np.cos(z) - 1, x * y / 2], axis=1)
-    return Transform(Deformer(mesh), pose, u, u + 0.3 * rng.standard_normal((draws, *u.shape)))
+    cells = np.ones(len(mesh.cells))
+    unresolved = unresolved_displacement(mesh, 5 * cells, cells, 0.1, 0.2, np.ones(len(mesh.points)))
+    return Transform(Deformer(mesh), pose, u, u + 0.3 * rng.standard_normal((draws, *u.shape)), unresolved)
 
 
 def _smooth_image(grid: Image) -> Image:
@@ -109,7 +113,7 @@ def test_each_draw_has_its_own(name, tmp_path):
     ]
     points = CENTRE + np.random.default_rng(1).uniform(-20, 20, (100, 3))
     for number, u in enumerate(transform.draws, start=1):
-        draw_transform = Transform(transform.deformer, POSE, u, transform.draws[:0])
+        draw_transform = replace(transform, u_mean=u, draws=transform.draws[:0])
         placed, _ = draw_transform.place(points)
         base = tmp_path / "transforms" / f"draw-{number}"
         forward = SimpleITK.ReadTransform(f"{base}.h5")
@@ -164,7 +168,7 @@ def test_a_field_moves_an_image_by_nibabel_and_scipy_alone(tmp_path):
         index = nib.affines.apply_affine(np.linalg.inv(moving.affine), places)
         theirs = ndimage.map_coordinates(np.asarray(moving.voxels), np.moveaxis(index, -1, 0), order=1)
         centres = nib.affines.apply_affine(field.affine, voxels).reshape(-1, 3)
-        moving_points, _ = Transform(transform.deformer, POSE, u, transform.draws[:0]).place(centres)
+        moving_points, _ = replace(transform, u_mean=u, draws=transform.draws[:0]).place(centres)
         interior = _lies_between_voxels(moving, moving_points)
         np.testing.assert_allclose(
             theirs.ravel()[interior], np.asarray(moving.interpolate(moving_points))[interior], atol=5e-4
@@ -199,11 +203,10 @@ def test_small_voxels_are_passed_over(tmp_path):
 @pytest.mark.parametrize(
     ("linear", "around"), [(GRIDS["oblique"], 1e-5), (TURN @ np.diag([0.75, 2.0, 3.0]), 0.05)], ids=["coarse", "fine"]
 )
-def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow(linear, around):
+def test_moments_are_those_of_the_draws_and_of_what_the_mesh_cannot_resolve(linear, around):
     """On small voxels, too, where what lies around the mesh is interpolated."""
-    transform, grid = _transform(), _grid(linear)
-    sd = np.full(transform.mesh.points.shape, 0.2)
-    mean, total_sd, sd_by_cause = moments = moments_on(transform, sd, grid)
+    transform, grid = _transform(draws=20), _grid(linear)
+    mean, total_sd, sd_by_cause = moments = moments_on(transform, grid)
     points = grid.grid_points().reshape(-1, 3)
     covered = covered_voxels(grid, transform.mesh)
     index = tuple(covered.voxel.T)
@@ -211,10 +214,12 @@ def test_moments_are_those_of_the_nodes_and_of_what_the_mesh_cannot_follow(linea
     assert away[index].max() < 1e-5
     assert np.percentile(away, 99) < around
     assert away.max() < 5 * around
-    total = transform.pose.displacement(transform.mesh.points, transform.u_mean)
-    expected = np.sqrt(0.04 + discretisation_variance(transform.mesh, total)[covered.cell])
-    np.testing.assert_allclose(total_sd[index], expected, rtol=1e-5)
-    assert sd_by_cause["nodes"] == pytest.approx(0.2)
+    corners = transform.mesh.cells[covered.cell]
+    drawn = np.einsum("ka,skai->ski", covered.barycentric, transform.draws[:, corners]) @ transform.pose.rotation.T
+    unresolved = transform.unresolved.covariance_at(covered.cell, covered.barycentric)
+    along = np.einsum("ij,kjl,il->ki", transform.pose.rotation, unresolved, transform.pose.rotation)
+    np.testing.assert_allclose(total_sd[index] ** 2, drawn.var(axis=0, ddof=1) + along, rtol=1e-4)
+    assert sd_by_cause["mesh"] == pytest.approx(np.sqrt(along.mean()), rel=1e-5)
     assert sd_by_cause["nodes"] ** 2 + sd_by_cause["mesh"] ** 2 == pytest.approx(
         (total_sd[index].astype(float) ** 2).mean()
     )

@@ -1,5 +1,7 @@
 """The posterior of a transform: against closed forms, against brute force, and how often it holds the truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -7,6 +9,7 @@ from scipy.stats import chi2
 from bayesreg.fem.deformation import Deformer
 from bayesreg.image import Image
 from bayesreg.mesh import TetMesh
+from bayesreg.model.submesh import Unresolved, unresolved_displacement
 from bayesreg.pose import Motion
 from bayesreg.results.carried_labels import carry_labels
 from bayesreg.results.transform import Transform, distances_of, spread
@@ -20,7 +23,12 @@ def _transform(draws: int = 40, sd: float = 0.3, seed: int = 0) -> Transform:
     mesh, rng = ball_mesh(radius=38, spacing=18.0), np.random.default_rng(seed)
     x, y, z = (mesh.points - CENTRE).T / 25
     u = 2.0 * np.stack([np.sin(y), np.cos(z) - 1, x * y], axis=1)
-    return Transform(Deformer(mesh), POSE, u, u + sd * rng.standard_normal((draws, *u.shape)))
+    return Transform(Deformer(mesh), POSE, u, u + sd * rng.standard_normal((draws, *u.shape)), _unresolved(mesh))
+
+
+def _unresolved(mesh: TetMesh, size: float = 0.1) -> Unresolved:
+    cells = np.ones(len(mesh.cells))
+    return unresolved_displacement(mesh, 5 * cells, cells, size, 2 * size, np.ones(len(mesh.points)))
 
 
 def _points(transform: Transform, count: int, radius: float, seed: int = 1) -> np.ndarray:
@@ -42,14 +50,23 @@ def test_there_and_back():
     np.testing.assert_allclose(placed[inside], transform.pose.place(points[inside] + u), atol=1e-12)
 
 
-def test_the_covariance_is_that_of_the_nodes_interpolated_and_turned_with_the_pose():
-    """Nodes that err alone by sd 0.3 make points err by 0.3 where the displacement is linear, not by half of it."""
+def test_the_covariance_is_that_of_the_draws_turned_with_the_pose():
+    """Of draws that shift the whole mesh, and of what the mesh cannot resolve."""
     mesh = ball_mesh(radius=38, spacing=18.0)
     u = 0.02 * (mesh.points - CENTRE)
     sd = np.array([0.1, 0.2, 0.4])
-    draws = u + sd * np.random.default_rng(0).standard_normal((2000, *u.shape))
-    transform = Transform(Deformer(mesh), POSE, u, draws)
-    uncertainty = spread(transform, _points(transform, 200, 25.0), far=(0.5, 1.0))
+    draws = u + sd * np.random.default_rng(0).standard_normal((2000, 1, 3))
+    rigid = Transform(Deformer(mesh), POSE, u, draws, _unresolved(mesh, size=0.0))
+    transform = replace(rigid, unresolved=_unresolved(mesh, size=3.0))
+    points = _points(transform, 200, 25.0)
+    alone, both = spread(rigid, points).covariance, spread(transform, points).covariance
+    location = transform.deformer.locate(points)
+    beside = transform.unresolved.turned(POSE.rotation).covariance_at(location.cell, location.barycentric)
+    assert np.trace(beside, axis1=1, axis2=2).mean() > 0.05
+    np.testing.assert_allclose(both - alone, beside, atol=0.25 * beside.max())
+    turned = np.einsum("ij,kjl,ml->kim", POSE.rotation, transform.covariance(location), POSE.rotation)
+    np.testing.assert_allclose(both, turned, atol=0.15 * turned.max())
+    uncertainty = spread(rigid, points, far=(0.5, 1.0))
     assert uncertainty.inside.all()
     expected = POSE.rotation @ np.diag(sd**2) @ POSE.rotation.T
     np.testing.assert_allclose(uncertainty.covariance.mean(axis=0), expected, atol=0.004)
@@ -88,7 +105,7 @@ def test_folded_draws_are_counted():
     bad = transform.draws.copy()
     node = transform.mesh.interior[0]
     bad[3, node] += 40.0
-    assert Transform(transform.deformer, POSE, transform.u_mean, bad).folded == pytest.approx(0.1)
+    assert replace(transform, draws=bad).folded == pytest.approx(0.1)
 
 
 def _labels(seed: int = 0) -> Image:
@@ -114,16 +131,15 @@ def test_label_probabilities_are_those_of_brute_force(turned):
     assert 0.02 < len(carried.open) / len(carried.certain) < 0.9
     inverse, places = transform.inverse, grid.grid_points().reshape(-1, 3)
     _, near = inverse.place(places)
-    # Every voxel by every draw; the Normal numbers are those of the open voxels.
+    # Every voxel by every draw; what the mesh cannot resolve moves the open voxels alone.
     open_near = type(near)(near.cell[carried.open], near.barycentric[carried.open])
-    sd = inverse.unresolved_sd(open_near)
     brute = {value: np.zeros(len(places)) for value in (2, 5, 70)}
     for draw, u in enumerate(inverse.draws):
         if inverse.turned:
             source = inverse.deformer.displaced(u).sources(inverse.pose.inverse.place(places))[0]
         else:
             source = inverse.pose.place(places + inverse.deformer.displaced(u).displacement(places, near))
-        source[carried.open] = inverse.place_by(draw, places[carried.open], open_near, sd.astype(np.float32))
+        source[carried.open] = inverse.place_by(draw, places[carried.open], open_near)
         for value, count in brute.items():
             count += labels.nearest(source) == value
     for value, probability in carried.probabilities():
@@ -170,7 +186,7 @@ def test_ellipsoids_and_labels_hold_the_truth_as_often_as_they_say():
     hits, calibrated = np.zeros((2, len(LEVELS))), []
     for _ in range(CASES):
         *draws, u = _normal(201, rng, mesh)
-        transform = Transform(deformer, POSE, mean, np.array(draws))
+        transform = Transform(deformer, POSE, mean, np.array(draws), _unresolved(mesh))
         start = CENTRE + rng.uniform(-12, 12, (1, 3))
         for row, way in enumerate((transform, transform.inverse)):
             points = start if row == 0 else POSE.place(start)
@@ -201,7 +217,8 @@ def test_ellipsoids_and_labels_hold_the_truth_as_often_as_they_say():
 def _true_place(way, points, u, rng):
     """By a displacement and what the mesh does not resolve of it."""
     _, near = way.place(points)
-    beside = way.unresolved_sd(near) * rng.standard_normal(points.shape)
+    drawn = way.unresolved.draw((int(rng.integers(2**32)),))
+    beside = way.unresolved.displacement(drawn, near.cell, near.barycentric)
     displaced = way.deformer.displaced(u)
     if way.turned:
         return displaced.sources(way.pose.inverse.place(points))[0] - beside
