@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from bayesreg.fem.deformation import Displaced
 from bayesreg.fem.location import Location
-from bayesreg.image import Image
+from bayesreg.image import Image, slices
 from bayesreg.io.fields import save_displacement
 from bayesreg.io.run_folder import Place
 from bayesreg.io.transforms import save_transform
@@ -27,6 +27,8 @@ MEAN_SPACING = 0.15
 # Written values are multiples of these, mm: the mean in the mesh, the mean around it, where nothing is observed, and
 # the standard deviation. Rounding moves the mean by at most 0.004 mm in the mesh.
 MEAN_STEP, STEP_AROUND, SD_STEP = 2.0**-7, 2.0**-3, 2.0**-8
+# The number of voxels whose variances are computed at a time.
+VOXELS = 300_000
 # The grid of an inverse extends this far beyond the displaced mesh, mm.
 MARGIN = 10.0
 
@@ -78,7 +80,9 @@ def moments_on(transform: Transform, grid: Image) -> Moments:
     mean[covered_index] = np.einsum("ka,kai->ki", covered.barycentric, transform.u_mean[corners])
     for block, points in grid.blocks():
         mean[block] = pose.displacement(points, mean[block])
-    drawn, unresolved = transform.variances(covered.cell, covered.barycentric)
+    blocks = slices(len(covered.cell), VOXELS)
+    parts = [transform.variances(covered.cell[block], covered.barycentric[block]) for block in blocks]
+    drawn, unresolved = np.concatenate(parts, axis=1)
     sd = np.zeros_like(mean)
     sd[covered_index] = np.sqrt(drawn + unresolved)
     shape, variances = (*grid.shape, 3), {"nodes": drawn, "mesh": unresolved}
