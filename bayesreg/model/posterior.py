@@ -14,6 +14,7 @@ from jaxtyping import Int
 from bayesreg.mesh import TetMesh
 from bayesreg.model import coordinates, evaluation
 from bayesreg.model.blocks import LAME, Values
+from bayesreg.model.curvature import displacement_curvature
 from bayesreg.model.evaluation import Evaluation
 from bayesreg.model.observations.images.likelihood import ComparedImages, images_of
 from bayesreg.model.observations.observation import Correlated
@@ -145,18 +146,24 @@ class Posterior:
     def count_independent_points(self, values: Values) -> dict[str, float]:
         """Count the independent quadrature points of each pair of images, from its residuals at these values.
 
-        The counted points are those of the rule "voxels"; see
-        `bayesreg.model.observations.images.independence.independent_scores`.
+        The counted points are those of the rule "voxels". If all nodes are sampled and points are compared one by one,
+        see `bayesreg.model.observations.images.independence.excess_of_patches`, else `independent_scores` there.
         """
         filled = self.fill(values)
         u = self.evaluate(filled).u
         correlated = {
             name: observation for name, observation in self.observations.items() if isinstance(observation, Correlated)
         }
-        return {
+        counts = {
             name: observation.count_independent_points(self.data.terms[name], u, filled)
             for name, observation in correlated.items()
         }
+        pairs = [term for term in self.data.terms.values() if isinstance(term, ComparedImages) and term.name in counts]
+        if len(self.sampled) < len(self.mesh.points) or not pairs:
+            return counts
+        rows = displacement_curvature(self.data, filled, u).gauss_newton
+        curvature = rows[len(rows) - 3 * len(self.sampled) :, len(rows) - 3 * len(self.sampled) :]
+        return counts | {term.name: term.count_by_patches(u, filled, curvature) for term in pairs if term.is_pointwise}
 
     def with_independent_points(self, counts: Mapping[str, float]) -> Posterior:
         """Return the posterior with each pair of images tempered to its count of independent points."""

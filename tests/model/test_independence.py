@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 import pytest
+import scipy.sparse
 from scipy import ndimage
 
 import bayesreg as br
@@ -14,7 +15,12 @@ from bayesreg.inference.chains.beginning import first_checkpoint, temper_target
 from bayesreg.inference.gaussian.mode_search import approach
 from bayesreg.inference.layout import flat_position
 from bayesreg.model.coordinates import complete
-from bayesreg.model.observations.images.independence import independent_points, independent_scores
+from bayesreg.model.observations.images.independence import (
+    excess_of_patches,
+    independent_points,
+    independent_scores,
+)
+from bayesreg.model.term import PointCurvature
 from bayesreg.types import InputError
 from tests.options import posterior_of
 from tests.phantoms import ball_mesh, rotated_affine, smooth_image
@@ -163,6 +169,29 @@ def test_a_search_goes_on_where_the_tempering_has_led_to():
         for values in (tempered.coordinates.reference(), tempered.mode_search.search_start)
     )
     np.testing.assert_array_equal(approach(tempered, start), search_start)
+
+
+@pytest.mark.parametrize("misfit", [0.0, 0.7])
+def test_forces_on_patches_tell_noise_from_a_misfit_as_wide_as_a_tetrahedron(misfit):
+    """A linear model in closed form: the mode of y = ∇m · u + noise under a Normal prior; the noise has sd one."""
+    mesh, rng = ball_mesh(spacing=16.0), np.random.default_rng(0)
+    cells, count = rng.integers(len(mesh.cells), size=20_000), 3 * len(mesh.points)
+    weights, slopes = rng.dirichlet(np.ones(4), len(cells)), rng.normal(size=(len(cells), 3))
+    rows = np.repeat(np.arange(len(cells)), 12)
+    columns = (3 * mesh.cells[cells][:, :, None] + np.arange(3)).ravel()
+    J = scipy.sparse.csr_array(((weights[:, :, None] * slopes[:, None]).ravel(), (rows, columns)), (len(cells), count))
+    H = (J.T @ J).toarray() + 4 * np.eye(count)
+    points = PointCurvature(mesh.cells[cells], weights, slopes[:, :, None] * slopes[:, None])
+    excess = []
+    for _ in range(12):
+        shift = misfit * rng.normal(size=(len(mesh.cells), 3)) / np.sqrt(len(cells) / len(mesh.cells))
+        y = J @ (rng.normal(size=count) / 2) + (shift[cells] * slopes).sum(axis=1) + rng.normal(size=len(cells))
+        residual = y - J @ np.linalg.solve(H, J.T @ y)
+        excess.append(excess_of_patches(residual[:, None] * slopes, points, H))
+    if misfit:
+        assert np.mean(excess) > 1.2
+    else:
+        assert np.mean(excess) == pytest.approx(1, abs=0.05)
 
 
 def test_residuals_tell_of_voxels_alone():

@@ -55,7 +55,7 @@ def test_the_covariance_is_that_of_the_draws_turned_with_the_pose():
     mesh = ball_mesh(radius=38, spacing=18.0)
     u = 0.02 * (mesh.points - CENTRE)
     sd = np.array([0.1, 0.2, 0.4])
-    draws = u + sd * np.random.default_rng(0).standard_normal((1000, 1, 3))
+    draws = u + sd * np.random.default_rng(0).standard_normal((2000, 1, 3))
     rigid = Transform(Deformer(mesh), POSE, u, draws, _unresolved(mesh, size=0.0))
     transform = replace(rigid, unresolved=_unresolved(mesh, size=3.0))
     points = _points(transform, 200, 25.0)
@@ -63,10 +63,10 @@ def test_the_covariance_is_that_of_the_draws_turned_with_the_pose():
     location = transform.deformer.locate(points)
     beside = transform.unresolved.turned(POSE.rotation).covariance_at(location.cell, location.barycentric)
     assert np.trace(beside, axis1=1, axis2=2).mean() > 0.05
-    np.testing.assert_allclose(both - alone, beside, atol=0.35 * beside.max())
+    np.testing.assert_allclose(both - alone, beside, atol=0.25 * beside.max())
     np.testing.assert_allclose((both - alone).mean(axis=0), beside.mean(axis=0), atol=0.04 * beside.max())
     turned = np.einsum("ij,kjl,ml->kim", POSE.rotation, transform.covariance(location), POSE.rotation)
-    np.testing.assert_allclose(both, turned, atol=0.2 * turned.max())
+    np.testing.assert_allclose(both, turned, atol=0.15 * turned.max())
     uncertainty = spread(rigid, points, far=(0.5, 1.0))
     assert uncertainty.inside.all()
     expected = POSE.rotation @ np.diag(sd**2) @ POSE.rotation.T

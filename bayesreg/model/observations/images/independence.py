@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import scipy.fft
+import scipy.linalg
+import scipy.sparse
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from bayesreg.image import Image
+from bayesreg.model.term import PointCurvature
 from bayesreg.types import InputError
+
+# The greatest number of patches whose forces are compared with the model, and the least number of points of one.
+MOST_PATCHES, LEAST_POINTS = 500, 20
 
 
 def independent_points(residual: Image, mask: Image) -> float:
@@ -95,6 +103,47 @@ def independent_scores(
     near = (pairs > 0) & (lags < _first_gap(correlation, pairs, lags, grid.voxel_sizes.max()))
     share = (pairs * correlation)[near].sum() / len(voxels)
     return float(np.clip(len(voxels) / share, 1, len(voxels)))
+
+
+def excess_of_patches(
+    forces: Float[np.ndarray, "points 3"], points: PointCurvature, curvature: Float[np.ndarray, "unknowns unknowns"]
+) -> float:
+    """Compute how many times as large as in the model the squared forces on patches are, at a mode.
+
+    The patch of a node is the tetrahedra around it. In the model, the force g on a patch, which is the gradient of the
+    log likelihood in a shift of the patch, has the covariance A = Σ_q A_q at the true displacement. At the mode the
+    displacements have followed the forces, and the covariance is A − Jᵀ H⁻¹ J, where J is the curvature between the
+    nodes and the patch, and H the whole curvature. The result is the mean of gᵀ (A − Jᵀ H⁻¹ J)⁻¹ g / 3 over patches. It
+    is one if nothing but noise is left. A misfit as wide as a tetrahedron, such as that of a displacement which the
+    mesh cannot resolve, makes it larger, and hardly shows in the correlation of neighbouring residuals, since the
+    displacements have absorbed most of it.
+
+    Parameters
+    ----------
+    forces : (q, 3) array
+        The gradient of the log likelihood in the displacement of each point, 1/mm.
+    points : PointCurvature
+        A_q, the Gauss–Newton curvature of the same likelihood.
+    curvature : (3n, 3n) array
+        H, 1/mm², with row 3 · node + axis.
+    """
+    nodes, count = np.asarray(points.nodes), len(curvature) // 3
+    matrices = np.asarray(points.matrices)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_PATCHES)).round().astype(int))
+    places, shape = (np.repeat(np.arange(len(nodes)), 4), nodes.ravel()), (len(nodes), count)
+    interpolation = scipy.sparse.csr_array((np.asarray(points.weights).ravel(), places), shape)
+    members = scipy.sparse.csr_array((np.ones(nodes.size), places), shape)[:, chosen]
+    chosen = chosen[members.sum(axis=0) >= LEAST_POINTS]
+    members = members[:, members.sum(axis=0) >= LEAST_POINTS]
+    force = members.T @ forces
+    alone = (members.T @ matrices.reshape(-1, 9)).reshape(-1, 3, 3)
+    coupling = np.empty((count, 3, len(chosen), 3))
+    for i, j in product(range(3), repeat=2):
+        coupling[:, i, :, j] = (interpolation.T @ (scipy.sparse.diags_array(matrices[:, i, j]) @ members)).toarray()
+    followed = scipy.linalg.solve(curvature, coupling.reshape(3 * count, -1), assume_a="pos")
+    by_patch = (array.reshape(3 * count, -1, 3) for array in (coupling, followed))
+    covariance = alone - np.einsum("umi,umj->mij", *by_patch)
+    return float((force * np.linalg.solve(covariance, force[:, :, None])[:, :, 0]).sum(axis=1).mean() / 3)
 
 
 def _autocorrelation(

@@ -17,7 +17,8 @@ from numpyro.distributions import constraints
 from bayesreg.fem.elements import Quadrature
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
-from bayesreg.model.observations.images.pointwise import Intensities, ValueCurvature
+from bayesreg.model.observations.images.independence import excess_of_patches
+from bayesreg.model.observations.images.pointwise import Intensities, Pointwise, ValueCurvature
 from bayesreg.model.observations.images.self_similarity import AlternatingImages
 from bayesreg.model.observations.images.similarity import Similarity
 from bayesreg.model.state import State
@@ -176,6 +177,22 @@ class ComparedImages(NamedTuple):
             return 1.0
         curvature = self.gauss_newton(u, values).matrices.trace(axis1=1, axis2=2).sum() / self.independent_share
         return float(curvature * self.temperature(values) ** 2 / (self.scores(u, values) ** 2).sum())
+
+    @property
+    def is_pointwise(self) -> bool:
+        """Whether the similarity compares the images point by point."""
+        return isinstance(self.similarity, Pointwise)
+
+    def count_by_patches(
+        self, u: Float[AnyArray, "nodes 3"], values: Values, curvature: Float[np.ndarray, "unknowns unknowns"]
+    ) -> float:
+        """Count the independent points from the forces on patches at a mode, see `excess_of_patches`.
+
+        `curvature` is that of minus the log posterior in all displacements there.
+        """
+        forces = np.asarray(self.scores(u, values)) * float(self.independent_share / self.temperature(values))
+        excess = excess_of_patches(forces, self.gauss_newton(u, values), curvature)
+        return float(np.clip(self.independent_points / excess, 1.0, len(self.positions)))
 
     def with_independent_points(self, count: float) -> ComparedImages:
         """Return the term with the likelihood tempered to this number of independent points."""
